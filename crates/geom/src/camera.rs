@@ -1,0 +1,205 @@
+//! Camera intrinsics and lenses: projection, distortion, and its inverse.
+
+use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+/// How directions become normalised image coordinates.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "model", rename_all = "snake_case")]
+pub enum Lens {
+    /// `x = X/Z`, no distortion.
+    Pinhole,
+    /// Brown–Conrady with OpenCV's rational radial term:
+    /// `r = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)`, tangential `p1 p2`.
+    Brown { k: [f64; 6], p: [f64; 2] },
+    /// OpenCV's equidistant fisheye: `θd = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)`, with thin-prism
+    /// terms of COLMAP's THIN_PRISM_FISHEYE (zero otherwise).
+    Fisheye { k: [f64; 4], p: [f64; 2], s: [f64; 2] },
+    /// Devernay–Faugeras field-of-view model: `rd = atan(2 r tan(ω/2)) / ω`.
+    Fov { omega: f64 },
+    /// Longitude and latitude over the whole image; focal lengths and centre are not used.
+    Equirectangular,
+}
+
+/// Intrinsics in pixels; pixel (i, j) covers `[i, i+1) × [j, j+1)`.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Camera {
+    pub width: u32,
+    pub height: u32,
+    pub fx: f64,
+    pub fy: f64,
+    pub cx: f64,
+    pub cy: f64,
+    pub lens: Lens,
+}
+
+impl Camera {
+    /// A pinhole with a horizontal field of view in radians and a centred principal point.
+    pub fn pinhole(width: u32, height: u32, fov_x: f64) -> Camera {
+        let f = 0.5 * width as f64 / (0.5 * fov_x).tan();
+        Camera { width, height, fx: f, fy: f, cx: 0.5 * width as f64, cy: 0.5 * height as f64, lens: Lens::Pinhole }
+    }
+
+    /// The same camera for images resized to `width × height`.
+    pub fn resized(&self, width: u32, height: u32) -> Camera {
+        let (sx, sy) = (width as f64 / self.width as f64, height as f64 / self.height as f64);
+        Camera { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy, lens: self.lens }
+    }
+
+    /// The same camera for images reduced `factor` times (sizes rounded down, at least one pixel).
+    pub fn downscaled(&self, factor: u32) -> Camera {
+        self.resized((self.width / factor).max(1), (self.height / factor).max(1))
+    }
+
+    /// Unit direction, in the camera, of the ray through pixel coordinates (x, y).
+    pub fn direction(&self, x_px: f64, y_px: f64) -> DVec3 {
+        if let Lens::Equirectangular = self.lens {
+            let lon = (x_px / self.width as f64 - 0.5) * std::f64::consts::TAU;
+            let lat = (y_px / self.height as f64 - 0.5) * std::f64::consts::PI;
+            return DVec3::new(lon.sin() * lat.cos(), lat.sin(), lon.cos() * lat.cos());
+        }
+        let d = DVec2::new((x_px - self.cx) / self.fx, (y_px - self.cy) / self.fy);
+        match self.lens {
+            Lens::Fisheye { .. } => {
+                let theta = self.lens.invert(d);
+                let t = theta.length();
+                let s = if t > 1e-12 { t.sin() / t } else { 1.0 };
+                DVec3::new(theta.x * s, theta.y * s, t.cos()).normalize()
+            }
+            _ => {
+                let n = self.lens.invert(d);
+                DVec3::new(n.x, n.y, 1.0).normalize()
+            }
+        }
+    }
+
+    /// Pixel coordinates of a point in the camera; `None` behind a perspective camera.
+    pub fn project(&self, x_in_camera: DVec3) -> Option<DVec2> {
+        let p = x_in_camera;
+        let d = match self.lens {
+            Lens::Equirectangular => {
+                let n = p.normalize();
+                return Some(DVec2::new(
+                    (n.x.atan2(n.z) / std::f64::consts::TAU + 0.5) * self.width as f64,
+                    (n.y.clamp(-1.0, 1.0).asin() / std::f64::consts::PI + 0.5) * self.height as f64,
+                ));
+            }
+            Lens::Fisheye { .. } => {
+                let r = DVec2::new(p.x, p.y).length();
+                let theta = r.atan2(p.z);
+                let u = if r > 1e-12 { DVec2::new(p.x, p.y) * (theta / r) } else { DVec2::ZERO };
+                self.lens.distort(u)
+            }
+            _ if p.z <= 1e-9 => return None,
+            _ => self.lens.distort(DVec2::new(p.x / p.z, p.y / p.z)),
+        };
+        Some(DVec2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy))
+    }
+}
+
+impl Lens {
+    /// Ideal to distorted normalised coordinates. For a fisheye the ideal coordinates are
+    /// `θ (cos φ, sin φ)`, for the others `(X/Z, Y/Z)`.
+    pub fn distort(&self, u: DVec2) -> DVec2 {
+        let r2 = u.length_squared();
+        let prism = |p: &[f64; 2]| {
+            DVec2::new(
+                2.0 * p[0] * u.x * u.y + p[1] * (r2 + 2.0 * u.x * u.x),
+                2.0 * p[1] * u.x * u.y + p[0] * (r2 + 2.0 * u.y * u.y),
+            )
+        };
+        match self {
+            Lens::Pinhole | Lens::Equirectangular => u,
+            Lens::Brown { k, p } => {
+                let num = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]));
+                let den = 1.0 + r2 * (k[3] + r2 * (k[4] + r2 * k[5]));
+                u * (num / den) + prism(p)
+            }
+            Lens::Fisheye { k, p, s } => {
+                let radial = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * k[3])));
+                u * radial + prism(p) + DVec2::new(s[0], s[1]) * r2
+            }
+            Lens::Fov { omega } => {
+                let r = r2.sqrt();
+                if r < 1e-9 || *omega < 1e-9 { u } else { u * ((2.0 * r * (omega / 2.0).tan()).atan() / (omega * r)) }
+            }
+        }
+    }
+
+    /// Inverts [`Lens::distort`] by Newton's method with a central-difference Jacobian.
+    pub fn invert(&self, d: DVec2) -> DVec2 {
+        match self {
+            Lens::Pinhole | Lens::Equirectangular => return d,
+            Lens::Brown { k, p } if k == &[0.0; 6] && p == &[0.0; 2] => return d,
+            Lens::Fov { omega } => {
+                let r = d.length();
+                if r < 1e-9 || *omega < 1e-9 {
+                    return d;
+                }
+                return d * ((r * omega).tan() / (2.0 * r * (omega / 2.0).tan()));
+            }
+            _ => {}
+        }
+        let mut u = d;
+        let h = 1e-6;
+        for _ in 0..20 {
+            let e = self.distort(u) - d;
+            if e.length_squared() < 1e-24 {
+                break;
+            }
+            let jx = (self.distort(u + DVec2::new(h, 0.0)) - self.distort(u - DVec2::new(h, 0.0))) / (2.0 * h);
+            let jy = (self.distort(u + DVec2::new(0.0, h)) - self.distort(u - DVec2::new(0.0, h))) / (2.0 * h);
+            let det = jx.x * jy.y - jy.x * jx.y;
+            if det.abs() < 1e-12 {
+                break;
+            }
+            u -= DVec2::new(jy.y * e.x - jy.x * e.y, jx.x * e.y - jx.y * e.x) / det;
+        }
+        u
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn lenses() -> Vec<Lens> {
+        vec![
+            Lens::Pinhole,
+            Lens::Brown { k: [0.0578, -0.0805, 0.01, 0.0, 0.0, 0.0], p: [-9.8e-4, 1.6e-4] },
+            Lens::Brown { k: [0.2, 0.05, 0.01, 0.1, 0.02, 0.001], p: [1e-3, -2e-3] },
+            Lens::Fisheye { k: [0.02, -0.005, 0.001, 0.0], p: [0.0; 2], s: [0.0; 2] },
+            Lens::Fisheye { k: [0.02, -0.005, 0.001, 0.0], p: [1e-3, 2e-3], s: [1e-3, -1e-3] },
+            Lens::Fov { omega: 0.8 },
+            Lens::Equirectangular,
+        ]
+    }
+
+    #[test]
+    fn project_undoes_direction_for_every_lens() {
+        for lens in lenses() {
+            let c = Camera { width: 640, height: 480, fx: 420.0, fy: 430.0, cx: 318.0, cy: 245.0, lens };
+            for (x, y) in [(0.5, 0.5), (320.0, 240.0), (600.5, 13.5), (31.0, 460.0)] {
+                let dir = c.direction(x, y);
+                assert!((dir.length() - 1.0).abs() < 1e-12);
+                let back = c.project(dir * 3.7).unwrap();
+                assert!((back - DVec2::new(x, y)).length() < 1e-6, "{lens:?}: {back} for {x},{y}");
+            }
+        }
+    }
+
+    #[test]
+    fn directions_point_right_and_down() {
+        let c = Camera::pinhole(100, 80, 1.0);
+        let d = c.direction(99.5, 79.5);
+        assert!(d.x > 0.0 && d.y > 0.0 && d.z > 0.0);
+    }
+
+    #[test]
+    fn downscaling_keeps_the_field_of_view() {
+        let c = Camera { lens: Lens::Pinhole, ..Camera::pinhole(1080, 1920, 0.75) };
+        let s = c.downscaled(4);
+        assert_eq!((s.width, s.height), (270, 480));
+        assert!((c.direction(1080.0, 0.0) - s.direction(270.0, 0.0)).length() < 1e-12);
+    }
+}

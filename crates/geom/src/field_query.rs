@@ -1,0 +1,22 @@
+//! Traits through which rooms meet: meshing asks a field without knowing how it is computed.
+
+/// A radiance field that can be asked at points of the world.
+pub trait FieldQuery: Sync {
+    /// Density in inverse world units at `points` `[N, 3]`, written to `sigma` `[N]`.
+    fn density(&self, points_in_world: &[[f32; 3]], sigma: &mut [f32]);
+
+    /// sRGB colour seen at `points` `[N, 3]` along unit `directions` `[N, 3]`, written to `rgb` `[N, 3]`.
+    fn color(&self, points_in_world: &[[f32; 3]], directions: &[[f32; 3]], rgb_srgb: &mut [[f32; 3]]);
+}
+
+/// What a viewer needs of a run: an image for a camera.
+pub trait ViewSource: Sync {
+    /// Renders `camera` at `world_from_camera` as `[H, W, 4]` sRGB with alpha.
+    fn view(&self, camera: &crate::Camera, world_from_camera: &crate::Pose) -> crate::Image;
+}
+
+/// Pixels that are decoded when first asked for.
+pub trait ImageSource: Send + Sync {
+    /// The pixels of frame `index`, or a one-line error that names the file.
+    fn load(&self, index: usize) -> Result<crate::ImageU8, String>;
+}

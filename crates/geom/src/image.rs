@@ -1,0 +1,126 @@
+//! Plain images, row-major, channels interleaved.
+
+use crate::color::u8_from_unit;
+
+/// `[H, W, C]` of f32.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Image {
+    pub width: usize,
+    pub height: usize,
+    pub channels: usize,
+    pub data: Vec<f32>,
+}
+
+/// `[H, W, C]` of u8; colour is sRGB-encoded, a fourth channel is straight alpha.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ImageU8 {
+    pub width: usize,
+    pub height: usize,
+    pub channels: usize,
+    pub data: Vec<u8>,
+}
+
+impl Image {
+    pub fn zeros(width: usize, height: usize, channels: usize) -> Image {
+        Image { width, height, channels, data: vec![0.0; width * height * channels] }
+    }
+
+    /// The values of one pixel, `[C]`.
+    pub fn pixel(&self, x: usize, y: usize) -> &[f32] {
+        let i = (y * self.width + x) * self.channels;
+        &self.data[i..i + self.channels]
+    }
+
+    pub fn to_u8(&self) -> ImageU8 {
+        let data = self.data.iter().map(|&v| u8_from_unit(v)).collect();
+        ImageU8 { width: self.width, height: self.height, channels: self.channels, data }
+    }
+}
+
+impl ImageU8 {
+    /// The values of one pixel, `[C]`.
+    pub fn pixel(&self, x: usize, y: usize) -> &[u8] {
+        let i = (y * self.width + x) * self.channels;
+        &self.data[i..i + self.channels]
+    }
+
+    pub fn to_f32(&self) -> Image {
+        let data = self.data.iter().map(|&v| v as f32 / 255.0).collect();
+        Image { width: self.width, height: self.height, channels: self.channels, data }
+    }
+
+    /// Area average over the exact pixel footprint; colour is weighted by alpha where there is one.
+    pub fn downsampled(&self, width: usize, height: usize) -> ImageU8 {
+        if (width, height) == (self.width, self.height) {
+            return self.clone();
+        }
+        let c = self.channels;
+        let xs = footprints(self.width, width);
+        let ys = footprints(self.height, height);
+        let mut out = vec![0u8; width * height * c];
+        for (y, rows) in ys.iter().enumerate() {
+            for (x, cols) in xs.iter().enumerate() {
+                let (mut sum, mut total, mut alpha_total) = ([0.0f32; 4], 0.0f32, 0.0f32);
+                for &(sy, wy) in rows {
+                    for &(sx, wx) in cols {
+                        let p = self.pixel(sx, sy);
+                        let w = wx * wy;
+                        let a = if c == 4 { p[3] as f32 * w } else { w };
+                        total += w;
+                        alpha_total += a;
+                        for k in 0..c.min(3) {
+                            sum[k] += a * p[k] as f32;
+                        }
+                    }
+                }
+                let o = &mut out[(y * width + x) * c..][..c];
+                for k in 0..c.min(3) {
+                    o[k] = if alpha_total > 0.0 { (sum[k] / alpha_total + 0.5) as u8 } else { 0 };
+                }
+                if c == 4 {
+                    o[3] = (alpha_total / total + 0.5) as u8;
+                }
+            }
+        }
+        ImageU8 { width, height, channels: c, data: out }
+    }
+}
+
+/// For each output pixel the input pixels that it covers and by how much.
+fn footprints(from: usize, to: usize) -> Vec<Vec<(usize, f32)>> {
+    let step = from as f64 / to as f64;
+    (0..to)
+        .map(|i| {
+            let (a, b) = (i as f64 * step, ((i + 1) as f64 * step).min(from as f64));
+            (a as usize..(b.ceil() as usize).min(from))
+                .map(|s| (s, ((b.min(s as f64 + 1.0)) - a.max(s as f64)) as f32))
+                .filter(|&(_, w)| w > 1e-6)
+                .collect()
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn downsampling_averages_whole_blocks() {
+        let im = ImageU8 { width: 4, height: 2, channels: 1, data: vec![0, 100, 10, 20, 200, 100, 30, 40] };
+        assert_eq!(im.downsampled(2, 1).data, vec![100, 25]);
+    }
+
+    #[test]
+    fn transparent_pixels_do_not_bleed_colour() {
+        let im = ImageU8 { width: 2, height: 1, channels: 4, data: vec![255, 0, 0, 255, 0, 255, 0, 0] };
+        assert_eq!(im.downsampled(1, 1).data, vec![255, 0, 0, 128]);
+    }
+
+    #[test]
+    fn uneven_footprints_cover_everything_once() {
+        for (from, to) in [(770, 192), (1368, 342), (7, 3)] {
+            let total: f32 = footprints(from, to).iter().flatten().map(|f| f.1).sum();
+            assert!((total - from as f32).abs() < 1e-2);
+        }
+    }
+}

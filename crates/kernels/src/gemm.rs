@@ -1,0 +1,245 @@
+//! Small matrix products on blocks that stay in cache: `C = act(init + A·B)`.
+
+use crate::simd::{self, Lane, Level, Plain};
+
+/// What an output element starts from.
+#[derive(Clone, Copy)]
+pub enum Init<'a> {
+    Zero,
+    /// One value per column, `[n]`.
+    Bias(&'a [f32]),
+    /// What `c` holds.
+    Accumulate,
+}
+
+/// A matrix view: element `(i, j)` is `data[i * row + j * col]`.
+#[derive(Clone, Copy)]
+pub struct View<'a> {
+    pub data: &'a [f32],
+    pub row: usize,
+    pub col: usize,
+}
+
+impl<'a> View<'a> {
+    /// Row-major with the given row length.
+    pub fn rows(data: &'a [f32], row: usize) -> Self {
+        View { data, row, col: 1 }
+    }
+
+    /// The transpose of a row-major matrix.
+    pub fn transposed(data: &'a [f32], row: usize) -> Self {
+        View { data, row: 1, col: row }
+    }
+}
+
+/// `c[i, j] = act(init + Σ_p a[i, p] b[p, j])`, with `act` ReLU or nothing.
+///
+/// # Shapes
+/// a: `[m, k]` any strides; b: `[k, n]` row-major, rows `ldb` apart; c: `[m, n]`, rows `ldc` apart.
+/// Sums run over `p` in increasing order, so results do not depend on the thread count.
+///
+/// # Panics
+/// When a slice is too short for its shape.
+#[allow(clippy::too_many_arguments)]
+pub fn gemm(m: usize, n: usize, k: usize, a: View, b: &[f32], ldb: usize, c: &mut [f32], ldc: usize, init: Init, relu: bool) {
+    if m == 0 || n == 0 {
+        return;
+    }
+    assert!(k == 0 || a.data.len() > (m - 1) * a.row + (k - 1) * a.col, "gemm: a is too short");
+    assert!(k == 0 || b.len() >= (k - 1) * ldb + n, "gemm: b is too short");
+    assert!(c.len() >= (m - 1) * ldc + n, "gemm: c is too short");
+    if let Init::Bias(bias) = init {
+        assert!(bias.len() >= n, "gemm: bias is too short");
+    }
+    let g = Gemm { m, n, k, a, b, ldb, ldc, init, relu };
+    // SAFETY: bounds were asserted above; `level()` only names sets that this CPU has.
+    unsafe {
+        match simd::level() {
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => g.run_avx512(c),
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => g.run_avx2(c),
+            _ => g.run::<Plain, 4, 2>(c),
+        }
+    }
+}
+
+struct Gemm<'a> {
+    m: usize,
+    n: usize,
+    k: usize,
+    a: View<'a>,
+    b: &'a [f32],
+    ldb: usize,
+    ldc: usize,
+    init: Init<'a>,
+    relu: bool,
+}
+
+impl Gemm<'_> {
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+    unsafe fn run_avx512(&self, c: &mut [f32]) {
+        // SAFETY: compiled for the set; bounds asserted by `gemm`.
+        unsafe { self.run::<simd::Avx512, 6, 4>(c) }
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2,fma")]
+    unsafe fn run_avx2(&self, c: &mut [f32]) {
+        // SAFETY: compiled for the set; bounds asserted by `gemm`.
+        unsafe { self.run::<simd::Avx2, 6, 2>(c) }
+    }
+
+    /// Walks the output in tiles of `MR` rows by `NR` vectors.
+    #[inline(always)]
+    unsafe fn run<L: Lane, const MR: usize, const NR: usize>(&self, c: &mut [f32]) {
+        let cp = c.as_mut_ptr();
+        let mut j = 0;
+        // SAFETY: every tile lies inside the shapes that `gemm` asserted.
+        unsafe {
+            while j + NR * L::N <= self.n {
+                self.column_tile::<L, MR, NR>(cp, j);
+                j += NR * L::N;
+            }
+            if NR > 2 && j + 2 * L::N <= self.n {
+                self.column_tile::<L, MR, 2>(cp, j);
+                j += 2 * L::N;
+            }
+            while j + L::N <= self.n {
+                self.column_tile::<L, MR, 1>(cp, j);
+                j += L::N;
+            }
+            for i in 0..self.m {
+                for j in j..self.n {
+                    self.scalar(cp, i, j);
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn column_tile<L: Lane, const MR: usize, const NR: usize>(&self, c: *mut f32, j: usize) {
+        let mut i = 0;
+        // SAFETY: as in `run`.
+        unsafe {
+            while i + MR <= self.m {
+                self.tile::<L, MR, NR>(c, i, j);
+                i += MR;
+            }
+            while i < self.m {
+                self.tile::<L, 1, NR>(c, i, j);
+                i += 1;
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(&self, c: *mut f32, i: usize, j: usize) {
+        // SAFETY: as in `run`: rows i..i+MR and columns j..j+NR*N exist.
+        unsafe {
+            let mut acc = [[L::splat(0.0); NR]; MR];
+            match self.init {
+                Init::Zero => {}
+                Init::Bias(bias) => {
+                    for row in &mut acc {
+                        for (q, v) in row.iter_mut().enumerate() {
+                            *v = L::load(bias.as_ptr().add(j + q * L::N));
+                        }
+                    }
+                }
+                Init::Accumulate => {
+                    for (r, row) in acc.iter_mut().enumerate() {
+                        for (q, v) in row.iter_mut().enumerate() {
+                            *v = L::load(c.add((i + r) * self.ldc + j + q * L::N));
+                        }
+                    }
+                }
+            }
+            let mut ap = self.a.data.as_ptr().add(i * self.a.row);
+            let mut bp = self.b.as_ptr().add(j);
+            for _ in 0..self.k {
+                let mut bv = [L::splat(0.0); NR];
+                for (q, v) in bv.iter_mut().enumerate() {
+                    *v = L::load(bp.add(q * L::N));
+                }
+                for (r, row) in acc.iter_mut().enumerate() {
+                    let av = L::splat(*ap.add(r * self.a.row));
+                    for q in 0..NR {
+                        row[q] = L::fma(av, bv[q], row[q]);
+                    }
+                }
+                ap = ap.wrapping_add(self.a.col);
+                bp = bp.wrapping_add(self.ldb);
+            }
+            let zero = L::splat(0.0);
+            for (r, row) in acc.iter().enumerate() {
+                for (q, v) in row.iter().enumerate() {
+                    let v = if self.relu { L::max(*v, zero) } else { *v };
+                    L::store(c.add((i + r) * self.ldc + j + q * L::N), v);
+                }
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn scalar(&self, c: *mut f32, i: usize, j: usize) {
+        // SAFETY: (i, j) lies inside the shapes that `gemm` asserted.
+        unsafe {
+            let out = c.add(i * self.ldc + j);
+            let mut acc = match self.init {
+                Init::Zero => 0.0,
+                Init::Bias(bias) => bias[j],
+                Init::Accumulate => *out,
+            };
+            for p in 0..self.k {
+                acc += self.a.data[i * self.a.row + p * self.a.col] * self.b[p * self.ldb + j];
+            }
+            *out = if self.relu { acc.max(0.0) } else { acc };
+        }
+    }
+}
+
+/// `out[n, k] = b[k, n]ᵀ`.
+pub fn transpose(k: usize, n: usize, b: &[f32], out: &mut Vec<f32>) {
+    out.resize(k * n, 0.0);
+    for p in 0..k {
+        for j in 0..n {
+            out[j * k + p] = b[p * n + j];
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diorama_testkit::{assert_close, random};
+
+    #[test]
+    fn every_level_and_shape_matches_plain_loops() {
+        for level in Level::available() {
+            simd::force_level(level);
+            for (m, n, k) in [(1, 1, 1), (6, 64, 64), (13, 80, 31), (7, 3, 5), (64, 17, 100), (0, 4, 4), (5, 16, 0)] {
+                let a = random(m * k, 1);
+                let at: Vec<f32> = (0..m * k).map(|i| if m > 0 { a[(i % m.max(1)) * k + i / m.max(1)] } else { 0.0 }).collect();
+                let b = random(k * n, 2);
+                let bias = random(n, 3);
+                for relu in [false, true] {
+                    let want: Vec<f64> = (0..m * n)
+                        .map(|e| {
+                            let (i, j) = (e / n, e % n);
+                            let s = bias[j] as f64 + (0..k).map(|p| a[i * k + p] as f64 * b[p * n + j] as f64).sum::<f64>();
+                            if relu { s.max(0.0) } else { s }
+                        })
+                        .collect();
+                    let mut c = vec![9.0; m * n];
+                    gemm(m, n, k, View::rows(&a, k), &b, n, &mut c, n, Init::Bias(&bias), relu);
+                    assert_close("rows", &c, &want, 1e-5);
+                    let mut c: Vec<f32> = (0..m * n).map(|e| bias[e % n]).collect();
+                    gemm(m, n, k, View::transposed(&at, m), &b, n, &mut c, n, Init::Accumulate, relu);
+                    assert_close("transposed", &c, &want, 1e-5);
+                }
+            }
+        }
+    }
+}

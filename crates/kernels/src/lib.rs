@@ -1,0 +1,10 @@
+//! Ops of radiance fields with an f64 reference and a CPU implementation each, and the devices they
+//! run on. Every op is a folder: `mod.rs` contract, `reference.rs` plain loops in f64 forward and
+//! backward, `cpu.rs`, `tests.rs`.
+#![allow(unsafe_code)]
+
+pub mod burn_op;
+pub mod device;
+pub mod gemm;
+pub mod ops;
+pub mod simd;

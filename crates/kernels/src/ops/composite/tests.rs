@@ -1,0 +1,131 @@
+use super::*;
+use crate::burn_op::values;
+use burn::tensor::{Device, TensorData};
+use diorama_testkit::{assert_close, assert_gradient, random, random_unit, wide};
+
+pub(crate) struct Scene {
+    pub offsets: Vec<u32>,
+    pub t: Vec<f32>,
+    pub dt: Vec<f32>,
+    pub sigma: Vec<f32>,
+}
+
+/// Ragged rays, empty ones among them, some opaque.
+pub(crate) fn scene(rays: usize, seed: u64) -> Scene {
+    let n = random_unit(rays, seed);
+    let mut offsets = vec![0u32];
+    let (mut t, mut dt) = (Vec::new(), Vec::new());
+    for r in 0..rays {
+        let count = if r % 5 == 1 { 0 } else { (n[r] * 40.0) as u32 + 1 };
+        let steps = random_unit(count as usize, seed + r as u64 + 7);
+        let mut at = 0.1;
+        for s in steps {
+            t.push(at);
+            dt.push(0.02 + 0.05 * s);
+            at += 0.1;
+        }
+        offsets.push(t.len() as u32);
+    }
+    let sigma = random_unit(t.len(), seed + 1).iter().map(|s| s * s * 40.0).collect();
+    Scene { offsets, t, dt, sigma }
+}
+
+impl Scene {
+    pub fn packed(&self) -> Packed<'_> {
+        Packed { offsets: &self.offsets, t: &self.t, dt: &self.dt }
+    }
+}
+
+#[test]
+fn matches_the_reference_both_ways_for_any_channel_count() {
+    for rays in [0, 1, 3, 130] {
+        for c in [1, 3, 19, 512] {
+            let s = scene(rays, 3);
+            let n = s.t.len();
+            let (f, b) = (random(n * c, 1), random(rays * c, 2));
+            let out = cpu::forward(&s.packed(), &s.sigma, &f, c, &b);
+            let (sd, fd, bd) = (wide(&s.sigma), wide(&f), wide(&b));
+            let want = reference::forward(&s.packed(), &sd, &fd, c, &bd);
+            assert_close("color", &out.color, &want.color, 1e-4);
+            assert_close("depth", &out.depth, &want.depth, 1e-4);
+            assert_close("opacity", &out.opacity, &want.opacity, 1e-4);
+            assert_close("weights", &out.weights, &want.weights, 1e-4);
+            let (dc, dd, d_o, dw) = (random(rays * c, 4), random(rays, 5), random(rays, 6), random(n, 7));
+            let d = cpu::Upstream { color: Some(&dc), depth: Some(&dd), opacity: Some(&d_o), weights: Some(&dw) };
+            let g = cpu::backward(&s.packed(), &s.sigma, &f, c, &b, &d);
+            let wide_d = Composited { color: wide(&dc), depth: wide(&dd), opacity: wide(&d_o), weights: wide(&dw) };
+            let (ds, df, db) = reference::backward(&s.packed(), &sd, &fd, c, &bd, &wide_d);
+            assert_close("sigma", &g.sigma, &ds, 1e-4);
+            assert_close("features", &g.features, &df, 1e-4);
+            assert_close("background", &g.background, &db, 1e-4);
+        }
+    }
+}
+
+#[test]
+fn reference_gradients_match_central_differences() {
+    let s = scene(4, 9);
+    let (n, c) = (s.t.len(), 2);
+    let (sigma, f, b) = (wide(&s.sigma), wide(&random(n * c, 1)), wide(&random(4 * c, 2)));
+    let d = Composited { color: wide(&random(4 * c, 3)), depth: wide(&random(4, 4)), opacity: wide(&random(4, 5)), weights: wide(&random(n, 6)) };
+    let loss = |s: &[f64], f: &[f64], b: &[f64], p: &Packed| {
+        let o = reference::forward(p, s, f, c, b);
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        dot(&o.color, &d.color) + dot(&o.depth, &d.depth) + dot(&o.opacity, &d.opacity) + dot(&o.weights, &d.weights)
+    };
+    let p = s.packed();
+    let (ds, df, db) = reference::backward(&p, &sigma, &f, c, &b, &d);
+    assert_gradient("sigma", &ds, &sigma, 1e-5, |x| loss(x, &f, &b, &p));
+    assert_gradient("features", &df, &f, 1e-5, |x| loss(&sigma, x, &b, &p));
+    assert_gradient("background", &db, &b, 1e-5, |x| loss(&sigma, &f, x, &p));
+}
+
+#[test]
+fn weights_sum_to_the_opacity_and_a_wall_hides_what_is_behind() {
+    let s = scene(60, 5);
+    let out = cpu::forward(&s.packed(), &s.sigma, &vec![1.0; s.t.len()], 1, &vec![1.0; 60]);
+    for r in 0..60 {
+        let sum: f32 = out.weights[s.packed().range(r)].iter().sum();
+        assert!((sum - out.opacity[r]).abs() < 1e-5 && (0.0..=1.0 + 1e-6).contains(&sum));
+        // White furnace: everything radiates 1, so does the pixel.
+        assert!((out.color[r] - 1.0).abs() < 1e-5);
+    }
+    let (t, dt, offsets) = ([1.0, 2.0], [0.5, 0.5], [0, 2]);
+    let p = Packed { offsets: &offsets, t: &t, dt: &dt };
+    let wall = cpu::forward(&p, &[1e4, 5.0], &[0.25, 9.0], 1, &[7.0]);
+    assert!((wall.color[0] - 0.25).abs() < 1e-6);
+}
+
+#[test]
+fn transmittance_and_split_match_the_reference_and_each_other() {
+    let s = scene(40, 8);
+    let p = s.packed();
+    let (f, tq) = (random(s.t.len() * 3, 1), random_unit(40, 2).iter().map(|v| v * 4.0).collect::<Vec<f32>>());
+    let (sd, fd, td) = (wide(&s.sigma), wide(&f), wide(&tq));
+    assert_close("transmittance", &cpu::transmittance_at(&p, &s.sigma, &tq), &reference::transmittance_at(&p, &sd, &td), 1e-4);
+    let (front, between, back) = cpu::split(&p, &s.sigma, &f, 3, &tq);
+    let (rf, rt, rb) = reference::split(&p, &sd, &fd, 3, &td);
+    assert_close("front", &front, &rf, 1e-4);
+    assert_close("between", &between, &rt, 1e-4);
+    assert_close("back", &back, &rb, 1e-4);
+    let whole = cpu::forward(&p, &s.sigma, &f, 3, &vec![0.0; 120]);
+    let joined: Vec<f64> = (0..120).map(|i| (front[i] + between[i / 3] * back[i]) as f64).collect();
+    assert_close("front + T back", &whole.color, &joined, 1e-4);
+}
+
+#[test]
+fn burn_sees_the_same_gradients() {
+    let s = scene(5, 4);
+    let n = s.t.len();
+    let device = Device::flex().autodiff();
+    let f = random(n * 3, 1);
+    let st = Tensor::<1>::from_data(TensorData::new(s.sigma.clone(), [n]), &device).require_grad();
+    let ft = Tensor::<2>::from_data(TensorData::new(f.clone(), [n, 3]), &device).require_grad();
+    let bt = Tensor::<2>::zeros([5, 3], &device);
+    let (color, _, _, weights) = composite(s.packed(), st.clone(), ft.clone(), bt);
+    let grads = (color.sum() + weights.sum() * 0.5).backward();
+    let d = Composited { color: vec![1.0; 15], depth: vec![0.0; 5], opacity: vec![0.0; 5], weights: vec![0.5; n] };
+    let (ds, df, _) = reference::backward(&s.packed(), &wide(&s.sigma), &wide(&f), 3, &[0.0; 15], &d);
+    assert_close("sigma", &values(st.grad(&grads).unwrap()), &ds, 1e-4);
+    assert_close("features", &values(ft.grad(&grads).unwrap()), &df, 1e-4);
+}

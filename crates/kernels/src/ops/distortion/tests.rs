@@ -1,0 +1,36 @@
+use super::*;
+use crate::burn_op::values;
+use crate::ops::composite::tests::scene;
+use burn::tensor::{Device, TensorData};
+use diorama_testkit::{assert_close, assert_gradient, random_unit, wide};
+
+#[test]
+fn matches_the_reference_both_ways() {
+    for rays in [0, 1, 77] {
+        let s = scene(rays, 3);
+        let p = s.packed();
+        let (w, d) = (random_unit(s.t.len(), 1), random_unit(rays, 2));
+        let mut g = vec![0.0; w.len()];
+        let loss: Vec<f32> = (0..rays).map(|r| cpu::ray(&p, r, &w[p.range(r)], d[r], &mut g[p.range(r)])).collect();
+        assert_close("loss", &loss, &reference::forward(&p, &wide(&w)), 1e-4);
+        assert_close("weights", &g, &reference::backward(&p, &wide(&w), &wide(&d)), 1e-4);
+    }
+}
+
+#[test]
+fn reference_gradient_matches_central_differences() {
+    let s = scene(4, 6);
+    let p = s.packed();
+    let w = wide(&random_unit(s.t.len(), 1));
+    let g = reference::backward(&p, &w, &[1.0; 4]);
+    assert_gradient("weights", &g, &w, 1e-5, |w| reference::forward(&p, w).iter().sum());
+}
+
+#[test]
+fn burn_sees_the_same_gradient() {
+    let s = scene(3, 4);
+    let w = random_unit(s.t.len(), 1);
+    let wt = Tensor::<1>::from_data(TensorData::new(w.clone(), [w.len()]), &Device::flex().autodiff()).require_grad();
+    let grads = distortion(s.packed(), wt.clone()).sum().backward();
+    assert_close("w", &values(wt.grad(&grads).unwrap()), &reference::backward(&s.packed(), &wide(&w), &[1.0; 3]), 1e-4);
+}

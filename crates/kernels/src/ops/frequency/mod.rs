@@ -1,0 +1,64 @@
+//! Positional encoding (Mildenhall et al. 2020, NeRF, eq. 4):
+//! `γ(x) = (x, sin(2⁰ s x), cos(2⁰ s x), …, sin(2ᴸ⁻¹ s x), cos(2ᴸ⁻¹ s x))` with `s = π` or 1, the raw
+//! input optional, and a band window for coarse-to-fine training (Park et al. 2021, eq. 8).
+
+pub mod cpu;
+pub mod reference;
+#[cfg(test)]
+mod tests;
+
+use crate::burn_op::{self, In, Out, SliceOp};
+use burn::tensor::Tensor;
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Frequency {
+    pub dims: usize,
+    pub bands: usize,
+    pub include_input: bool,
+    /// Whether angles are multiplied by π.
+    pub pi: bool,
+    /// Bands admitted so far, in [0, bands]; the last one fades in by a raised cosine.
+    pub window: Option<f32>,
+}
+
+impl Frequency {
+    /// Numbers per encoded row.
+    pub fn output_dims(&self) -> usize {
+        self.dims * (2 * self.bands + self.include_input as usize)
+    }
+
+    /// Weight of band `k`: `(1 − cos(π clamp(window − k, 0, 1))) / 2`.
+    pub fn band_weight(&self, k: usize) -> f64 {
+        match self.window {
+            None => 1.0,
+            Some(a) => 0.5 * (1.0 - (std::f64::consts::PI * (a as f64 - k as f64).clamp(0.0, 1.0)).cos()),
+        }
+    }
+}
+
+#[derive(Debug)]
+struct FrequencyOp(Frequency);
+
+impl SliceOp for FrequencyOp {
+    fn forward(&self, i: &[In]) -> Vec<Out> {
+        let n = i[0].shape[0];
+        let mut out = vec![0.0; n * self.0.output_dims()];
+        cpu::forward(&self.0, i[0].data, &mut out);
+        vec![(out, vec![n, self.0.output_dims()])]
+    }
+    fn backward(&self, i: &[In], d: &[Option<&[f32]>]) -> Vec<Option<Vec<f32>>> {
+        vec![d[0].map(|d| {
+            let mut dx = vec![0.0; i[0].data.len()];
+            cpu::backward(&self.0, i[0].data, d, &mut dx);
+            dx
+        })]
+    }
+}
+
+/// Encodes rows, differentiable in `x`.
+///
+/// # Shapes
+/// x: `[N, dims]`; result: `[N, output_dims]`, per band all sines then all cosines.
+pub fn frequency(f: &Frequency, x: Tensor<2>) -> Tensor<2> {
+    burn_op::apply_one(FrequencyOp(*f), vec![x.into_dispatch()])
+}

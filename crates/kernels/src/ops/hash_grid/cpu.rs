@@ -1,0 +1,311 @@
+//! Vectorised over points, parallel over (level, chunk of points) forward and over levels backward,
+//! so that every gradient row has one writer and sums are in a fixed order.
+
+use super::{HashGrid, Level};
+use crate::simd;
+use rayon::prelude::*;
+
+/// Points per task.
+const CHUNK: usize = 8192;
+
+/// Floats per cache line: the unit in which `touched` marks the table.
+pub const LINE: usize = 16;
+
+/// The eight rows of a point's cell and the fractions along the axes.
+#[inline(always)]
+fn cell(level: &Level, p: &[f32]) -> ([usize; 8], [f32; 3], [bool; 3]) {
+    let n = level.cells as f32;
+    let (mut i, mut f, mut clamped) = ([0u32; 3], [0.0f32; 3], [false; 3]);
+    for k in 0..3 {
+        let c = p[k].clamp(0.0, 1.0);
+        clamped[k] = c != p[k];
+        let x = c * n;
+        i[k] = (x as u32).min(level.cells - 1);
+        f[k] = x - i[k] as f32;
+    }
+    let rows = if level.dense {
+        let s1 = level.cells as usize + 1;
+        let s2 = s1 * s1;
+        let base = i[0] as usize + s1 * i[1] as usize + s2 * i[2] as usize;
+        std::array::from_fn(|c| base + (c & 1) + s1 * ((c >> 1) & 1) + s2 * (c >> 2))
+    } else {
+        let mask = level.rows as u32 - 1;
+        let y = [i[1].wrapping_mul(2_654_435_761), (i[1] + 1).wrapping_mul(2_654_435_761)];
+        let z = [i[2].wrapping_mul(805_459_861), (i[2] + 1).wrapping_mul(805_459_861)];
+        std::array::from_fn(|c| (((i[0] + (c as u32 & 1)) ^ y[(c >> 1) & 1] ^ z[c >> 2]) & mask) as usize)
+    };
+    (rows, f, clamped)
+}
+
+#[inline(always)]
+fn weights(f: [f32; 3]) -> [f32; 8] {
+    let g = [1.0 - f[0], 1.0 - f[1], 1.0 - f[2]];
+    let yz = [g[1] * g[2], f[1] * g[2], g[1] * f[2], f[1] * f[2]];
+    std::array::from_fn(|c| yz[c >> 1] * if c & 1 == 1 { f[0] } else { g[0] })
+}
+
+/// Features of points.
+///
+/// # Shapes
+/// points `[S, 3]`, table `[rows, F]`, out `[L, S, F]`, all of it written.
+///
+/// # Panics
+/// When a slice does not fit.
+pub fn forward(grid: &HashGrid, points: &[f32], table: &[f32], out: &mut [f32]) {
+    let (s, width) = (points.len() / 3, grid.config.features);
+    assert_eq!(table.len(), grid.params_len(), "hash grid: table");
+    assert_eq!(out.len(), s * grid.output_dims(), "hash grid: out");
+    if s == 0 {
+        return;
+    }
+    out.par_chunks_mut(s * width).enumerate().for_each(|(l, out)| {
+        let level = &grid.levels[l];
+        let rows = &table[level.offset * width..(level.offset + level.rows) * width];
+        out.par_chunks_mut(CHUNK * width).zip(points.par_chunks(CHUNK * 3)).for_each(|(out, points)| match width {
+            1 => forward_level::<1>(level, points, rows, out),
+            2 => forward_level2(level, points, rows, out),
+            4 => forward_level::<4>(level, points, rows, out),
+            _ => forward_level::<8>(level, points, rows, out),
+        });
+    });
+}
+
+fn forward_level<const F: usize>(level: &Level, points: &[f32], rows: &[f32], out: &mut [f32]) {
+    for (p, o) in points.chunks_exact(3).zip(out.chunks_exact_mut(F)) {
+        let (idx, f, _) = cell(level, p);
+        let w = weights(f);
+        let mut acc = [0.0f32; F];
+        for c in 0..8 {
+            let row = &rows[idx[c] * F..idx[c] * F + F];
+            for k in 0..F {
+                acc[k] += w[c] * row[k];
+            }
+        }
+        o.copy_from_slice(&acc);
+    }
+}
+
+fn forward_level2(level: &Level, points: &[f32], rows: &[f32], out: &mut [f32]) {
+    #[cfg(target_arch = "x86_64")]
+    if simd::level() == simd::Level::Avx512 {
+        let whole = points.len() / 3 / 16 * 16;
+        // SAFETY: the CPU has AVX-512; `whole` points are a multiple of 16 inside both slices; every
+        // row index is below `level.rows` by construction (masked, or a vertex of a dense level).
+        unsafe { x86::forward16(level, &points[..whole * 3], rows, &mut out[..whole * 2]) };
+        return forward_level::<2>(level, &points[whole * 3..], rows, &mut out[whole * 2..]);
+    }
+    forward_level::<2>(level, points, rows, out);
+}
+
+/// Adds the table's gradient and, where asked, marks each touched line of [`LINE`] floats.
+///
+/// # Shapes
+/// d_out `[L, S, F]`; d_table `[rows, F]`, added to; touched `[rows · F / LINE]`.
+///
+/// # Panics
+/// When a slice does not fit.
+pub fn backward(grid: &HashGrid, points: &[f32], d_out: &[f32], d_table: &mut [f32], touched: Option<&mut [u8]>) {
+    let (s, width) = (points.len() / 3, grid.config.features);
+    assert_eq!(d_table.len(), grid.params_len(), "hash grid: gradient");
+    assert_eq!(d_out.len(), s * grid.output_dims(), "hash grid: d_out");
+    if s == 0 {
+        return;
+    }
+    let mut tasks = Vec::with_capacity(grid.levels.len());
+    let (mut rest, mut marks) = (d_table, touched);
+    for (l, level) in grid.levels.iter().enumerate() {
+        let (own, tail) = rest.split_at_mut(level.rows * width);
+        rest = tail;
+        let own_marks = marks.take().map(|m| {
+            let (own, tail) = m.split_at_mut(level.rows * width / LINE);
+            marks = Some(tail);
+            own
+        });
+        tasks.push((level, &d_out[l * s * width..(l + 1) * s * width], own, own_marks));
+    }
+    tasks.into_par_iter().with_max_len(1).for_each(|(level, d, own, marks)| match width {
+        1 => backward_level::<1>(level, points, d, own, marks),
+        2 => backward_level::<2>(level, points, d, own, marks),
+        4 => backward_level::<4>(level, points, d, own, marks),
+        _ => backward_level::<8>(level, points, d, own, marks),
+    });
+}
+
+fn backward_level<const F: usize>(level: &Level, points: &[f32], d_out: &[f32], d_rows: &mut [f32], marks: Option<&mut [u8]>) {
+    let mut none = [0u8; 0];
+    let (marks, marking) = match marks {
+        Some(m) => (m, true),
+        None => (&mut none[..], false),
+    };
+    for (p, d) in points.chunks_exact(3).zip(d_out.chunks_exact(F)) {
+        if d.iter().all(|&v| v == 0.0) {
+            continue;
+        }
+        let (idx, f, _) = cell(level, p);
+        let w = weights(f);
+        for c in 0..8 {
+            let row = &mut d_rows[idx[c] * F..idx[c] * F + F];
+            for k in 0..F {
+                row[k] += w[c] * d[k];
+            }
+            if marking {
+                marks[idx[c] * F / LINE] = 1;
+            }
+        }
+    }
+}
+
+/// Gradient of the points, overwritten.
+///
+/// # Shapes
+/// points and d_points `[S, 3]`, table `[rows, F]`, d_out `[L, S, F]`.
+pub fn backward_positions(grid: &HashGrid, points: &[f32], table: &[f32], d_out: &[f32], d_points: &mut [f32]) {
+    let (s, width) = (points.len() / 3, grid.config.features);
+    assert_eq!(d_out.len(), s * grid.output_dims(), "hash grid: d_out");
+    d_points.par_chunks_mut(3 * 256).enumerate().for_each(|(chunk, d_points)| {
+        for (i, dp) in d_points.chunks_exact_mut(3).enumerate() {
+            let i = chunk * 256 + i;
+            dp.fill(0.0);
+            for (l, level) in grid.levels.iter().enumerate() {
+                let d = &d_out[(l * s + i) * width..][..width];
+                let (idx, f, clamped) = cell(level, &points[i * 3..i * 3 + 3]);
+                // What each corner's row contributes to the loss per unit of weight.
+                let v: [f32; 8] = std::array::from_fn(|c| {
+                    let row = &table[(level.offset + idx[c]) * width..][..width];
+                    row.iter().zip(d).map(|(r, d)| r * d).sum()
+                });
+                let slopes = trilinear_slopes(v, f);
+                for k in 0..3 {
+                    if !clamped[k] {
+                        dp[k] += slopes[k] * level.cells as f32;
+                    }
+                }
+            }
+        }
+    });
+}
+
+/// Slopes along the axes of the trilinear interpolant with corner values `v` (bit k = axis k).
+#[inline(always)]
+fn trilinear_slopes(v: [f32; 8], f: [f32; 3]) -> [f32; 3] {
+    let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
+    let x = mix(mix(v[1] - v[0], v[3] - v[2], f[1]), mix(v[5] - v[4], v[7] - v[6], f[1]), f[2]);
+    let y = mix(mix(v[2] - v[0], v[3] - v[1], f[0]), mix(v[6] - v[4], v[7] - v[5], f[0]), f[2]);
+    let z = mix(mix(v[4] - v[0], v[5] - v[1], f[0]), mix(v[6] - v[2], v[7] - v[3], f[0]), f[1]);
+    [x, y, z]
+}
+
+/// `∂features/∂point`, `[L, S, F, 3]`, overwritten.
+pub fn jacobian(grid: &HashGrid, points: &[f32], table: &[f32], out: &mut [f32]) {
+    let (s, width) = (points.len() / 3, grid.config.features);
+    assert_eq!(out.len(), s * grid.output_dims() * 3, "hash grid: jacobian");
+    if s == 0 {
+        return;
+    }
+    out.par_chunks_mut(s * width * 3).zip(&grid.levels).for_each(|(out, level)| {
+        for (p, o) in points.chunks_exact(3).zip(out.chunks_exact_mut(width * 3)) {
+            let (idx, f, clamped) = cell(level, p);
+            for k in 0..width {
+                let v = idx.map(|r| table[(level.offset + r) * width + k]);
+                let slopes = trilinear_slopes(v, f);
+                for a in 0..3 {
+                    o[k * 3 + a] = if clamped[a] { 0.0 } else { slopes[a] * level.cells as f32 };
+                }
+            }
+        }
+    });
+}
+
+/// Adds to the table's gradient what the Jacobian's gradient `[L, S, F, 3]` gives it.
+pub fn jacobian_backward(grid: &HashGrid, points: &[f32], d_jacobian: &[f32], d_table: &mut [f32]) {
+    let (s, width) = (points.len() / 3, grid.config.features);
+    assert_eq!(d_jacobian.len(), s * grid.output_dims() * 3, "hash grid: d_jacobian");
+    let mut rest = d_table;
+    let mut tasks = Vec::with_capacity(grid.levels.len());
+    for (l, level) in grid.levels.iter().enumerate() {
+        let (own, tail) = rest.split_at_mut(level.rows * width);
+        rest = tail;
+        tasks.push((level, &d_jacobian[l * s * width * 3..(l + 1) * s * width * 3], own));
+    }
+    tasks.into_par_iter().with_max_len(1).for_each(|(level, d, own)| {
+        for (p, d) in points.chunks_exact(3).zip(d.chunks_exact(width * 3)) {
+            let (idx, f, clamped) = cell(level, p);
+            let n = level.cells as f32;
+            for c in 0..8usize {
+                let bit = |k: usize| (c >> k) & 1 == 1;
+                let w = |k: usize| if bit(k) { f[k] } else { 1.0 - f[k] };
+                let s = |k: usize| if clamped[k] { 0.0 } else if bit(k) { n } else { -n };
+                let dw = [s(0) * w(1) * w(2), w(0) * s(1) * w(2), w(0) * w(1) * s(2)];
+                for k in 0..width {
+                    own[idx[c] * width + k] += dw[0] * d[k * 3] + dw[1] * d[k * 3 + 1] + dw[2] * d[k * 3 + 2];
+                }
+            }
+        }
+    });
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use super::Level;
+    use std::arch::x86_64::*;
+
+    /// Sixteen points at a time, two features per row.
+    ///
+    /// # Safety
+    /// AVX-512F and DQ; a multiple of 16 points; `rows` holds every row of `level`.
+    #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+    pub unsafe fn forward16(level: &Level, points: &[f32], rows: &[f32], out: &mut [f32]) {
+        // SAFETY: all loads and stores lie inside the slices, see the caller.
+        unsafe {
+            let n = _mm512_set1_ps(level.cells as f32);
+            let last = _mm512_set1_epi32(level.cells as i32 - 1);
+            let (zero, one) = (_mm512_setzero_ps(), _mm512_set1_ps(1.0));
+            let lane3 = _mm512_mullo_epi32(_mm512_set1_epi32(3), _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
+            let low = _mm512_setr_epi32(0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
+            let high = _mm512_setr_epi32(8, 8, 9, 9, 10, 10, 11, 11, 12, 12, 13, 13, 14, 14, 15, 15);
+            let (p1, p2, mask, xor) = if level.dense {
+                let s = level.cells as i32 + 1;
+                (s, s * s, -1i32, false)
+            } else {
+                (2_654_435_761u32 as i32, 805_459_861u32 as i32, level.rows as i32 - 1, true)
+            };
+            let (v1, v2, vmask) = (_mm512_set1_epi32(p1), _mm512_set1_epi32(p2), _mm512_set1_epi32(mask));
+            let unit = _mm512_set1_epi32(1);
+            let base = rows.as_ptr().cast::<i64>();
+            for g in 0..points.len() / 48 {
+                let src = points.as_ptr().add(g * 48);
+                let axis = |k: i32| {
+                    let x = _mm512_i32gather_ps::<4>(_mm512_add_epi32(lane3, _mm512_set1_epi32(k)), src);
+                    let x = _mm512_mul_ps(_mm512_min_ps(_mm512_max_ps(x, zero), one), n);
+                    let i = _mm512_min_epi32(_mm512_cvttps_epi32(x), last);
+                    (i, _mm512_sub_ps(x, _mm512_cvtepi32_ps(i)))
+                };
+                let ((ix, fx), (iy, fy), (iz, fz)) = (axis(0), axis(1), axis(2));
+                let y0 = _mm512_mullo_epi32(iy, v1);
+                let z0 = _mm512_mullo_epi32(iz, v2);
+                let xs = [ix, _mm512_add_epi32(ix, unit)];
+                let ys = [y0, _mm512_add_epi32(y0, v1)];
+                let zs = [z0, _mm512_add_epi32(z0, v2)];
+                let wx = [_mm512_sub_ps(one, fx), fx];
+                let wy = [_mm512_sub_ps(one, fy), fy];
+                let wz = [_mm512_sub_ps(one, fz), fz];
+                let (mut lo, mut hi) = (zero, zero);
+                for c in 0..8usize {
+                    let (a, b, d) = (c & 1, (c >> 1) & 1, c >> 2);
+                    let idx = if xor {
+                        _mm512_and_epi32(_mm512_xor_epi32(_mm512_xor_epi32(xs[a], ys[b]), zs[d]), vmask)
+                    } else {
+                        _mm512_add_epi32(_mm512_add_epi32(xs[a], ys[b]), zs[d])
+                    };
+                    let w = _mm512_mul_ps(wx[a], _mm512_mul_ps(wy[b], wz[d]));
+                    let first = _mm512_i32gather_epi64::<8>(_mm512_castsi512_si256(idx), base);
+                    let second = _mm512_i32gather_epi64::<8>(_mm512_extracti64x4_epi64::<1>(idx), base);
+                    lo = _mm512_fmadd_ps(_mm512_permutexvar_ps(low, w), _mm512_castsi512_ps(first), lo);
+                    hi = _mm512_fmadd_ps(_mm512_permutexvar_ps(high, w), _mm512_castsi512_ps(second), hi);
+                }
+                _mm512_storeu_ps(out.as_mut_ptr().add(g * 32), lo);
+                _mm512_storeu_ps(out.as_mut_ptr().add(g * 32 + 16), hi);
+            }
+        }
+    }
+}

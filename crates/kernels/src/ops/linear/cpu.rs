@@ -1,0 +1,117 @@
+//! Blocks of rows through the small matrix product; weight gradients per block group, added in order.
+
+use super::{Activation, BiasKind};
+use crate::gemm::{self, Init, View, gemm};
+use rayon::prelude::*;
+
+/// Rows per block.
+const BLOCK: usize = 192;
+/// Groups of blocks with a weight gradient of their own: fixed, so that results do not depend on threads.
+const GROUPS: usize = 16;
+
+/// Applies an activation in place.
+pub fn activate(a: Activation, values: &mut [f32]) {
+    match a {
+        Activation::None => {}
+        Activation::Relu => values.iter_mut().for_each(|v| *v = v.max(0.0)),
+        Activation::Sigmoid => values.iter_mut().for_each(|v| *v = 1.0 / (1.0 + (-*v).exp())),
+        Activation::Softplus => values.iter_mut().for_each(|v| *v = v.max(0.0) + (-v.abs()).exp().ln_1p()),
+        Activation::TruncatedExp => values.iter_mut().for_each(|v| *v = v.exp()),
+    }
+}
+
+/// Slope of an activation from its output.
+#[inline(always)]
+pub fn slope_from_output(a: Activation, y: f32) -> f32 {
+    match a {
+        Activation::None => 1.0,
+        Activation::Relu => (y > 0.0) as u8 as f32,
+        Activation::Sigmoid => y * (1.0 - y),
+        Activation::Softplus => 1.0 - (-y).exp(),
+        Activation::TruncatedExp => y.min(3_269_017.4),
+    }
+}
+
+/// `out = act(x W + b)`, all of it written.
+///
+/// # Shapes
+/// x `[m, k]`, w `[k, n]`, bias empty, `[n]` or `[m, n]`, out `[m, n]`.
+#[allow(clippy::too_many_arguments)]
+pub fn forward(m: usize, k: usize, n: usize, x: &[f32], w: &[f32], bias: &[f32], kind: BiasKind, a: Activation, out: &mut [f32]) {
+    assert!(x.len() == m * k && w.len() == k * n && out.len() == m * n, "linear: shapes");
+    if m * n == 0 {
+        return;
+    }
+    out.par_chunks_mut(BLOCK * n).enumerate().for_each(|(block, out)| {
+        let (first, rows) = (block * BLOCK, out.len() / n);
+        let x = View::rows(&x[first * k..(first + rows) * k], k);
+        let init = match kind {
+            BiasKind::None => Init::Zero,
+            BiasKind::Shared => Init::Bias(bias),
+            BiasKind::PerRow => {
+                out.copy_from_slice(&bias[first * n..(first + rows) * n]);
+                Init::Accumulate
+            }
+        };
+        gemm(rows, n, k, x, w, n, out, n, init, a == Activation::Relu);
+        if a != Activation::Relu {
+            activate(a, out);
+        }
+    });
+}
+
+/// Gradients of x, w and b, overwritten, given the layer's output.
+#[allow(clippy::too_many_arguments)]
+pub fn backward(
+    m: usize, k: usize, n: usize, x: &[f32], w: &[f32], kind: BiasKind, a: Activation, out: &[f32], d: &[f32],
+    dx: &mut [f32], dw: &mut [f32], db: &mut [f32],
+) {
+    dw.fill(0.0);
+    db.fill(0.0);
+    if m * n == 0 {
+        return;
+    }
+    let mut wt = Vec::new();
+    gemm::transpose(k, n, w, &mut wt);
+    let rows_per_group = m.div_ceil(GROUPS).next_multiple_of(BLOCK);
+    let per_row = kind == BiasKind::PerRow;
+    let mut empty = vec![0.0f32; 0];
+    let db_rows = if per_row { &mut *db } else { &mut empty[..] };
+    let mut db_chunks: Vec<&mut [f32]> = db_rows.chunks_mut(rows_per_group * n).collect();
+    db_chunks.resize_with(m.div_ceil(rows_per_group), Default::default);
+    let partial: Vec<(Vec<f32>, Vec<f32>)> = dx
+        .par_chunks_mut((rows_per_group * k).max(1))
+        .zip(db_chunks)
+        .enumerate()
+        .map(|(group, (dx, db_rows))| {
+            let (mut dw, mut db) = (vec![0.0; k * n], vec![0.0; n]);
+            let mut g = vec![0.0; BLOCK * n];
+            let first = group * rows_per_group;
+            let last = (first + rows_per_group).min(m);
+            for start in (first..last).step_by(BLOCK) {
+                let rows = BLOCK.min(last - start);
+                let span = start * n..(start + rows) * n;
+                for ((g, d), y) in g.iter_mut().zip(&d[span.clone()]).zip(&out[span]) {
+                    *g = d * slope_from_output(a, *y);
+                }
+                let g = &g[..rows * n];
+                let local = start - first;
+                gemm(rows, k, n, View::rows(g, n), &wt, k, &mut dx[local * k..], k, Init::Zero, false);
+                gemm(k, n, rows, View::transposed(&x[start * k..], k), g, n, &mut dw, n, Init::Accumulate, false);
+                if per_row {
+                    db_rows[local * n..(local + rows) * n].copy_from_slice(g);
+                }
+                for row in g.chunks_exact(n) {
+                    db.iter_mut().zip(row).for_each(|(b, g)| *b += g);
+                }
+            }
+            (dw, db)
+        })
+        .collect();
+    for (w, b) in &partial {
+        dw.iter_mut().zip(w).for_each(|(a, b)| *a += b);
+        if kind == BiasKind::Shared {
+            db.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+        }
+    }
+}

@@ -1,0 +1,73 @@
+//! Plain loops in f64.
+
+use super::{Activation, BiasKind};
+
+/// Value of an activation.
+pub fn activate(a: Activation, x: f64) -> f64 {
+    match a {
+        Activation::None => x,
+        Activation::Relu => x.max(0.0),
+        Activation::Sigmoid => 1.0 / (1.0 + (-x).exp()),
+        Activation::Softplus => x.max(0.0) + (-x.abs()).exp().ln_1p(),
+        Activation::TruncatedExp => x.exp(),
+    }
+}
+
+/// Slope of an activation.
+pub fn slope(a: Activation, x: f64) -> f64 {
+    match a {
+        Activation::None => 1.0,
+        Activation::Relu => (x > 0.0) as u8 as f64,
+        Activation::Sigmoid => {
+            let s = activate(a, x);
+            s * (1.0 - s)
+        }
+        Activation::Softplus => activate(Activation::Sigmoid, x),
+        Activation::TruncatedExp => x.min(15.0).exp(),
+    }
+}
+
+fn pre(m: usize, k: usize, n: usize, x: &[f64], w: &[f64], b: &[f64], kind: BiasKind) -> Vec<f64> {
+    let mut out = vec![0.0; m * n];
+    for i in 0..m {
+        for j in 0..n {
+            let start = match kind {
+                BiasKind::None => 0.0,
+                BiasKind::Shared => b[j],
+                BiasKind::PerRow => b[i * n + j],
+            };
+            out[i * n + j] = start + (0..k).map(|p| x[i * k + p] * w[p * n + j]).sum::<f64>();
+        }
+    }
+    out
+}
+
+/// `[M, N]`
+#[allow(clippy::too_many_arguments)]
+pub fn forward(m: usize, k: usize, n: usize, x: &[f64], w: &[f64], b: &[f64], kind: BiasKind, a: Activation) -> Vec<f64> {
+    pre(m, k, n, x, w, b, kind).into_iter().map(|v| activate(a, v)).collect()
+}
+
+/// Gradients of x, w and b.
+#[allow(clippy::too_many_arguments)]
+pub fn backward(
+    m: usize, k: usize, n: usize, x: &[f64], w: &[f64], b: &[f64], kind: BiasKind, a: Activation, d: &[f64],
+) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
+    let pre = pre(m, k, n, x, w, b, kind);
+    let (mut dx, mut dw, mut db) = (vec![0.0; m * k], vec![0.0; k * n], vec![0.0; b.len()]);
+    for i in 0..m {
+        for j in 0..n {
+            let g = d[i * n + j] * slope(a, pre[i * n + j]);
+            for p in 0..k {
+                dx[i * k + p] += g * w[p * n + j];
+                dw[p * n + j] += g * x[i * k + p];
+            }
+            match kind {
+                BiasKind::None => {}
+                BiasKind::Shared => db[j] += g,
+                BiasKind::PerRow => db[i * n + j] += g,
+            }
+        }
+    }
+    (dx, dw, db)
+}

@@ -1,0 +1,68 @@
+use super::*;
+use crate::burn_op::values;
+use burn::tensor::{Device, TensorData};
+use diorama_testkit::{assert_close, assert_gradient, random, wide};
+
+const ALL: [Activation; 5] =
+    [Activation::None, Activation::Relu, Activation::Sigmoid, Activation::Softplus, Activation::TruncatedExp];
+const KINDS: [BiasKind; 3] = [BiasKind::None, BiasKind::Shared, BiasKind::PerRow];
+
+fn bias_len(kind: BiasKind, m: usize, n: usize) -> usize {
+    match kind {
+        BiasKind::None => 0,
+        BiasKind::Shared => n,
+        BiasKind::PerRow => m * n,
+    }
+}
+
+#[test]
+fn matches_the_reference_both_ways() {
+    for (m, k, n) in [(0, 3, 4), (1, 1, 1), (7, 5, 3), (500, 64, 64), (385, 33, 257), (12, 256, 16)] {
+        for kind in KINDS {
+            for a in ALL {
+                let (x, mut w, b) = (random(m * k, 1), random(k * n, 2), random(bias_len(kind, m, n), 3));
+                let fan = (k as f32).sqrt();
+                w.iter_mut().for_each(|w| *w /= fan);
+                let d = random(m * n, 4);
+                let mut out = vec![9.0; m * n];
+                cpu::forward(m, k, n, &x, &w, &b, kind, a, &mut out);
+                let (xd, wd, bd, dd) = (wide(&x), wide(&w), wide(&b), wide(&d));
+                assert_close("forward", &out, &reference::forward(m, k, n, &xd, &wd, &bd, kind, a), 1e-4);
+                let (mut dx, mut dw, mut db) = (vec![9.0; x.len()], vec![9.0; w.len()], vec![9.0; b.len()]);
+                cpu::backward(m, k, n, &x, &w, kind, a, &out, &d, &mut dx, &mut dw, &mut db);
+                let (rx, rw, rb) = reference::backward(m, k, n, &xd, &wd, &bd, kind, a, &dd);
+                assert_close("dx", &dx, &rx, 1e-4);
+                assert_close("dw", &dw, &rw, 1e-4);
+                assert_close("db", &db, &rb, 1e-4);
+            }
+        }
+    }
+}
+
+#[test]
+fn reference_gradients_match_central_differences() {
+    let (m, k, n) = (2, 3, 2);
+    for a in ALL {
+        let (x, w, b, d) = (wide(&random(6, 1)), wide(&random(6, 2)), wide(&random(4, 3)), wide(&random(4, 4)));
+        let (dx, dw, db) = reference::backward(m, k, n, &x, &w, &b, BiasKind::PerRow, a, &d);
+        let loss = |x: &[f64], w: &[f64], b: &[f64]| {
+            reference::forward(m, k, n, x, w, b, BiasKind::PerRow, a).iter().zip(&d).map(|(a, b)| a * b).sum::<f64>()
+        };
+        assert_gradient("x", &dx, &x, 1e-6, |x| loss(x, &w, &b));
+        assert_gradient("w", &dw, &w, 1e-6, |w| loss(&x, w, &b));
+        assert_gradient("b", &db, &b, 1e-6, |b| loss(&x, &w, b));
+    }
+}
+
+#[test]
+fn burn_sees_the_same_gradients() {
+    let device = Device::flex().autodiff();
+    let t = |v: &[f32], r: usize, c: usize| Tensor::<2>::from_data(TensorData::new(v.to_vec(), [r, c]), &device).require_grad();
+    let (x, w, b) = (random(20, 1), random(12, 2), random(3, 3));
+    let (xt, wt, bt) = (t(&x, 5, 4), t(&w, 4, 3), t(&b, 1, 3));
+    let grads = linear(xt.clone(), wt.clone(), Some(bt.clone()), Activation::Sigmoid).sum().backward();
+    let (dx, dw, db) = reference::backward(5, 4, 3, &wide(&x), &wide(&w), &wide(&b), BiasKind::Shared, Activation::Sigmoid, &[1.0; 15]);
+    assert_close("x", &values(xt.grad(&grads).unwrap()), &dx, 1e-4);
+    assert_close("w", &values(wt.grad(&grads).unwrap()), &dw, 1e-4);
+    assert_close("b", &values(bt.grad(&grads).unwrap()), &db, 1e-4);
+}

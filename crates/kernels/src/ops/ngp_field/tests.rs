@@ -1,0 +1,158 @@
+use super::*;
+use crate::ops::composite::{Composited, Packed, tests::scene};
+use crate::ops::frequency;
+use crate::ops::fused_mlp::{Layer, Source};
+use crate::ops::hash_grid::{HashGrid, HashGridConfig, cpu as hash, reference as hash_reference};
+use diorama_geom::rng::Rng;
+use diorama_testkit::{assert_close, random, random_unit, wide};
+
+/// A linear loss with random coefficients for everything that a loss may touch.
+struct Linear {
+    color: Vec<f32>,
+    depth: Vec<f32>,
+    opacity: Vec<f32>,
+    weights: Vec<f32>,
+}
+
+impl Linear {
+    fn new(rays: usize, samples: usize) -> Self {
+        Linear { color: random(rays * 3, 1), depth: random(rays, 2), opacity: random(rays, 3), weights: random(samples, 4) }
+    }
+    fn wide(&self) -> Composited<f64> {
+        Composited { color: wide(&self.color), depth: wide(&self.depth), opacity: wide(&self.opacity), weights: wide(&self.weights) }
+    }
+}
+
+impl RayLoss for Linear {
+    fn ray(&self, r: usize, out: &RayOutput, g: &mut RayGradient) -> f64 {
+        g.rgb.copy_from_slice(&self.color[r * 3..r * 3 + 3]);
+        g.depth = self.depth[r];
+        g.opacity = self.opacity[r];
+        let n = g.weights.len();
+        g.weights.copy_from_slice(&self.weights[out.first..out.first + n]);
+        let mut loss = (out.depth * g.depth + out.opacity * g.opacity) as f64;
+        loss += out.rgb.iter().zip(&g.rgb).map(|(a, b)| (a * b) as f64).sum::<f64>();
+        loss + out.weights.iter().zip(g.weights.iter()).map(|(a, b)| (a * b) as f64).sum::<f64>()
+    }
+}
+
+fn ngp_net(features: usize) -> FieldNet {
+    let l = |inputs: Vec<Source>, width, relu| Layer { inputs, width, relu, bias: false };
+    use Source::{Input, Layer as L};
+    let layers = vec![
+        l(vec![Input(0)], 32, true),
+        l(vec![L(0)], 16, false),
+        l(vec![L(1), Input(1), Input(2)], 32, true),
+        l(vec![L(2)], 16, false),
+    ];
+    FieldNet {
+        mlp: Mlp::new(vec![features, 16, 5], layers),
+        sigma: Head { layer: 1, channel: 0, activation: Activation::TruncatedExp, shift: 0.5 },
+        rgb: Head { layer: 3, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    }
+}
+
+fn expand(p: &Packed, code: &[f32], width: usize) -> Vec<f64> {
+    (0..p.rays()).flat_map(|r| p.range(r).map(move |_| r)).flat_map(|r| wide(&code[r * width..(r + 1) * width])).collect()
+}
+
+fn fold(p: &Packed, d: &[f64], width: usize) -> Vec<f64> {
+    (0..p.rays()).flat_map(|r| (0..width).map(move |k| (r, k))).map(|(r, k)| p.range(r).map(|i| d[i * width + k]).sum()).collect()
+}
+
+#[test]
+fn fused_equals_composed_with_hash_features_codes_and_all_gradients() {
+    let grid = HashGrid::new(HashGridConfig { levels: 4, features: 2, log2_size: 9, base: 4, finest: 32 });
+    let net = ngp_net(grid.output_dims());
+    for rays in [0, 1, 90] {
+        let s = scene(rays, 3);
+        let (p, n) = (s.packed(), s.t.len());
+        let points = random_unit(n * 3, 5);
+        let table = random(grid.params_len(), 6);
+        let params = net.mlp.init(&Rng::new(1, 1));
+        let (sh, emb, bg) = (random(rays * 16, 7), random(rays * 5, 8), random(rays * 3, 9));
+        let mut features = vec![0.0; n * grid.output_dims()];
+        hash::forward(&grid, &points, &table, &mut features);
+        let loss = Linear::new(rays, n);
+        let (mut d_sh, mut d_emb) = (vec![9.0; sh.len()], vec![9.0; emb.len()]);
+        let mut d_params = vec![0.0; params.len()];
+        let mut out = StepOutput::default();
+        let input = StepInput { net: &net, params: &params, samples: p, background: &bg };
+        let mut codes = [
+            RayCode { values: &sh, width: 16, gradient: Some(&mut d_sh) },
+            RayCode { values: &emb, width: 5, gradient: Some(&mut d_emb) },
+        ];
+        let positions = Positions::Features { data: &mut features, levels: 4, width: 2 };
+        run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
+
+        let level_major = hash_reference::forward(&grid, &wide(&points), &wide(&table));
+        let rows: Vec<f64> = (0..n * 8).map(|e| level_major[(e % 8 / 2 * n + e / 8) * 2 + e % 2]).collect();
+        let inputs = [rows, expand(&p, &sh, 16), expand(&p, &emb, 5)];
+        let views: Vec<&[f64]> = inputs.iter().map(|v| &v[..]).collect();
+        let want = reference::step(&net, &wide(&params), &p, &views, &wide(&bg), &loss.wide());
+        assert_close("rgb", &out.rgb, &want.out.color, 1e-4);
+        assert_close("depth", &out.depth, &want.out.depth, 1e-4);
+        assert_close("opacity", &out.opacity, &want.out.opacity, 1e-4);
+        assert_close("weights", &out.weights, &want.out.weights, 1e-4);
+        assert_close("d background", &out.d_background, &want.d_background, 1e-4);
+        assert_close("d params", &d_params, &want.d_params, 1e-4);
+        assert_close("d direction code", &d_sh, &fold(&p, &want.d_inputs[1], 16), 1e-4);
+        assert_close("d embedding", &d_emb, &fold(&p, &want.d_inputs[2], 5), 1e-4);
+        let d_rows: Vec<f64> = (0..n * 8).map(|e| want.d_inputs[0][(e / 2 % n.max(1)) * 8 + e / 2 / n.max(1) * 2 + e % 2]).collect();
+        assert_close("d features", &features, &d_rows, 1e-4);
+        // And on to the table and the points.
+        let mut d_table = vec![0.0; table.len()];
+        hash::backward(&grid, &points, &features, &mut d_table, None);
+        let (_, rt) = hash_reference::backward(&grid, &wide(&points), &wide(&table), &d_rows);
+        assert_close("d table", &d_table, &rt, 1e-4);
+    }
+}
+
+#[test]
+fn fused_equals_composed_with_encoded_positions() {
+    let encoding = Frequency { dims: 3, bands: 4, include_input: true, pi: true, window: None };
+    let net = FieldNet {
+        mlp: Mlp::chain(vec![encoding.output_dims()], &[48, 48, 16], true),
+        sigma: Head { layer: 2, channel: 3, activation: Activation::Softplus, shift: -1.0 },
+        rgb: Head { layer: 2, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    };
+    let s = scene(70, 13);
+    let (p, n) = (s.packed(), s.t.len());
+    let points = random(n * 3, 5);
+    let params = net.mlp.init(&Rng::new(1, 1));
+    let bg = random(210, 9);
+    let loss = Linear::new(70, n);
+    let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
+    let input = StepInput { net: &net, params: &params, samples: p, background: &bg };
+    let positions = Positions::Encoded { encoding, points: &points, d_points: Some(&mut d_points) };
+    run(&input, positions, &mut [], Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
+    let rows = frequency::reference::forward(&encoding, &wide(&points));
+    let want = reference::step(&net, &wide(&params), &p, &[&rows], &wide(&bg), &loss.wide());
+    assert_close("rgb", &out.rgb, &want.out.color, 1e-4);
+    assert_close("d params", &d_params, &want.d_params, 1e-4);
+    assert_close("d points", &d_points, &frequency::reference::backward(&encoding, &wide(&points), &want.d_inputs[0]), 1e-4);
+}
+
+#[test]
+fn the_result_does_not_depend_on_the_thread_count() {
+    let run_with = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let net = ngp_net(8);
+            let s = scene(200, 3);
+            let n = s.t.len();
+            let mut features = random(n * 8, 5);
+            let params = net.mlp.init(&Rng::new(1, 1));
+            let (sh, emb, bg) = (random(3200, 7), random(1000, 8), random(600, 9));
+            let loss = Linear::new(200, n);
+            let mut d_params = vec![0.0; params.len()];
+            let mut out = StepOutput::default();
+            let input = StepInput { net: &net, params: &params, samples: s.packed(), background: &bg };
+            let mut codes = [RayCode { values: &sh, width: 16, gradient: None }, RayCode { values: &emb, width: 5, gradient: None }];
+            let positions = Positions::Features { data: &mut features, levels: 4, width: 2 };
+            run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
+            (d_params, out.rgb, out.loss.to_bits())
+        })
+    };
+    assert_eq!(run_with(1), run_with(3));
+}

@@ -1,0 +1,176 @@
+//! One source for every vector width: kernels are generic over [`Lane`], compiled once per
+//! instruction set, and chosen at run time.
+
+use std::sync::atomic::{AtomicU8, Ordering};
+
+/// An instruction set that the kernels are compiled for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Level {
+    /// Plain Rust on arrays of eight floats; the compiler vectorises it for the base target.
+    Portable = 1,
+    /// AVX2 with FMA, 8 floats.
+    Avx2 = 2,
+    /// AVX-512F, 16 floats.
+    Avx512 = 3,
+}
+
+impl Level {
+    pub fn name(self) -> &'static str {
+        match self {
+            Level::Portable => "portable",
+            Level::Avx2 => "avx2",
+            Level::Avx512 => "avx512",
+        }
+    }
+
+    /// Whether this machine can run the level.
+    pub fn is_available(self) -> bool {
+        match self {
+            Level::Portable => true,
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => {
+                is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") && Level::Avx2.is_available()
+            }
+            #[cfg(not(target_arch = "x86_64"))]
+            _ => false,
+        }
+    }
+
+    /// The levels that this machine can run, slowest first.
+    pub fn available() -> Vec<Level> {
+        [Level::Portable, Level::Avx2, Level::Avx512].into_iter().filter(|l| l.is_available()).collect()
+    }
+}
+
+static ACTIVE: AtomicU8 = AtomicU8::new(0);
+
+/// The level in use: the best available, or what `DIORAMA_SIMD` or [`force_level`] says.
+pub fn level() -> Level {
+    match ACTIVE.load(Ordering::Relaxed) {
+        1 => Level::Portable,
+        2 => Level::Avx2,
+        3 => Level::Avx512,
+        _ => {
+            let best = *Level::available().last().unwrap_or(&Level::Portable);
+            let wanted = std::env::var("DIORAMA_SIMD").ok();
+            let chosen = wanted
+                .and_then(|w| Level::available().into_iter().find(|l| l.name() == w))
+                .unwrap_or(best);
+            ACTIVE.store(chosen as u8, Ordering::Relaxed);
+            chosen
+        }
+    }
+}
+
+/// Makes every later kernel use `level`, for tests and benchmarks.
+///
+/// # Panics
+/// When this machine cannot run it.
+pub fn force_level(level: Level) {
+    assert!(level.is_available(), "this CPU has no {}", level.name());
+    ACTIVE.store(level as u8, Ordering::Relaxed);
+}
+
+/// A vector of floats. Methods must be inlined into a function compiled for the instruction set.
+///
+/// # Safety
+/// Every method may only run on a CPU that has the set; pointers must be valid for `N` floats.
+pub unsafe trait Lane: Copy {
+    const N: usize;
+    type V: Copy;
+    unsafe fn splat(x: f32) -> Self::V;
+    unsafe fn load(p: *const f32) -> Self::V;
+    unsafe fn store(p: *mut f32, v: Self::V);
+    /// `a * b + c`
+    unsafe fn fma(a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    unsafe fn max(a: Self::V, b: Self::V) -> Self::V;
+}
+
+/// Plain arrays.
+#[derive(Clone, Copy)]
+pub struct Plain;
+
+// SAFETY: no special instructions.
+unsafe impl Lane for Plain {
+    const N: usize = 8;
+    type V = [f32; 8];
+    #[inline(always)]
+    unsafe fn splat(x: f32) -> [f32; 8] {
+        [x; 8]
+    }
+    #[inline(always)]
+    unsafe fn load(p: *const f32) -> [f32; 8] {
+        // SAFETY: the caller guarantees eight readable floats.
+        unsafe { p.cast::<[f32; 8]>().read_unaligned() }
+    }
+    #[inline(always)]
+    unsafe fn store(p: *mut f32, v: [f32; 8]) {
+        // SAFETY: the caller guarantees eight writable floats.
+        unsafe { p.cast::<[f32; 8]>().write_unaligned(v) }
+    }
+    #[inline(always)]
+    unsafe fn fma(a: [f32; 8], b: [f32; 8], c: [f32; 8]) -> [f32; 8] {
+        std::array::from_fn(|i| a[i] * b[i] + c[i])
+    }
+    #[inline(always)]
+    unsafe fn max(a: [f32; 8], b: [f32; 8]) -> [f32; 8] {
+        std::array::from_fn(|i| if a[i] > b[i] { a[i] } else { b[i] })
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+pub use x86::{Avx2, Avx512};
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use super::Lane;
+    use std::arch::x86_64::*;
+
+    macro_rules! lane {
+        ($(#[$doc:meta])* $name:ident, $n:literal, $v:ty, $set:ident, $load:ident, $store:ident, $fma:ident, $max:ident) => {
+            $(#[$doc])*
+            #[derive(Clone, Copy)]
+            pub struct $name;
+            // SAFETY: callers uphold the trait's contract: right CPU, valid pointers.
+            unsafe impl Lane for $name {
+                const N: usize = $n;
+                type V = $v;
+                #[inline(always)]
+                unsafe fn splat(x: f32) -> $v {
+                    // SAFETY: see the impl.
+                    unsafe { $set(x) }
+                }
+                #[inline(always)]
+                unsafe fn load(p: *const f32) -> $v {
+                    // SAFETY: see the impl.
+                    unsafe { $load(p) }
+                }
+                #[inline(always)]
+                unsafe fn store(p: *mut f32, v: $v) {
+                    // SAFETY: see the impl.
+                    unsafe { $store(p, v) }
+                }
+                #[inline(always)]
+                unsafe fn fma(a: $v, b: $v, c: $v) -> $v {
+                    // SAFETY: see the impl.
+                    unsafe { $fma(a, b, c) }
+                }
+                #[inline(always)]
+                unsafe fn max(a: $v, b: $v) -> $v {
+                    // SAFETY: see the impl.
+                    unsafe { $max(a, b) }
+                }
+            }
+        };
+    }
+    lane!(
+        /// 256-bit vectors.
+        Avx2, 8, __m256, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_max_ps
+    );
+    lane!(
+        /// 512-bit vectors.
+        Avx512, 16, __m512, _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_max_ps
+    );
+}

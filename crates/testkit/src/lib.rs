@@ -1,0 +1,106 @@
+//! Comparators, gradient checks and generators for tests.
+
+use diorama_geom::rng::Rng;
+
+/// `n` numbers in [-1, 1), the same for the same seed.
+pub fn random(n: usize, seed: u64) -> Vec<f32> {
+    let rng = Rng::new(seed, 0x7e57);
+    (0..n as u64).map(|i| rng.uniform(i) * 2.0 - 1.0).collect()
+}
+
+/// `n` numbers in [0, 1).
+pub fn random_unit(n: usize, seed: u64) -> Vec<f32> {
+    random(n, seed).into_iter().map(|v| (v * 0.5 + 0.5).min(0.999_999)).collect()
+}
+
+/// The first place where `|a − b| > tolerance · (|b| + rms b)`, with its error, or the largest error.
+pub fn compare(a: &[f32], b: &[f64], tolerance: f64) -> Result<f64, String> {
+    if a.len() != b.len() {
+        return Err(format!("lengths differ: {} and {}", a.len(), b.len()));
+    }
+    let rms = (b.iter().map(|v| v * v).sum::<f64>() / b.len().max(1) as f64).sqrt();
+    let mut worst = 0.0f64;
+    for (i, (&x, &y)) in a.iter().zip(b).enumerate() {
+        let error = (x as f64 - y).abs();
+        let scale = y.abs() + rms;
+        // Written so that NaN on either side fails.
+        if !(error <= tolerance * scale || error == 0.0) {
+            return Err(format!("element {i}: {x} is not {y} (error {error:.3e}, allowed {:.3e})", tolerance * scale));
+        }
+        worst = worst.max(if scale > 0.0 { error / scale } else { 0.0 });
+    }
+    Ok(worst)
+}
+
+/// Panics with `what` unless [`compare`] passes.
+#[track_caller]
+pub fn assert_close(what: &str, a: &[f32], b: &[f64], tolerance: f64) {
+    if let Err(e) = compare(a, b, tolerance) {
+        panic!("{what}: {e}");
+    }
+}
+
+/// Central differences of `f` at `x`, one parameter at a time, step `h`.
+pub fn central_differences(x: &[f64], h: f64, mut f: impl FnMut(&[f64]) -> f64) -> Vec<f64> {
+    let mut x = x.to_vec();
+    (0..x.len())
+        .map(|i| {
+            let keep = x[i];
+            x[i] = keep + h;
+            let up = f(&x);
+            x[i] = keep - h;
+            let down = f(&x);
+            x[i] = keep;
+            (up - down) / (2.0 * h)
+        })
+        .collect()
+}
+
+/// Panics unless an f64 gradient equals the central differences of `f` within `tolerance`.
+#[track_caller]
+pub fn assert_gradient(what: &str, gradient: &[f64], x: &[f64], tolerance: f64, f: impl FnMut(&[f64]) -> f64) {
+    let numeric = central_differences(x, 1e-5, f);
+    let gradient: Vec<f32> = gradient.iter().map(|&v| v as f32).collect();
+    assert_close(what, &gradient, &numeric, tolerance);
+}
+
+/// Widens to f64, for references.
+pub fn wide(x: &[f32]) -> Vec<f64> {
+    x.iter().map(|&v| v as f64).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn equal_passes() {
+        assert_eq!(compare(&[1.0, -2.0], &[1.0, -2.0], 1e-6), Ok(0.0));
+        assert_eq!(compare(&[0.0], &[0.0], 0.0), Ok(0.0));
+    }
+
+    #[test]
+    fn one_wrong_element_fails() {
+        assert!(compare(&[1.0, 2.0, 3.0], &[1.0, 2.0, 3.001], 1e-4).is_err());
+    }
+
+    #[test]
+    fn nan_and_infinity_fail() {
+        assert!(compare(&[f32::NAN], &[1.0], 1.0).is_err());
+        assert!(compare(&[1.0], &[f64::NAN], 1.0).is_err());
+        assert!(compare(&[f32::INFINITY], &[1.0], 1.0).is_err());
+    }
+
+    #[test]
+    fn a_missing_element_fails() {
+        assert!(compare(&[1.0], &[1.0, 1.0], 1.0).is_err());
+    }
+
+    #[test]
+    fn a_wrong_gradient_fails() {
+        let f = |x: &[f64]| x[0] * x[0] + 3.0 * x[1];
+        assert_gradient("right", &[4.0, 3.0], &[2.0, 1.0], 1e-6, f);
+        let caught = std::panic::catch_unwind(|| assert_gradient("wrong", &[4.0, -3.0], &[2.0, 1.0], 1e-6, f));
+        assert!(caught.is_err());
+    }
+}
