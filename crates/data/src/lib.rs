@@ -1,1 +1,22 @@
+//! Every byte to or from disk: captures, images, video, meshes, checkpoints, logs. Knows no training.
+#![allow(unsafe_code)] // the memory map in `pixel_store`
 
+pub mod atomic;
+pub mod camera_path_json;
+pub mod checkpoint;
+pub mod colmap;
+pub mod error;
+pub mod glb;
+pub mod import;
+pub mod json;
+pub mod llff;
+pub mod mesh_text;
+pub mod mp4;
+pub mod photo;
+pub mod pixel_store;
+pub mod plot;
+pub mod split;
+pub mod tfevents;
+pub mod transforms_json;
+
+pub use error::{DataError, Result};

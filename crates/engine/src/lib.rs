@@ -1,1 +1,10 @@
+//! Fields, samplers, renderers, losses, metrics, optimisers and the training run. Opens no file.
 
+pub mod background;
+pub mod fields;
+pub mod losses;
+pub mod metrics;
+pub mod params;
+pub mod renderers;
+pub mod samplers;
+pub mod train;

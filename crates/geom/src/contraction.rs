@@ -21,9 +21,42 @@ pub fn uncontract(y: [f32; 3]) -> [f32; 3] {
     [y[0] * s, y[1] * s, y[2] * s]
 }
 
+/// Gradient of [`contract`]'s input at `x`, given that of its output.
+pub fn contract_backward(x: [f32; 3], d: [f32; 3]) -> [f32; 3] {
+    let big = (0..3).max_by(|&a, &b| x[a].abs().total_cmp(&x[b].abs())).unwrap_or(0);
+    let m = x[big].abs();
+    if m <= 1.0 {
+        return d;
+    }
+    // y = s(m) x with s = 2/m − 1/m², so ds/dm = −2/m² + 2/m³.
+    let s = (2.0 - 1.0 / m) / m;
+    let slope = -2.0 / (m * m) + 2.0 / (m * m * m);
+    let mut g = d.map(|d| d * s);
+    g[big] += x[big].signum() * slope * (d[0] * x[0] + d[1] * x[1] + d[2] * x[2]);
+    g
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_gradient_matches_central_differences() {
+        for x in [[0.3, -0.2, 0.9], [1.5, 0.2, -0.7], [-2.0, 3.5, 1.0]] {
+            let d = [0.3, -1.1, 0.7];
+            let g = contract_backward(x, d);
+            for k in 0..3 {
+                let at = |h: f32| {
+                    let mut x = x;
+                    x[k] += h;
+                    let y = contract(x);
+                    (y[0] * d[0] + y[1] * d[1] + y[2] * d[2]) as f64
+                };
+                let numeric = (at(1e-2) - at(-1e-2)) / 2e-2;
+                assert!((g[k] as f64 - numeric).abs() < 2e-3, "{x:?} {k}: {} {numeric}", g[k]);
+            }
+        }
+    }
 
     #[test]
     fn contraction_is_invertible_and_bounded() {

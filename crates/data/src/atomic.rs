@@ -1,0 +1,85 @@
+//! Files appear whole or not at all: temporary file, fsync, rename, fsync of the folder.
+
+use crate::error::{DataError, Result};
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+const SUFFIX: &str = ".partial";
+
+/// Writes `path` through `fill`; on any error the old file stays and the temporary one is removed.
+pub fn write_with(path: &Path, fill: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>) -> Result<()> {
+    let temporary = temporary_name(path);
+    let attempt = || -> std::io::Result<()> {
+        let mut w = BufWriter::with_capacity(1 << 20, File::create(&temporary)?);
+        fill(&mut w)?;
+        let file = w.into_inner().map_err(|e| e.into_error())?;
+        file.sync_all()?;
+        std::fs::rename(&temporary, path)?;
+        sync_folder(path)
+    };
+    attempt().map_err(|e| {
+        let _ = std::fs::remove_file(&temporary);
+        DataError::io(path, "write")(e)
+    })
+}
+
+/// [`write_with`] for bytes at hand.
+pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    write_with(path, |w| w.write_all(bytes))
+}
+
+/// Removes what interrupted writes left in a folder.
+pub fn sweep(folder: &Path) -> Result<()> {
+    let entries = std::fs::read_dir(folder).map_err(DataError::io(folder, "read"))?;
+    for entry in entries.flatten() {
+        if entry.file_name().to_string_lossy().ends_with(SUFFIX) {
+            let path = entry.path();
+            std::fs::remove_file(&path).map_err(DataError::io(&path, "remove"))?;
+        }
+    }
+    Ok(())
+}
+
+fn temporary_name(path: &Path) -> PathBuf {
+    let mut name = path.file_name().unwrap_or_default().to_os_string();
+    name.push(SUFFIX);
+    path.with_file_name(name)
+}
+
+fn sync_folder(path: &Path) -> std::io::Result<()> {
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    // Some systems cannot open folders; the rename itself is what must not fail.
+    match File::open(folder) {
+        Ok(f) => f.sync_all().or(Ok(())),
+        Err(_) => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failed_write_keeps_the_old_file_and_leaves_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a");
+        write(&path, b"old").unwrap();
+        let failed = write_with(&path, |w| {
+            w.write_all(b"half of the new")?;
+            Err(std::io::Error::other("disk full"))
+        });
+        assert!(failed.unwrap_err().to_string().contains("disk full"));
+        assert_eq!(std::fs::read(&path).unwrap(), b"old");
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn sweeping_removes_leftovers_only() {
+        let dir = tempfile::tempdir().unwrap();
+        write(&dir.path().join("kept"), b"x").unwrap();
+        std::fs::write(dir.path().join("lost.partial"), b"x").unwrap();
+        sweep(dir.path()).unwrap();
+        assert!(dir.path().join("kept").exists() && !dir.path().join("lost.partial").exists());
+    }
+}

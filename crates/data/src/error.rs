@@ -1,0 +1,44 @@
+//! Errors that name the file, the field and the cure in one line.
+
+use std::path::{Path, PathBuf};
+
+pub type Result<T> = std::result::Result<T, DataError>;
+
+/// What went wrong with a file.
+#[derive(Debug, thiserror::Error)]
+pub enum DataError {
+    /// The file's content or the request is at fault; the user can mend it.
+    #[error("{}: {message}", path.display())]
+    Input { path: PathBuf, message: String },
+    /// The system would not do it: disk full, permission, missing folder.
+    #[error("{}: cannot {doing}: {source}", path.display())]
+    Io { path: PathBuf, doing: &'static str, source: std::io::Error },
+}
+
+impl DataError {
+    pub fn input(path: impl Into<PathBuf>, message: impl Into<String>) -> Self {
+        DataError::Input { path: path.into(), message: message.into() }
+    }
+
+    pub fn io(path: &Path, doing: &'static str) -> impl FnOnce(std::io::Error) -> DataError {
+        let path = path.to_path_buf();
+        move |source| DataError::Io { path, doing, source }
+    }
+
+    /// Whether the input is at fault (exit code 2) rather than the work (exit code 1).
+    pub fn is_input(&self) -> bool {
+        match self {
+            DataError::Input { .. } => true,
+            DataError::Io { doing, source, .. } => doing.starts_with("read") && source.kind() == std::io::ErrorKind::NotFound,
+        }
+    }
+}
+
+/// Reads a whole file, refusing more than `limit` bytes.
+pub fn read(path: &Path, limit: u64) -> Result<Vec<u8>> {
+    let size = std::fs::metadata(path).map_err(DataError::io(path, "read"))?.len();
+    if size > limit {
+        return Err(DataError::input(path, format!("{size} bytes, more than the {limit} that such a file may have")));
+    }
+    std::fs::read(path).map_err(DataError::io(path, "read"))
+}

@@ -1,0 +1,193 @@
+//! From a folder of photographs with poses to a [`Capture`].
+
+use crate::error::{DataError, Result};
+use crate::split::{self, SplitRule};
+use crate::{colmap, llff, transforms_json};
+use diorama_geom::capture::{Frame, Split, focus_point};
+use diorama_geom::glam::DVec3;
+use diorama_geom::{Capture, SceneBox, Similarity};
+use std::path::{Component, Path, PathBuf};
+
+/// Descriptions of a capture that can be read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// `transforms.json` of instant-ngp or nerfstudio.
+    Transforms,
+    /// `transforms_{train,val,test}.json` of the Blender set.
+    Blender,
+    /// COLMAP's `cameras`, `images`, `points3D`, binary or text.
+    Colmap,
+    /// `poses_bounds.npy` of LLFF.
+    Llff,
+}
+
+impl std::str::FromStr for Format {
+    type Err = String;
+
+    fn from_str(s: &str) -> std::result::Result<Self, String> {
+        match s {
+            "transforms" | "nerfstudio" | "instant-ngp" => Ok(Format::Transforms),
+            "blender" => Ok(Format::Blender),
+            "colmap" => Ok(Format::Colmap),
+            "llff" => Ok(Format::Llff),
+            _ => Err(format!("format {s:?}: expected transforms, blender, colmap or llff")),
+        }
+    }
+}
+
+/// How to read a capture.
+#[derive(Clone, Debug)]
+pub struct ImportOptions {
+    pub format: Option<Format>,
+    pub split: SplitRule,
+    pub seed: u64,
+    /// Fewest usable views.
+    pub min_views: usize,
+}
+
+impl Default for ImportOptions {
+    fn default() -> Self {
+        ImportOptions { format: None, split: SplitRule::File, seed: 0, min_views: 3 }
+    }
+}
+
+/// What a reader of one format returns.
+#[derive(Debug, Default)]
+pub struct Imported {
+    pub frames: Vec<Frame>,
+    /// The scene's box, where the format states it.
+    pub scene: Option<SceneBox>,
+    /// Names of listed images that do not exist.
+    pub missing: Vec<String>,
+    pub has_own_split: bool,
+    /// Whether the world is not z up yet and must be turned by the cameras' up directions.
+    pub unknown_up: bool,
+}
+
+/// Reads a capture: a folder, or one of the description files in it.
+///
+/// `transforms.json` wins over the Blender set, COLMAP and LLFF unless `options.format` says otherwise.
+pub fn import(data: &Path, options: &ImportOptions) -> Result<Capture> {
+    if !data.exists() {
+        return Err(DataError::input(data, "does not exist; give a folder with photographs and transforms.json, a COLMAP model or poses_bounds.npy"));
+    }
+    let (root, file) = if data.is_dir() { (data, None) } else { (data.parent().unwrap_or(Path::new(".")), Some(data)) };
+    let root = if root.as_os_str().is_empty() { Path::new(".") } else { root };
+    let named = file.and_then(|f| f.extension()).is_some_and(|e| e == "json");
+    let format = match (options.format, named) {
+        (Some(f), _) => f,
+        (None, true) => Format::Transforms,
+        (None, false) => detect(root)?,
+    };
+    let imported = match format {
+        Format::Transforms => transforms_json::read(&file.filter(|_| named).map_or_else(|| root.join("transforms.json"), Path::to_path_buf), root)?,
+        Format::Blender => transforms_json::read_blender(root)?,
+        Format::Colmap => colmap::read(root)?,
+        Format::Llff => llff::read(root)?,
+    };
+    finish(data, imported, options)
+}
+
+fn detect(root: &Path) -> Result<Format> {
+    if root.join("transforms.json").exists() {
+        Ok(Format::Transforms)
+    } else if root.join("transforms_train.json").exists() {
+        Ok(Format::Blender)
+    } else if colmap::find_model(root).is_some() {
+        Ok(Format::Colmap)
+    } else if root.join("poses_bounds.npy").exists() {
+        Ok(Format::Llff)
+    } else {
+        Err(DataError::input(root, "holds no transforms.json, transforms_train.json, COLMAP model (sparse/0) or poses_bounds.npy; estimate poses first, for example with COLMAP"))
+    }
+}
+
+fn finish(data: &Path, mut imported: Imported, options: &ImportOptions) -> Result<Capture> {
+    let mut notes = Vec::new();
+    if !imported.missing.is_empty() {
+        let shown = imported.missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
+        let more = if imported.missing.len() > 3 { ", …" } else { "" };
+        notes.push(format!("{} listed images do not exist and are skipped ({shown}{more})", imported.missing.len()));
+    }
+    let n = imported.frames.len();
+    if n < options.min_views {
+        return Err(DataError::input(data, format!("only {n} usable views ({} listed images are missing); at least {} are needed", imported.missing.len(), options.min_views)));
+    }
+    let first = imported.frames[0].world_from_camera;
+    if n > 1 && imported.frames.iter().all(|f| (f.world_from_camera.translation - first.translation).length() < 1e-9) {
+        return Err(DataError::input(data, "all cameras stand at the same place, so depth cannot be found; estimate the poses again"));
+    }
+    let mut seen = std::collections::HashSet::new();
+    if let Some(twice) = imported.frames.iter().find(|f| !seen.insert(&f.image)) {
+        notes.push(format!("{} is listed more than once", twice.name));
+    }
+    let world_from_capture = if imported.unknown_up { level(&mut imported.frames) } else { Similarity::IDENTITY };
+    split::apply(&options.split, &mut imported.frames, imported.has_own_split, options.seed);
+    let train = imported.frames.iter().filter(|f| f.split == Split::Train).count();
+    if train < 2 {
+        return Err(DataError::input(data, format!("the split leaves {train} training views of {n}; choose another --split")));
+    }
+    let scene = imported.scene.unwrap_or_else(|| automatic_scene(&imported.frames));
+    Ok(Capture { frames: imported.frames, world_from_capture, scene, notes })
+}
+
+/// Turns the world so that the cameras' mean up direction is +z.
+fn level(frames: &mut [Frame]) -> Similarity {
+    let up: DVec3 = frames.iter().map(|f| -f.world_from_camera.rotation.y_axis).sum();
+    if up.length() < 1e-6 {
+        return Similarity::IDENTITY;
+    }
+    let s = Similarity { rotation: diorama_geom::transform::rotation_between(up, DVec3::Z), ..Similarity::IDENTITY };
+    for f in frames {
+        f.world_from_camera = s.pose(&f.world_from_camera);
+    }
+    s
+}
+
+/// A box around what the cameras look at: the inner cube is half as wide as the cameras are far, the
+/// outer one eight times that.
+fn automatic_scene(frames: &[Frame]) -> SceneBox {
+    let poses: Vec<_> = frames.iter().map(|f| f.world_from_camera).collect();
+    let (center, distance) = focus_point(&poses);
+    SceneBox { center, half: 0.5 * distance, aabb_scale: 8 }
+}
+
+/// Finds a file that a description names, inside `root` only; a missing extension is completed.
+///
+/// # Errors
+/// When the name leads out of `root`.
+pub fn locate(root: &Path, name: &str, file: &Path, field: &str) -> Result<Option<PathBuf>> {
+    let escape = || DataError::input(file, format!("{field}: {name} leads out of the dataset folder; move the file into it"));
+    let relative = Path::new(name);
+    let windows = name.contains('\\') || name.as_bytes().get(1) == Some(&b':');
+    let mut depth = 0i32;
+    for c in relative.components() {
+        match c {
+            Component::Normal(_) => depth += 1,
+            Component::ParentDir => depth -= 1,
+            Component::CurDir => {}
+            Component::RootDir | Component::Prefix(_) => return Err(escape()),
+        }
+        if depth < 0 {
+            return Err(escape());
+        }
+    }
+    if windows {
+        return Err(escape());
+    }
+    let direct = root.join(relative);
+    let mut candidates = vec![direct.clone()];
+    for extension in ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "exr", "hdr"] {
+        let mut name = direct.clone().into_os_string();
+        name.push(".");
+        name.push(extension);
+        candidates.push(name.into());
+    }
+    let Some(found) = candidates.into_iter().find(|c| c.is_file()) else { return Ok(None) };
+    let real = found.canonicalize().map_err(DataError::io(&found, "read"))?;
+    let base = root.canonicalize().map_err(DataError::io(root, "read"))?;
+    if !real.starts_with(&base) {
+        return Err(escape());
+    }
+    Ok(Some(found))
+}

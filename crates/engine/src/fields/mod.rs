@@ -1,0 +1,285 @@
+//! Radiance fields: an encoding of position, codes of direction and appearance, and a network.
+
+mod presets;
+
+pub use presets::{baseline, mlp, nerf, ngp};
+
+use crate::params::ParamGroup;
+use diorama_geom::contraction::contract;
+use diorama_kernels::ops::composite::Packed;
+use diorama_kernels::ops::fused_mlp::{self, Mlp};
+use diorama_kernels::ops::hash_grid::{self, HashGrid};
+use diorama_kernels::ops::ngp_field::{self, FieldNet, Positions, RayCode, RayLoss, StepBuffers, StepInput, StepOutput};
+use diorama_kernels::ops::{frequency, linear, spherical_harmonics};
+use rayon::prelude::*;
+
+/// How positions are encoded.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Encoding {
+    /// Over the outer cube as `[0, 1]³`.
+    Hash(HashGrid),
+    /// Over the outer cube as `[−1, 1]³`.
+    Frequency(frequency::Frequency),
+}
+
+/// How directions are encoded.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum DirectionCode {
+    None,
+    SphericalHarmonics(usize),
+    Frequency(frequency::Frequency),
+}
+
+impl DirectionCode {
+    pub fn dims(&self) -> usize {
+        match self {
+            DirectionCode::None => 0,
+            DirectionCode::SphericalHarmonics(d) => d * d,
+            DirectionCode::Frequency(f) => f.output_dims(),
+        }
+    }
+
+    fn encode(&self, dirs: &[f32], out: &mut Vec<f32>) {
+        out.resize(dirs.len() / 3 * self.dims(), 0.0);
+        match self {
+            DirectionCode::None => {}
+            DirectionCode::SphericalHarmonics(d) => spherical_harmonics::cpu::forward(*d, dirs, out),
+            DirectionCode::Frequency(f) => frequency::cpu::forward(f, dirs, out),
+        }
+    }
+}
+
+/// A vector per training image that the colour network reads (NeRF in the Wild).
+#[derive(Clone, Debug)]
+pub struct Appearance {
+    pub dims: usize,
+    /// `[images, dims]`
+    pub group: ParamGroup,
+}
+
+/// A field in model space, where the inner cube is `[0, 1]³` and the outer one `outer` times as wide.
+#[derive(Clone, Debug)]
+pub struct Field {
+    pub encoding: Encoding,
+    pub directions: DirectionCode,
+    pub net: FieldNet,
+    pub outer: f32,
+    /// Contract space around the inner cube instead of scaling it down.
+    pub contraction: bool,
+    pub table: Option<ParamGroup>,
+    pub weights: ParamGroup,
+    pub appearance: Option<Appearance>,
+}
+
+/// Samples of a batch of rays, in model space.
+#[derive(Clone, Copy)]
+pub struct Batch<'a> {
+    pub samples: Packed<'a>,
+    /// Sample midpoints, `[S, 3]`.
+    pub positions: &'a [f32],
+    /// `[R, 3]`
+    pub dirs: &'a [f32],
+    /// Image of each ray for the appearance code; none: the mean code.
+    pub images: Option<&'a [u32]>,
+    /// `[R, 3]`
+    pub background: &'a [f32],
+}
+
+/// Memory kept between evaluations.
+#[derive(Default)]
+pub struct FieldBuffers {
+    unit: Vec<f32>,
+    features: Vec<f32>,
+    direction: Vec<f32>,
+    appearance: Vec<f32>,
+    d_appearance: Vec<f32>,
+    step: StepBuffers,
+    pub out: StepOutput,
+}
+
+impl Field {
+    /// Field coordinates of model points: `[0, 1]³` for a hash grid, `[−1, 1]³` for frequencies.
+    fn unit(&self, model: &[f32], out: &mut Vec<f32>) {
+        out.resize(model.len(), 0.0);
+        let (outer, contraction) = (self.outer, self.contraction);
+        let frequency = matches!(self.encoding, Encoding::Frequency(_));
+        out.par_chunks_mut(3 * 4096).zip(model.par_chunks(3 * 4096)).for_each(|(out, model)| {
+            for (o, m) in out.chunks_exact_mut(3).zip(model.chunks_exact(3)) {
+                let centred = [m[0] - 0.5, m[1] - 0.5, m[2] - 0.5];
+                let u = if contraction { contract(centred.map(|v| 2.0 * v)).map(|v| 0.25 * v) } else { centred.map(|v| v / outer) };
+                for k in 0..3 {
+                    o[k] = if frequency { 2.0 * u[k] } else { u[k] + 0.5 };
+                }
+            }
+        });
+    }
+
+    /// Turns gradients of field coordinates into gradients of model points, in place.
+    fn unit_backward(&self, model: &[f32], d: &mut [f32]) {
+        let factor = if matches!(self.encoding, Encoding::Frequency(_)) { 2.0 } else { 1.0 };
+        for (d, m) in d.chunks_exact_mut(3).zip(model.chunks_exact(3)) {
+            if !self.contraction {
+                d.iter_mut().for_each(|d| *d *= factor / self.outer);
+                continue;
+            }
+            let x = [0, 1, 2].map(|k: usize| 2.0 * (m[k] - 0.5));
+            let g = diorama_geom::contraction::contract_backward(x, [d[0], d[1], d[2]]);
+            d.copy_from_slice(&g.map(|g| g * 0.5 * factor));
+        }
+    }
+
+    fn codes(&self, batch: &Batch, buf: &mut FieldBuffers) {
+        self.directions.encode(batch.dirs, &mut buf.direction);
+        let Some(a) = &self.appearance else { return };
+        let rays = batch.samples.rays();
+        buf.appearance.resize(rays * a.dims, 0.0);
+        let mean = if batch.images.is_none() { a.mean() } else { Vec::new() };
+        for (r, row) in buf.appearance.chunks_exact_mut(a.dims).enumerate() {
+            match batch.images {
+                Some(images) => {
+                    let i = images[r] as usize * a.dims;
+                    row.copy_from_slice(&a.group.values[i..i + a.dims]);
+                }
+                None => row.copy_from_slice(&mean),
+            }
+        }
+    }
+
+    /// Composites a batch into `buf.out`.
+    pub fn render(&self, batch: &Batch, buf: &mut FieldBuffers) {
+        self.unit(batch.positions, &mut buf.unit);
+        self.codes(batch, buf);
+        let (direction, appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
+        let mut codes = Vec::new();
+        if self.directions.dims() > 0 {
+            codes.push(RayCode { values: &direction, width: self.directions.dims(), gradient: None });
+        }
+        if let Some(a) = &self.appearance {
+            codes.push(RayCode { values: &appearance, width: a.dims, gradient: None });
+        }
+        let input = StepInput { net: &self.net, params: &self.weights.values, samples: batch.samples, background: batch.background };
+        let positions = match (&self.encoding, &self.table) {
+            (Encoding::Hash(grid), Some(table)) => {
+                buf.features.resize(batch.samples.samples() * grid.output_dims(), 0.0);
+                hash_grid::cpu::forward(grid, &buf.unit, &table.values, &mut buf.features);
+                Positions::Features { data: &mut buf.features, levels: grid.levels.len(), width: grid.config.features }
+            }
+            (Encoding::Frequency(f), _) => Positions::Encoded { encoding: *f, points: &buf.unit, d_points: None },
+            (Encoding::Hash(_), None) => unreachable!("a hash field has a table"),
+        };
+        ngp_field::run(&input, positions, &mut codes, None, &mut buf.step, &mut buf.out, &mut []);
+        drop(codes);
+        (buf.direction, buf.appearance) = (direction, appearance);
+    }
+
+    /// [`Field::render`] with a loss: adds gradients to the groups and, where asked, gives those of the positions.
+    pub fn train(&mut self, batch: &Batch, loss: &dyn RayLoss, buf: &mut FieldBuffers, d_positions: Option<&mut Vec<f32>>) {
+        self.unit(batch.positions, &mut buf.unit);
+        self.codes(batch, buf);
+        let (direction, appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
+        let mut d_appearance = std::mem::take(&mut buf.d_appearance);
+        d_appearance.resize(appearance.len(), 0.0);
+        let mut codes = Vec::new();
+        if self.directions.dims() > 0 {
+            codes.push(RayCode { values: &direction, width: self.directions.dims(), gradient: None });
+        }
+        if let Some(a) = &self.appearance {
+            codes.push(RayCode { values: &appearance, width: a.dims, gradient: Some(&mut d_appearance) });
+        }
+        let input = StepInput { net: &self.net, params: &self.weights.values, samples: batch.samples, background: batch.background };
+        let mut own = Vec::new();
+        match (&self.encoding, &mut self.table) {
+            (Encoding::Hash(grid), Some(table)) => {
+                buf.features.resize(batch.samples.samples() * grid.output_dims(), 0.0);
+                hash_grid::cpu::forward(grid, &buf.unit, &table.values, &mut buf.features);
+                let positions = Positions::Features { data: &mut buf.features, levels: grid.levels.len(), width: grid.config.features };
+                ngp_field::run(&input, positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut self.weights.grads);
+                if !table.frozen {
+                    hash_grid::cpu::backward(grid, &buf.unit, &buf.features, &mut table.grads, Some(&mut table.touched));
+                }
+                if let Some(d) = d_positions {
+                    d.resize(batch.positions.len(), 0.0);
+                    hash_grid::cpu::backward_positions(grid, &buf.unit, &table.values, &buf.features, d);
+                    self.unit_backward(batch.positions, d);
+                }
+            }
+            (Encoding::Frequency(f), _) => {
+                let wanted = d_positions.is_some();
+                own.resize(if wanted { batch.positions.len() } else { 0 }, 0.0);
+                let d_points = wanted.then_some(&mut own[..]);
+                let positions = Positions::Encoded { encoding: *f, points: &buf.unit, d_points };
+                ngp_field::run(&input, positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut self.weights.grads);
+                if let Some(d) = d_positions {
+                    self.unit_backward(batch.positions, &mut own);
+                    *d = own;
+                }
+            }
+            (Encoding::Hash(_), None) => unreachable!("a hash field has a table"),
+        }
+        drop(codes);
+        if let (Some(a), Some(images)) = (&mut self.appearance, batch.images) {
+            for (row, &i) in d_appearance.chunks_exact(a.dims).zip(images) {
+                let g = &mut a.group.grads[i as usize * a.dims..][..a.dims];
+                g.iter_mut().zip(row).for_each(|(g, d)| *g += d);
+            }
+        }
+        (buf.direction, buf.appearance, buf.d_appearance) = (direction, appearance, d_appearance);
+    }
+
+    /// Densities `[N]` (per unit of model space) at model points `[N, 3]`.
+    pub fn density(&self, model: &[f32], sigma: &mut [f32]) {
+        // The layers up to the density head read positions alone, and their parameters come first.
+        let head = self.net.sigma;
+        let mlp = Mlp::new(self.net.mlp.input_widths[..1].to_vec(), self.net.mlp.layers[..=head.layer].to_vec());
+        let params = &self.weights.values[..mlp.params_len()];
+        let width = mlp.layers[head.layer].width;
+        let (mut unit, mut rows, mut features, mut out) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        const CHUNK: usize = 1 << 16;
+        for (points, sigma) in model.chunks(CHUNK * 3).zip(sigma.chunks_mut(CHUNK)) {
+            let n = sigma.len();
+            self.unit(points, &mut unit);
+            rows.resize(n * mlp.input_widths[0], 0.0);
+            match (&self.encoding, &self.table) {
+                (Encoding::Hash(grid), Some(table)) => {
+                    features.resize(n * grid.output_dims(), 0.0);
+                    hash_grid::cpu::forward(grid, &unit, &table.values, &mut features);
+                    let f = grid.config.features;
+                    rows.par_chunks_mut(grid.output_dims()).enumerate().with_min_len(512).for_each(|(i, row)| {
+                        for (l, o) in row.chunks_exact_mut(f).enumerate() {
+                            o.copy_from_slice(&features[(l * n + i) * f..][..f]);
+                        }
+                    });
+                }
+                (Encoding::Frequency(f), _) => {
+                    let w = f.output_dims();
+                    rows.par_chunks_mut(w * 256).zip(unit.par_chunks(3 * 256)).for_each(|(o, x)| frequency::cpu::forward(f, x, o));
+                }
+                (Encoding::Hash(_), None) => unreachable!("a hash field has a table"),
+            }
+            out.resize(n * width, 0.0);
+            fused_mlp::cpu::forward(&mlp, params, &[&rows], n, &mut out);
+            for (s, o) in sigma.iter_mut().zip(out.chunks_exact(width)) {
+                *s = o[head.channel] + head.shift;
+            }
+            linear::cpu::activate(head.activation, sigma);
+        }
+    }
+
+    /// All parameter groups.
+    pub fn groups(&self) -> Vec<&ParamGroup> {
+        self.table.iter().chain([&self.weights]).chain(self.appearance.iter().map(|a| &a.group)).collect()
+    }
+
+    /// All parameter groups, to be changed.
+    pub fn groups_mut(&mut self) -> Vec<&mut ParamGroup> {
+        self.table.iter_mut().chain([&mut self.weights]).chain(self.appearance.iter_mut().map(|a| &mut a.group)).collect()
+    }
+}
+
+impl Appearance {
+    /// The mean code over all images, used for views that were not trained on.
+    pub fn mean(&self) -> Vec<f32> {
+        let n = (self.group.values.len() / self.dims).max(1) as f32;
+        (0..self.dims).map(|k| self.group.values.iter().skip(k).step_by(self.dims).sum::<f32>() / n).collect()
+    }
+}

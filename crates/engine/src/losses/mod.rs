@@ -1,0 +1,107 @@
+//! Losses over rays.
+
+use crate::samplers::RayBatch;
+use diorama_kernels::ops::composite::Packed;
+use diorama_kernels::ops::distortion;
+use diorama_kernels::ops::ngp_field::{RayGradient, RayLoss, RayOutput};
+
+/// How a colour difference counts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum ColorLoss {
+    /// `d²`
+    Mse,
+    /// `d² / 2δ` within δ, `|d| − δ/2` beyond (Huber 1964).
+    Huber(f32),
+}
+
+impl ColorLoss {
+    /// Value and slope.
+    fn at(self, d: f32) -> (f32, f32) {
+        match self {
+            ColorLoss::Mse => (d * d, 2.0 * d),
+            ColorLoss::Huber(delta) if d.abs() <= delta => (d * d / (2.0 * delta), d / delta),
+            ColorLoss::Huber(delta) => (d.abs() - 0.5 * delta, d.signum()),
+        }
+    }
+}
+
+/// Colour, distortion and opacity terms of a batch, each a mean over its rays.
+pub struct Photometric<'a> {
+    pub batch: &'a RayBatch,
+    pub samples: Packed<'a>,
+    /// Background of each ray, `[R, 3]`: what transparent pixels are composited on.
+    pub background: &'a [f32],
+    pub color: ColorLoss,
+    /// Weight of the distortion loss.
+    pub distortion: f32,
+    /// Weight of the squared difference between opacity and the photograph's alpha.
+    pub alpha: f32,
+}
+
+impl Photometric<'_> {
+    /// What the ray should come to, background included.
+    pub fn target(&self, r: usize) -> [f32; 3] {
+        let t = &self.batch.target[r * 4..r * 4 + 4];
+        std::array::from_fn(|k| t[k] * t[3] + self.background[r * 3 + k] * (1.0 - t[3]))
+    }
+}
+
+impl RayLoss for Photometric<'_> {
+    fn ray(&self, r: usize, out: &RayOutput, g: &mut RayGradient) -> f64 {
+        let target = self.target(r);
+        if target[0].is_nan() {
+            return 0.0;
+        }
+        let scale = 1.0 / self.batch.len() as f32;
+        let mut loss = 0.0f32;
+        for k in 0..3 {
+            let (value, slope) = self.color.at(out.rgb[k] - target[k]);
+            loss += value / 3.0;
+            g.rgb[k] = slope * scale / 3.0;
+        }
+        if self.alpha > 0.0 {
+            let d = out.opacity - self.batch.target[r * 4 + 3];
+            loss += self.alpha * d * d;
+            g.opacity = self.alpha * 2.0 * d * scale;
+        }
+        if self.distortion > 0.0 {
+            loss += self.distortion * distortion::cpu::ray(&self.samples, r, out.weights, self.distortion * scale, g.weights);
+        }
+        (loss * scale) as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slopes_match_differences_of_the_values() {
+        for loss in [ColorLoss::Mse, ColorLoss::Huber(0.1)] {
+            for d in [-0.7f32, -0.05, 0.03, 0.4] {
+                let numeric = (loss.at(d + 1e-3).0 - loss.at(d - 1e-3).0) / 2e-3;
+                assert!((numeric - loss.at(d).1).abs() < 1e-3, "{loss:?} {d}");
+            }
+        }
+    }
+
+    #[test]
+    fn each_term_changes_the_loss_and_masked_rays_do_not_count() {
+        let mut batch = RayBatch::default();
+        batch.resize(1);
+        batch.target = vec![0.2, 0.4, 0.6, 0.5];
+        let (offsets, t, dt) = ([0u32, 2], [0.0, 1.0], [0.5, 0.5]);
+        let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
+        let run = |batch: &RayBatch, distortion: f32, alpha: f32, color: ColorLoss| {
+            let p = Photometric { batch, samples, background: &[1.0; 3], color, distortion, alpha };
+            let mut w = [0.0; 2];
+            let out = RayOutput { rgb: [0.5, 0.5, 0.5], opacity: 0.9, depth: 1.0, weights: &[0.4, 0.5], first: 0 };
+            p.ray(0, &out, &mut RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut w })
+        };
+        let base = run(&batch, 0.0, 0.0, ColorLoss::Mse);
+        assert!(run(&batch, 0.1, 0.0, ColorLoss::Mse) > base && run(&batch, 0.0, 0.1, ColorLoss::Mse) > base);
+        assert_ne!(run(&batch, 0.0, 0.0, ColorLoss::Huber(0.1)), base);
+        batch.target[0] = f32::NAN;
+        assert_eq!(run(&batch, 0.1, 0.1, ColorLoss::Mse), 0.0);
+    }
+}

@@ -1,0 +1,88 @@
+//! Image quality.
+
+use diorama_geom::Image;
+use diorama_kernels::ops::ssim;
+
+/// Scores of one image against its photograph.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Scores {
+    pub mse: f64,
+    /// `−10 log₁₀ mse`, dB.
+    pub psnr: f64,
+    pub ssim: f64,
+    /// PSNR after the best affine map per channel, for captures of varying exposure.
+    pub psnr_affine: f64,
+}
+
+/// Decibels of a mean squared error of values in [0, 1].
+pub fn psnr(mse: f64) -> f64 {
+    -10.0 * mse.max(1e-12).log10()
+}
+
+/// Compares images of equal size, 3 channels, over the pixels that `counts` admits (SSIM over all).
+///
+/// # Panics
+/// When sizes differ.
+pub fn compare(rendered: &Image, photo: &Image, counts: impl Fn(usize, usize) -> bool) -> Scores {
+    assert_eq!((rendered.width, rendered.height, rendered.channels), (photo.width, photo.height, photo.channels), "scores");
+    let pixels: Vec<usize> = (0..photo.width * photo.height).filter(|i| counts(i % photo.width, i / photo.width)).collect();
+    let c = photo.channels;
+    let error = |f: &dyn Fn(usize, f64) -> f64| {
+        let sum: f64 = pixels.iter().flat_map(|i| (0..c).map(move |k| i * c + k)).map(|e| (f(e % c, rendered.data[e] as f64) - photo.data[e] as f64).powi(2)).sum();
+        sum / (pixels.len() * c).max(1) as f64
+    };
+    let mse = error(&|_, v| v);
+    let fits: Vec<(f64, f64)> = (0..c).map(|k| affine_fit(pixels.iter().map(|i| (rendered.data[i * c + k] as f64, photo.data[i * c + k] as f64)))).collect();
+    let affine = error(&|k, v| fits[k].0 * v + fits[k].1);
+    let ssim = ssim::cpu::ssim(photo.width, photo.height, c, &rendered.data, &photo.data);
+    Scores { mse, psnr: psnr(mse), ssim, psnr_affine: psnr(affine) }
+}
+
+/// Least-squares `y ≈ a x + b`.
+fn affine_fit(points: impl Iterator<Item = (f64, f64)>) -> (f64, f64) {
+    let (mut n, mut sx, mut sy, mut sxx, mut sxy) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    for (x, y) in points {
+        n += 1.0;
+        sx += x;
+        sy += y;
+        sxx += x * x;
+        sxy += x * y;
+    }
+    let d = n * sxx - sx * sx;
+    if d.abs() < 1e-12 {
+        return (0.0, if n > 0.0 { sy / n } else { 0.0 });
+    }
+    let a = (n * sxy - sx * sy) / d;
+    (a, (sy - a * sx) / n)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn affine_scores_forgive_exposure_and_nothing_else() {
+        let photo = Image { width: 16, height: 16, channels: 3, data: (0..768).map(|i| (i * 37 % 256) as f32 / 255.0).collect() };
+        let mut dim = photo.clone();
+        dim.data.iter_mut().for_each(|v| *v = *v * 0.5 + 0.1);
+        let s = compare(&dim, &photo, |_, _| true);
+        assert!(s.psnr < 20.0 && s.psnr_affine > 80.0, "{s:?}");
+        let same = compare(&photo, &photo, |_, _| true);
+        assert!(same.psnr > 100.0 && (same.ssim - 1.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn masked_pixels_do_not_count() {
+        let photo = Image::zeros(16, 16, 3);
+        let mut wrong = photo.clone();
+        wrong.data[0] = 1.0;
+        assert!(compare(&wrong, &photo, |_, _| true).psnr < 40.0);
+        assert!(compare(&wrong, &photo, |x, y| x + y > 0).psnr > 100.0);
+    }
+
+    #[test]
+    fn known_decibels() {
+        assert!((psnr(0.01) - 20.0).abs() < 1e-9);
+        assert!((psnr(0.0033) - 24.81).abs() < 0.01);
+    }
+}

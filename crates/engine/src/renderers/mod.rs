@@ -1,0 +1,3 @@
+//! From fields to images.
+
+pub mod volume;

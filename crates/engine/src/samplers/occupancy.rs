@@ -1,0 +1,196 @@
+//! The occupancy grid (instant-ngp, section E.2): decayed maxima of sampled densities per cell, and the
+//! bits that marching reads.
+
+use crate::fields::Field;
+use diorama_geom::glam::DVec3;
+use diorama_geom::rng::Rng;
+use diorama_kernels::ops::march::{MarchConfig, OccupancyBits};
+use diorama_kernels::ops::ray_generation::PosedCamera;
+
+/// Smallest step of marching: the diagonal of the model cube in 1024 steps.
+pub const MIN_STEP: f32 = 1.732_050_8 / 1024.0;
+
+/// Optical thickness of a smallest step above which a cell is occupied.
+const THRESHOLD: f32 = 0.01;
+
+/// Density that stands for "no camera sees this": never sampled, never occupied.
+const UNSEEN: f32 = -1.0;
+
+/// Cells per axis of the blocks in which visibility is decided.
+const SEEN_BLOCK: usize = 8;
+
+#[derive(Clone, Debug)]
+pub struct Occupancy {
+    pub bits: OccupancyBits,
+    /// Decayed maximum density per cell.
+    pub density: Vec<f32>,
+    /// Cells that some camera sees.
+    live: Vec<u32>,
+    /// How much of a stored density survives an update of its cell.
+    pub decay: f32,
+}
+
+impl Occupancy {
+    pub fn new(resolution: usize, cascades: usize) -> Self {
+        let bits = OccupancyBits::full(resolution, cascades);
+        let density = vec![THRESHOLD / MIN_STEP * 2.0; bits.cells()];
+        let live = (0..bits.cells() as u32).collect();
+        Occupancy { bits, density, live, decay: 0.8 }
+    }
+
+    /// The marching that belongs to this grid. `max_samples` bounds the samples of a ray.
+    pub fn march_config(&self, max_samples: usize) -> MarchConfig {
+        let cascades = self.bits.cascades;
+        let cone = if cascades > 1 { 1.0 / 256.0 } else { 0.0 };
+        let dt_max = MIN_STEP * 1024.0 / self.bits.resolution as f32 * (1u32 << (cascades - 1)) as f32;
+        MarchConfig { cone, dt_min: MIN_STEP, dt_max: dt_max.max(MIN_STEP), max_samples }
+    }
+
+    /// Rules out cells that fewer than `min_views` cameras see, and cells of a coarser cascade that a finer one covers.
+    pub fn keep_visible(&mut self, cameras: &[PosedCamera], min_views: usize) {
+        let n = self.bits.resolution;
+        let blocks = n / SEEN_BLOCK;
+        for c in 0..self.bits.cascades {
+            let (low, size) = OccupancyBits::cube(c);
+            let edge = (size / blocks as f32) as f64;
+            let radius = edge * 0.5 * 3f64.sqrt();
+            for b in 0..blocks.pow(3) {
+                let p = [b % blocks, b / blocks % blocks, b / blocks / blocks];
+                let center = DVec3::from_array(p.map(|i| low as f64 + (i as f64 + 0.5) * edge));
+                let covered = c > 0 && p.iter().all(|&i| i >= blocks / 4 && i < blocks - blocks / 4);
+                let seen = cameras.iter().filter(|c| sees(c, center, radius)).count();
+                if covered || seen < min_views.min(cameras.len()) {
+                    for k in 0..SEEN_BLOCK.pow(3) {
+                        let q = [k % SEEN_BLOCK, k / SEEN_BLOCK % SEEN_BLOCK, k / SEEN_BLOCK / SEEN_BLOCK];
+                        let at = [0, 1, 2].map(|a: usize| p[a] * SEEN_BLOCK + q[a]);
+                        self.density[((c * n + at[2]) * n + at[1]) * n + at[0]] = UNSEEN;
+                    }
+                }
+            }
+        }
+        self.refresh();
+    }
+
+    /// Recomputes the bits, and which cells are live, from the densities.
+    pub fn refresh(&mut self) {
+        self.live = (0..self.density.len() as u32).filter(|&i| self.density[i as usize] >= 0.0).collect();
+        self.refresh_bits();
+    }
+
+    fn refresh_bits(&mut self) {
+        let live = self.live.len().max(1) as f64;
+        let mean = self.live.iter().map(|&i| self.density[i as usize] as f64).sum::<f64>() / live;
+        let threshold = (THRESHOLD / MIN_STEP).min(mean as f32);
+        for (word, cells) in self.bits.bits.iter_mut().zip(self.density.chunks_exact(64)) {
+            *word = cells.iter().enumerate().fold(0, |w, (i, d)| w | ((*d > threshold) as u64) << i);
+        }
+    }
+
+    /// Samples the field at `count` random points of cells and refreshes the bits. Blocks of `block³`
+    /// cells share one sample (1 once the field has settled). Half of the points go to occupied cells.
+    pub fn update(&mut self, field: &Field, rng: &Rng, counter: u64, count: usize, block: usize) {
+        if self.live.is_empty() {
+            return;
+        }
+        let n = self.bits.resolution;
+        let mut cells = Vec::with_capacity(count);
+        let mut points = Vec::with_capacity(count * 3);
+        for i in 0..count as u64 {
+            let base = (counter * count as u64 + i) * 8;
+            let mut cell = self.live[rng.below(base, self.live.len() as u64) as usize] as usize;
+            if i % 2 == 1 {
+                // Look a few times for an occupied cell.
+                for k in 1..4 {
+                    if self.bits.get(cell) {
+                        break;
+                    }
+                    cell = self.live[rng.below(base + k, self.live.len() as u64) as usize] as usize;
+                }
+            }
+            let c = cell / n.pow(3);
+            let (low, size) = OccupancyBits::cube(c);
+            let scale = size / n as f32;
+            let at = [cell % n, cell / n % n, cell / n / n % n].map(|v| v / block * block);
+            for (k, a) in at.iter().enumerate() {
+                points.push(low + (*a as f32 + rng.uniform(base + 5 + k as u64) * block as f32) * scale);
+            }
+            cells.push(((c * n + at[2]) * n + at[1]) * n + at[0]);
+        }
+        let mut sigma = vec![0.0; count];
+        field.density(&points, &mut sigma);
+        for (&cell, &s) in cells.iter().zip(&sigma) {
+            for k in 0..block.pow(3) {
+                let d = &mut self.density[cell + k % block + n * (k / block % block) + n * n * (k / block / block)];
+                if *d >= 0.0 {
+                    *d = (*d * self.decay).max(s);
+                }
+            }
+        }
+        self.refresh_bits();
+    }
+}
+
+/// Whether a ball may be seen: its centre projects into the image, widened by the ball's radius.
+fn sees(c: &PosedCamera, center: DVec3, radius: f64) -> bool {
+    let p = c.pose.inverse().point(center);
+    if p.length() < radius {
+        return true;
+    }
+    if p.z < -radius {
+        // Only lenses that see backwards could.
+        return matches!(c.camera.lens, diorama_geom::Lens::Fisheye { .. } | diorama_geom::Lens::Equirectangular);
+    }
+    let margin = radius / p.z.max(radius * 0.5) * c.camera.fx.max(c.camera.fy);
+    let (w, h) = (c.camera.width as f64, c.camera.height as f64);
+    // Distortion polynomials fold back far outside of the image: judge by the ideal pinhole.
+    let ideal = diorama_geom::Camera { lens: diorama_geom::Lens::Pinhole, ..c.camera };
+    match ideal.project(if p.z < radius * 0.5 { DVec3::new(p.x, p.y, radius * 0.5) } else { p }) {
+        Some(x) => {
+            let margin = margin + 0.05 * w.max(h);
+            x.x > -margin && x.x < w + margin && x.y > -margin && x.y < h + margin
+        }
+        None => true,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fields;
+    use diorama_geom::{Camera, Pose};
+    use diorama_kernels::ops::hash_grid::HashGridConfig;
+
+    fn field() -> Field {
+        let grid = HashGridConfig { levels: 2, features: 2, log2_size: 8, base: 4, finest: 8 };
+        fields::ngp(grid, 1.0, false, 1e-2, 0, 0, 1)
+    }
+
+    #[test]
+    fn cells_that_the_field_leaves_empty_are_cleared() {
+        let mut o = Occupancy::new(16, 1);
+        let mut f = field();
+        // A field of density e^-20 everywhere.
+        f.net.sigma.shift = -20.0;
+        for i in 0..60 {
+            o.update(&f, &Rng::new(1, 1), i, 4096, 1);
+        }
+        assert!(o.density.iter().all(|d| *d < 1.0));
+        f.net.sigma.shift = 5.0;
+        for i in 0..10 {
+            o.update(&f, &Rng::new(1, 1), i, 4096, 1);
+        }
+        assert!(o.bits.fill() > 0.4, "{}", o.bits.fill());
+    }
+
+    #[test]
+    fn what_no_camera_sees_is_never_occupied() {
+        let mut o = Occupancy::new(32, 2);
+        let pose = Pose::look_at(DVec3::new(0.5, -1.0, 0.5), DVec3::splat(0.5), DVec3::Z);
+        o.keep_visible(&[PosedCamera { camera: Camera::pinhole(64, 64, 0.6), pose }], 1);
+        let n = 32;
+        let cell = |c: usize, x: usize, y: usize, z: usize| ((c * n + z) * n + y) * n + x;
+        assert!(o.bits.get(cell(0, 16, 16, 16)), "the middle is in view");
+        assert!(!o.bits.get(cell(1, 1, 1, 1)), "a corner beside the camera is not");
+        assert!(!o.bits.get(cell(1, 16, 16, 16)), "the finer cascade covers the middle");
+    }
+}

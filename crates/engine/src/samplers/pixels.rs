@@ -1,0 +1,173 @@
+//! Draws training pixels, optionally more often where the error is high.
+
+use super::RayBatch;
+use diorama_geom::rng::Rng;
+use diorama_kernels::ops::{pixel_gather, ray_aabb, ray_generation};
+use diorama_kernels::ops::ray_generation::PosedCamera;
+use rayon::prelude::*;
+
+/// Access to training pixels, wherever they lie.
+pub trait PixelSource: Sync {
+    fn images(&self) -> usize;
+    fn size(&self, image: usize) -> (u32, u32);
+    fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4];
+    /// Whether the pixel may be trained on.
+    fn counts(&self, image: usize, x: u32, y: u32) -> bool;
+}
+
+/// Cells per side of the error map of one image.
+const CELLS: usize = 16;
+/// Share of rays that are drawn uniformly whatever the error map says.
+const UNIFORM_SHARE: f32 = 0.5;
+
+/// Mean error of the parts of the training images, for drawing (instant-ngp, error-driven sampling).
+#[derive(Clone, Debug)]
+pub struct ErrorMap {
+    /// `[images, CELLS, CELLS]`
+    pub errors: Vec<f32>,
+    cdf: Vec<f32>,
+}
+
+impl ErrorMap {
+    pub fn new(images: usize) -> Self {
+        ErrorMap { errors: vec![1.0; images * CELLS * CELLS], cdf: Vec::new() }
+    }
+
+    /// Mixes a ray's squared error into its cell.
+    pub fn record(&mut self, image: usize, u: f32, v: f32, error: f32) {
+        let cell = |t: f32| ((t * CELLS as f32) as usize).min(CELLS - 1);
+        let e = &mut self.errors[(image * CELLS + cell(v)) * CELLS + cell(u)];
+        *e = 0.9 * *e + 0.1 * error;
+    }
+
+    /// Brings the distribution up to date.
+    pub fn refresh(&mut self) {
+        let mut sum = 0.0f64;
+        self.cdf.clear();
+        for e in &self.errors {
+            sum += (*e as f64).sqrt();
+            self.cdf.push(sum as f32);
+        }
+    }
+
+    fn draw(&self, x: f32) -> usize {
+        let total = self.cdf.last().copied().unwrap_or(0.0);
+        self.cdf.partition_point(|c| *c < x * total).min(self.errors.len() - 1)
+    }
+}
+
+/// What [`draw`] needs besides the pixels.
+pub struct DrawOptions<'a> {
+    pub cameras: &'a [PosedCamera],
+    /// Counter of the first ray: the number of rays drawn so far.
+    pub first: u64,
+    pub rng: Rng,
+    pub near: f32,
+    /// The scene's outer cube in model space: lowest corner and edge.
+    pub cube: (f32, f32),
+    pub error_map: Option<&'a ErrorMap>,
+}
+
+/// Fills `batch` (already resized) with random training rays.
+///
+/// Errors weigh the draw but not the loss: the objective shifts towards hard pixels, as in instant-ngp.
+pub fn draw(source: &dyn PixelSource, o: &DrawOptions, batch: &mut RayBatch) {
+    let images = source.images() as u64;
+    let picked = batch.images.par_iter_mut().zip(batch.pixels.par_chunks_mut(2)).zip(batch.target.par_chunks_mut(4)).zip(&mut batch.jitter);
+    picked.enumerate().with_min_len(256).for_each(|(i, (((image, pixel), target), jitter))| {
+        // Sixteen numbers per ray: the draw may be repeated where a mask refuses the pixel.
+        let base = (o.first + i as u64) * 16;
+        *jitter = o.rng.uniform(base);
+        for attempt in 0..5u64 {
+            let at = base + 1 + attempt * 3;
+            let (img, u, v) = match o.error_map {
+                Some(map) if i as f32 % 1024.0 / 1024.0 >= UNIFORM_SHARE => {
+                    let cell = map.draw(o.rng.uniform(at));
+                    let within = |c: usize, r: f32| (c as f32 + r) / CELLS as f32;
+                    let (cx, cy) = (cell % CELLS, cell / CELLS % CELLS);
+                    ((cell / CELLS / CELLS) as u64, within(cx, o.rng.uniform(at + 1)), within(cy, o.rng.uniform(at + 2)))
+                }
+                _ => (o.rng.below(at, images), o.rng.uniform(at + 1), o.rng.uniform(at + 2)),
+            };
+            let (w, h) = source.size(img as usize);
+            let (x, y) = (((u * w as f32) as u32).min(w - 1), ((v * h as f32) as u32).min(h - 1));
+            *image = img as u32;
+            pixel.copy_from_slice(&[x as f32 + 0.5, y as f32 + 0.5]);
+            target.copy_from_slice(&pixel_gather::cpu::convert(source.rgba(img as usize, x, y)));
+            if source.counts(img as usize, x, y) {
+                return;
+            }
+        }
+        // Masked five times over: a NaN target tells the loss to leave the ray out.
+        target[0] = f32::NAN;
+    });
+    rays(o.cameras, o.near, o.cube, batch);
+}
+
+/// Origins, directions and extents for the images and pixels in `batch`.
+pub fn rays(cameras: &[PosedCamera], near: f32, cube: (f32, f32), batch: &mut RayBatch) {
+    ray_generation::cpu::forward(cameras, &batch.images, &batch.pixels, &mut batch.origins, &mut batch.dirs);
+    let (low, size) = cube;
+    ray_aabb::cpu::intersect(&batch.origins, &batch.dirs, [low; 3], [low + size; 3], near, &mut batch.near_far);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diorama_geom::glam::DVec3;
+    use diorama_geom::{Camera, Pose};
+
+    struct Half;
+    impl PixelSource for Half {
+        fn images(&self) -> usize {
+            2
+        }
+        fn size(&self, _: usize) -> (u32, u32) {
+            (8, 4)
+        }
+        fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4] {
+            [x as u8, y as u8, image as u8, 255]
+        }
+        fn counts(&self, _: usize, x: u32, _: u32) -> bool {
+            x >= 4
+        }
+    }
+
+    fn draw_with(map: Option<&ErrorMap>) -> RayBatch {
+        let camera = PosedCamera { camera: Camera::pinhole(8, 4, 1.0), pose: Pose::look_at(DVec3::new(2.0, 0.5, 0.5), DVec3::splat(0.5), DVec3::Z) };
+        let mut batch = RayBatch::default();
+        batch.resize(4096);
+        let o = DrawOptions { cameras: &[camera, camera], first: 0, rng: Rng::new(1, 1), near: 0.1, cube: (0.0, 1.0), error_map: map };
+        draw(&Half, &o, &mut batch);
+        batch
+    }
+
+    #[test]
+    fn masked_pixels_are_not_trained_on_and_targets_match_their_pixel() {
+        let b = draw_with(None);
+        let mut refused = 0;
+        for (p, t) in b.pixels.chunks_exact(2).zip(b.target.chunks_exact(4)) {
+            if t[0].is_nan() {
+                refused += 1;
+                continue;
+            }
+            assert!(p[0] >= 4.0);
+            assert!((t[0] * 255.0 - (p[0] - 0.5)).abs() < 1e-3 && (t[1] * 255.0 - (p[1] - 0.5)).abs() < 1e-3);
+        }
+        assert!(refused < 400, "{refused} of 4096");
+    }
+
+    #[test]
+    fn the_error_map_draws_where_the_error_is() {
+        let mut map = ErrorMap::new(2);
+        map.errors.fill(1e-6);
+        for _ in 0..100 {
+            map.record(1, 0.9, 0.9, 1.0);
+        }
+        map.refresh();
+        let share = |b: &RayBatch| {
+            b.images.iter().zip(b.pixels.chunks_exact(2)).filter(|(i, p)| **i == 1 && p[0] > 6.0 && p[1] > 3.0).count()
+        };
+        assert!(share(&draw_with(Some(&map))) > 3 * share(&draw_with(None)));
+    }
+}

@@ -1,0 +1,70 @@
+//! Marching cubes (Lorensen and Cline 1987) over slices of a density grid, so that memory stays at two
+//! slices. The case table is derived, not typed in: on every face of a cell, each run of inside corners
+//! is cut off by one segment, a rule that both cells of a face share, so surfaces have no holes.
+//!
+//! Vertices lie where the density crosses `level` linearly along an edge, in grid coordinates;
+//! triangles wind counter-clockwise seen from the side below `level`.
+
+pub mod cpu;
+pub mod reference;
+#[cfg(test)]
+mod tests;
+
+/// Corners of edge `e`: edge `4 a + i` runs along axis `a`. Corner bit `k` is the step along axis `k`.
+pub fn edge_corners(e: usize) -> (usize, usize) {
+    let (a, i) = (e / 4, e % 4);
+    let (u, v) = ((a + 1) % 3, (a + 2) % 3);
+    let low = ((i & 1) << u) | ((i >> 1) << v);
+    (low, low | 1 << a)
+}
+
+/// Triangles, as edge numbers, for each of the 256 sets of inside corners.
+pub fn case_table() -> Vec<Vec<[u8; 3]>> {
+    (0..256).map(triangles_of_case).collect()
+}
+
+fn edge_between(p: usize, q: usize) -> usize {
+    (0..12).find(|&e| edge_corners(e) == (p.min(q), p.max(q))).expect("corners that differ in one bit")
+}
+
+fn triangles_of_case(inside: usize) -> Vec<[u8; 3]> {
+    // next[e] = f: a segment runs from crossing e to crossing f on some face.
+    let mut next = [usize::MAX; 12];
+    for axis in 0..3 {
+        for side in 0..2 {
+            let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
+            let corner = |a: usize, b: usize| (side << axis) | (a << u) | (b << v);
+            let mut ring = [corner(0, 0), corner(1, 0), corner(1, 1), corner(0, 1)];
+            if side == 0 {
+                ring.reverse();
+            }
+            let is_in = |k: usize| inside >> ring[k % 4] & 1 == 1;
+            for k in 0..4 {
+                if is_in(k) || !is_in(k + 1) {
+                    continue;
+                }
+                let enter = edge_between(ring[k], ring[(k + 1) % 4]);
+                let end = (k + 1..k + 4).find(|&m| !is_in(m + 1)).expect("corner k is outside");
+                next[edge_between(ring[end % 4], ring[(end + 1) % 4])] = enter;
+            }
+        }
+    }
+    let mut used = [false; 12];
+    let mut out = Vec::new();
+    for start in 0..12 {
+        if next[start] == usize::MAX || used[start] {
+            continue;
+        }
+        let mut ring = Vec::new();
+        let mut e = start;
+        while !used[e] {
+            used[e] = true;
+            ring.push(e as u8);
+            e = next[e];
+        }
+        for k in 1..ring.len() - 1 {
+            out.push([ring[0], ring[k], ring[k + 1]]);
+        }
+    }
+    out
+}

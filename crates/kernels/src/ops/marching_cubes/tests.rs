@@ -1,0 +1,81 @@
+use super::*;
+use diorama_testkit::{random, wide};
+
+fn run(nx: usize, ny: usize, nz: usize, values: &[f32], level: f32) -> cpu::Mesher {
+    let mut m = cpu::Mesher::new(nx, ny, level);
+    for z in 0..nz {
+        m.push(&values[z * nx * ny..(z + 1) * nx * ny]);
+    }
+    m
+}
+
+#[test]
+fn equals_the_reference_triangle_by_triangle() {
+    for (nx, ny, nz) in [(1, 1, 1), (2, 2, 2), (7, 5, 6)] {
+        let v = random(nx * ny * nz, 4);
+        let m = run(nx, ny, nz, &v, 0.1);
+        let want = reference::triangles(nx, ny, nz, &wide(&v), 0.1f32 as f64);
+        assert_eq!(m.faces.len(), want.len());
+        for (f, w) in m.faces.iter().zip(&want) {
+            for (i, p) in f.iter().zip(w) {
+                let q = m.positions[*i as usize];
+                assert!((0..3).all(|k| (q[k] as f64 - p[k]).abs() < 1e-4), "{q:?} {p:?}");
+            }
+        }
+    }
+}
+
+#[test]
+fn random_fields_closed_by_their_border_are_watertight() {
+    for seed in 0..5 {
+        let n = 9;
+        let mut v = random(n * n * n, seed);
+        for (i, v) in v.iter_mut().enumerate() {
+            let p = [i % n, i / n % n, i / n / n];
+            if p.iter().any(|&c| c == 0 || c == n - 1) {
+                *v = -1.0;
+            }
+        }
+        let m = run(n, n, n, &v, 0.0);
+        let mesh = diorama_geom::Mesh { positions: m.positions, faces: m.faces, ..Default::default() };
+        assert!(mesh.is_watertight());
+    }
+}
+
+#[test]
+fn a_sphere_lies_on_its_surface_and_faces_outward() {
+    let (n, c, r) = (24, 11.5f32, 8.0f32);
+    let v: Vec<f32> = (0..n * n * n)
+        .map(|i| {
+            let p = [(i % n) as f32 - c, (i / n % n) as f32 - c, (i / n / n) as f32 - c];
+            r - (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt()
+        })
+        .collect();
+    let m = run(n, n, n, &v, 0.0);
+    for p in &m.positions {
+        let d = p.iter().map(|v| (v - c) * (v - c)).sum::<f32>().sqrt();
+        assert!((d - r).abs() < 0.05, "{d}");
+    }
+    let volume: f32 = m
+        .faces
+        .iter()
+        .map(|f| {
+            let [a, b, d] = f.map(|i| m.positions[i as usize].map(|v| v - c));
+            let n = diorama_geom::mesh::cross(b, d);
+            (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) / 6.0
+        })
+        .sum();
+    let exact = 4.0 / 3.0 * std::f32::consts::PI * r * r * r;
+    assert!((volume / exact - 1.0).abs() < 0.02, "signed volume {volume}, sphere {exact}");
+}
+
+#[test]
+fn every_case_uses_exactly_its_crossing_edges() {
+    for (inside, triangles) in case_table().iter().enumerate() {
+        let used: std::collections::HashSet<u8> = triangles.iter().flatten().copied().collect();
+        for e in 0..12 {
+            let (a, b) = edge_corners(e);
+            assert_eq!(used.contains(&(e as u8)), (inside >> a & 1) != (inside >> b & 1), "case {inside} edge {e}");
+        }
+    }
+}

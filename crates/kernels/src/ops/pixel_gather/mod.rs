@@ -1,0 +1,6 @@
+//! Colours of chosen pixels: bytes of packed RGBA frames to floats in [0, 1], alpha straight.
+
+pub mod cpu;
+pub mod reference;
+#[cfg(test)]
+mod tests;

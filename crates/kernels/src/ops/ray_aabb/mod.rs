@@ -1,0 +1,7 @@
+//! Where rays enter and leave a box (Kay and Kajiya 1986): `[near, far]` along each unit direction,
+//! clipped to `near ≥ near_plane`; an empty interval (`near = far = 0`) when the ray misses.
+
+pub mod cpu;
+pub mod reference;
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,39 @@
+use super::*;
+use crate::burn_op::values;
+use burn::tensor::{Device, TensorData};
+use diorama_testkit::{assert_close, assert_gradient, random_unit, wide};
+
+#[test]
+fn matches_the_reference_both_ways() {
+    for (w, h, c) in [(11, 11, 1), (17, 13, 3), (24, 30, 1)] {
+        let (x, y) = (random_unit(w * h * c, 1), random_unit(w * h * c, 2));
+        assert_close("ssim", &[cpu::ssim(w, h, c, &x, &y) as f32], &[reference::ssim(w, h, c, &wide(&x), &wide(&y))], 1e-5);
+        assert_close("gradient", &cpu::gradient(w, h, c, &x, &y), &reference::gradient(w, h, c, &wide(&x), &wide(&y)), 1e-4);
+    }
+}
+
+#[test]
+fn reference_gradient_matches_central_differences() {
+    let (x, y) = (wide(&random_unit(12 * 12, 1)), wide(&random_unit(12 * 12, 2)));
+    let g = reference::gradient(12, 12, 1, &x, &y);
+    assert_gradient("x", &g, &x, 1e-5, |x| reference::ssim(12, 12, 1, x, &y));
+}
+
+#[test]
+fn an_image_is_like_itself_and_less_like_another() {
+    let (x, y) = (random_unit(400, 1), random_unit(400, 2));
+    assert!((cpu::ssim(20, 20, 1, &x, &x) - 1.0).abs() < 1e-9);
+    assert!(cpu::ssim(20, 20, 1, &x, &y) < 0.5);
+    assert!(cpu::ssim(10, 20, 2, &x, &y).is_nan());
+}
+
+#[test]
+fn burn_sees_the_same_gradient() {
+    let (x, y) = (random_unit(169, 1), random_unit(169, 2));
+    let d = Device::flex().autodiff();
+    let xt = Tensor::<3>::from_data(TensorData::new(x.clone(), [13, 13, 1]), &d).require_grad();
+    let yt = Tensor::<3>::from_data(TensorData::new(y.clone(), [13, 13, 1]), &d);
+    let grads = (ssim(xt.clone(), yt) * 2.0).backward();
+    let want: Vec<f64> = reference::gradient(13, 13, 1, &wide(&x), &wide(&y)).iter().map(|v| v * 2.0).collect();
+    assert_close("x", &values(xt.grad(&grads).unwrap()), &want, 1e-4);
+}
