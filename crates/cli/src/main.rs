@@ -1,1 +1,12 @@
-fn main(){}
+//! The `diorama` command.
+
+mod arguments;
+mod commands;
+mod terminal;
+
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+fn main() -> std::process::ExitCode {
+    arguments::main()
+}

@@ -1,1 +1,6 @@
+//! The applications: each a recipe over the rooms below.
 
+pub mod error;
+pub mod object;
+
+pub use error::{PipelineError, Result};

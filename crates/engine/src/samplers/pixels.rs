@@ -25,12 +25,17 @@ const UNIFORM_SHARE: f32 = 0.5;
 pub struct ErrorMap {
     /// `[images, CELLS, CELLS]`
     pub errors: Vec<f32>,
+    /// The errors that draws go by: a copy as of the last refresh.
+    pub drawn: Vec<f32>,
     cdf: Vec<f32>,
 }
 
 impl ErrorMap {
     pub fn new(images: usize) -> Self {
-        ErrorMap { errors: vec![1.0; images * CELLS * CELLS], cdf: Vec::new() }
+        let errors = vec![1.0; images * CELLS * CELLS];
+        let mut map = ErrorMap { drawn: errors.clone(), errors, cdf: Vec::new() };
+        map.rebuild();
+        map
     }
 
     /// Mixes a ray's squared error into its cell.
@@ -42,9 +47,15 @@ impl ErrorMap {
 
     /// Brings the distribution up to date.
     pub fn refresh(&mut self) {
+        self.drawn.copy_from_slice(&self.errors);
+        self.rebuild();
+    }
+
+    /// Recomputes the distribution from `drawn`.
+    pub fn rebuild(&mut self) {
         let mut sum = 0.0f64;
         self.cdf.clear();
-        for e in &self.errors {
+        for e in &self.drawn {
             sum += (*e as f64).sqrt();
             self.cdf.push(sum as f32);
         }

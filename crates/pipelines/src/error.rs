@@ -1,0 +1,39 @@
+//! What an application can fail with.
+
+use diorama_data::DataError;
+
+pub type Result<T> = std::result::Result<T, PipelineError>;
+
+/// A failure and whose fault it is.
+#[derive(Debug, thiserror::Error)]
+pub enum PipelineError {
+    #[error(transparent)]
+    Data(#[from] DataError),
+    /// The request cannot be met as it stands (exit code 2).
+    #[error("{0}")]
+    Usage(String),
+    /// The loss was not finite twice.
+    #[error("the loss was not finite twice: stopped at step {step}; {checkpoint} is the last good checkpoint; lower --set optim.rate")]
+    Diverged { step: u64, checkpoint: String },
+}
+
+impl PipelineError {
+    /// Whether the input or request is at fault.
+    pub fn is_input(&self) -> bool {
+        match self {
+            PipelineError::Data(e) => e.is_input(),
+            PipelineError::Usage(_) => true,
+            PipelineError::Diverged { .. } => false,
+        }
+    }
+
+    /// One word for scripts.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            PipelineError::Data(e) if e.is_input() => "input",
+            PipelineError::Data(_) => "io",
+            PipelineError::Usage(_) => "usage",
+            PipelineError::Diverged { .. } => "diverged",
+        }
+    }
+}

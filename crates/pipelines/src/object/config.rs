@@ -1,0 +1,354 @@
+//! Everything that a run depends on, as written to `config.toml`.
+
+use crate::error::{PipelineError, Result};
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// The four methods (object.md, section 4).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Method {
+    Ngp,
+    Nerf,
+    Mlp,
+    Baseline,
+}
+
+/// What stands behind the scene, in training and in renders.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Background {
+    /// White for photographs with alpha; random for opaque ones, so that every ray must end on matter.
+    Auto,
+    White,
+    Black,
+    /// A new colour for every ray in training; black in renders of opaque captures, white of others.
+    Random,
+    /// Learned as a function of direction.
+    Learned,
+}
+
+macro_rules! names {
+    ($t:ty { $($v:ident = $n:literal),* }) => {
+        impl std::str::FromStr for $t {
+            type Err = String;
+            fn from_str(s: &str) -> std::result::Result<Self, String> {
+                match s { $($n => Ok(Self::$v),)* _ => Err(format!("{s:?}: expected one of {}", [$($n),*].join(", "))) }
+            }
+        }
+        impl std::fmt::Display for $t {
+            fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str(match self { $(Self::$v => $n),* })
+            }
+        }
+    };
+}
+names!(Method { Ngp = "ngp", Nerf = "nerf", Mlp = "mlp", Baseline = "baseline" });
+names!(Background { Auto = "auto", White = "white", Black = "black", Random = "random", Learned = "learned" });
+
+/// Where the photographs are and how they are read.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DataConfig {
+    pub path: PathBuf,
+    /// `transforms`, `blender`, `colmap` or `llff`; empty: whichever is there.
+    pub format: String,
+    pub downscale: u32,
+    pub split: String,
+    /// Bytes of pixels kept in memory; beyond that a mapped scratch file is used.
+    pub memory_budget: u64,
+}
+
+/// Shape of the field.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FieldConfig {
+    pub levels: usize,
+    pub features: usize,
+    pub log2_size: u32,
+    pub base: u32,
+    /// Cells per axis at the finest level; 0: 2048 per inner cube.
+    pub finest: u32,
+    /// Length of the per-image appearance code; 0: none.
+    pub appearance: usize,
+    pub contraction: bool,
+}
+
+/// What the field is trained to do.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LossConfig {
+    /// `mse` or `huber`.
+    pub color: String,
+    pub distortion: f32,
+    pub alpha: f32,
+}
+
+/// Rates and their course.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OptimConfig {
+    pub rate: f32,
+    /// Rate at the end over the rate at the start.
+    pub final_scale: f32,
+    pub warmup: f32,
+    pub decay_from: f32,
+    /// L2 penalty on the network's weights.
+    pub weight_decay: f32,
+}
+
+/// Rays and samples.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SamplingConfig {
+    /// Rays per step; 0: as many as give `batch_samples` samples.
+    pub rays: usize,
+    pub batch_samples: usize,
+    /// Samples per ray of the methods without an occupancy grid.
+    pub samples: usize,
+    /// More samples per ray for the fine network of `nerf`.
+    pub importance: usize,
+    pub max_samples: usize,
+    /// Nearest distance at which matter may be, in inner cubes.
+    pub near: f32,
+    pub occupancy_resolution: usize,
+    /// Points of the occupancy grid sampled per update.
+    pub occupancy_points: usize,
+    pub occupancy_every: u64,
+    /// Cameras that must see a cell for it to hold matter.
+    pub min_cell_views: usize,
+    /// Draw rays where the error is high.
+    pub error_map: bool,
+}
+
+/// Correction of the given cameras.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraConfig {
+    pub refine: bool,
+    pub refine_focal: bool,
+    pub rate: f32,
+    /// Pull of the corrections towards zero.
+    pub decay: f32,
+}
+
+/// Length of the run and what it writes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// 0: no limit.
+    pub steps: u64,
+    /// 0: no limit.
+    pub seconds: f64,
+    pub log_every: u64,
+    pub save_every_seconds: f64,
+    /// 0: by time alone.
+    pub save_every_steps: u64,
+    /// Judge held-out views each time so many steps are done; 0: never.
+    pub evaluate_every: u64,
+}
+
+/// A whole configuration.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    pub method: Method,
+    pub background: Background,
+    pub seed: u64,
+    pub device: String,
+    pub data: DataConfig,
+    pub field: FieldConfig,
+    pub loss: LossConfig,
+    pub optim: OptimConfig,
+    pub sampling: SamplingConfig,
+    pub camera: CameraConfig,
+    pub run: RunConfig,
+}
+
+impl Config {
+    /// A method's defaults for the capture at `path`.
+    pub fn new(method: Method, path: PathBuf) -> Config {
+        let ngp = method == Method::Ngp;
+        let (rate, rays, steps) = match method {
+            Method::Ngp => (1e-2, 0, 6000),
+            Method::Nerf => (5e-4, 512, 20_000),
+            Method::Mlp => (1e-3, 1024, 6000),
+            Method::Baseline => (1e-3, 1024, 1000),
+        };
+        Config {
+            method,
+            background: Background::Auto,
+            seed: 1,
+            device: "auto".into(),
+            data: DataConfig {
+                path,
+                format: String::new(),
+                downscale: 1,
+                split: "file".into(),
+                memory_budget: diorama_data::pixel_store::DEFAULT_BUDGET,
+            },
+            field: FieldConfig { levels: 16, features: 2, log2_size: 19, base: 16, finest: 0, appearance: 0, contraction: false },
+            loss: LossConfig { color: if ngp { "huber" } else { "mse" }.into(), distortion: 0.0, alpha: 0.0 },
+            optim: OptimConfig {
+                rate,
+                final_scale: if ngp { 0.03 } else { 0.1 },
+                warmup: if ngp { 0.0 } else { 0.01 },
+                decay_from: if ngp { 0.3 } else { 0.0 },
+                weight_decay: 0.0,
+            },
+            sampling: SamplingConfig {
+                rays,
+                batch_samples: 1 << 16,
+                samples: 64,
+                importance: 128,
+                max_samples: 1024,
+                near: 0.1,
+                occupancy_resolution: 128,
+                occupancy_points: 1 << 16,
+                occupancy_every: 16,
+                min_cell_views: 2,
+                error_map: false,
+            },
+            camera: CameraConfig { refine: false, refine_focal: false, rate: 3e-4, decay: 1e-2 },
+            run: RunConfig { steps, seconds: 0.0, log_every: 10, save_every_seconds: 60.0, save_every_steps: 0, evaluate_every: 0 },
+        }
+    }
+
+    /// Overrides one value, named by its path, for example `loss.distortion`.
+    ///
+    /// # Errors
+    /// When the key does not exist (the nearest one is named) or the value has the wrong type.
+    pub fn set(&mut self, key: &str, value: &str) -> Result<()> {
+        let mut table = toml::Value::try_from(&*self).expect("a configuration is a table");
+        let known = keys(&table, "");
+        let mut at = &mut table;
+        for part in key.split('.') {
+            let exists = at.get(part).is_some();
+            if !exists {
+                return Err(PipelineError::Usage(unknown_key(key, &known)));
+            }
+            at = &mut at[part];
+        }
+        let parsed = match at {
+            toml::Value::String(_) => Some(toml::Value::String(value.into())),
+            toml::Value::Integer(_) => value.parse().ok().map(toml::Value::Integer),
+            toml::Value::Float(_) => value.parse().ok().filter(|v: &f64| v.is_finite()).map(toml::Value::Float),
+            toml::Value::Boolean(_) => value.parse().ok().map(toml::Value::Boolean),
+            _ => None,
+        };
+        *at = parsed.ok_or_else(|| PipelineError::Usage(format!("{key}: {value:?} does not fit; it is {at} now")))?;
+        *self = table.try_into().map_err(|e: toml::de::Error| PipelineError::Usage(format!("{key} = {value:?}: {}", e.message())))?;
+        self.check()
+    }
+
+    /// Reads what [`Config::to_toml`] wrote.
+    pub fn from_toml(text: &str) -> std::result::Result<Config, String> {
+        let value: toml::Value = toml::from_str(text).map_err(|e| e.message().to_string())?;
+        let template = toml::Value::try_from(Config::new(Method::Ngp, "x".into())).expect("a configuration is a table");
+        let known = keys(&template, "");
+        if let Some(bad) = keys(&value, "").into_iter().find(|k| !known.contains(k)) {
+            return Err(unknown_key(&bad, &known));
+        }
+        value.try_into().map_err(|e: toml::de::Error| e.message().to_string())
+    }
+
+    pub fn to_toml(&self) -> String {
+        toml::to_string(self).expect("a configuration is a table")
+    }
+
+    /// Values that make no sense together or alone.
+    pub fn check(&self) -> Result<()> {
+        let fail = |m: &str| Err(PipelineError::Usage(m.to_string()));
+        let f = &self.field;
+        if ![1, 2, 4, 8].contains(&f.features) || f.levels == 0 || f.base == 0 || !(4..=24).contains(&f.log2_size) {
+            return fail("field: features must be 1, 2, 4 or 8, levels and base at least 1, log2_size 4 to 24");
+        }
+        if !["mse", "huber"].contains(&&self.loss.color[..]) {
+            return fail("loss.color: expected mse or huber");
+        }
+        if !matches!(&self.device[..], "auto" | "cpu") {
+            return Err(PipelineError::Usage(format!("device {:?} is not available in this build; use auto or cpu", self.device)));
+        }
+        let s = &self.sampling;
+        if s.samples < 2 || s.max_samples == 0 || s.batch_samples < 64 || s.occupancy_every == 0 {
+            return fail("sampling: samples at least 2, max_samples and occupancy_every at least 1, batch_samples at least 64");
+        }
+        if s.occupancy_resolution == 0 || !s.occupancy_resolution.is_multiple_of(16) {
+            return fail("sampling.occupancy_resolution: must be a multiple of 16");
+        }
+        if self.data.downscale == 0 || self.run.log_every == 0 {
+            return fail("data.downscale and run.log_every: at least 1");
+        }
+        if self.field.appearance > 0 && matches!(self.method, Method::Mlp | Method::Baseline) {
+            return fail("field.appearance: only ngp and nerf have a view-dependent part that takes an appearance code");
+        }
+        if self.run.steps == 0 && self.run.seconds <= 0.0 {
+            return fail("run.steps and run.seconds: one of them must be greater than 0");
+        }
+        Ok(())
+    }
+}
+
+/// Paths of all leaves.
+fn keys(value: &toml::Value, prefix: &str) -> Vec<String> {
+    match value {
+        toml::Value::Table(t) => t
+            .iter()
+            .flat_map(|(k, v)| keys(v, &if prefix.is_empty() { k.clone() } else { format!("{prefix}.{k}") }))
+            .collect(),
+        _ => vec![prefix.to_string()],
+    }
+}
+
+fn unknown_key(key: &str, known: &[String]) -> String {
+    let nearest = known.iter().min_by_key(|k| distance(key, k).min(k.rsplit('.').next().map_or(99, |last| distance(key, last))));
+    format!("unknown configuration key {key}; did you mean {}?", nearest.map_or("", |k| k))
+}
+
+/// Levenshtein distance.
+fn distance(a: &str, b: &str) -> usize {
+    let b: Vec<char> = b.chars().collect();
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, x) in a.chars().enumerate() {
+        let mut diagonal = row[0];
+        row[0] = i + 1;
+        for (j, y) in b.iter().enumerate() {
+            let next = (diagonal + (x != *y) as usize).min(row[j] + 1).min(row[j + 1] + 1);
+            diagonal = row[j + 1];
+            row[j + 1] = next;
+        }
+    }
+    row[b.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_round_trips_and_takes_overrides() {
+        let mut c = Config::new(Method::Nerf, "a b/ü".into());
+        c.set("loss.distortion", "0.01").unwrap();
+        c.set("method", "mlp").unwrap();
+        c.set("camera.refine", "true").unwrap();
+        assert_eq!(Config::from_toml(&c.to_toml()).unwrap(), c);
+        assert!(c.camera.refine && c.method == Method::Mlp && c.loss.distortion == 0.01);
+    }
+
+    #[test]
+    fn unknown_keys_name_the_nearest() {
+        let mut c = Config::new(Method::Ngp, "x".into());
+        assert!(c.set("loss.distorsion", "1").unwrap_err().to_string().contains("loss.distortion"));
+        assert!(c.set("levles", "1").unwrap_err().to_string().contains("field.levels"));
+        let text = c.to_toml().replace("log2_size", "log_size");
+        assert!(Config::from_toml(&text).unwrap_err().contains("field.log2_size"));
+    }
+
+    #[test]
+    fn values_that_make_no_sense_are_refused() {
+        let c = Config::new(Method::Ngp, "x".into());
+        for (k, v) in [("field.features", "3"), ("loss.color", "l7"), ("optim.rate", "fast"), ("optim.rate", "inf"), ("data.downscale", "0"), ("device", "cuda")] {
+            assert!(c.clone().set(k, v).is_err(), "{k} = {v}");
+        }
+    }
+}

@@ -1,0 +1,12 @@
+//! Photographs to a radiance field, novel views and a mesh.
+
+pub mod compare;
+pub mod config;
+pub mod evaluate;
+pub mod export;
+pub mod model;
+pub mod quickstart;
+pub mod recipe;
+pub mod render;
+pub mod report;
+pub mod run_folder;

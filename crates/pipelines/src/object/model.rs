@@ -1,0 +1,322 @@
+//! A capture with the fields that are fitted to it: what a run folder holds.
+
+use super::config::{Background, Config, Method};
+use crate::error::{PipelineError, Result};
+use diorama_data::checkpoint::{Checkpoint, Entry};
+use diorama_engine::background::LearnedBackground;
+use diorama_engine::fields::{self, Batch, Field, FieldBuffers};
+use diorama_engine::params::ParamGroup;
+use diorama_engine::renderers::volume::{Backdrop, Sampling, Tracer};
+use diorama_engine::samplers::occupancy::Occupancy;
+use diorama_engine::samplers::pixels::ErrorMap;
+use diorama_engine::train::Origin;
+use diorama_geom::capture::Split;
+use diorama_geom::field_query::FieldQuery;
+use diorama_geom::glam::DVec3;
+use diorama_geom::{Capture, Pose, Similarity};
+use diorama_kernels::ops::adam::Adam;
+use diorama_kernels::ops::composite::Packed;
+use diorama_kernels::ops::hash_grid::HashGridConfig;
+use diorama_kernels::ops::march::OccupancyBits;
+use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
+use std::collections::HashMap;
+
+/// Rays below this transmittance end, in renders for scores and files.
+pub const STOP: f32 = 1e-4;
+
+/// Fields, occupancy and corrections of one run, with the capture they belong to.
+pub struct ObjectModel {
+    pub config: Config,
+    pub capture: Capture,
+    pub model_from_world: Similarity,
+    pub field: Field,
+    /// The coarse network of `nerf`.
+    pub coarse: Option<Field>,
+    pub occupancy: Option<Occupancy>,
+    pub learned: Option<LearnedBackground>,
+    /// Corrections of the training cameras, `[train, 7]`.
+    pub corrections: Option<ParamGroup>,
+    pub error_map: Option<ErrorMap>,
+    /// Training frames, as indices into the capture.
+    pub train: Vec<usize>,
+    /// Whether the photographs have transparent pixels.
+    pub has_alpha: bool,
+    pub origin: Origin,
+    /// Running mean of samples per ray, which sets the rays per step.
+    pub samples_per_ray: f64,
+    /// Lowered once after a loss that was not finite.
+    pub rate_scale: f32,
+}
+
+impl ObjectModel {
+    /// An untrained model.
+    pub fn new(config: Config, capture: Capture, has_alpha: bool) -> Result<ObjectModel> {
+        config.check()?;
+        let train = capture.indices(Split::Train);
+        let outer = capture.scene.aabb_scale as f32;
+        let (seed, rate, images, dims) = (config.seed, config.optim.rate, train.len(), config.field.appearance);
+        let f = &config.field;
+        let (field, coarse) = match config.method {
+            Method::Ngp => {
+                let widest = if f.contraction { 2.0 } else { outer };
+                let finest = if f.finest > 0 { f.finest } else { (2048.0 * widest) as u32 };
+                let grid = HashGridConfig { levels: f.levels, features: f.features, log2_size: f.log2_size, base: f.base, finest };
+                (fields::ngp(grid, outer, f.contraction, rate, images, dims, seed), None)
+            }
+            Method::Nerf => (fields::nerf(outer, rate, images, dims, seed, 1), Some(fields::nerf(outer, rate, images, dims, seed, 0))),
+            Method::Mlp => (fields::mlp(outer, rate, seed), None),
+            Method::Baseline => (fields::baseline(outer, rate, seed), None),
+        };
+        let cascades = capture.scene.aabb_scale.max(1).ilog2() as usize + 1;
+        let occupancy = (config.method == Method::Ngp).then(|| Occupancy::new(config.sampling.occupancy_resolution, cascades));
+        let learned = (config.background == Background::Learned).then(|| LearnedBackground::new(Adam { rate, ..Adam::default() }));
+        let corrections = config.camera.refine.then(|| {
+            let adam = Adam { rate: config.camera.rate, weight_decay: config.camera.decay, ..Adam::default() };
+            ParamGroup::dense("corrections", vec![0.0; images * CORRECTION], adam)
+        });
+        let error_map = config.sampling.error_map.then(|| ErrorMap::new(images));
+        let mut model = ObjectModel {
+            model_from_world: capture.scene.model_from_world(),
+            field,
+            coarse,
+            occupancy,
+            learned,
+            corrections,
+            error_map,
+            train,
+            has_alpha,
+            origin: Origin::default(),
+            samples_per_ray: 256.0,
+            rate_scale: 1.0,
+            config,
+            capture,
+        };
+        let cameras = model.base_cameras();
+        if let Some(o) = &mut model.occupancy {
+            o.keep_visible(&cameras, model.config.sampling.min_cell_views);
+        }
+        let decay = model.config.optim.weight_decay;
+        model.fields_mut().into_iter().for_each(|f| f.weights.adam.weight_decay = decay);
+        Ok(model)
+    }
+
+    fn fields_mut(&mut self) -> Vec<&mut Field> {
+        [&mut self.field].into_iter().chain(self.coarse.as_mut()).collect()
+    }
+
+    /// A frame's camera at the run's resolution, standing in model space.
+    pub fn posed(&self, frame: usize) -> PosedCamera {
+        let f = &self.capture.frames[frame];
+        PosedCamera { camera: f.camera.downscaled(self.config.data.downscale), pose: self.model_from_world.pose(&f.world_from_camera) }
+    }
+
+    /// A camera that stands in the world, in model space.
+    pub fn to_model(&self, camera: diorama_geom::Camera, world_from_camera: &Pose) -> PosedCamera {
+        PosedCamera { camera, pose: self.model_from_world.pose(world_from_camera) }
+    }
+
+    /// The training cameras as given.
+    pub fn base_cameras(&self) -> Vec<PosedCamera> {
+        self.train.iter().map(|&i| self.posed(i)).collect()
+    }
+
+    /// The training cameras with their corrections.
+    pub fn cameras(&self) -> Vec<PosedCamera> {
+        let base = self.base_cameras();
+        match &self.corrections {
+            None => base,
+            Some(g) => base
+                .iter()
+                .zip(g.values.chunks_exact(CORRECTION))
+                .map(|(c, d)| c.corrected(&std::array::from_fn(|k| d[k] as f64)))
+                .collect(),
+        }
+    }
+
+    /// The scene's outer cube in model space: lowest corner and edge.
+    pub fn cube(&self) -> (f32, f32) {
+        OccupancyBits::cube(self.capture.scene.aabb_scale.max(1).ilog2() as usize)
+    }
+
+    /// The colour that renders and scores are composited on, unless it is learned.
+    pub fn backdrop_color(&self) -> [f32; 3] {
+        match self.config.background {
+            Background::White => [1.0; 3],
+            Background::Black => [0.0; 3],
+            _ if self.has_alpha => [1.0; 3],
+            _ => [0.0; 3],
+        }
+    }
+
+    /// Ready to render, wearing the mean appearance.
+    pub fn tracer(&self) -> Tracer<'_> {
+        let s = &self.config.sampling;
+        let sampling = match (&self.occupancy, &self.coarse) {
+            (Some(grid), _) => Sampling::Occupancy { grid, max_samples: s.max_samples },
+            (None, Some(coarse)) => Sampling::Hierarchical { coarse, samples: s.samples, more: s.importance },
+            (None, None) => Sampling::Stratified { samples: s.samples },
+        };
+        Tracer {
+            field: &self.field,
+            sampling,
+            backdrop: self.learned.as_ref().map_or(Backdrop::Color(self.backdrop_color()), Backdrop::Learned),
+            near: s.near,
+            cube: self.cube(),
+            clip: None,
+            stop: STOP,
+            appearance: None,
+        }
+    }
+
+    fn groups(&self) -> Vec<(String, &ParamGroup)> {
+        let field = self.field.groups().into_iter().map(|g| (format!("field.{}", g.name), g));
+        let coarse = self.coarse.iter().flat_map(|f| f.groups()).map(|g| (format!("coarse.{}", g.name), g));
+        let rest = self.learned.iter().map(|l| &l.group).chain(self.corrections.iter()).map(|g| (g.name.to_string(), g));
+        field.chain(coarse).chain(rest).collect()
+    }
+
+    fn groups_mut(&mut self) -> Vec<(String, &mut ParamGroup)> {
+        let field = self.field.groups_mut().into_iter().map(|g| (format!("field.{}", g.name), g));
+        let coarse = self.coarse.iter_mut().flat_map(|f| f.groups_mut()).map(|g| (format!("coarse.{}", g.name), g));
+        let rest = self.learned.iter_mut().map(|l| &mut l.group).chain(self.corrections.iter_mut()).map(|g| (g.name.to_string(), g));
+        field.chain(coarse).chain(rest).collect()
+    }
+
+    /// One optimiser step for every group; corrections follow their own constant rate.
+    pub fn optimise(&mut self, t: u32, scale: f32) {
+        let scale = scale * self.rate_scale;
+        for (_, g) in self.groups_mut() {
+            g.step(t, scale);
+        }
+        if !self.config.camera.refine_focal {
+            if let Some(c) = &mut self.corrections {
+                c.values.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);
+            }
+        }
+    }
+
+    /// Whether any parameter is not finite.
+    pub fn is_broken(&self) -> bool {
+        self.groups().iter().any(|(_, g)| g.is_broken())
+    }
+
+    /// Everything that a checkpoint holds.
+    pub fn entries(&self) -> (Vec<Entry<'_>>, HashMap<String, String>) {
+        let mut entries = Vec::new();
+        let mut add = |name: String, data| entries.push(Entry { name, shape: vec![<[f32]>::len(data)], data });
+        for (name, g) in self.groups() {
+            add(name.clone(), &g.values);
+            add(format!("{name}.moment1"), &g.moment1);
+            add(format!("{name}.moment2"), &g.moment2);
+        }
+        if let Some(o) = &self.occupancy {
+            add("occupancy".into(), &o.density);
+        }
+        if let Some(m) = &self.error_map {
+            add("error_map".into(), &m.errors);
+            add("error_map.drawn".into(), &m.drawn);
+        }
+        let o = &self.origin;
+        let metadata = HashMap::from([
+            ("method".to_string(), self.config.method.to_string()),
+            ("step".into(), o.step.to_string()),
+            ("rays".into(), o.rays.to_string()),
+            ("samples".into(), o.samples.to_string()),
+            ("seconds_bits".into(), o.seconds.to_bits().to_string()),
+            ("samples_per_ray_bits".into(), self.samples_per_ray.to_bits().to_string()),
+            ("rate_scale_bits".into(), self.rate_scale.to_bits().to_string()),
+            ("has_alpha".into(), self.has_alpha.to_string()),
+        ]);
+        (entries, metadata)
+    }
+
+    /// Takes over a checkpoint of the same method and shape.
+    pub fn restore(&mut self, mut c: Checkpoint, file: &std::path::Path) -> Result<()> {
+        let wrong = |what: String| PipelineError::Usage(format!("{}: {what}", file.display()));
+        let method = c.metadata.get("method").cloned().unwrap_or_default();
+        if method != self.config.method.to_string() {
+            return Err(wrong(format!("holds method {method}, but the run is {}; use another run folder", self.config.method)));
+        }
+        fn number<T: std::str::FromStr>(c: &Checkpoint, key: &str) -> Option<T> {
+            c.metadata.get(key).and_then(|v| v.parse().ok())
+        }
+        let missing = |k: &str| wrong(format!("metadata {k} is missing or malformed"));
+        self.origin = Origin {
+            step: number(&c, "step").ok_or_else(|| missing("step"))?,
+            rays: number(&c, "rays").ok_or_else(|| missing("rays"))?,
+            samples: number(&c, "samples").ok_or_else(|| missing("samples"))?,
+            seconds: f64::from_bits(number(&c, "seconds_bits").ok_or_else(|| missing("seconds_bits"))?),
+        };
+        self.samples_per_ray = f64::from_bits(number(&c, "samples_per_ray_bits").ok_or_else(|| missing("samples_per_ray_bits"))?);
+        self.rate_scale = f32::from_bits(number(&c, "rate_scale_bits").ok_or_else(|| missing("rate_scale_bits"))?);
+        self.has_alpha = number(&c, "has_alpha").ok_or_else(|| missing("has_alpha"))?;
+        let mut load = |name: &str, into: &mut Vec<f32>| -> Result<()> {
+            let v = c.take(name).ok_or_else(|| wrong(format!("{name} is missing")))?;
+            if v.len() != into.len() {
+                return Err(wrong(format!("{name} has {} numbers where the configuration needs {}; use the configuration that it was trained with", v.len(), into.len())));
+            }
+            *into = v;
+            Ok(())
+        };
+        for (name, g) in self.groups_mut() {
+            load(&name, &mut g.values)?;
+            load(&format!("{name}.moment1"), &mut g.moment1)?;
+            load(&format!("{name}.moment2"), &mut g.moment2)?;
+            g.grads.fill(0.0);
+            g.touched.fill(0);
+        }
+        if let Some(o) = &mut self.occupancy {
+            load("occupancy", &mut o.density)?;
+            o.refresh();
+        }
+        if let Some(m) = &mut self.error_map {
+            load("error_map", &mut m.errors)?;
+            load("error_map.drawn", &mut m.drawn)?;
+            m.rebuild();
+        }
+        Ok(())
+    }
+}
+
+impl FieldQuery for ObjectModel {
+    fn density(&self, points_in_world: &[[f32; 3]], sigma: &mut [f32]) {
+        let model = self.model_points(points_in_world);
+        self.field.density(&model, sigma);
+        // Per model unit to per world unit; nothing lies outside of the scene's cube.
+        let (low, size) = self.cube();
+        let scale = self.model_from_world.scale as f32;
+        for (s, p) in sigma.iter_mut().zip(model.chunks_exact(3)) {
+            let inside = p.iter().all(|v| (low..=low + size).contains(v));
+            *s = if inside { *s * scale } else { 0.0 };
+        }
+    }
+
+    fn color(&self, points_in_world: &[[f32; 3]], directions: &[[f32; 3]], rgb_srgb: &mut [[f32; 3]]) {
+        const CHUNK: usize = 1 << 16;
+        let mut buf = FieldBuffers::default();
+        for ((p, d), out) in points_in_world.chunks(CHUNK).zip(directions.chunks(CHUNK)).zip(rgb_srgb.chunks_mut(CHUNK)) {
+            let n = p.len();
+            let offsets: Vec<u32> = (0..=n as u32).collect();
+            // One sample per ray, so long that it is opaque: the colour is the field's own.
+            let (t, dt) = (vec![0.0; n], vec![1e30f32; n]);
+            let batch = Batch {
+                samples: Packed { offsets: &offsets, t: &t, dt: &dt },
+                positions: &self.model_points(p),
+                dirs: d.as_flattened(),
+                images: None,
+                background: &vec![0.0; n * 3],
+            };
+            self.field.render(&batch, &mut buf);
+            out.as_flattened_mut().copy_from_slice(&buf.out.rgb);
+        }
+    }
+}
+
+impl ObjectModel {
+    fn model_points(&self, points_in_world: &[[f32; 3]]) -> Vec<f32> {
+        points_in_world
+            .iter()
+            .flat_map(|p| self.model_from_world.point(DVec3::new(p[0] as f64, p[1] as f64, p[2] as f64)).as_vec3().to_array())
+            .collect()
+    }
+}

@@ -1,0 +1,386 @@
+//! Training, from top to bottom.
+
+use super::config::{Background, Config, Method};
+use super::evaluate;
+use super::model::ObjectModel;
+use super::run_folder::RunFolder;
+use crate::error::{PipelineError, Result};
+use diorama_data::import::{self, ImportOptions};
+use diorama_data::pixel_store::{PixelStore, StoreOptions};
+use diorama_data::{checkpoint, photo};
+use diorama_engine::fields::{Batch, Field, FieldBuffers};
+use diorama_engine::losses::{ColorLoss, Photometric};
+use diorama_engine::params::Schedule;
+use diorama_engine::samplers::pixels::{self, DrawOptions, PixelSource};
+use diorama_engine::samplers::{RayBatch, stratified};
+use diorama_engine::train::{self, Event, RunError, RunOptions, StepReport, Summary, Trainee};
+use diorama_geom::Capture;
+use diorama_geom::capture::Split;
+use diorama_geom::rng::Rng;
+use diorama_kernels::ops::composite::Packed;
+use diorama_kernels::ops::march::{self, MarchRays, Marched};
+use diorama_kernels::ops::ray_generation::{self, PosedCamera};
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+/// Streams of random numbers.
+const PIXELS: u64 = 10;
+const OCCUPANCY: u64 = 11;
+const BACKGROUND: u64 = 12;
+const COARSE: u64 = 13;
+const FINE: u64 = 14;
+
+/// Steps during which an occupancy sample stands for a block of cells, and that block's edge.
+const OCCUPANCY_WARMUP: (u64, usize) = (256, 2);
+
+/// Reads the capture that a configuration names.
+pub fn load_capture(config: &Config) -> Result<Capture> {
+    let split = config.data.split.parse().map_err(PipelineError::Usage)?;
+    let format = match &config.data.format[..] {
+        "" => None,
+        f => Some(f.parse().map_err(PipelineError::Usage)?),
+    };
+    let options = ImportOptions { format, split, seed: config.seed, ..ImportOptions::default() };
+    Ok(import::import(&config.data.path, &options)?)
+}
+
+/// Trains into `folder`, from the start or from its checkpoint.
+///
+/// Capture → pixels → model → loop of steps → checkpoint; `events` hears of all of it.
+pub fn train(
+    config: &Config, folder: &mut RunFolder, resume: bool, interrupt: &AtomicBool, events: &mut dyn FnMut(&Event),
+) -> Result<(ObjectModel, Summary)> {
+    let capture = if resume { folder.capture()? } else { load_capture(config)? };
+    for note in &capture.notes {
+        events(&Event::Note(note.clone()));
+    }
+    let train = capture.indices(Split::Train);
+    let frames: Vec<_> = train.iter().map(|&i| &capture.frames[i]).collect();
+    let options = StoreOptions { downscale: config.data.downscale, budget: config.data.memory_budget, scratch: folder.path() };
+    let store = PixelStore::load(&frames, &options, &|| {})?;
+    if store.is_mapped() {
+        events(&Event::Note("the photographs exceed the memory budget and are read from a mapped scratch file".into()));
+    }
+    let has_alpha = store.has_alpha;
+    let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
+    if resume {
+        let (c, note) = checkpoint::load(&folder.checkpoints())?;
+        model.restore(c, &checkpoint::latest(&folder.checkpoints()))?;
+        note.into_iter().for_each(|n| events(&Event::Note(n)));
+        folder.cut_metrics(model.origin.step)?;
+    } else {
+        folder.write_description(config, &model.capture)?;
+    }
+    let options = run_options(config);
+    let origin = model.origin;
+    let checkpoints = folder.checkpoints();
+    let mut trainer = Trainer::new(model, Photographs(store), &checkpoints);
+    let mut log_error = None;
+    let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
+        if let Err(e) = folder.log(e) {
+            log_error.get_or_insert(e);
+        }
+        events(e);
+    });
+    if let Some(e) = log_error {
+        return Err(e);
+    }
+    let summary = result.map_err(|e| match e {
+        RunError::Save(e) => e,
+        RunError::Diverged { step } => PipelineError::Diverged { step, checkpoint: checkpoint::latest(&checkpoints).display().to_string() },
+    })?;
+    folder.draw_curves()?;
+    Ok((trainer.model, summary))
+}
+
+fn run_options(config: &Config) -> RunOptions {
+    let r = &config.run;
+    let positive = |n: u64| (n > 0).then_some(n);
+    RunOptions {
+        steps: positive(r.steps),
+        seconds: (r.seconds > 0.0).then_some(r.seconds),
+        log_every: r.log_every,
+        save_every_seconds: r.save_every_seconds,
+        save_every_steps: positive(r.save_every_steps),
+        evaluate_every: positive(r.evaluate_every),
+    }
+}
+
+struct Photographs(PixelStore);
+
+impl PixelSource for Photographs {
+    fn images(&self) -> usize {
+        self.0.len()
+    }
+    fn size(&self, image: usize) -> (u32, u32) {
+        self.0.size(image)
+    }
+    fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4] {
+        self.0.pixel(image, x, y)
+    }
+    fn counts(&self, image: usize, x: u32, y: u32) -> bool {
+        self.0.counts(image, x, y)
+    }
+}
+
+/// Buffers that steps reuse.
+#[derive(Default)]
+struct Buffers {
+    batch: RayBatch,
+    background: Vec<f32>,
+    marched: Marched,
+    fine: Marched,
+    positions: Vec<f32>,
+    d_positions: Vec<f32>,
+    march: march::cpu::MarchScratch,
+    field: FieldBuffers,
+}
+
+struct Trainer<'a> {
+    model: ObjectModel,
+    photographs: Photographs,
+    cameras: Vec<PosedCamera>,
+    checkpoints: &'a Path,
+    buffers: Buffers,
+    schedule: Schedule,
+    recovered: bool,
+}
+
+impl<'a> Trainer<'a> {
+    fn new(model: ObjectModel, photographs: Photographs, checkpoints: &'a Path) -> Self {
+        let o = &model.config.optim;
+        let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
+        Trainer { cameras: model.cameras(), model, photographs, checkpoints, buffers: Buffers::default(), schedule, recovered: false }
+    }
+
+    /// As many rays as give about the wanted number of samples.
+    fn rays(&self) -> usize {
+        let s = &self.model.config.sampling;
+        if s.rays > 0 {
+            return s.rays;
+        }
+        let n = s.batch_samples as f64 / self.model.samples_per_ray.max(1.0);
+        (n as usize).clamp(64, 1 << 14).next_multiple_of(64)
+    }
+
+    fn draw(&mut self, first: u64) {
+        let n = self.rays();
+        let m = &self.model;
+        self.buffers.batch.resize(n);
+        let options = DrawOptions {
+            cameras: &self.cameras,
+            first,
+            rng: Rng::new(m.config.seed, PIXELS),
+            near: m.config.sampling.near,
+            cube: m.cube(),
+            error_map: m.error_map.as_ref(),
+        };
+        pixels::draw(&self.photographs, &options, &mut self.buffers.batch);
+        self.fill_background(first);
+    }
+
+    fn fill_background(&mut self, first: u64) {
+        let b = &mut self.buffers;
+        let n = b.batch.len();
+        b.background.resize(n * 3, 0.0);
+        let m = &self.model;
+        let random = match m.config.background {
+            Background::Random => true,
+            Background::Auto => m.config.method == Method::Ngp,
+            _ => false,
+        };
+        if let Some(l) = &m.learned {
+            l.forward(&b.batch.dirs, &mut b.background);
+        } else if random {
+            let rng = Rng::new(m.config.seed, BACKGROUND);
+            b.background.iter_mut().enumerate().for_each(|(i, v)| *v = rng.uniform(first * 3 + i as u64));
+        } else {
+            let color = m.backdrop_color();
+            b.background.chunks_exact_mut(3).for_each(|c| c.copy_from_slice(&color));
+        }
+    }
+
+    /// Occupied samples through the one field.
+    fn step_ngp(&mut self, step: u64) -> (f64, u64) {
+        let b = &mut self.buffers;
+        let m = &mut self.model;
+        let s = &m.config.sampling;
+        let grid = m.occupancy.as_mut().expect("ngp has an occupancy grid");
+        if step > 0 && step.is_multiple_of(s.occupancy_every) {
+            let (until, block) = OCCUPANCY_WARMUP;
+            let rng = Rng::new(m.config.seed, OCCUPANCY);
+            grid.update(&m.field, &rng, step, s.occupancy_points, if step <= until { block } else { 1 });
+        }
+        let rays = MarchRays { origins: &b.batch.origins, dirs: &b.batch.dirs, near_far: &b.batch.near_far, jitter: &b.batch.jitter };
+        march::cpu::march(&grid.bits, &rays, &grid.march_config(s.max_samples), &mut b.march, &mut b.marched);
+        march::cpu::positions(&rays, &b.marched, &mut b.positions);
+        let per_ray = b.marched.t.len() as f64 / b.batch.len() as f64;
+        m.samples_per_ray = if step == 0 { per_ray } else { 0.9 * m.samples_per_ray + 0.1 * per_ray };
+        let loss = train_field(&mut m.field, &m.config, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, m.corrections.is_some().then_some(&mut b.d_positions));
+        (loss, b.marched.t.len() as u64)
+    }
+
+    /// Stratified samples through the one field.
+    fn step_stratified(&mut self, first: u64) -> (f64, u64) {
+        let b = &mut self.buffers;
+        let m = &mut self.model;
+        let rng = Rng::new(m.config.seed, COARSE);
+        stratified::stratified(&b.batch, m.config.sampling.samples, Some((rng, first)), &mut b.marched);
+        positions(&b.batch, &b.marched, &mut b.positions);
+        let d = m.corrections.is_some().then_some(&mut b.d_positions);
+        let loss = train_field(&mut m.field, &m.config, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
+        (loss, b.marched.t.len() as u64)
+    }
+
+    /// Stratified samples through the coarse field, then more where it found matter through the fine one.
+    fn step_hierarchical(&mut self, first: u64) -> (f64, u64) {
+        let b = &mut self.buffers;
+        let m = &mut self.model;
+        let (n, more) = (m.config.sampling.samples, m.config.sampling.importance);
+        stratified::stratified(&b.batch, n, Some((Rng::new(m.config.seed, COARSE), first)), &mut b.fine);
+        positions(&b.batch, &b.fine, &mut b.positions);
+        let coarse = m.coarse.as_mut().expect("nerf has a coarse field");
+        let coarse_loss = train_field(coarse, &m.config, &b.batch, &b.fine, &b.positions, &b.background, &mut b.field, None);
+        stratified::refine(&b.fine, &b.field.out.weights, n, more, Some((Rng::new(m.config.seed, FINE), first)), &mut b.marched);
+        positions(&b.batch, &b.marched, &mut b.positions);
+        let d = m.corrections.is_some().then_some(&mut b.d_positions);
+        let loss = train_field(&mut m.field, &m.config, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
+        (coarse_loss + loss, (b.fine.t.len() + b.marched.t.len()) as u64)
+    }
+
+    /// Squared error of the step's colours, and what the error map learns from it.
+    fn score(&mut self) -> f64 {
+        let b = &self.buffers;
+        let (mut sum, mut n) = (0.0f64, 0usize);
+        for r in 0..b.batch.len() {
+            let t = &b.batch.target[r * 4..r * 4 + 4];
+            if t[0].is_nan() {
+                continue;
+            }
+            let e: f32 = (0..3)
+                .map(|k| {
+                    let want = t[k] * t[3] + b.background[r * 3 + k] * (1.0 - t[3]);
+                    (b.field.out.rgb[r * 3 + k] - want).powi(2) / 3.0
+                })
+                .sum();
+            sum += e as f64;
+            n += 1;
+            if let Some(map) = &mut self.model.error_map {
+                let image = b.batch.images[r] as usize;
+                let (w, h) = self.photographs.size(image);
+                map.record(image, b.batch.pixels[r * 2] / w as f32, b.batch.pixels[r * 2 + 1] / h as f32, e);
+            }
+        }
+        sum / n.max(1) as f64
+    }
+
+    /// Gradients of the camera corrections from those of the sample positions.
+    fn correct_cameras(&mut self) {
+        let Some(group) = &mut self.model.corrections else { return };
+        let b = &self.buffers;
+        let rays = b.batch.len();
+        let (mut d_origins, mut d_dirs) = (vec![0.0; rays * 3], vec![0.0; rays * 3]);
+        for r in 0..rays {
+            for i in b.marched.offsets[r] as usize..b.marched.offsets[r + 1] as usize {
+                let t = b.marched.t[i] + 0.5 * b.marched.dt[i];
+                for k in 0..3 {
+                    d_origins[r * 3 + k] += b.d_positions[i * 3 + k];
+                    d_dirs[r * 3 + k] += t * b.d_positions[i * 3 + k];
+                }
+            }
+        }
+        let mut d = vec![0.0f64; group.values.len()];
+        ray_generation::cpu::backward(&self.cameras, &b.batch.images, &b.batch.pixels, &b.batch.dirs, &d_origins, &d_dirs, &mut d);
+        group.grads.iter_mut().zip(&d).for_each(|(g, d)| *g += *d as f32);
+    }
+}
+
+fn positions(batch: &RayBatch, marched: &Marched, out: &mut Vec<f32>) {
+    let rays = MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter };
+    march::cpu::positions(&rays, marched, out);
+}
+
+#[allow(clippy::too_many_arguments)]
+fn train_field(
+    field: &mut Field, config: &Config, batch: &RayBatch, marched: &Marched, positions: &[f32], background: &[f32],
+    buffers: &mut FieldBuffers, d_positions: Option<&mut Vec<f32>>,
+) -> f64 {
+    let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
+    let color = if config.loss.color == "huber" { ColorLoss::Huber(0.1) } else { ColorLoss::Mse };
+    let loss = Photometric { batch, samples, background, color, distortion: config.loss.distortion, alpha: config.loss.alpha };
+    let b = Batch { samples, positions, dirs: &batch.dirs, images: Some(&batch.images), background };
+    field.train(&b, &loss, buffers, d_positions);
+    buffers.out.loss
+}
+
+impl Trainee for Trainer<'_> {
+    type Error = PipelineError;
+
+    fn step(&mut self, step: u64, progress: f64) -> StepReport {
+        let first = self.model.origin.rays;
+        self.draw(first);
+        let (loss, samples) = match self.model.config.method {
+            Method::Ngp => self.step_ngp(step),
+            Method::Mlp | Method::Baseline => self.step_stratified(first),
+            Method::Nerf => self.step_hierarchical(first),
+        };
+        let mse = self.score();
+        let rays = self.buffers.batch.len() as u64;
+        let report = StepReport { loss, mse, rays, samples };
+        if !loss.is_finite() {
+            return report;
+        }
+        if let Some(l) = &mut self.model.learned {
+            l.backward(&self.buffers.batch.dirs, &self.buffers.background, &self.buffers.field.out.d_background);
+        }
+        self.correct_cameras();
+        self.model.optimise(step as u32 + 1, self.schedule.scale(progress as f32));
+        if self.model.corrections.is_some() {
+            self.cameras = self.model.cameras();
+        }
+        if step.is_multiple_of(16) {
+            if let Some(map) = &mut self.model.error_map {
+                map.refresh();
+            }
+        }
+        let o = &mut self.model.origin;
+        o.rays += rays;
+        o.samples += samples;
+        report
+    }
+
+    fn save(&mut self, step: u64, seconds: f64) -> Result<()> {
+        if self.model.is_broken() {
+            return Err(PipelineError::Diverged { step, checkpoint: checkpoint::latest(self.checkpoints).display().to_string() });
+        }
+        self.model.origin.step = step;
+        self.model.origin.seconds = seconds;
+        let (entries, metadata) = self.model.entries();
+        Ok(checkpoint::save(self.checkpoints, &entries, metadata)?)
+    }
+
+    fn recover(&mut self) -> Result<Option<u64>> {
+        if self.recovered || !checkpoint::latest(self.checkpoints).exists() {
+            return Ok(None);
+        }
+        self.recovered = true;
+        let (c, _) = checkpoint::load(self.checkpoints)?;
+        self.model.restore(c, self.checkpoints)?;
+        self.model.rate_scale *= 0.3;
+        self.cameras = self.model.cameras();
+        Ok(Some(self.model.origin.step))
+    }
+
+    fn evaluate(&mut self) -> (f64, f64) {
+        let frames = evaluate::held_out(&self.model.capture, Split::Test);
+        let few: Vec<usize> = frames.into_iter().take(4).collect();
+        let mut scores = Vec::new();
+        for i in few {
+            if let Ok(image) = photo::load(&self.model.capture.frames[i].image) {
+                scores.push(evaluate::score_view(&self.model, i, &image).scores);
+            }
+        }
+        let n = scores.len().max(1) as f64;
+        (scores.iter().map(|s| s.psnr).sum::<f64>() / n, scores.iter().map(|s| s.mse).sum::<f64>() / n)
+    }
+}

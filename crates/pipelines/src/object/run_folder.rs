@@ -1,0 +1,246 @@
+//! The folder of a run: `config.toml`, `capture.json`, `command.txt`, `metrics.jsonl`,
+//! `events.tfevents`, `curves.svg` and `.png`, `checkpoints/`.
+
+use super::config::Config;
+use super::model::ObjectModel;
+use crate::error::{PipelineError, Result};
+use diorama_data::plot::{Chart, Series};
+use diorama_data::tfevents::TfEvents;
+use diorama_data::{DataError, atomic, checkpoint, error};
+use diorama_engine::train::Event;
+use diorama_geom::Capture;
+use std::fs::File;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+const LIMIT: u64 = 1 << 30;
+
+/// An open, locked run folder.
+pub struct RunFolder {
+    path: PathBuf,
+    metrics: Option<File>,
+    tensorboard: Option<TfEvents>,
+    _lock: File,
+}
+
+impl RunFolder {
+    /// A folder for a new run. What an earlier run left there is removed only with `force`.
+    pub fn create(path: &Path, force: bool) -> Result<RunFolder> {
+        if path.join("config.toml").exists() && !force {
+            return Err(DataError::input(path, "already holds a run; give --resume to go on, --force to replace it, or another --out").into());
+        }
+        let occupied = path.is_dir() && !force && path.read_dir().map_err(DataError::io(path, "read"))?.flatten().any(|e| e.file_name() != ".lock");
+        if occupied {
+            return Err(DataError::input(path, "is not empty and holds no run; give --force or another --out").into());
+        }
+        if path.is_file() {
+            return Err(DataError::input(path, "is a file; --out must name a folder").into());
+        }
+        std::fs::create_dir_all(path).map_err(DataError::io(path, "create"))?;
+        let folder = Self::lock(path)?;
+        for name in ["config.toml", "capture.json", "command.txt", "metrics.jsonl", "events.tfevents", "curves.svg", "curves.png"] {
+            let _ = std::fs::remove_file(path.join(name));
+        }
+        let _ = std::fs::remove_dir_all(path.join("checkpoints"));
+        Ok(folder)
+    }
+
+    /// An existing run, with its configuration.
+    pub fn open(path: &Path) -> Result<(RunFolder, Config)> {
+        let config = read_config(path)?;
+        let folder = Self::lock(path)?;
+        atomic::sweep(path)?;
+        let checkpoints = folder.checkpoints();
+        if checkpoints.is_dir() {
+            atomic::sweep(&checkpoints)?;
+        }
+        Ok((folder, config))
+    }
+
+    fn lock(path: &Path) -> Result<RunFolder> {
+        let name = path.join(".lock");
+        let lock = File::create(&name).map_err(DataError::io(&name, "create"))?;
+        lock.try_lock().map_err(|_| DataError::input(path, "is in use by another process; wait for it or choose another --out"))?;
+        Ok(RunFolder { path: path.to_path_buf(), metrics: None, tensorboard: None, _lock: lock })
+    }
+
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    pub fn checkpoints(&self) -> PathBuf {
+        self.path.join("checkpoints")
+    }
+
+    /// The capture as it was imported when the run began.
+    pub fn capture(&self) -> Result<Capture> {
+        read_capture(&self.path)
+    }
+
+    /// Writes what the run was started with.
+    pub fn write_description(&self, config: &Config, capture: &Capture) -> Result<()> {
+        let json = serde_json::to_vec(capture).expect("a capture is JSON");
+        atomic::write(&self.path.join("capture.json"), &json)?;
+        let command: Vec<String> = std::env::args().collect();
+        atomic::write(&self.path.join("command.txt"), format!("{}\n", command.join(" ")).as_bytes())?;
+        atomic::write(&self.path.join("config.toml"), config.to_toml().as_bytes())?;
+        Ok(())
+    }
+
+    /// Drops metrics past `step` and writes the TensorBoard file anew from what is left.
+    pub fn cut_metrics(&mut self, step: u64) -> Result<()> {
+        let path = self.path.join("metrics.jsonl");
+        let rows: Vec<Row> = read_rows(&self.path).into_iter().filter(|r| r.step <= step).collect();
+        let text: String = rows.iter().map(|r| format!("{}\n", serde_json::to_string(r).expect("a row is JSON"))).collect();
+        atomic::write(&path, text.as_bytes())?;
+        let name = self.path.join("events.tfevents");
+        let mut t = TfEvents::create(&name).map_err(DataError::io(&name, "write"))?;
+        for r in &rows {
+            r.to_tensorboard(&mut t).map_err(DataError::io(&name, "write"))?;
+        }
+        self.tensorboard = Some(t);
+        Ok(())
+    }
+
+    /// Appends what an event says to the metrics.
+    pub fn log(&mut self, event: &Event) -> Result<()> {
+        let row = match *event {
+            Event::Progress { step, seconds, loss, mse, psnr, rays, samples, rays_per_s, .. } => {
+                Row { step, seconds, loss: Some(loss), mse: Some(mse), psnr: Some(psnr), rays: Some(rays), samples: Some(samples), rays_per_s: Some(rays_per_s), ..Row::default() }
+            }
+            Event::Evaluated { step, seconds, psnr, mse } => Row { step, seconds, val_psnr: Some(psnr), val_mse: Some(mse), ..Row::default() },
+            Event::Recovered { to_step, .. } => {
+                self.metrics = None;
+                return self.cut_metrics(to_step);
+            }
+            _ => return Ok(()),
+        };
+        let name = self.path.join("metrics.jsonl");
+        if self.metrics.is_none() {
+            let file = File::options().create(true).append(true).open(&name).map_err(DataError::io(&name, "write"))?;
+            self.metrics = Some(file);
+        }
+        let line = format!("{}\n", serde_json::to_string(&row).expect("a row is JSON"));
+        let file = self.metrics.as_mut().expect("opened above");
+        file.write_all(line.as_bytes()).map_err(DataError::io(&name, "write"))?;
+        let events = self.path.join("events.tfevents");
+        if self.tensorboard.is_none() {
+            self.tensorboard = Some(TfEvents::create(&events).map_err(DataError::io(&events, "write"))?);
+        }
+        let t = self.tensorboard.as_mut().expect("created above");
+        row.to_tensorboard(t).map_err(DataError::io(&events, "write"))?;
+        Ok(())
+    }
+
+    /// Draws PSNR and MSE against steps.
+    pub fn draw_curves(&self) -> Result<()> {
+        let name = self.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let charts = charts(&[(name, read_rows(&self.path))]);
+        atomic::write(&self.path.join("curves.svg"), diorama_data::plot::svg(&charts).as_bytes())?;
+        diorama_data::photo::save_png(&self.path.join("curves.png"), &diorama_data::plot::raster(&charts))?;
+        Ok(())
+    }
+}
+
+/// One line of `metrics.jsonl`.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct Row {
+    pub step: u64,
+    pub seconds: f64,
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub loss: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub mse: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub psnr: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub rays: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub samples: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub rays_per_s: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub val_psnr: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub val_mse: Option<f64>,
+}
+
+impl Row {
+    fn to_tensorboard(&self, t: &mut TfEvents) -> std::io::Result<()> {
+        let tags = [
+            ("train/loss", self.loss),
+            ("train/mse", self.mse),
+            ("train/psnr", self.psnr),
+            ("train/rays_per_s", self.rays_per_s),
+            ("val/psnr", self.val_psnr),
+            ("val/mse", self.val_mse),
+        ];
+        for (tag, value) in tags {
+            if let Some(v) = value {
+                t.scalar(tag, self.step, self.seconds, v as f32)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The metrics of a run, without lines that a crash cut short.
+pub fn read_rows(path: &Path) -> Vec<Row> {
+    let text = std::fs::read_to_string(path.join("metrics.jsonl")).unwrap_or_default();
+    text.lines().filter_map(|l| serde_json::from_str(l).ok()).collect()
+}
+
+/// PSNR and MSE curves of named runs; held-out values where there are any.
+pub fn charts(runs: &[(String, Vec<Row>)]) -> Vec<Chart> {
+    let series = |f: fn(&Row) -> Option<f64>, suffix: &str| -> Vec<Series> {
+        runs.iter()
+            .map(|(name, rows)| Series {
+                name: format!("{name}{suffix}"),
+                points: rows.iter().filter_map(|r| f(r).map(|v| (r.step as f64, v))).collect(),
+            })
+            .filter(|s| !s.points.is_empty())
+            .collect()
+    };
+    let both = |train: fn(&Row) -> Option<f64>, val: fn(&Row) -> Option<f64>| {
+        let mut s = series(train, " train");
+        s.extend(series(val, " held out"));
+        s
+    };
+    vec![
+        Chart { title: "PSNR".into(), x: "step".into(), y: "dB".into(), series: both(|r| r.psnr, |r| r.val_psnr) },
+        Chart { title: "MSE".into(), x: "step".into(), y: "mean squared error".into(), series: both(|r| r.mse, |r| r.val_mse) },
+    ]
+}
+
+/// The configuration of a run.
+pub fn read_config(path: &Path) -> Result<Config> {
+    let file = path.join("config.toml");
+    if !file.exists() {
+        return Err(DataError::input(path, "is not a run folder: it holds no config.toml; give the --out of a training run").into());
+    }
+    let text = error::read(&file, LIMIT)?;
+    let text = String::from_utf8(text).map_err(|_| DataError::input(&file, "is not UTF-8 text"))?;
+    let config = Config::from_toml(&text).map_err(|e| PipelineError::from(DataError::input(&file, e)))?;
+    config.check()?;
+    Ok(config)
+}
+
+fn read_capture(path: &Path) -> Result<Capture> {
+    let file = path.join("capture.json");
+    let bytes = error::read(&file, LIMIT)?;
+    serde_json::from_slice(&bytes).map_err(|e| DataError::input(&file, format!("is damaged: {e}; train again")).into())
+}
+
+/// A trained model, read from its folder.
+pub fn load_model(path: &Path) -> Result<(ObjectModel, Vec<String>)> {
+    let config = read_config(path)?;
+    let capture = read_capture(path)?;
+    let mut model = ObjectModel::new(config, capture, false)?;
+    let folder = path.join("checkpoints");
+    if !checkpoint::latest(&folder).exists() {
+        return Err(DataError::input(path, "holds no checkpoint yet; train it first").into());
+    }
+    let (c, note) = checkpoint::load(&folder)?;
+    model.restore(c, &checkpoint::latest(&folder))?;
+    Ok((model, note.into_iter().collect()))
+}
