@@ -16,6 +16,9 @@ const THRESHOLD: f32 = 0.01;
 /// Density that stands for "no camera sees this": never sampled, never occupied.
 const UNSEEN: f32 = -1.0;
 
+/// Density that stands for "not sampled yet": occupied until it is.
+const UNKNOWN: f32 = f32::MAX;
+
 /// Cells per axis of the blocks in which visibility is decided.
 const SEEN_BLOCK: usize = 8;
 
@@ -33,7 +36,7 @@ pub struct Occupancy {
 impl Occupancy {
     pub fn new(resolution: usize, cascades: usize) -> Self {
         let bits = OccupancyBits::full(resolution, cascades);
-        let density = vec![THRESHOLD / MIN_STEP * 2.0; bits.cells()];
+        let density = vec![UNKNOWN; bits.cells()];
         let live = (0..bits.cells() as u32).collect();
         Occupancy { bits, density, live, decay: 0.8 }
     }
@@ -78,9 +81,14 @@ impl Occupancy {
     }
 
     fn refresh_bits(&mut self) {
-        let live = self.live.len().max(1) as f64;
-        let mean = self.live.iter().map(|&i| self.density[i as usize] as f64).sum::<f64>() / live;
-        let threshold = (THRESHOLD / MIN_STEP).min(mean as f32);
+        let (mut sum, mut known) = (0.0f64, 0usize);
+        for d in &self.density {
+            if *d >= 0.0 && *d != UNKNOWN {
+                sum += *d as f64;
+                known += 1;
+            }
+        }
+        let threshold = (THRESHOLD / MIN_STEP).min((sum / known.max(1) as f64) as f32);
         for (word, cells) in self.bits.bits.iter_mut().zip(self.density.chunks_exact(64)) {
             *word = cells.iter().enumerate().fold(0, |w, (i, d)| w | ((*d > threshold) as u64) << i);
         }
@@ -121,7 +129,9 @@ impl Occupancy {
         for (&cell, &s) in cells.iter().zip(&sigma) {
             for k in 0..block.pow(3) {
                 let d = &mut self.density[cell + k % block + n * (k / block % block) + n * n * (k / block / block)];
-                if *d >= 0.0 {
+                if *d == UNKNOWN {
+                    *d = s;
+                } else if *d >= 0.0 {
                     *d = (*d * self.decay).max(s);
                 }
             }

@@ -172,8 +172,8 @@ impl Config {
         let (rate, rays, steps) = match method {
             Method::Ngp => (1e-2, 0, 6000),
             Method::Nerf => (5e-4, 512, 20_000),
-            Method::Mlp => (1e-3, 1024, 6000),
-            Method::Baseline => (1e-3, 1024, 1000),
+            Method::Mlp => (1e-3, 128, 40_000),
+            Method::Baseline => (1e-3, 256, 4000),
         };
         Config {
             method,
@@ -198,13 +198,13 @@ impl Config {
             },
             sampling: SamplingConfig {
                 rays,
-                batch_samples: 1 << 16,
+                batch_samples: 1 << 15,
                 samples: 64,
                 importance: 128,
                 max_samples: 1024,
                 near: 0.1,
                 occupancy_resolution: 128,
-                occupancy_points: 1 << 16,
+                occupancy_points: 1 << 17,
                 occupancy_every: 16,
                 min_cell_views: 2,
                 error_map: false,

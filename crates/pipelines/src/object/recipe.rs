@@ -210,6 +210,7 @@ impl<'a> Trainer<'a> {
             let (until, block) = OCCUPANCY_WARMUP;
             let rng = Rng::new(m.config.seed, OCCUPANCY);
             grid.update(&m.field, &rng, step, s.occupancy_points, if step <= until { block } else { 1 });
+
         }
         let rays = MarchRays { origins: &b.batch.origins, dirs: &b.batch.dirs, near_far: &b.batch.near_far, jitter: &b.batch.jitter };
         march::cpu::march(&grid.bits, &rays, &grid.march_config(s.max_samples), &mut b.march, &mut b.marched);

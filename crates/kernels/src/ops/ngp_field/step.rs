@@ -11,8 +11,9 @@ use rayon::prelude::*;
 
 /// Samples per block: activations of a 64-wide network stay in L2 with room to spare.
 const BLOCK: usize = 252;
-/// Groups with gradients of their own.
+/// Most groups with gradients of their own, and samples that make another group worth its memory traffic.
 const GROUPS: usize = 16;
+const GROUP_SAMPLES: usize = 2048;
 
 /// What a step reads.
 #[derive(Clone, Copy)]
@@ -118,10 +119,15 @@ pub fn run(
     if loss.is_some() {
         buffers.prepared.update(mlp, input.params);
     }
-    buffers.groups.resize_with(GROUPS, Group::default);
-    let bounds = group_bounds(&input.samples);
+    // By the number of samples alone, so that sums do not depend on threads.
+    let count = (s / GROUP_SAMPLES).clamp(1, GROUPS);
+    if buffers.groups.len() < count {
+        buffers.groups.resize_with(count, Group::default);
+    }
+    let bounds = group_bounds(&input.samples, count);
     let prepared = &buffers.prepared;
-    buffers.groups.par_iter_mut().with_max_len(1).enumerate().for_each(|(g, group)| {
+    let groups = &mut buffers.groups[..count];
+    groups.par_iter_mut().with_max_len(1).enumerate().for_each(|(g, group)| {
         group.loss = 0.0;
         if loss.is_some() {
             group.d_params.clear();
@@ -138,11 +144,11 @@ pub fn run(
             first = last;
         }
     });
-    out.loss = buffers.groups.iter().map(|g| g.loss).sum();
+    out.loss = groups.iter().map(|g| g.loss).sum();
     if loss.is_some() {
         // Parallel over parameters, groups always in order.
         d_params.par_chunks_mut(4096).enumerate().for_each(|(c, d)| {
-            for g in &buffers.groups {
+            for g in groups.iter() {
                 d.iter_mut().zip(&g.d_params[c * 4096..]).for_each(|(d, g)| *d += g);
             }
         });
@@ -150,14 +156,14 @@ pub fn run(
 }
 
 /// Ray boundaries of the groups, with about equal samples in each.
-fn group_bounds(p: &Packed) -> Vec<usize> {
+fn group_bounds(p: &Packed, count: usize) -> Vec<usize> {
     let (r, s) = (p.rays(), p.samples());
-    let mut bounds = vec![0; GROUPS + 1];
-    for g in 1..GROUPS {
-        let target = (s * g / GROUPS) as u32;
+    let mut bounds = vec![0; count + 1];
+    for g in 1..count {
+        let target = (s * g / count) as u32;
         bounds[g] = p.offsets.partition_point(|o| *o < target).min(r).max(bounds[g - 1]);
     }
-    bounds[GROUPS] = r;
+    bounds[count] = r;
     bounds
 }
 
