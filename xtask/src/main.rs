@@ -1,1 +1,80 @@
-fn main(){}
+//! Chores: `cargo xtask ci` and `cargo xtask tidy`.
+
+mod tidy;
+
+use std::process::{Command, ExitCode, Stdio};
+
+fn main() -> ExitCode {
+    let verb = std::env::args().nth(1).unwrap_or_default();
+    let ok = match &verb[..] {
+        "ci" => ci(),
+        "tidy" => step("tidy", tidy::run()),
+        _ => {
+            eprintln!("usage: cargo xtask ci | tidy");
+            false
+        }
+    };
+    if ok { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
+
+fn step(name: &str, ok: bool) -> bool {
+    println!("{} {name}", if ok { "ok    " } else { "FAILED" });
+    ok
+}
+
+fn cargo(args: &[&str]) -> bool {
+    println!("\n$ cargo {}", args.join(" "));
+    Command::new("cargo").args(args).env("RUSTDOCFLAGS", "-D warnings").status().is_ok_and(|s| s.success())
+}
+
+fn installed(tool: &str) -> bool {
+    Command::new("cargo").args([tool, "--version"]).stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
+}
+
+/// Everything that must pass before a change lands.
+fn ci() -> bool {
+    let mut ok = step("tidy", tidy::run());
+    ok &= step("format", cargo(&["fmt", "--all", "--check"]));
+    ok &= step("clippy", cargo(&["clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"]));
+    let (passed, failed, skipped) = tests();
+    ok &= step("tests", failed == 0 && passed > 0);
+    ok &= step("docs", cargo(&["doc", "--release", "--workspace", "--no-deps"]));
+    for (tool, args) in [("deny", &["deny", "check", "licenses", "bans", "sources"][..]), ("typos", &["typos"][..])] {
+        if installed(tool) {
+            ok &= step(tool, cargo(args));
+        } else {
+            println!("skipped {tool}: not installed");
+        }
+    }
+    println!("\n{passed} tests ran, {skipped} skipped for want of data or tools; 0 GPU cases skipped (this build has no GPU kernels)");
+    println!("{passed} passed, {failed} failed, {skipped} skipped");
+    ok
+}
+
+/// Runs the tests and counts results; a test that prints a line `skipped: …` counts as skipped.
+fn tests() -> (usize, usize, usize) {
+    let args = ["test", "--release", "--workspace", "--no-fail-fast", "--", "--show-output"];
+    println!("\n$ cargo {}", args.join(" "));
+    let Ok(out) = Command::new("cargo").args(args).stderr(Stdio::inherit()).output() else { return (0, 1, 0) };
+    let text = String::from_utf8_lossy(&out.stdout);
+    let (mut passed, mut failed, mut skipped) = (0, 0, 0);
+    for line in text.lines() {
+        let shown = line.starts_with("test ") || line.starts_with("skipped:") || line.contains("panicked") || line.starts_with("running");
+        if shown || !out.status.success() {
+            println!("{line}");
+        }
+        skipped += line.starts_with("skipped:") as usize;
+        if let Some(rest) = line.strip_prefix("test result:") {
+            let count = |word: &str| {
+                let at = rest.split(';').find(|p| p.contains(word))?;
+                at.split_whitespace().filter_map(|w| w.parse::<usize>().ok()).next_back()
+            };
+            passed += count("passed").unwrap_or(0);
+            failed += count("failed").unwrap_or(0);
+        }
+    }
+    if !out.status.success() && failed == 0 {
+        failed = 1;
+    }
+    (passed.saturating_sub(skipped), failed, skipped)
+}

@@ -22,6 +22,20 @@ enum Command {
     /// Score held-out views
     #[command(after_help = "Example:\n  diorama eval runs/chair --save-images --json")]
     Eval(EvalArgs),
+    /// Render novel views along a camera path
+    #[command(after_help = "Examples:\n  diorama render runs/chair --video orbit.mp4\n  diorama render runs/chair --path camera_path.json --layers rgb,depth,normal --images frames/")]
+    Render(RenderArgs),
+    /// Extract a mesh
+    #[command(after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --format stl --resolution 384 --faces 100000 -o chair.stl")]
+    Export(ExportArgs),
+    /// Runs side by side: curves, held-out images, cost
+    Compare(CompareArgs),
+    /// Everything at once on a capture that the program generates itself
+    Quickstart(QuickstartArgs),
+    /// What a capture or a run is
+    Info(InfoArgs),
+    /// What this machine offers, and what each missing part disables
+    Doctor(DoctorArgs),
 }
 
 /// Flags of `train`.
@@ -97,6 +111,127 @@ pub struct EvalArgs {
     pub json: bool,
 }
 
+/// Flags of `render`.
+#[derive(Args, Clone, Debug)]
+pub struct RenderArgs {
+    /// Folder of the run
+    pub run: PathBuf,
+    /// orbit, spiral, interpolate, held-out, or a camera_path.json
+    #[arg(long, default_value = "orbit")]
+    pub path: String,
+    #[arg(long, default_value_t = 90)]
+    pub frames: usize,
+    /// WIDTHxHEIGHT [default: that of the run]
+    #[arg(long)]
+    pub size: Option<String>,
+    /// Horizontal field of view in degrees [default: that of the capture]
+    #[arg(long)]
+    pub fov: Option<f64>,
+    /// rgb, depth, normal, opacity
+    #[arg(long, default_value = "rgb", value_delimiter = ',')]
+    pub layers: Vec<String>,
+    /// Folder for PNG sequences [default: RUN/render unless --video is given]
+    #[arg(long)]
+    pub images: Option<PathBuf>,
+    /// MP4 file of the first layer
+    #[arg(long)]
+    pub video: Option<PathBuf>,
+    #[arg(long, default_value_t = 30)]
+    pub fps: u32,
+    /// Show only what lies in x0,y0,z0,x1,y1,z1 (the input's frame)
+    #[arg(long, allow_hyphen_values = true)]
+    pub clip: Option<String>,
+    #[arg(long)]
+    pub threads: Option<usize>,
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Flags of `export`.
+#[derive(Args, Clone, Debug)]
+pub struct ExportArgs {
+    /// Folder of the run
+    pub run: PathBuf,
+    /// glb, obj, ply or stl [default: the extension of --out]
+    #[arg(long)]
+    pub format: Option<String>,
+    /// The file to write
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// Cells along the longest side
+    #[arg(long, default_value_t = 256)]
+    pub resolution: usize,
+    /// auto, or the density of the surface in inverse units of the input
+    #[arg(long, default_value = "auto")]
+    pub level: String,
+    /// Most faces; 0 keeps all
+    #[arg(long, default_value_t = 200_000)]
+    pub faces: usize,
+    /// Extract only x0,y0,z0,x1,y1,z1 (the input's frame) [default: the scene's inner cube]
+    #[arg(long, allow_hyphen_values = true)]
+    pub clip: Option<String>,
+    /// Remove parts with fewer faces than this share of the largest part's
+    #[arg(long, default_value_t = 0.01)]
+    pub floaters: f32,
+    #[arg(long)]
+    pub threads: Option<usize>,
+    /// Replace an existing file
+    #[arg(long)]
+    pub force: bool,
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Flags of `compare`.
+#[derive(Args, Clone, Debug)]
+pub struct CompareArgs {
+    /// Folders of runs
+    #[arg(required = true)]
+    pub runs: Vec<PathBuf>,
+    /// Folder for curves.svg, curves.png, views.png and compare.json
+    #[arg(short, long, default_value = "runs/compare")]
+    pub out: PathBuf,
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Flags of `quickstart`.
+#[derive(Args, Clone, Debug)]
+pub struct QuickstartArgs {
+    /// Folder for everything that is made
+    #[arg(short, long, default_value = "runs/quickstart")]
+    pub out: PathBuf,
+    /// Seconds of training
+    #[arg(long, default_value_t = 90.0)]
+    pub seconds: f64,
+    #[arg(long)]
+    pub threads: Option<usize>,
+    /// Replace an earlier quickstart
+    #[arg(long)]
+    pub force: bool,
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Flags of `info`.
+#[derive(Args, Clone, Debug)]
+pub struct InfoArgs {
+    /// A capture's folder or a run's
+    pub path: PathBuf,
+    /// Format of a capture, where a folder holds several
+    #[arg(long)]
+    pub format: Option<String>,
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Flags of `doctor`.
+#[derive(Args, Clone, Debug)]
+pub struct DoctorArgs {
+    #[arg(long)]
+    pub json: bool,
+}
+
 /// Parses, runs, reports.
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
@@ -109,10 +244,22 @@ pub fn main() -> ExitCode {
     let json = match &cli.command {
         Command::Train(a) => a.json,
         Command::Eval(a) => a.json,
+        Command::Render(a) => a.json,
+        Command::Export(a) => a.json,
+        Command::Compare(a) => a.json,
+        Command::Quickstart(a) => a.json,
+        Command::Info(a) => a.json,
+        Command::Doctor(a) => a.json,
     };
     let result = match cli.command {
         Command::Train(a) => commands::train::run(&a),
         Command::Eval(a) => commands::eval::run(&a),
+        Command::Render(a) => commands::render::run(&a),
+        Command::Export(a) => commands::export::run(&a),
+        Command::Compare(a) => commands::compare::run(&a),
+        Command::Quickstart(a) => commands::quickstart::run(&a),
+        Command::Info(a) => commands::info::run(&a),
+        Command::Doctor(a) => commands::doctor::run(&a),
     };
     ExitCode::from(match result {
         Ok(Outcome::Done) => 0,

@@ -1,1 +1,368 @@
-pub fn find_model(_: &std::path::Path) -> Option<std::path::PathBuf> { None } pub fn read(_: &std::path::Path) -> crate::Result<crate::import::Imported> { todo!() }
+//! COLMAP models: `cameras`, `images` and `points3D`, binary or text; world to camera, quaternion (w, x, y, z).
+
+use crate::error::{self, DataError, Result};
+use crate::import::{Imported, locate};
+use diorama_geom::capture::{ColorSpace, Frame, Split};
+use diorama_geom::glam::DVec3;
+use diorama_geom::transform::rotation_from_quaternion;
+use diorama_geom::{Camera, Capture, Lens, Pose};
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+const LIMIT: u64 = 16 << 30;
+
+/// Names of the camera models by number, with their parameter counts.
+const MODELS: [(&str, usize); 11] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+];
+
+/// One registered image.
+struct Registered {
+    name: String,
+    camera: u32,
+    world_from_camera: Pose,
+}
+
+/// The folder of a model at or below `root`; of several sub-models the one with most images.
+pub fn find_model(root: &Path) -> Option<PathBuf> {
+    let mut candidates = vec![root.to_path_buf()];
+    for base in ["sparse", "colmap/sparse", "colmap"] {
+        let base = root.join(base);
+        candidates.push(base.clone());
+        let mut subs: Vec<PathBuf> = base.read_dir().into_iter().flatten().flatten().map(|e| e.path()).filter(|p| p.is_dir()).collect();
+        subs.sort();
+        candidates.extend(subs);
+    }
+    let size = |p: &Path| ["images.bin", "images.txt"].iter().filter_map(|n| std::fs::metadata(p.join(n)).ok()).map(|m| m.len()).max();
+    let mut best: Option<(u64, PathBuf)> = None;
+    for c in candidates {
+        if let Some(s) = size(&c) {
+            if best.as_ref().is_none_or(|b| s > b.0) {
+                best = Some((s, c));
+            }
+        }
+    }
+    best.map(|b| b.1)
+}
+
+/// Reads the largest model under `root`, whose photographs lie in `root/images` or `root`.
+pub fn read(root: &Path) -> Result<Imported> {
+    let model = find_model(root).ok_or_else(|| DataError::input(root, "holds no COLMAP model (images.bin or images.txt, in sparse/0 for example)"))?;
+    let (cameras, images, file) = if model.join("images.bin").exists() {
+        (read_cameras_bin(&model.join("cameras.bin"))?, read_images_bin(&model.join("images.bin"))?, model.join("images.bin"))
+    } else {
+        (read_cameras_txt(&model.join("cameras.txt"))?, read_images_txt(&model.join("images.txt"))?, model.join("images.txt"))
+    };
+    let mut out = Imported { unknown_up: true, ..Imported::default() };
+    let mut images = images;
+    images.sort_by(|a, b| a.name.cmp(&b.name));
+    for im in images {
+        let camera = *cameras
+            .get(&im.camera)
+            .ok_or_else(|| DataError::input(&file, format!("image {} names camera {}, which the cameras file does not hold", im.name, im.camera)))?;
+        let pose = crate::transforms_json::rigid(im.world_from_camera).map_err(|e| DataError::input(&file, format!("image {}: {e}; run COLMAP again", im.name)))?;
+        let inside = format!("images/{}", im.name);
+        let found = match locate(root, &inside, &file, "name")? {
+            Some(p) => Some(p),
+            None => locate(root, &im.name, &file, "name")?,
+        };
+        let Some(image) = found else {
+            out.missing.push(im.name);
+            continue;
+        };
+        out.frames.push(Frame {
+            name: Path::new(&im.name).with_extension("").to_string_lossy().into_owned(),
+            image,
+            camera,
+            world_from_camera: pose,
+            mask: None,
+            depth: None,
+            time: None,
+            session: None,
+            labels: None,
+            conditioning: Vec::new(),
+            split: Split::Train,
+            color_space: ColorSpace::Srgb,
+        });
+    }
+    Ok(out)
+}
+
+/// A camera from a model's number, size and parameters.
+fn camera(file: &Path, model: usize, width: u64, height: u64, p: &[f64]) -> Result<Camera> {
+    let &(name, n) = MODELS
+        .get(model)
+        .ok_or_else(|| DataError::input(file, format!("camera model {model} is not supported; use one of {}", MODELS.map(|m| m.0).join(", "))))?;
+    if p.len() != n || p.iter().any(|v| !v.is_finite()) || p[0] <= 0.0 {
+        return Err(DataError::input(file, format!("camera model {name} needs {n} finite numbers, the focal length above 0")));
+    }
+    if width == 0 || height == 0 || width > 1 << 20 || height > 1 << 20 {
+        return Err(DataError::input(file, format!("camera size {width}×{height} is not plausible; run COLMAP again")));
+    }
+    let brown = |k: [f64; 6], p: [f64; 2]| Lens::Brown { k, p };
+    let fisheye = |k: [f64; 4]| Lens::Fisheye { k, p: [0.0; 2], s: [0.0; 2] };
+    let shared = matches!(model, 0 | 2 | 3 | 8 | 9);
+    let (fx, fy, cx, cy, rest) = if shared { (p[0], p[0], p[1], p[2], &p[3..]) } else { (p[0], p[1], p[2], p[3], &p[4..]) };
+    let lens = match model {
+        0 | 1 => Lens::Pinhole,
+        2 => brown([rest[0], 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2]),
+        3 => brown([rest[0], rest[1], 0.0, 0.0, 0.0, 0.0], [0.0; 2]),
+        4 => brown([rest[0], rest[1], 0.0, 0.0, 0.0, 0.0], [rest[2], rest[3]]),
+        5 => fisheye([rest[0], rest[1], rest[2], rest[3]]),
+        6 => brown([rest[0], rest[1], rest[4], rest[5], rest[6], rest[7]], [rest[2], rest[3]]),
+        7 => Lens::Fov { omega: rest[0] },
+        8 => fisheye([rest[0], 0.0, 0.0, 0.0]),
+        9 => fisheye([rest[0], rest[1], 0.0, 0.0]),
+        _ => Lens::Fisheye { k: [rest[0], rest[1], rest[4], rest[5]], p: [rest[2], rest[3]], s: [rest[6], rest[7]] },
+    };
+    Ok(Camera { width: width as u32, height: height as u32, fx, fy, cx, cy, lens })
+}
+
+fn pose(q: [f64; 4], t: [f64; 3]) -> Pose {
+    Pose { rotation: rotation_from_quaternion(q), translation: DVec3::from_array(t) }.inverse()
+}
+
+/// A cursor over bytes that names the file when they end too early.
+struct Bytes<'a> {
+    file: &'a Path,
+    data: &'a [u8],
+}
+
+impl<'a> Bytes<'a> {
+    fn take(&mut self, n: usize) -> Result<&'a [u8]> {
+        if self.data.len() < n {
+            return Err(DataError::input(self.file, "ends too early; copy it again or run COLMAP again"));
+        }
+        let (head, tail) = self.data.split_at(n);
+        self.data = tail;
+        Ok(head)
+    }
+
+    fn u32(&mut self) -> Result<u32> {
+        Ok(u32::from_le_bytes(self.take(4)?.try_into().expect("four bytes")))
+    }
+
+    fn u64(&mut self) -> Result<u64> {
+        Ok(u64::from_le_bytes(self.take(8)?.try_into().expect("eight bytes")))
+    }
+
+    fn f64(&mut self) -> Result<f64> {
+        Ok(f64::from_le_bytes(self.take(8)?.try_into().expect("eight bytes")))
+    }
+}
+
+fn read_cameras_bin(file: &Path) -> Result<HashMap<u32, Camera>> {
+    let data = error::read(file, LIMIT)?;
+    let mut b = Bytes { file, data: &data };
+    let n = b.u64()?;
+    let mut out = HashMap::new();
+    for _ in 0..n {
+        let (id, model, w, h) = (b.u32()?, b.u32()? as usize, b.u64()?, b.u64()?);
+        let count = MODELS.get(model).map_or(0, |m| m.1);
+        let params = (0..count).map(|_| b.f64()).collect::<Result<Vec<f64>>>()?;
+        out.insert(id, camera(file, model, w, h, &params)?);
+    }
+    Ok(out)
+}
+
+fn read_images_bin(file: &Path) -> Result<Vec<Registered>> {
+    let data = error::read(file, LIMIT)?;
+    let mut b = Bytes { file, data: &data };
+    let n = b.u64()?;
+    let mut out = Vec::new();
+    for _ in 0..n {
+        b.u32()?;
+        let mut v = [0.0; 7];
+        for x in &mut v {
+            *x = b.f64()?;
+        }
+        let camera = b.u32()?;
+        let end = b.data.iter().position(|c| *c == 0).ok_or_else(|| DataError::input(file, "ends inside an image name"))?;
+        let name = String::from_utf8_lossy(b.take(end)?).into_owned();
+        b.take(1)?;
+        let points = b.u64()?;
+        let bytes = usize::try_from(points).ok().and_then(|p| p.checked_mul(24)).unwrap_or(usize::MAX);
+        b.take(bytes)?;
+        out.push(Registered { name, camera, world_from_camera: pose([v[0], v[1], v[2], v[3]], [v[4], v[5], v[6]]) });
+    }
+    Ok(out)
+}
+
+fn text(file: &Path) -> Result<String> {
+    String::from_utf8(error::read(file, LIMIT)?).map_err(|_| DataError::input(file, "is not UTF-8 text"))
+}
+
+fn malformed(file: &Path, line: usize, what: &str) -> DataError {
+    DataError::input(file, format!("line {}: {what}", line + 1))
+}
+
+fn read_cameras_txt(file: &Path) -> Result<HashMap<u32, Camera>> {
+    let mut out = HashMap::new();
+    for (i, line) in text(file)?.lines().enumerate() {
+        if line.starts_with('#') || line.trim().is_empty() {
+            continue;
+        }
+        let f: Vec<&str> = line.split_whitespace().collect();
+        let expected = "expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS";
+        if f.len() < 5 {
+            return Err(malformed(file, i, expected));
+        }
+        let model = MODELS.iter().position(|m| m.0 == f[1]).ok_or_else(|| {
+            malformed(file, i, &format!("camera model {} is not supported; use one of {}", f[1], MODELS.map(|m| m.0).join(", ")))
+        })?;
+        let number = |s: &str| s.parse::<f64>().map_err(|_| malformed(file, i, expected));
+        let params = f[4..].iter().map(|s| number(s)).collect::<Result<Vec<f64>>>()?;
+        out.insert(number(f[0])? as u32, camera(file, model, number(f[2])? as u64, number(f[3])? as u64, &params)?);
+    }
+    Ok(out)
+}
+
+fn read_images_txt(file: &Path) -> Result<Vec<Registered>> {
+    let mut out = Vec::new();
+    let all = text(file)?;
+    let mut lines = all.lines().enumerate().filter(|(_, l)| !l.starts_with('#'));
+    while let Some((i, line)) = lines.next() {
+        if line.trim().is_empty() {
+            continue;
+        }
+        let f: Vec<&str> = line.split_whitespace().collect();
+        let expected = "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME";
+        if f.len() < 10 {
+            return Err(malformed(file, i, expected));
+        }
+        let v = f[1..9].iter().map(|s| s.parse::<f64>().map_err(|_| malformed(file, i, expected))).collect::<Result<Vec<f64>>>()?;
+        out.push(Registered {
+            name: f[9..].join(" "),
+            camera: v[7] as u32,
+            world_from_camera: pose([v[0], v[1], v[2], v[3]], [v[4], v[5], v[6]]),
+        });
+        // The line of 2D points, which may be empty.
+        lines.next();
+    }
+    Ok(out)
+}
+
+/// Writes a capture as a text model: `cameras.txt`, `images.txt`, an empty `points3D.txt`.
+pub fn write_text(folder: &Path, capture: &Capture) -> Result<()> {
+    std::fs::create_dir_all(folder).map_err(DataError::io(folder, "create"))?;
+    let to_capture = capture.world_from_capture.inverse();
+    let (mut cameras, mut images) = (String::new(), String::new());
+    for (i, f) in capture.frames.iter().enumerate() {
+        let c = &f.camera;
+        let (model, params) = model_of(c);
+        let numbers: Vec<String> = params.iter().map(|p| format!("{p:?}")).collect();
+        cameras += &format!("{} {} {} {} {}\n", i + 1, MODELS[model].0, c.width, c.height, numbers.join(" "));
+        let p = to_capture.pose(&f.world_from_camera).inverse();
+        let q = diorama_geom::glam::DQuat::from_mat3(&p.rotation);
+        let t = p.translation;
+        let name = f.image.file_name().unwrap_or_default().to_string_lossy();
+        images += &format!("{} {:?} {:?} {:?} {:?} {:?} {:?} {:?} {} {name}\n\n", i + 1, q.w, q.x, q.y, q.z, t.x, t.y, t.z, i + 1);
+    }
+    crate::atomic::write(&folder.join("cameras.txt"), cameras.as_bytes())?;
+    crate::atomic::write(&folder.join("images.txt"), images.as_bytes())?;
+    crate::atomic::write(&folder.join("points3D.txt"), b"")
+}
+
+/// Number and parameters of the model that describes a camera.
+fn model_of(c: &Camera) -> (usize, Vec<f64>) {
+    let mut p = vec![c.fx, c.fy, c.cx, c.cy];
+    let model = match c.lens {
+        Lens::Pinhole | Lens::Equirectangular => 1,
+        Lens::Brown { k, p: t } => {
+            p.extend([k[0], k[1], t[0], t[1], k[2], k[3], k[4], k[5]]);
+            6
+        }
+        Lens::Fov { omega } => {
+            p.push(omega);
+            7
+        }
+        Lens::Fisheye { k, p: t, s } => {
+            p.extend([k[0], k[1], t[0], t[1], k[2], k[3], s[0], s[1]]);
+            10
+        }
+    };
+    (model, p)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn binary(dir: &Path, model: u32, params: &[f64], names: &[&str]) {
+        let mut cameras = 1u64.to_le_bytes().to_vec();
+        cameras.extend(7u32.to_le_bytes());
+        cameras.extend(model.to_le_bytes());
+        cameras.extend(64u64.to_le_bytes());
+        cameras.extend(48u64.to_le_bytes());
+        params.iter().for_each(|p| cameras.extend(p.to_le_bytes()));
+        let mut images = (names.len() as u64).to_le_bytes().to_vec();
+        for (i, n) in names.iter().enumerate() {
+            images.extend((i as u32 + 1).to_le_bytes());
+            // 90° about y, centre at (i, 2, 3): t = −R c.
+            let h = std::f64::consts::FRAC_1_SQRT_2;
+            let r = rotation_from_quaternion([h, 0.0, h, 0.0]);
+            let t = -(r * DVec3::new(i as f64, 2.0, 3.0));
+            for v in [h, 0.0, h, 0.0, t.x, t.y, t.z] {
+                images.extend(v.to_le_bytes());
+            }
+            images.extend(7u32.to_le_bytes());
+            images.extend(n.as_bytes());
+            images.push(0);
+            images.extend(1u64.to_le_bytes());
+            images.extend([0u8; 24]);
+        }
+        let sparse = dir.join("sparse/0");
+        std::fs::create_dir_all(&sparse).unwrap();
+        std::fs::create_dir_all(dir.join("images")).unwrap();
+        std::fs::write(sparse.join("cameras.bin"), cameras).unwrap();
+        std::fs::write(sparse.join("images.bin"), images).unwrap();
+        names.iter().for_each(|n| std::fs::write(dir.join("images").join(n), b"x").unwrap());
+    }
+
+    #[test]
+    fn binary_models_give_camera_centres_and_axes() {
+        let dir = tempfile::tempdir().unwrap();
+        binary(dir.path(), 4, &[50.0, 51.0, 32.0, 24.0, 0.1, 0.2, 0.3, 0.4], &["b.jpg", "a b.jpg"]);
+        let got = read(dir.path()).unwrap();
+        assert_eq!(got.frames[0].name, "a b");
+        assert!((got.frames[0].world_from_camera.translation - DVec3::new(1.0, 2.0, 3.0)).length() < 1e-9);
+        assert!((got.frames[0].world_from_camera.rotation.z_axis - DVec3::new(-1.0, 0.0, 0.0)).length() < 1e-9);
+        assert_eq!(got.frames[0].camera.lens, Lens::Brown { k: [0.1, 0.2, 0.0, 0.0, 0.0, 0.0], p: [0.3, 0.4] });
+    }
+
+    #[test]
+    fn every_camera_model_is_read() {
+        for (i, (_, n)) in MODELS.iter().enumerate() {
+            let dir = tempfile::tempdir().unwrap();
+            let params: Vec<f64> = (0..*n).map(|k| if k < 4 { 40.0 } else { 0.01 * k as f64 }).collect();
+            binary(dir.path(), i as u32, &params, &["a.jpg"]);
+            let c = read(dir.path()).unwrap().frames[0].camera;
+            let d = c.direction(50.0, 30.0);
+            assert!((c.project(d).unwrap() - diorama_geom::glam::DVec2::new(50.0, 30.0)).length() < 1e-4, "{}", MODELS[i].0);
+        }
+    }
+
+    #[test]
+    fn truncated_files_and_unknown_models_are_named() {
+        let dir = tempfile::tempdir().unwrap();
+        binary(dir.path(), 1, &[50.0, 51.0, 32.0, 24.0], &["a.jpg"]);
+        let file = dir.path().join("sparse/0/images.bin");
+        let good = std::fs::read(&file).unwrap();
+        for n in [3, 20, good.len() - 30, good.len() - 1] {
+            std::fs::write(&file, &good[..n]).unwrap();
+            assert!(read(dir.path()).unwrap_err().is_input());
+        }
+        binary(dir.path(), 99, &[], &["a.jpg"]);
+        assert!(read(dir.path()).unwrap_err().to_string().contains("not supported"));
+    }
+}

@@ -1,0 +1,116 @@
+//! Binary glTF 2.0 with vertex colours and an unlit material. glTF is y up: (x, y, z) is written as
+//! (x, z, −y). COLOR_0 is linear by the standard.
+
+use crate::atomic;
+use crate::error::{DataError, Result};
+use diorama_geom::Mesh;
+use diorama_geom::color::linear_from_srgb;
+use serde_json::json;
+use std::path::Path;
+
+fn y_up(p: [f32; 3]) -> [f32; 3] {
+    [p[0], p[2], -p[1]]
+}
+
+/// The file's bytes.
+///
+/// # Errors
+/// When the mesh is empty, since glTF has no empty accessors.
+pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
+    if mesh.faces.is_empty() {
+        return Err(DataError::input(path, "the mesh is empty: nothing is denser than the level; lower --level or train longer"));
+    }
+    let n = mesh.positions.len();
+    let mut bin: Vec<u8> = Vec::new();
+    let mut views = Vec::new();
+    let mut accessors = Vec::new();
+    let mut add = |data: Vec<u8>, target: u32, mut accessor: serde_json::Value| -> usize {
+        let offset = bin.len();
+        views.push(json!({ "buffer": 0, "byteOffset": offset, "byteLength": data.len(), "target": target }));
+        bin.extend(data);
+        bin.resize(bin.len().next_multiple_of(4), 0);
+        accessor["bufferView"] = (views.len() - 1).into();
+        accessors.push(accessor);
+        accessors.len() - 1
+    };
+    let floats = |v: &mut dyn Iterator<Item = [f32; 3]>| v.flat_map(|p| p.map(f32::to_le_bytes)).flatten().collect::<Vec<u8>>();
+    let turned: Vec<[f32; 3]> = mesh.positions.iter().map(|p| y_up(*p)).collect();
+    let (lo, hi) = turned.iter().fold(([f32::MAX; 3], [f32::MIN; 3]), |(lo, hi), p| {
+        (std::array::from_fn(|k| lo[k].min(p[k])), std::array::from_fn(|k| hi[k].max(p[k])))
+    });
+    let mut attributes = json!({});
+    attributes["POSITION"] =
+        add(floats(&mut turned.iter().copied()), 34962, json!({ "componentType": 5126, "count": n, "type": "VEC3", "min": lo, "max": hi })).into();
+    if mesh.normals.len() == n {
+        let data = floats(&mut mesh.normals.iter().map(|v| y_up(*v)));
+        attributes["NORMAL"] = add(data, 34962, json!({ "componentType": 5126, "count": n, "type": "VEC3" })).into();
+    }
+    if mesh.colors_srgb.len() == n {
+        let word = |v: f32| ((linear_from_srgb(v.clamp(0.0, 1.0)) * 65535.0 + 0.5) as u16).to_le_bytes();
+        let data = mesh.colors_srgb.iter().flat_map(|c| [word(c[0]), word(c[1]), word(c[2]), [255, 255]]).flatten().collect();
+        attributes["COLOR_0"] = add(data, 34962, json!({ "componentType": 5123, "count": n, "type": "VEC4", "normalized": true })).into();
+    }
+    let indices = mesh.faces.iter().flatten().flat_map(|i| i.to_le_bytes()).collect();
+    let indices = add(indices, 34963, json!({ "componentType": 5125, "count": mesh.faces.len() * 3, "type": "SCALAR" }));
+    let root = json!({
+        "asset": { "version": "2.0", "generator": concat!("diorama ", env!("CARGO_PKG_VERSION")) },
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{ "nodes": [0] }],
+        "nodes": [{ "mesh": 0, "name": "mesh" }],
+        "meshes": [{ "primitives": [{ "attributes": attributes, "indices": indices, "material": 0 }] }],
+        "materials": [{
+            "name": "radiance",
+            "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 1.0 },
+            "extensions": { "KHR_materials_unlit": {} },
+        }],
+        "buffers": [{ "byteLength": bin.len() }],
+        "bufferViews": views,
+        "accessors": accessors,
+    });
+    let mut text = serde_json::to_vec(&root).expect("JSON of plain values");
+    text.resize(text.len().next_multiple_of(4), b' ');
+    let total = 12 + 8 + text.len() + 8 + bin.len();
+    let total = u32::try_from(total).map_err(|_| DataError::input(path, "the mesh exceeds 4 GiB, the limit of .glb; lower --faces"))?;
+    let mut out = b"glTF".to_vec();
+    out.extend(2u32.to_le_bytes());
+    out.extend(total.to_le_bytes());
+    for (kind, chunk) in [(b"JSON", &text), (b"BIN\0", &bin)] {
+        out.extend((chunk.len() as u32).to_le_bytes());
+        out.extend(kind);
+        out.extend(chunk);
+    }
+    Ok(out)
+}
+
+/// Writes a `.glb` atomically.
+pub fn save(path: &Path, mesh: &Mesh) -> Result<()> {
+    atomic::write(path, &encode(mesh, path)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn chunks_are_aligned_and_the_axes_turned() {
+        let mesh = Mesh {
+            positions: vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 3.0]],
+            normals: vec![[0.0, 0.0, 1.0]; 3],
+            colors_srgb: vec![[1.0, 0.5, 0.0]; 3],
+            faces: vec![[0, 1, 2]],
+        };
+        let b = encode(&mesh, Path::new("x")).unwrap();
+        assert_eq!(b.len() % 4, 0);
+        assert_eq!(u32::from_le_bytes(b[8..12].try_into().unwrap()) as usize, b.len());
+        let n = u32::from_le_bytes(b[12..16].try_into().unwrap()) as usize;
+        let root: serde_json::Value = serde_json::from_slice(&b[20..20 + n]).unwrap();
+        assert_eq!(root["accessors"][0]["max"], json!([1.0, 3.0, 0.0]));
+        assert_eq!(root["accessors"][0]["min"], json!([0.0, 0.0, -2.0]));
+    }
+
+    #[test]
+    fn an_empty_mesh_is_an_error_with_a_cure() {
+        assert!(encode(&Mesh::default(), Path::new("x.glb")).unwrap_err().to_string().contains("--level"));
+    }
+}

@@ -1,1 +1,6 @@
+//! From a field to a mesh: extraction in bounded blocks, cleaning, simplification, colours.
 
+pub mod clean;
+pub mod color;
+pub mod extract;
+pub mod simplify;

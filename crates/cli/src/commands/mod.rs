@@ -1,6 +1,12 @@
 //! One file per verb.
 
+pub mod compare;
+pub mod doctor;
 pub mod eval;
+pub mod export;
+pub mod info;
+pub mod quickstart;
+pub mod render;
 pub mod train;
 
 use diorama_pipelines::{PipelineError, Result};
@@ -36,4 +42,24 @@ pub fn use_threads(threads: Option<usize>) -> Result<()> {
         let _ = rayon::ThreadPoolBuilder::new().num_threads(n).build_global();
     }
     Ok(())
+}
+
+/// Six numbers `x0,y0,z0,x1,y1,z1` in the input's frame, as a box in the world.
+pub fn parse_clip(text: &str, world_from_capture: &diorama_geom::Similarity) -> Result<([f32; 3], [f32; 3])> {
+    let bad = || PipelineError::Usage(format!("--clip {text}: expected x0,y0,z0,x1,y1,z1 with each second corner above the first"));
+    let v: Vec<f64> = text.split(',').map(|s| s.trim().parse().map_err(|_| bad())).collect::<Result<_>>()?;
+    if v.len() != 6 || v.iter().any(|x| !x.is_finite()) || (0..3).any(|k| v[k] >= v[k + 3]) {
+        return Err(bad());
+    }
+    // The box that holds all eight turned corners.
+    let (mut lo, mut hi) = ([f32::MAX; 3], [f32::MIN; 3]);
+    for c in 0..8 {
+        let corner: [f64; 3] = std::array::from_fn(|k| v[k + 3 * (c >> k & 1)]);
+        let p = world_from_capture.point(diorama_geom::glam::DVec3::from_array(corner)).as_vec3().to_array();
+        for k in 0..3 {
+            lo[k] = lo[k].min(p[k]);
+            hi[k] = hi[k].max(p[k]);
+        }
+    }
+    Ok((lo, hi))
 }

@@ -17,3 +17,5 @@ pub mod sample_pdf;
 pub mod scan;
 pub mod spherical_harmonics;
 pub mod ssim;
+pub mod triangle_wave;
+pub mod trilinear_corner_grid;

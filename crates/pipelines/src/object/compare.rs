@@ -1,1 +1,91 @@
+//! Runs side by side: curves, held-out images, cost.
 
+use super::evaluate;
+use super::run_folder::{charts, load_model, read_rows};
+use crate::error::Result;
+use diorama_data::{DataError, atomic, photo, plot};
+use diorama_geom::ImageU8;
+use diorama_geom::capture::Split;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// One run's line.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Compared {
+    pub run: PathBuf,
+    pub method: String,
+    pub steps: u64,
+    pub seconds: f64,
+    pub rays: u64,
+    pub samples: u64,
+    pub parameters: usize,
+    pub psnr: f64,
+    pub ssim: f64,
+    pub mse: f64,
+}
+
+/// Scores every run, and writes `curves.svg`, `curves.png` and `views.png` (photograph, then each run)
+/// into `out`.
+pub fn compare(runs: &[PathBuf], out: &Path, note: &mut dyn FnMut(&str)) -> Result<Vec<Compared>> {
+    std::fs::create_dir_all(out).map_err(DataError::io(out, "create"))?;
+    let mut table = Vec::new();
+    let mut strips: Vec<Vec<ImageU8>> = Vec::new();
+    for run in runs {
+        note(&format!("judging {}", run.display()));
+        let (model, _) = load_model(run)?;
+        let mut views = Vec::new();
+        let mut photos = Vec::new();
+        let report = evaluate::evaluate(&model, Split::Test, &mut |_, v| {
+            if views.len() < 4 {
+                views.push(v.view.rgb.to_u8());
+                photos.push(v.photo.to_u8());
+            }
+            Ok(())
+        })?;
+        if strips.is_empty() {
+            strips.push(photos);
+        }
+        strips.push(views);
+        table.push(Compared {
+            run: run.clone(),
+            method: model.config.method.to_string(),
+            steps: model.origin.step,
+            seconds: model.origin.seconds,
+            rays: model.origin.rays,
+            samples: model.origin.samples,
+            parameters: model.field.groups().iter().chain(model.coarse.iter().flat_map(|c| c.groups()).collect::<Vec<_>>().iter()).map(|g| g.values.len()).sum(),
+            psnr: report.psnr,
+            ssim: report.ssim,
+            mse: report.mse,
+        });
+    }
+    let named: Vec<_> = runs.iter().map(|r| (r.file_name().unwrap_or_default().to_string_lossy().into_owned(), read_rows(r))).collect();
+    let charts = charts(&named);
+    atomic::write(&out.join("curves.svg"), plot::svg(&charts).as_bytes())?;
+    photo::save_png(&out.join("curves.png"), &plot::raster(&charts))?;
+    photo::save_png(&out.join("views.png"), &tile(&strips))?;
+    let json = serde_json::to_vec_pretty(&table).expect("a table is JSON");
+    atomic::write(&out.join("compare.json"), &json)?;
+    Ok(table)
+}
+
+/// Rows of images, each scaled by its own size, left-aligned on white.
+pub fn tile(rows: &[Vec<ImageU8>]) -> ImageU8 {
+    let width = rows.iter().map(|r| r.iter().map(|i| i.width + 4).sum::<usize>()).max().unwrap_or(1).max(1);
+    let heights: Vec<usize> = rows.iter().map(|r| r.iter().map(|i| i.height + 4).max().unwrap_or(0)).collect();
+    let height = heights.iter().sum::<usize>().max(1);
+    let mut out = ImageU8 { width, height, channels: 3, data: vec![255; width * height * 3] };
+    let mut y0 = 0;
+    for (row, h) in rows.iter().zip(heights) {
+        let mut x0 = 0;
+        for im in row {
+            for y in 0..im.height {
+                let at = ((y0 + y) * width + x0) * 3;
+                out.data[at..at + im.width * 3].copy_from_slice(&im.data[y * im.width * 3..(y + 1) * im.width * 3]);
+            }
+            x0 += im.width + 4;
+        }
+        y0 += h;
+    }
+    out
+}

@@ -1,1 +1,121 @@
+//! Everything at once on a capture that the project generates itself.
 
+use super::config::{Config, Method};
+use super::evaluate::{self, Report};
+use super::export::{self, ExportOptions, Exported, Format};
+use super::recipe;
+use super::render::{self, Layer, PathKind, RenderOptions};
+use super::report;
+use super::run_folder::RunFolder;
+use crate::error::Result;
+use diorama_data::{DataError, photo, transforms_json};
+use diorama_engine::train::{Event, Summary};
+use diorama_geom::capture::{ColorSpace, Frame, Split};
+use diorama_geom::{Capture, ImageU8, Similarity};
+use diorama_scenes::still_life;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+/// What the quickstart made.
+#[derive(Clone, Debug, Serialize)]
+pub struct Made {
+    pub folder: PathBuf,
+    pub psnr: f64,
+    pub ssim: f64,
+    pub train_seconds: f64,
+    pub steps: u64,
+    pub mesh: Exported,
+    pub video: PathBuf,
+    pub report: PathBuf,
+    pub interrupted: bool,
+}
+
+/// Writes the still life as a capture with `transforms.json` into `folder`.
+pub fn write_capture(folder: &Path) -> Result<()> {
+    let images = folder.join("images");
+    std::fs::create_dir_all(&images).map_err(DataError::io(&images, "create"))?;
+    let mut frames = Vec::new();
+    for (i, p) in still_life::photographs().into_iter().enumerate() {
+        let image = images.join(format!("{}.png", p.name));
+        photo::save_png(&image, &p.image)?;
+        frames.push(Frame {
+            name: p.name,
+            image,
+            camera: p.camera,
+            world_from_camera: p.world_from_camera,
+            mask: None,
+            depth: None,
+            time: None,
+            session: None,
+            labels: None,
+            conditioning: Vec::new(),
+            split: if i % 8 == 0 { Split::Test } else { Split::Train },
+            color_space: ColorSpace::Srgb,
+        });
+    }
+    let capture = Capture { frames, world_from_capture: Similarity::IDENTITY, scene: still_life::scene_box(), notes: Vec::new() };
+    Ok(transforms_json::write(&folder.join("transforms.json"), folder, &capture)?)
+}
+
+/// Generates, trains, scores, films, exports and reports, all into `folder`.
+pub fn quickstart(
+    folder: &Path, seconds: f64, force: bool, interrupt: &AtomicBool, note: &mut dyn FnMut(&str), events: &mut dyn FnMut(&Event),
+) -> Result<Made> {
+    let mut run = RunFolder::create(folder, force)?;
+    note("rendering the still life");
+    let data = folder.join("capture");
+    write_capture(&data)?;
+    let mut config = Config::new(Method::Ngp, data);
+    config.run.steps = 0;
+    config.run.seconds = seconds;
+    config.run.log_every = 20;
+    // A small scene: a smaller table is as sharp and trains faster.
+    config.field.log2_size = 17;
+    config.field.finest = 512;
+    let (model, summary) = recipe::train(&config, &mut run, false, interrupt, events)?;
+    note("scoring held-out views");
+    let mut pairs: Vec<Vec<ImageU8>> = vec![Vec::new(), Vec::new()];
+    let scores = evaluate::evaluate(&model, Split::Test, &mut |_, v| {
+        if pairs[0].len() < 4 {
+            pairs[0].push(v.photo.to_u8());
+            pairs[1].push(v.view.rgb.to_u8());
+        }
+        Ok(())
+    })?;
+    photo::save_png(&folder.join("held_out.png"), &super::compare::tile(&pairs))?;
+    note("filming a turntable");
+    let video = folder.join("turntable.mp4");
+    let options = RenderOptions {
+        path: PathKind::Orbit,
+        frames: 60,
+        size: None,
+        fov: None,
+        layers: vec![Layer::Rgb],
+        images: None,
+        video: Some(video.clone()),
+        fps: 20,
+        clip: None,
+    };
+    render::render(&model, &options, interrupt, &mut |_, _| {})?;
+    note("extracting the mesh");
+    let options = ExportOptions { format: Format::Glb, out: folder.join("still_life.glb"), resolution: 192, level: None, faces: 60_000, clip: None, floaters: 0.05 };
+    let mesh = export::export(&model, &options, &mut |_, _| {})?;
+    let page = folder.join("report.html");
+    report::write(&page, &summary, &scores, &mesh)?;
+    Ok(made(folder, summary, scores, mesh, video, page))
+}
+
+fn made(folder: &Path, summary: Summary, scores: Report, mesh: Exported, video: PathBuf, report: PathBuf) -> Made {
+    Made {
+        folder: folder.to_path_buf(),
+        psnr: scores.psnr,
+        ssim: scores.ssim,
+        train_seconds: summary.seconds,
+        steps: summary.step,
+        mesh,
+        video,
+        report,
+        interrupted: summary.interrupted,
+    }
+}

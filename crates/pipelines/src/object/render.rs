@@ -1,1 +1,229 @@
+//! Novel views: camera paths, layers, image sequences and video.
 
+use super::model::ObjectModel;
+use crate::error::{PipelineError, Result};
+use diorama_data::camera_path_json::{self, CameraPath};
+use diorama_data::mp4::Video;
+use diorama_data::{DataError, photo};
+use diorama_engine::renderers::volume::View;
+use diorama_geom::camera_path::{self, PathView};
+use diorama_geom::capture::focus_point;
+use diorama_geom::glam::DVec3;
+use diorama_geom::{Camera, Image, Pose};
+use diorama_kernels::ops::ray_generation::PosedCamera;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Where the camera goes.
+#[derive(Clone, Debug, PartialEq)]
+pub enum PathKind {
+    Orbit,
+    Spiral,
+    Interpolate,
+    /// nerfstudio's `camera_path.json`.
+    File(PathBuf),
+    /// The held-out cameras themselves.
+    HeldOut,
+}
+
+impl std::str::FromStr for PathKind {
+    type Err = String;
+
+    fn from_str(s: &str) -> std::result::Result<Self, String> {
+        match s {
+            "orbit" => Ok(PathKind::Orbit),
+            "spiral" => Ok(PathKind::Spiral),
+            "interpolate" => Ok(PathKind::Interpolate),
+            "held-out" => Ok(PathKind::HeldOut),
+            f if f.ends_with(".json") => Ok(PathKind::File(f.into())),
+            _ => Err(format!("path {s:?}: expected orbit, spiral, interpolate, held-out or a camera_path.json")),
+        }
+    }
+}
+
+/// An image layer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Layer {
+    Rgb,
+    Depth,
+    Normal,
+    Opacity,
+}
+
+impl std::str::FromStr for Layer {
+    type Err = String;
+
+    fn from_str(s: &str) -> std::result::Result<Self, String> {
+        match s {
+            "rgb" => Ok(Layer::Rgb),
+            "depth" => Ok(Layer::Depth),
+            "normal" => Ok(Layer::Normal),
+            "opacity" => Ok(Layer::Opacity),
+            _ => Err(format!("layer {s:?}: expected rgb, depth, normal or opacity")),
+        }
+    }
+}
+
+/// What to render and where to put it.
+#[derive(Clone, Debug)]
+pub struct RenderOptions {
+    pub path: PathKind,
+    pub frames: usize,
+    /// Width and height; none: those of the run.
+    pub size: Option<(u32, u32)>,
+    /// Horizontal field of view in radians; none: that of the capture.
+    pub fov: Option<f64>,
+    pub layers: Vec<Layer>,
+    /// Folder for PNG sequences, if any.
+    pub images: Option<PathBuf>,
+    /// MP4 of the first layer, if any.
+    pub video: Option<PathBuf>,
+    pub fps: u32,
+    /// Only what lies in this box (world) is shown.
+    pub clip: Option<([f32; 3], [f32; 3])>,
+}
+
+/// The views of a path in the world.
+pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> {
+    let frames = &model.capture.frames;
+    let poses: Vec<Pose> = model.train.iter().map(|&i| frames[i].world_from_camera).collect();
+    let (center, _) = focus_point(&poses);
+    let base = frames[model.train[0]].camera.downscaled(model.config.data.downscale);
+    let camera = view_camera(&base, o.size, o.fov);
+    let n = o.frames.max(1);
+    let views = |poses: Vec<Pose>| poses.into_iter().map(|p| PathView { camera, world_from_camera: p }).collect();
+    let up = DVec3::Z;
+    Ok(match &o.path {
+        PathKind::Orbit => CameraPath { views: views(camera_path::orbit(&poses, center, up, n)), fps: o.fps as f64 },
+        PathKind::Spiral => CameraPath { views: views(camera_path::spiral(&poses, center, up, n)), fps: o.fps as f64 },
+        PathKind::Interpolate => CameraPath { views: views(camera_path::interpolate(&poses, n)), fps: o.fps as f64 },
+        PathKind::File(f) => camera_path_json::read(f, &model.capture.world_from_capture)?,
+        PathKind::HeldOut => {
+            let held = super::evaluate::held_out(&model.capture, diorama_geom::capture::Split::Test);
+            if held.is_empty() {
+                return Err(PipelineError::Usage("the run holds no views out; choose another --path".into()));
+            }
+            let views = held.iter().map(|&i| PathView { camera: model.posed(i).camera, world_from_camera: frames[i].world_from_camera }).collect();
+            CameraPath { views, fps: o.fps as f64 }
+        }
+    })
+}
+
+/// The capture's camera without distortion, at another size and field of view.
+fn view_camera(base: &Camera, size: Option<(u32, u32)>, fov: Option<f64>) -> Camera {
+    let (w, h) = size.unwrap_or((base.width, base.height));
+    let fov = fov.unwrap_or(2.0 * (0.5 * base.width as f64 / base.fx).atan());
+    Camera::pinhole(w, h, fov)
+}
+
+/// Renders a path; returns the number of frames and whether it was interrupted. `progress` is told (frame, of).
+pub fn render(model: &ObjectModel, o: &RenderOptions, interrupt: &AtomicBool, progress: &mut dyn FnMut(usize, usize)) -> Result<(usize, bool)> {
+    let path = path_views(model, o)?;
+    if let Some(folder) = &o.images {
+        std::fs::create_dir_all(folder).map_err(DataError::io(folder, "create"))?;
+    }
+    let mut video = match (&o.video, path.views.first()) {
+        (Some(file), Some(v)) => Some(Video::create(file, v.camera.width as usize, v.camera.height as usize, path.fps.round().max(1.0) as u32)?),
+        _ => None,
+    };
+    let total = path.views.len();
+    for (i, v) in path.views.iter().enumerate() {
+        if interrupt.load(Ordering::Relaxed) {
+            return Ok((i, true));
+        }
+        let posed = model.to_model(v.camera, &v.world_from_camera);
+        let view = trace(model, &posed, o.clip);
+        for (k, layer) in o.layers.iter().enumerate() {
+            let image = draw_layer(model, &posed, &view, *layer);
+            if let Some(folder) = &o.images {
+                save_layer(folder, i, *layer, &image, &view, model)?;
+            }
+            if let (0, Some(video)) = (k, &mut video) {
+                video.push(&image)?;
+            }
+        }
+        progress(i + 1, total);
+    }
+    if let Some(v) = video {
+        v.finish()?;
+    }
+    Ok((total, false))
+}
+
+fn trace(model: &ObjectModel, camera: &PosedCamera, clip: Option<([f32; 3], [f32; 3])>) -> View {
+    let mut tracer = model.tracer();
+    tracer.clip = clip.map(|(lo, hi)| {
+        let to = |p: [f32; 3]| model.model_from_world.point(DVec3::new(p[0] as f64, p[1] as f64, p[2] as f64)).as_vec3().to_array();
+        (to(lo), to(hi))
+    });
+    tracer.view(camera, &mut |_| {})
+}
+
+/// A layer as it is shown: depth from near (bright) to far, normals as colours.
+fn draw_layer(model: &ObjectModel, camera: &PosedCamera, view: &View, layer: Layer) -> diorama_geom::ImageU8 {
+    let (w, h) = (view.rgb.width, view.rgb.height);
+    let mut out = Image::zeros(w, h, 3);
+    let fill = |out: &mut Image, f: &dyn Fn(usize) -> [f32; 3]| {
+        out.data.chunks_exact_mut(3).enumerate().for_each(|(i, o)| o.copy_from_slice(&f(i)));
+    };
+    match layer {
+        Layer::Rgb => return view.rgb.to_u8(),
+        Layer::Opacity => fill(&mut out, &|i| [view.opacity.data[i]; 3]),
+        Layer::Depth => {
+            let seen: Vec<f32> = view.depth.data.iter().copied().filter(|d| *d > 0.0).collect();
+            let (lo, hi) = seen.iter().fold((f32::MAX, f32::MIN), |(a, b), d| (a.min(*d), b.max(*d)));
+            let range = (hi - lo).max(1e-6);
+            fill(&mut out, &|i| [if view.depth.data[i] > 0.0 { 1.0 - 0.9 * (view.depth.data[i] - lo) / range } else { 0.0 }; 3]);
+        }
+        Layer::Normal => {
+            let normals = normals(model, camera, view);
+            fill(&mut out, &|i| if view.opacity.data[i] > 0.5 { normals[i].map(|n| 0.5 + 0.5 * n) } else { [0.0; 3] });
+        }
+    }
+    out.to_u8()
+}
+
+/// World normals `−∇σ / ‖∇σ‖` at the expected depth, by central differences of the density.
+fn normals(model: &ObjectModel, camera: &PosedCamera, view: &View) -> Vec<[f32; 3]> {
+    let w = view.rgb.width;
+    let h = 1.0 / 512.0;
+    let mut points = Vec::with_capacity(view.depth.data.len() * 18);
+    for (i, depth) in view.depth.data.iter().enumerate() {
+        let d = camera.camera.direction((i % w) as f64 + 0.5, (i / w) as f64 + 0.5);
+        let p = (camera.pose.translation + camera.pose.rotation * d * *depth as f64).as_vec3().to_array();
+        for k in 0..3 {
+            for s in [h, -h] {
+                let mut q = p;
+                q[k] += s;
+                points.extend(q);
+            }
+        }
+    }
+    let mut sigma = vec![0.0; points.len() / 3];
+    model.field.density(&points, &mut sigma);
+    sigma
+        .chunks_exact(6)
+        .map(|s| {
+            let g = [s[1] - s[0], s[3] - s[2], s[5] - s[4]];
+            let l = (g[0] * g[0] + g[1] * g[1] + g[2] * g[2]).sqrt().max(1e-12);
+            g.map(|v| v / l)
+        })
+        .collect()
+}
+
+fn save_layer(folder: &Path, i: usize, layer: Layer, image: &diorama_geom::ImageU8, view: &View, model: &ObjectModel) -> Result<()> {
+    let name = match layer {
+        Layer::Rgb => format!("{i:04}.png"),
+        Layer::Depth => {
+            // Beside the picture, metric depth: 16 bit, thousandths of a world unit.
+            let mut metric = view.depth.clone();
+            let scale = 1.0 / model.model_from_world.scale as f32;
+            metric.data.iter_mut().for_each(|d| *d *= scale);
+            photo::save_depth_png(&folder.join(format!("depth16_{i:04}.png")), &metric)?;
+            format!("depth_{i:04}.png")
+        }
+        Layer::Normal => format!("normal_{i:04}.png"),
+        Layer::Opacity => format!("opacity_{i:04}.png"),
+    };
+    Ok(photo::save_png(&folder.join(name), image)?)
+}

@@ -1,0 +1,60 @@
+//! `diorama doctor`
+
+use super::Outcome;
+use crate::arguments::DoctorArgs;
+use diorama_pipelines::Result;
+use std::process::{Command, Stdio};
+
+pub fn run(a: &DoctorArgs) -> Result<Outcome> {
+    let cpu = diorama_kernels::device::cpu();
+    let (total, available) = memory();
+    let ffmpeg = tool("ffmpeg", "-version");
+    let colmap = tool("colmap", "-h");
+    let data = std::env::var("DIORAMA_TEST_DATA").ok().filter(|d| std::path::Path::new(d).is_dir());
+    if a.json {
+        let object = serde_json::json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "cpu_features": cpu.features,
+            "simd": cpu.level.name(),
+            "cores": cpu.cores,
+            "memory_bytes": total,
+            "memory_available_bytes": available,
+            "devices": ["cpu"],
+            "ffmpeg": ffmpeg,
+            "colmap": colmap,
+            "test_data": data,
+        });
+        println!("{object}");
+        return Ok(Outcome::Done);
+    }
+    println!("diorama    {}", env!("CARGO_PKG_VERSION"));
+    println!("cpu        {} cores, {} kernels ({})", cpu.cores, cpu.level.name(), cpu.features.join(" "));
+    let gib = |b: Option<u64>| b.map_or("unknown".into(), |b| format!("{:.1} GiB", b as f64 / (1u64 << 30) as f64));
+    println!("memory     {}, {} available", gib(total), gib(available));
+    println!("devices    cpu (this build has no GPU kernels)");
+    let line = |name: &str, found: &Option<String>, without: &str| match found {
+        Some(v) => println!("{name:<10} {v}"),
+        None => println!("{name:<10} not found: {without}"),
+    };
+    line("ffmpeg", &ffmpeg, "videos cannot be read; writing MP4 works without it");
+    line("colmap", &colmap, "photographs need poses from elsewhere (transforms.json, a COLMAP model or poses_bounds.npy)");
+    line("test data", &data, "tests on real captures are skipped (set DIORAMA_TEST_DATA)");
+    Ok(Outcome::Done)
+}
+
+/// First line of a program's output, if it can be started.
+fn tool(name: &str, flag: &str) -> Option<String> {
+    let out = Command::new(name).arg(flag).stdin(Stdio::null()).output().ok()?;
+    let text = String::from_utf8_lossy(&out.stdout).into_owned();
+    Some(text.lines().find(|l| !l.trim().is_empty()).unwrap_or(name).trim().to_string())
+}
+
+/// Total and available bytes, where the system tells.
+fn memory() -> (Option<u64>, Option<u64>) {
+    let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
+    let field = |key: &str| {
+        let line = text.lines().find(|l| l.starts_with(key))?;
+        line.split_whitespace().nth(1)?.parse::<u64>().ok().map(|k| k << 10)
+    };
+    (field("MemTotal:"), field("MemAvailable:"))
+}

@@ -1,0 +1,68 @@
+//! `diorama info`
+
+use super::Outcome;
+use crate::arguments::InfoArgs;
+use diorama_data::import::{self, ImportOptions};
+use diorama_geom::capture::{Split, focus_point};
+use diorama_pipelines::object::run_folder;
+use diorama_pipelines::{PipelineError, Result};
+
+pub fn run(a: &InfoArgs) -> Result<Outcome> {
+    let object = if a.path.join("config.toml").exists() { describe_run(a)? } else { describe_capture(a)? };
+    if a.json {
+        println!("{object}");
+    } else if let Some(map) = object.as_object() {
+        for (k, v) in map {
+            match v {
+                serde_json::Value::String(s) => println!("{k:<18} {s}"),
+                v => println!("{k:<18} {v}"),
+            }
+        }
+    }
+    Ok(Outcome::Done)
+}
+
+fn describe_run(a: &InfoArgs) -> Result<serde_json::Value> {
+    let (model, notes) = run_folder::load_model(&a.path)?;
+    let o = model.origin;
+    Ok(serde_json::json!({
+        "kind": "object run",
+        "method": model.config.method,
+        "data": model.config.data.path,
+        "downscale": model.config.data.downscale,
+        "steps": o.step,
+        "seconds": o.seconds,
+        "rays": o.rays,
+        "samples": o.samples,
+        "parameters": model.field.groups().iter().map(|g| g.values.len()).sum::<usize>(),
+        "training_views": model.train.len(),
+        "held_out_views": model.capture.indices(Split::Test).len(),
+        "occupied": model.occupancy.as_ref().map(|g| g.bits.fill()),
+        "notes": notes,
+    }))
+}
+
+fn describe_capture(a: &InfoArgs) -> Result<serde_json::Value> {
+    let format = a.format.as_deref().map(str::parse).transpose().map_err(PipelineError::Usage)?;
+    let c = import::import(&a.path, &ImportOptions { format, min_views: 1, ..ImportOptions::default() })?;
+    let poses: Vec<_> = c.frames.iter().map(|f| f.world_from_camera).collect();
+    let (focus, distance) = focus_point(&poses);
+    let first = &c.frames[0].camera;
+    Ok(serde_json::json!({
+        "kind": "capture",
+        "views": c.frames.len(),
+        "train": c.indices(Split::Train).len(),
+        "val": c.indices(Split::Val).len(),
+        "test": c.indices(Split::Test).len(),
+        "size": format!("{}x{}", first.width, first.height),
+        "focal_length_px": [first.fx, first.fy],
+        "lens": first.lens,
+        "masks": c.frames.iter().filter(|f| f.mask.is_some()).count(),
+        "focus": focus.to_array(),
+        "camera_distance": distance,
+        "scene_center": c.scene.center.to_array(),
+        "scene_half": c.scene.half,
+        "aabb_scale": c.scene.aabb_scale,
+        "notes": c.notes,
+    }))
+}

@@ -1,0 +1,61 @@
+//! `diorama render`
+
+use super::{INTERRUPT, Outcome, parse_clip, use_threads, watch_interrupts};
+use crate::arguments::RenderArgs;
+use diorama_pipelines::object::render::{self, RenderOptions};
+use diorama_pipelines::object::run_folder;
+use diorama_pipelines::{PipelineError, Result};
+use std::time::Instant;
+
+pub fn run(a: &RenderArgs) -> Result<Outcome> {
+    use_threads(a.threads)?;
+    let usage = |e: String| PipelineError::Usage(format!("--{e}"));
+    let size = a.size.as_deref().map(parse_size).transpose()?;
+    if a.frames == 0 || a.fps == 0 {
+        return Err(PipelineError::Usage("--frames and --fps: must be at least 1".into()));
+    }
+    if a.fov.is_some_and(|f| !(f > 0.0 && f < 179.0)) {
+        return Err(PipelineError::Usage("--fov: must lie between 0 and 179 degrees".into()));
+    }
+    let layers = a.layers.iter().map(|l| l.parse().map_err(usage)).collect::<Result<Vec<_>>>()?;
+    let path = a.path.parse().map_err(usage)?;
+    let (model, notes) = run_folder::load_model(&a.run)?;
+    notes.iter().for_each(|n| eprintln!("note: {n}"));
+    let images = a.images.clone().or_else(|| a.video.is_none().then(|| a.run.join("render")));
+    let clip = a.clip.as_deref().map(|c| parse_clip(c, &model.capture.world_from_capture)).transpose()?;
+    let options = RenderOptions {
+        path,
+        frames: a.frames,
+        size,
+        fov: a.fov.map(f64::to_radians),
+        layers,
+        images: images.clone(),
+        video: a.video.clone(),
+        fps: a.fps,
+        clip,
+    };
+    watch_interrupts();
+    let start = Instant::now();
+    let mut last = Instant::now();
+    let (frames, interrupted) = render::render(&model, &options, &INTERRUPT, &mut |i, n| {
+        if last.elapsed().as_secs() >= 5 || i == n {
+            last = Instant::now();
+            eprintln!("frame {i} of {n}");
+        }
+    })?;
+    let seconds = start.elapsed().as_secs_f64();
+    if a.json {
+        println!("{}", serde_json::json!({ "run": a.run, "frames": frames, "seconds": seconds, "images": images, "video": a.video, "interrupted": interrupted }));
+    } else {
+        println!("{frames} frames in {seconds:.1} s");
+        images.iter().chain(a.video.iter()).for_each(|p| println!("{}", p.display()));
+    }
+    Ok(if interrupted { Outcome::Interrupted } else { Outcome::Done })
+}
+
+fn parse_size(text: &str) -> Result<(u32, u32)> {
+    let bad = || PipelineError::Usage(format!("--size {text}: expected WIDTHxHEIGHT, each 16 to 8192"));
+    let (w, h) = text.split_once('x').ok_or_else(bad)?;
+    let side = |s: &str| s.parse::<u32>().ok().filter(|v| (16..=8192).contains(v)).ok_or_else(bad);
+    Ok((side(w)?, side(h)?))
+}

@@ -1,0 +1,39 @@
+use super::*;
+use crate::burn_op::values;
+use burn::tensor::{Device, TensorData};
+use diorama_testkit::{assert_close, assert_gradient, random, wide};
+
+#[test]
+fn matches_the_reference_both_ways() {
+    for (n, dims, bands) in [(0, 3, 4), (1, 1, 1), (40, 3, 12)] {
+        let (x, d) = (random(n * dims, 1), random(n * dims * bands, 2));
+        let mut out = vec![9.0; d.len()];
+        cpu::forward(dims, bands, &x, &mut out);
+        assert_close("forward", &out, &reference::forward(bands, &wide(&x)), 1e-5);
+        let mut g = vec![9.0; x.len()];
+        cpu::backward(dims, bands, &x, &d, &mut g);
+        assert_close("backward", &g, &reference::backward(bands, &wide(&x), &wide(&d)), 1e-4);
+    }
+}
+
+#[test]
+fn reference_gradient_matches_central_differences() {
+    let (x, d) = (vec![0.13, -0.37, 0.81], wide(&random(12, 2)));
+    let g = reference::backward(4, &x, &d);
+    assert_gradient("x", &g, &x, 1e-6, |x| reference::forward(4, x).iter().zip(&d).map(|(a, b)| a * b).sum());
+}
+
+#[test]
+fn waves_are_continuous_and_bounded() {
+    let x: Vec<f64> = (0..4000).map(|i| i as f64 * 1e-3 - 2.0).collect();
+    let y = reference::forward(1, &x);
+    assert!(y.windows(2).all(|w| (w[1] - w[0]).abs() <= 2.1e-3) && y.iter().all(|v| v.abs() <= 1.0));
+}
+
+#[test]
+fn burn_sees_the_same_gradient() {
+    let x = random(6, 1);
+    let xt = Tensor::<2>::from_data(TensorData::new(x.clone(), [2, 3]), &Device::flex().autodiff()).require_grad();
+    let grads = triangle_wave(3, xt.clone()).sum().backward();
+    assert_close("x", &values(xt.grad(&grads).unwrap()), &reference::backward(3, &wide(&x), &[1.0; 18]), 1e-4);
+}

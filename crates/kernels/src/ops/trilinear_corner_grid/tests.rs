@@ -1,0 +1,64 @@
+use super::*;
+use crate::burn_op::values;
+use burn::tensor::{Device, TensorData};
+use diorama_testkit::{assert_close, assert_gradient, random, random_unit, wide};
+
+/// Two voxels that share a face: twelve corners.
+const ROWS: [u32; 16] = [0, 1, 2, 3, 4, 5, 6, 7, 1, 8, 3, 9, 5, 10, 7, 11];
+
+fn voxels(s: usize) -> Vec<u32> {
+    (0..s as u32).map(|i| i % 2).collect()
+}
+
+#[test]
+fn matches_the_reference_both_ways() {
+    for (s, c) in [(0, 3), (1, 1), (300, 24)] {
+        let voxel = voxels(s);
+        let k = Corners { rows: &ROWS, voxel: &voxel };
+        let (u, t, d) = (random_unit(s * 3, 1), random(12 * c, 2), random(s * c, 3));
+        let mut out = vec![9.0; s * c];
+        cpu::forward(&k, &u, &t, c, &mut out);
+        assert_close("forward", &out, &reference::forward(&k, &wide(&u), &wide(&t), c), 1e-5);
+        let (mut du, mut dt) = (vec![9.0; s * 3], vec![0.0; 12 * c]);
+        cpu::backward(&k, &u, &t, c, &d, &mut du, &mut dt);
+        let (ru, rt) = reference::backward(&k, &wide(&u), &wide(&t), c, &wide(&d));
+        assert_close("positions", &du, &ru, 1e-4);
+        assert_close("table", &dt, &rt, 1e-4);
+    }
+}
+
+#[test]
+fn reference_gradients_match_central_differences() {
+    let voxel = voxels(3);
+    let k = Corners { rows: &ROWS, voxel: &voxel };
+    let (u, t, d) = (wide(&random_unit(9, 1)), wide(&random(24, 2)), wide(&random(6, 3)));
+    let (du, dt) = reference::backward(&k, &u, &t, 2, &d);
+    let loss = |u: &[f64], t: &[f64]| reference::forward(&k, u, t, 2).iter().zip(&d).map(|(a, b)| a * b).sum::<f64>();
+    assert_gradient("positions", &du, &u, 1e-6, |x| loss(x, &t));
+    assert_gradient("table", &dt, &t, 1e-6, |x| loss(&u, x));
+}
+
+#[test]
+fn features_are_continuous_across_a_shared_face() {
+    let t = random(12, 4);
+    let at = |voxel: u32, u: [f32; 3]| {
+        let mut out = [0.0];
+        cpu::forward(&Corners { rows: &ROWS, voxel: &[voxel] }, &u, &t, 1, &mut out);
+        out[0]
+    };
+    assert!((at(0, [1.0, 0.3, 0.6]) - at(1, [0.0, 0.3, 0.6])).abs() < 1e-6);
+}
+
+#[test]
+fn burn_sees_the_same_gradients() {
+    let voxel = voxels(4);
+    let k = Corners { rows: &ROWS, voxel: &voxel };
+    let (u, t) = (random_unit(12, 1), random(36, 2));
+    let device = Device::flex().autodiff();
+    let ut = Tensor::<2>::from_data(TensorData::new(u.clone(), [4, 3]), &device).require_grad();
+    let tt = Tensor::<2>::from_data(TensorData::new(t.clone(), [12, 3]), &device).require_grad();
+    let grads = trilinear_corner_grid(k, ut.clone(), tt.clone()).sum().backward();
+    let (du, dt) = reference::backward(&k, &wide(&u), &wide(&t), 3, &[1.0; 12]);
+    assert_close("positions", &values(ut.grad(&grads).unwrap()), &du, 1e-4);
+    assert_close("table", &values(tt.grad(&grads).unwrap()), &dt, 1e-4);
+}

@@ -1,0 +1,173 @@
+//! Marching cubes over a [`FieldQuery`], a few slices at a time: memory is two slices of density plus
+//! the surface, whatever the resolution.
+
+use diorama_geom::Mesh;
+use diorama_geom::field_query::FieldQuery;
+use diorama_kernels::ops::marching_cubes::cpu::Mesher;
+
+/// Where and how finely to look.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Grid {
+    /// Lowest and highest corner in the world.
+    pub min: [f32; 3],
+    pub max: [f32; 3],
+    /// Cells along the longest side.
+    pub resolution: usize,
+}
+
+impl Grid {
+    /// Edge of a cell.
+    pub fn cell(&self) -> f32 {
+        let longest = (0..3).map(|k| self.max[k] - self.min[k]).fold(0.0, f32::max);
+        longest / self.resolution as f32
+    }
+
+    /// Grid points per axis.
+    pub fn points(&self) -> [usize; 3] {
+        let cell = self.cell();
+        std::array::from_fn(|k| ((self.max[k] - self.min[k]) / cell - 1e-4).ceil().max(1.0) as usize + 1)
+    }
+}
+
+/// Grid points that are asked for at once.
+const BATCH: usize = 1 << 18;
+
+/// The surface where density equals `level`, in world coordinates, faces outward. What lies outside of
+/// the box counts as empty, so the surface is closed where it is cut. `progress` is told slices done of all.
+pub fn extract(field: &dyn FieldQuery, grid: &Grid, level: f32, progress: &mut dyn FnMut(usize, usize)) -> Mesh {
+    let [nx, ny, nz] = grid.points();
+    let cell = grid.cell();
+    // One empty layer around the box closes the surface.
+    let (px, py) = (nx + 2, ny + 2);
+    let mut mesher = Mesher::new(px, py, level);
+    let empty = vec![0.0f32; px * py];
+    mesher.push(&empty);
+    let at_once = (BATCH / (nx * ny)).clamp(1, nz);
+    let mut points = Vec::new();
+    let mut sigma = Vec::new();
+    let mut slice = vec![0.0f32; px * py];
+    for z0 in (0..nz).step_by(at_once) {
+        let z1 = (z0 + at_once).min(nz);
+        points.clear();
+        for z in z0..z1 {
+            for y in 0..ny {
+                for x in 0..nx {
+                    points.push([grid.min[0] + x as f32 * cell, grid.min[1] + y as f32 * cell, grid.min[2] + z as f32 * cell]);
+                }
+            }
+        }
+        sigma.resize(points.len(), 0.0);
+        field.density(&points, &mut sigma);
+        for values in sigma.chunks_exact(nx * ny) {
+            slice.fill(0.0);
+            for y in 0..ny {
+                slice[(y + 1) * px + 1..][..nx].copy_from_slice(&values[y * nx..(y + 1) * nx]);
+            }
+            mesher.push(&slice);
+        }
+        progress(z1, nz);
+    }
+    mesher.push(&empty);
+    // The empty layer lies one cell outside: pull what it cut back onto the box.
+    let world = |p: &[f32; 3]| std::array::from_fn(|k| (grid.min[k] + (p[k] - 1.0) * cell).clamp(grid.min[k], grid.max[k].max(grid.min[k] + cell)));
+    let positions = mesher.positions.iter().map(world).collect();
+    Mesh { positions, faces: mesher.faces, ..Mesh::default() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Density of a sphere and of a box: a steep ramp through the level at the surface.
+    enum Shape {
+        Sphere { radius: f32 },
+        Box { half: [f32; 3] },
+    }
+
+    impl Shape {
+        /// Signed distance, negative inside.
+        fn distance(&self, p: [f32; 3]) -> f32 {
+            match self {
+                Shape::Sphere { radius } => (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt() - radius,
+                Shape::Box { half } => {
+                    let q: [f32; 3] = std::array::from_fn(|k| p[k].abs() - half[k]);
+                    let out = q.map(|v| v.max(0.0));
+                    (out[0] * out[0] + out[1] * out[1] + out[2] * out[2]).sqrt() + q[0].max(q[1]).max(q[2]).min(0.0)
+                }
+            }
+        }
+    }
+
+    impl FieldQuery for Shape {
+        fn density(&self, points: &[[f32; 3]], sigma: &mut [f32]) {
+            for (p, s) in points.iter().zip(sigma) {
+                *s = (10.0 - 40.0 * self.distance(*p)).max(0.0);
+            }
+        }
+        fn color(&self, _: &[[f32; 3]], _: &[[f32; 3]], rgb: &mut [[f32; 3]]) {
+            rgb.fill([0.5; 3]);
+        }
+    }
+
+    const GRID: Grid = Grid { min: [-1.0; 3], max: [1.0; 3], resolution: 48 };
+
+    fn nearest(mesh: &Mesh, p: [f32; 3]) -> f32 {
+        let d2 = |q: &[f32; 3]| (0..3).map(|k| (q[k] - p[k]) * (q[k] - p[k])).sum::<f32>();
+        mesh.positions.iter().map(d2).fold(f32::INFINITY, f32::min).sqrt()
+    }
+
+    #[test]
+    fn a_sphere_is_met_within_half_a_voxel_both_ways() {
+        let shape = Shape::Sphere { radius: 0.7 };
+        let mesh = extract(&shape, &GRID, 10.0, &mut |_, _| {});
+        let cell = GRID.cell();
+        assert!(mesh.is_watertight());
+        for p in &mesh.positions {
+            assert!(shape.distance(*p).abs() <= 0.5 * cell);
+        }
+        // Surface to mesh: the nearest vertex lies within half a voxel of the tangent plane's nearest point.
+        for i in 0..500 {
+            let z = 1.0 - (2.0 * i as f32 + 1.0) / 500.0;
+            let (r, a) = ((1.0 - z * z).sqrt(), i as f32 * 2.399_963);
+            let p = [0.7 * r * a.cos(), 0.7 * r * a.sin(), 0.7 * z];
+            assert!(nearest(&mesh, p) <= 1.0 * cell, "a hole near {p:?}");
+        }
+    }
+
+    #[test]
+    fn a_box_is_met_within_half_a_voxel_and_its_edges_within_one_and_a_fifth() {
+        let half = [0.6, 0.45, 0.3];
+        let shape = Shape::Box { half };
+        let mesh = extract(&shape, &GRID, 10.0, &mut |_, _| {});
+        let cell = GRID.cell();
+        assert!(mesh.is_watertight());
+        for p in &mesh.positions {
+            assert!(shape.distance(*p).abs() <= 0.5 * cell, "{p:?}");
+        }
+        for c in 0..8 {
+            let corner: [f32; 3] = std::array::from_fn(|k| if c >> k & 1 == 1 { half[k] } else { -half[k] });
+            assert!(nearest(&mesh, corner) <= 1.2 * cell, "{}", nearest(&mesh, corner) / cell);
+        }
+        // Faces outward: positive volume close to the box's.
+        let volume: f32 = mesh
+            .faces
+            .iter()
+            .map(|f| {
+                let [a, b, c] = f.map(|i| mesh.positions[i as usize]);
+                let n = diorama_geom::mesh::cross(b, c);
+                (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) / 6.0
+            })
+            .sum();
+        let exact = 8.0 * half[0] * half[1] * half[2];
+        assert!((volume / exact - 1.0).abs() < 0.05, "{volume} {exact}");
+    }
+
+    #[test]
+    fn what_the_box_cuts_is_closed() {
+        let grid = Grid { min: [-0.5, -1.0, -1.0], max: [0.5, 1.0, 1.0], resolution: 40 };
+        let mesh = extract(&Shape::Sphere { radius: 0.7 }, &grid, 10.0, &mut |_, _| {});
+        assert!(mesh.is_watertight());
+        let (lo, hi) = mesh.bounds().unwrap();
+        assert!(lo[0] >= -0.5 && hi[0] <= 0.5 + 1e-6);
+    }
+}

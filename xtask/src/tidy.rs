@@ -1,0 +1,146 @@
+//! The rules of the house that a script can check: the import table, file length, names, where
+//! `unsafe` may stand, sizes, and that the paths named in ARCHITECTURE.md exist.
+
+use std::path::{Path, PathBuf};
+
+/// Which crates each crate may import (ARCHITECTURE.md).
+const IMPORTS: [(&str, &[&str]); 10] = [
+    ("geom", &[]),
+    ("kernels", &["geom"]),
+    ("engine", &["geom", "kernels"]),
+    ("mesh", &["geom", "kernels"]),
+    ("data", &["geom"]),
+    ("scenes", &["geom", "mesh"]),
+    ("pipelines", &["geom", "kernels", "engine", "mesh", "data", "scenes"]),
+    ("cli", &["geom", "kernels", "engine", "mesh", "data", "scenes", "pipelines"]),
+    ("testkit", &["geom"]),
+    ("viewer", &["geom"]),
+];
+
+const MAX_LINES: usize = 800;
+const MAX_BYTES: u64 = 2 << 20;
+const BANNED: [&str; 6] = ["utils", "common", "helpers", "misc", "manager", "legacy"];
+const UNSAFE: [&str; 2] = ["crates/kernels/", "crates/data/"];
+const BURN: [&str; 4] = ["kernels", "engine", "nets", "pipelines"];
+
+/// Prints every breach; true when there are none.
+pub fn run() -> bool {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the workspace");
+    let mut breaches = Vec::new();
+    let mut files = Vec::new();
+    collect(root, root, &mut files);
+    for f in &files {
+        check_file(root, f, &mut breaches);
+    }
+    check_architecture(root, &mut breaches);
+    breaches.iter().for_each(|b| println!("tidy: {b}"));
+    breaches.is_empty()
+}
+
+fn collect(root: &Path, folder: &Path, out: &mut Vec<PathBuf>) {
+    for entry in folder.read_dir().into_iter().flatten().flatten() {
+        let path = entry.path();
+        let name = entry.file_name();
+        if path.is_dir() {
+            if ![".git", "target", "runs", "node_modules", ".carry"].contains(&&*name.to_string_lossy()) {
+                collect(root, &path, out);
+            }
+        } else {
+            out.push(path);
+        }
+    }
+}
+
+fn check_file(root: &Path, path: &Path, breaches: &mut Vec<String>) {
+    let name = path.strip_prefix(root).unwrap_or(path).to_string_lossy().replace('\\', "/");
+    if std::fs::metadata(path).is_ok_and(|m| m.len() > MAX_BYTES) {
+        breaches.push(format!("{name}: larger than 2 MiB"));
+    }
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let extension = path.extension().unwrap_or_default().to_string_lossy().into_owned();
+    if ["rs", "ts"].contains(&&*extension) && BANNED.contains(&&*stem) {
+        breaches.push(format!("{name}: a name that says nothing"));
+    }
+    if extension != "rs" {
+        return;
+    }
+    let Ok(text) = std::fs::read_to_string(path) else { return };
+    if text.lines().count() > MAX_LINES {
+        breaches.push(format!("{name}: {} lines, more than {MAX_LINES}", text.lines().count()));
+    }
+    if !text.trim_start().starts_with("//!") && !name.ends_with("tests.rs") {
+        breaches.push(format!("{name}: does not begin with what the file is (//!)"));
+    }
+    let this = name.split('/').nth(1).unwrap_or_default().to_string();
+    let is_tidy = name == "xtask/src/tidy.rs";
+    for (i, line) in text.lines().enumerate() {
+        let at = format!("{name}:{}", i + 1);
+        let code = line.split("//").next().unwrap_or_default();
+        if code.contains("unsafe ") && !is_tidy && !UNSAFE.iter().any(|u| name.starts_with(u)) {
+            breaches.push(format!("{at}: unsafe outside of kernels and data"));
+        }
+        if (code.contains("unsafe {") || code.contains("unsafe impl")) && !is_tidy {
+            let above: Vec<&str> = text.lines().skip(i.saturating_sub(6)).take(7).collect();
+            if !above.iter().any(|l| l.contains("SAFETY")) {
+                breaches.push(format!("{at}: unsafe without a SAFETY line"));
+            }
+        }
+        if code.contains("todo!(") || code.contains("unimplemented!(") {
+            breaches.push(format!("{at}: unfinished").to_string());
+        }
+        if is_tidy || !name.starts_with("crates/") {
+            continue;
+        }
+        if (code.contains("use burn::") || code.contains(" burn::")) && !BURN.contains(&&*this) {
+            breaches.push(format!("{at}: burn is not for {this}"));
+        }
+        let Some((_, allowed)) = IMPORTS.iter().find(|(c, _)| *c == this) else { continue };
+        for (other, _) in IMPORTS {
+            // The testkit may be used by any crate's tests.
+            let free = other == this || other == "testkit" || allowed.contains(&other);
+            if !free && code.contains(&format!("diorama_{other}::")) {
+                breaches.push(format!("{at}: {this} may not import {other}"));
+            }
+        }
+    }
+}
+
+/// Every `crates/…` path in backticks must exist.
+fn check_architecture(root: &Path, breaches: &mut Vec<String>) {
+    let Ok(text) = std::fs::read_to_string(root.join("ARCHITECTURE.md")) else {
+        breaches.push("ARCHITECTURE.md is missing".into());
+        return;
+    };
+    for name in text.split('`').skip(1).step_by(2) {
+        let is_path = ["crates/", "xtask/", "docs/", ".ci/"].iter().any(|p| name.starts_with(p)) && !name.contains(' ');
+        if is_path && !root.join(name).exists() {
+            breaches.push(format!("ARCHITECTURE.md: {name} does not exist"));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn breaches_are_found() {
+        let dir = std::env::temp_dir().join(format!("tidy-{}", std::process::id()));
+        let file = dir.join("crates/geom/src/utils.rs");
+        std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+        let bad = "use diorama_engine::fields;\nuse burn::tensor::Tensor;\nfn f() { unsafe { g() } }\n";
+        std::fs::write(&file, bad.to_string() + &"// x\n".repeat(900)).unwrap();
+        let mut b = Vec::new();
+        check_file(&dir, &file, &mut b);
+        check_architecture(&dir, &mut b);
+        std::fs::remove_dir_all(&dir).unwrap();
+        for what in ["says nothing", "more than 800", "does not begin", "may not import engine", "burn is not for geom", "unsafe outside", "SAFETY", "ARCHITECTURE.md is missing"] {
+            assert!(b.iter().any(|l| l.contains(what)), "{what}: {b:?}");
+        }
+    }
+
+    #[test]
+    fn the_project_is_tidy() {
+        assert!(run());
+    }
+}
