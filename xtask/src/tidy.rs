@@ -85,7 +85,7 @@ fn check_file(root: &Path, path: &Path, breaches: &mut Vec<String>) {
                 breaches.push(format!("{at}: unsafe without a SAFETY line"));
             }
         }
-        if code.contains("todo!(") || code.contains("unimplemented!(") {
+        if !is_tidy && (code.contains("todo!(") || code.contains("unimplemented!(")) {
             breaches.push(format!("{at}: unfinished").to_string());
         }
         if is_tidy || !name.starts_with("crates/") {
@@ -134,7 +134,16 @@ mod tests {
         check_file(&dir, &file, &mut b);
         check_architecture(&dir, &mut b);
         std::fs::remove_dir_all(&dir).unwrap();
-        for what in ["says nothing", "more than 800", "does not begin", "may not import engine", "burn is not for geom", "unsafe outside", "SAFETY", "ARCHITECTURE.md is missing"] {
+        for what in [
+            "says nothing",
+            "more than 800",
+            "does not begin",
+            "may not import engine",
+            "burn is not for geom",
+            "unsafe outside",
+            "SAFETY",
+            "ARCHITECTURE.md is missing",
+        ] {
             assert!(b.iter().any(|l| l.contains(what)), "{what}: {b:?}");
         }
     }

@@ -8,7 +8,12 @@ use std::process::ExitCode;
 
 /// Photographs to radiance fields, novel views and meshes.
 #[derive(Parser)]
-#[command(name = "diorama", version, arg_required_else_help = true, after_help = "Exit codes: 0 done, 1 the work failed, 2 bad input or usage, 130 interrupted with a checkpoint written.")]
+#[command(
+    name = "diorama",
+    version,
+    arg_required_else_help = true,
+    after_help = "Exit codes: 0 done, 1 the work failed, 2 bad input or usage, 130 interrupted with a checkpoint written."
+)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -17,16 +22,22 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Fit a field to photographs with poses
-    #[command(after_help = "Examples:\n  diorama train capture/ -o runs/chair --seconds 120\n  diorama train lego/ -o runs/lego --method mlp --downscale 8 --background white\n  diorama train capture/ -o runs/chair --resume")]
+    #[command(
+        after_help = "Examples:\n  diorama train capture/ -o runs/chair --seconds 120\n  diorama train lego/ -o runs/lego --method mlp --downscale 8 --background white\n  diorama train capture/ -o runs/chair --resume"
+    )]
     Train(TrainArgs),
     /// Score held-out views
     #[command(after_help = "Example:\n  diorama eval runs/chair --save-images --json")]
     Eval(EvalArgs),
     /// Render novel views along a camera path
-    #[command(after_help = "Examples:\n  diorama render runs/chair --video orbit.mp4\n  diorama render runs/chair --path camera_path.json --layers rgb,depth,normal --images frames/")]
+    #[command(
+        after_help = "Examples:\n  diorama render runs/chair --video orbit.mp4\n  diorama render runs/chair --path camera_path.json --layers rgb,depth,normal --images frames/"
+    )]
     Render(RenderArgs),
     /// Extract a mesh
-    #[command(after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --format stl --resolution 384 --faces 100000 -o chair.stl")]
+    #[command(
+        after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --format stl --resolution 384 --faces 100000 -o chair.stl"
+    )]
     Export(ExportArgs),
     /// Runs side by side: curves, held-out images, cost
     Compare(CompareArgs),
@@ -59,7 +70,7 @@ pub struct TrainArgs {
     #[arg(long)]
     pub steps: Option<u64>,
     /// Stop after S seconds of training
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true)]
     pub seconds: Option<f64>,
     /// every:N, A:B:C (percent), file or all
     #[arg(long)]

@@ -88,7 +88,10 @@ pub fn read(path: &Path) -> Result<Checkpoint> {
     let metadata = header.metadata().clone().unwrap_or_default();
     let version = metadata.get("version").map_or("none", |v| v);
     if version != VERSION {
-        return Err(DataError::input(path, format!("checkpoint version {version}; this program reads version {VERSION}: train again or use the program that wrote it")));
+        return Err(DataError::input(
+            path,
+            format!("checkpoint version {version}; this program reads version {VERSION}: train again or use the program that wrote it"),
+        ));
     }
     let tensors = SafeTensors::deserialize(&bytes).map_err(|e| broken(&e))?;
     let mut names: Vec<&str> = tensors.names();
@@ -123,6 +126,11 @@ pub fn load(folder: &Path) -> Result<(Checkpoint, Option<String>)> {
     }
 }
 
+/// Whether `folder` holds any checkpoint.
+pub fn exists(folder: &Path) -> bool {
+    folder.join(LATEST).exists() || folder.join(PREVIOUS).exists()
+}
+
 /// Path of the newest checkpoint.
 pub fn latest(folder: &Path) -> PathBuf {
     folder.join(LATEST)
@@ -141,7 +149,8 @@ mod tests {
     use super::*;
 
     fn save_values(folder: &Path, v: &[f32]) {
-        let entries = [Entry { name: "a.b".into(), shape: vec![v.len()], data: v }, Entry { name: "empty".into(), shape: vec![0], data: &[] }];
+        let entries =
+            [Entry { name: "a.b".into(), shape: vec![v.len()], data: v }, Entry { name: "empty".into(), shape: vec![0], data: &[] }];
         save(folder, &entries, HashMap::from([("step".into(), v.len().to_string())])).unwrap();
     }
 

@@ -57,7 +57,8 @@ pub fn find_model(root: &Path) -> Option<PathBuf> {
 
 /// Reads the largest model under `root`, whose photographs lie in `root/images` or `root`.
 pub fn read(root: &Path) -> Result<Imported> {
-    let model = find_model(root).ok_or_else(|| DataError::input(root, "holds no COLMAP model (images.bin or images.txt, in sparse/0 for example)"))?;
+    let model = find_model(root)
+        .ok_or_else(|| DataError::input(root, "holds no COLMAP model (images.bin or images.txt, in sparse/0 for example)"))?;
     let (cameras, images, file) = if model.join("images.bin").exists() {
         (read_cameras_bin(&model.join("cameras.bin"))?, read_images_bin(&model.join("images.bin"))?, model.join("images.bin"))
     } else {
@@ -67,10 +68,11 @@ pub fn read(root: &Path) -> Result<Imported> {
     let mut images = images;
     images.sort_by(|a, b| a.name.cmp(&b.name));
     for im in images {
-        let camera = *cameras
-            .get(&im.camera)
-            .ok_or_else(|| DataError::input(&file, format!("image {} names camera {}, which the cameras file does not hold", im.name, im.camera)))?;
-        let pose = crate::transforms_json::rigid(im.world_from_camera).map_err(|e| DataError::input(&file, format!("image {}: {e}; run COLMAP again", im.name)))?;
+        let camera = *cameras.get(&im.camera).ok_or_else(|| {
+            DataError::input(&file, format!("image {} names camera {}, which the cameras file does not hold", im.name, im.camera))
+        })?;
+        let pose = crate::transforms_json::rigid(im.world_from_camera)
+            .map_err(|e| DataError::input(&file, format!("image {}: {e}; run COLMAP again", im.name)))?;
         let inside = format!("images/{}", im.name);
         let found = match locate(root, &inside, &file, "name")? {
             Some(p) => Some(p),
@@ -100,9 +102,9 @@ pub fn read(root: &Path) -> Result<Imported> {
 
 /// A camera from a model's number, size and parameters.
 fn camera(file: &Path, model: usize, width: u64, height: u64, p: &[f64]) -> Result<Camera> {
-    let &(name, n) = MODELS
-        .get(model)
-        .ok_or_else(|| DataError::input(file, format!("camera model {model} is not supported; use one of {}", MODELS.map(|m| m.0).join(", "))))?;
+    let &(name, n) = MODELS.get(model).ok_or_else(|| {
+        DataError::input(file, format!("camera model {model} is not supported; use one of {}", MODELS.map(|m| m.0).join(", ")))
+    })?;
     if p.len() != n || p.iter().any(|v| !v.is_finite()) || p[0] <= 0.0 {
         return Err(DataError::input(file, format!("camera model {name} needs {n} finite numbers, the focal length above 0")));
     }

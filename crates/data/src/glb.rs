@@ -40,7 +40,8 @@ pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
     });
     let mut attributes = json!({});
     attributes["POSITION"] =
-        add(floats(&mut turned.iter().copied()), 34962, json!({ "componentType": 5126, "count": n, "type": "VEC3", "min": lo, "max": hi })).into();
+        add(floats(&mut turned.iter().copied()), 34962, json!({ "componentType": 5126, "count": n, "type": "VEC3", "min": lo, "max": hi }))
+            .into();
     if mesh.normals.len() == n {
         let data = floats(&mut mesh.normals.iter().map(|v| y_up(*v)));
         attributes["NORMAL"] = add(data, 34962, json!({ "componentType": 5126, "count": n, "type": "VEC3" })).into();

@@ -69,7 +69,10 @@ pub struct Imported {
 /// `transforms.json` wins over the Blender set, COLMAP and LLFF unless `options.format` says otherwise.
 pub fn import(data: &Path, options: &ImportOptions) -> Result<Capture> {
     if !data.exists() {
-        return Err(DataError::input(data, "does not exist; give a folder with photographs and transforms.json, a COLMAP model or poses_bounds.npy"));
+        return Err(DataError::input(
+            data,
+            "does not exist; give a folder with photographs and transforms.json, a COLMAP model or poses_bounds.npy",
+        ));
     }
     let (root, file) = if data.is_dir() { (data, None) } else { (data.parent().unwrap_or(Path::new(".")), Some(data)) };
     let root = if root.as_os_str().is_empty() { Path::new(".") } else { root };
@@ -80,7 +83,9 @@ pub fn import(data: &Path, options: &ImportOptions) -> Result<Capture> {
         (None, false) => detect(root)?,
     };
     let imported = match format {
-        Format::Transforms => transforms_json::read(&file.filter(|_| named).map_or_else(|| root.join("transforms.json"), Path::to_path_buf), root)?,
+        Format::Transforms => {
+            transforms_json::read(&file.filter(|_| named).map_or_else(|| root.join("transforms.json"), Path::to_path_buf), root)?
+        }
         Format::Blender => transforms_json::read_blender(root)?,
         Format::Colmap => colmap::read(root)?,
         Format::Llff => llff::read(root)?,
@@ -98,7 +103,10 @@ fn detect(root: &Path) -> Result<Format> {
     } else if root.join("poses_bounds.npy").exists() {
         Ok(Format::Llff)
     } else {
-        Err(DataError::input(root, "holds no transforms.json, transforms_train.json, COLMAP model (sparse/0) or poses_bounds.npy; estimate poses first, for example with COLMAP"))
+        Err(DataError::input(
+            root,
+            "holds no transforms.json, transforms_train.json, COLMAP model (sparse/0) or poses_bounds.npy; estimate poses first, for example with COLMAP",
+        ))
     }
 }
 
@@ -111,7 +119,14 @@ fn finish(data: &Path, mut imported: Imported, options: &ImportOptions) -> Resul
     }
     let n = imported.frames.len();
     if n < options.min_views {
-        return Err(DataError::input(data, format!("only {n} usable views ({} listed images are missing); at least {} are needed", imported.missing.len(), options.min_views)));
+        return Err(DataError::input(
+            data,
+            format!(
+                "only {n} usable views ({} listed images are missing); at least {} are needed",
+                imported.missing.len(),
+                options.min_views
+            ),
+        ));
     }
     let first = imported.frames[0].world_from_camera;
     if n > 1 && imported.frames.iter().all(|f| (f.world_from_camera.translation - first.translation).length() < 1e-9) {

@@ -21,11 +21,16 @@ pub fn read(root: &Path) -> Result<Imported> {
         .map_err(DataError::io(&folder, "read"))?
         .flatten()
         .map(|e| e.path())
-        .filter(|p| p.extension().and_then(|e| e.to_str()).is_some_and(|e| ["png", "jpg", "jpeg"].contains(&e.to_ascii_lowercase().as_str())))
+        .filter(|p| {
+            p.extension().and_then(|e| e.to_str()).is_some_and(|e| ["png", "jpg", "jpeg"].contains(&e.to_ascii_lowercase().as_str()))
+        })
         .collect();
     images.sort();
     if images.len() != shape[0] {
-        return Err(DataError::input(&file, format!("holds {} poses but images/ holds {} photographs; they must match", shape[0], images.len())));
+        return Err(DataError::input(
+            &file,
+            format!("holds {} poses but images/ holds {} photographs; they must match", shape[0], images.len()),
+        ));
     }
     let mut out = Imported { unknown_up: true, ..Imported::default() };
     for (i, (v, image)) in values.chunks_exact(17).zip(images).enumerate() {
@@ -63,7 +68,7 @@ pub fn read_npy(file: &Path) -> Result<(Vec<usize>, Vec<f64>)> {
     if data.len() < 12 || &data[..6] != b"\x93NUMPY" {
         return Err(bad("the magic bytes are missing"));
     }
-    let (length, start) = if data[6] == 1 {
+    let (length, start): (usize, usize) = if data[6] == 1 {
         (u16::from_le_bytes([data[8], data[9]]) as usize, 10)
     } else {
         (u32::from_le_bytes([data[8], data[9], data[10], data[11]]) as usize, 12)
@@ -80,8 +85,12 @@ pub fn read_npy(file: &Path) -> Result<(Vec<usize>, Vec<f64>)> {
         return Err(bad("only C order is read"));
     }
     let shape = field("'shape'").and_then(|s| s.strip_prefix('(')).and_then(|s| s.split_once(')')).ok_or_else(|| bad("no shape"))?.0;
-    let shape: Vec<usize> =
-        shape.split(',').map(str::trim).filter(|s| !s.is_empty()).map(|s| s.parse().map_err(|_| bad("the shape is malformed"))).collect::<Result<_>>()?;
+    let shape: Vec<usize> = shape
+        .split(',')
+        .map(str::trim)
+        .filter(|s| !s.is_empty())
+        .map(|s| s.parse().map_err(|_| bad("the shape is malformed")))
+        .collect::<Result<_>>()?;
     let count = shape.iter().try_fold(1usize, |a, b| a.checked_mul(*b));
     let bytes = count.and_then(|c| c.checked_mul(size));
     let body = &data[start + length..];

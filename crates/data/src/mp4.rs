@@ -34,7 +34,8 @@ impl Video {
             .rate_control_mode(RateControlMode::Quality)
             .skip_frames(false);
         let api = openh264::OpenH264API::from_source();
-        let encoder = Encoder::with_api_config(api, config).map_err(|e| DataError::input(path, format!("the video encoder refuses: {e}")))?;
+        let encoder =
+            Encoder::with_api_config(api, config).map_err(|e| DataError::input(path, format!("the video encoder refuses: {e}")))?;
         Ok(Video { path: path.to_path_buf(), encoder, fps, size, sps: vec![], pps: vec![], data: vec![], samples: vec![] })
     }
 
@@ -79,10 +80,14 @@ impl Video {
         let n = self.samples.len() as u32;
         let timescale = self.fps * 1000;
         let duration = n * 1000;
-        let mvhd = full(b"mvhd", 0, &[&words(&[0, 0, timescale, duration, 0x10000, 0x0100_0000, 0, 0]), &matrix(), &words(&[0; 6]), &words(&[2])].concat());
-        let tkhd = full(b"tkhd", 3, &[&words(&[0, 0, 1, 0, duration, 0, 0, 0, 0]), &matrix(), &words(&[w << 16, h << 16])].concat());
+        let mvhd = full(
+            b"mvhd",
+            0,
+            &[&words(&[0, 0, timescale, duration, 0x10000, 0x0100_0000, 0, 0])[..], &matrix(), &words(&[0; 6]), &words(&[2])].concat(),
+        );
+        let tkhd = full(b"tkhd", 3, &[&words(&[0, 0, 1, 0, duration, 0, 0, 0, 0])[..], &matrix(), &words(&[w << 16, h << 16])].concat());
         let mdhd = full(b"mdhd", 0, &words(&[0, 0, timescale, duration, 0x55c4_0000]));
-        let hdlr = full(b"hdlr", 0, &[&words(&[0]), &b"vide"[..], &words(&[0; 3]), b"video\0"].concat());
+        let hdlr = full(b"hdlr", 0, &[&words(&[0])[..], b"vide", &words(&[0; 3]), b"video\0"].concat());
         let avcc = [&[1, self.sps[1], self.sps[2], self.sps[3], 0xff, 0xe1][..], &sized(&self.sps), &[1], &sized(&self.pps)].concat();
         let avc1 = atom(
             b"avc1",

@@ -155,7 +155,8 @@ fn decode(frame: &Frame, size: (u32, u32)) -> Result<(ImageU8, Option<ImageU8>)>
         Some(path) => {
             let m = photo::load_mask(path)?;
             if (m.width, m.height) != (full.width, full.height) {
-                let message = format!("the mask is {}×{} but the photograph is {}×{}; make them equal", m.width, m.height, full.width, full.height);
+                let message =
+                    format!("the mask is {}×{} but the photograph is {}×{}; make them equal", m.width, m.height, full.width, full.height);
                 return Err(DataError::input(path, message));
             }
             Some(m.downsampled(size.0 as usize, size.1 as usize))

@@ -27,9 +27,18 @@ const COLORS: [[u8; 3]; 8] =
 
 /// What both outputs draw.
 enum Mark {
-    Line { points: Vec<(f64, f64)>, color: [u8; 3], width: f64 },
+    Line {
+        points: Vec<(f64, f64)>,
+        color: [u8; 3],
+        width: f64,
+    },
     /// Anchor: 0 left, 0.5 middle, 1 right.
-    Text { at: (f64, f64), text: String, anchor: f64, color: [u8; 3] },
+    Text {
+        at: (f64, f64),
+        text: String,
+        anchor: f64,
+        color: [u8; 3],
+    },
 }
 
 /// "Nice" step so that about `n` of them span `range`.
@@ -49,7 +58,8 @@ fn label(v: f64, step: f64) -> String {
 
 fn marks(chart: &Chart, top: f64) -> Vec<Mark> {
     let (ink, grid) = ([40; 3], [225; 3]);
-    let all: Vec<(f64, f64)> = chart.series.iter().flat_map(|s| &s.points).copied().filter(|p| p.0.is_finite() && p.1.is_finite()).collect();
+    let all: Vec<(f64, f64)> =
+        chart.series.iter().flat_map(|s| &s.points).copied().filter(|p| p.0.is_finite() && p.1.is_finite()).collect();
     let title = Mark::Text { at: (WIDTH / 2.0, top + 12.0), text: chart.title.clone(), anchor: 0.5, color: ink };
     if all.is_empty() {
         let note = Mark::Text { at: (WIDTH / 2.0, top + HEIGHT / 2.0), text: "no data".into(), anchor: 0.5, color: ink };
@@ -102,12 +112,19 @@ pub fn svg(charts: &[Chart]) -> String {
             match m {
                 Mark::Line { points, color: [r, g, b], width } => {
                     let p: Vec<String> = points.iter().map(|p| format!("{:.1},{:.1}", p.0, p.1)).collect();
-                    out += &format!("<polyline fill=\"none\" stroke=\"rgb({r},{g},{b})\" stroke-width=\"{width}\" points=\"{}\"/>\n", p.join(" "));
+                    out += &format!(
+                        "<polyline fill=\"none\" stroke=\"rgb({r},{g},{b})\" stroke-width=\"{width}\" points=\"{}\"/>\n",
+                        p.join(" ")
+                    );
                 }
                 Mark::Text { at, text, anchor, color: [r, g, b] } => {
                     let anchor = ["start", "middle", "end"][(anchor * 2.0) as usize];
                     let text = text.replace('&', "&amp;").replace('<', "&lt;");
-                    out += &format!("<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"{anchor}\" fill=\"rgb({r},{g},{b})\">{text}</text>\n", at.0, at.1 + 8.0);
+                    out += &format!(
+                        "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"{anchor}\" fill=\"rgb({r},{g},{b})\">{text}</text>\n",
+                        at.0,
+                        at.1 + 8.0
+                    );
                 }
             }
         }

@@ -66,7 +66,13 @@ pub fn apply(rule: &SplitRule, frames: &mut [Frame], has_own: bool, seed: u64) {
             let (n, share) = (frames.len(), |p: u32| frames.len() * p as usize / 100);
             let (a, b) = (share(train).max(1).min(n), share(train + val).max(1).min(n));
             for (rank, i) in order.into_iter().enumerate() {
-                frames[i].split = if rank < a { Split::Train } else if rank < b { Split::Val } else { Split::Test };
+                frames[i].split = if rank < a {
+                    Split::Train
+                } else if rank < b {
+                    Split::Val
+                } else {
+                    Split::Test
+                };
             }
         }
     }

@@ -67,9 +67,8 @@ fn ngp_scene(head: &Object) -> Result<Option<SceneBox>> {
 }
 
 fn read_frames(head: &Object, root: &Path, split: Split, out: &mut Imported) -> Result<()> {
-    let frames = head
-        .array("frames")?
-        .ok_or_else(|| DataError::input(head.path, "frames: missing; expected a list of photographs with poses"))?;
+    let frames =
+        head.array("frames")?.ok_or_else(|| DataError::input(head.path, "frames: missing; expected a list of photographs with poses"))?;
     let mut sizes = None;
     for (i, value) in frames.iter().enumerate() {
         let place = format!("frames[{i}].");
@@ -105,7 +104,9 @@ fn read_frames(head: &Object, root: &Path, split: Split, out: &mut Imported) -> 
 fn optional_file(frame: &Object, key: &str, root: &Path) -> Result<Option<std::path::PathBuf>> {
     let Some(name) = frame.text(key)? else { return Ok(None) };
     let found = locate(root, name, frame.path, &format!("{}{key}", frame.place))?;
-    found.map(Some).ok_or_else(|| DataError::input(frame.path, format!("{}{key}: {name} does not exist; remove the field or add the file", frame.place)))
+    found.map(Some).ok_or_else(|| {
+        DataError::input(frame.path, format!("{}{key}: {name} does not exist; remove the field or add the file", frame.place))
+    })
 }
 
 fn read_pose(frame: &Object) -> Result<Pose> {
@@ -125,7 +126,7 @@ pub fn rigid(pose: Pose) -> std::result::Result<Pose, String> {
     if pose.rotation == DMat3::ZERO {
         return Err("the rotation is zero".into());
     }
-    if error > 2.0 && error < 2.02 {
+    if error > 1.98 && error < 2.02 {
         return Err("the rotation mirrors (determinant −1)".into());
     }
     if error.is_nan() || error > 0.02 {
@@ -152,9 +153,8 @@ fn read_camera(head: &Object, frame: &Object, image: &Path, sizes: &mut Option<(
         (Some(f), _) => f,
         (None, Some(a)) if a < std::f64::consts::PI => from_angle(a, width),
         (None, Some(a)) => return Err(DataError::input(head.path, format!("camera_angle_x: {a} is not an angle below π radians"))),
-        (None, None) => positive("fl_y")?.ok_or_else(|| {
-            DataError::input(head.path, "fl_x: missing; give fl_x in pixels or camera_angle_x in radians")
-        })?,
+        (None, None) => positive("fl_y")?
+            .ok_or_else(|| DataError::input(head.path, "fl_x: missing; give fl_x in pixels or camera_angle_x in radians"))?,
     };
     let fy = match (positive("fl_y")?, positive("camera_angle_y")?, positive("fl_x")?) {
         (Some(f), _, _) => f,
@@ -235,7 +235,12 @@ pub fn write(path: &Path, root: &Path, capture: &diorama_geom::Capture) -> Resul
         })
         .collect();
     let names = |split: Split| -> Vec<String> {
-        capture.frames.iter().filter(|f| f.split == split).map(|f| f.image.strip_prefix(root).unwrap_or(&f.image).to_string_lossy().into_owned()).collect()
+        capture
+            .frames
+            .iter()
+            .filter(|f| f.split == split)
+            .map(|f| f.image.strip_prefix(root).unwrap_or(&f.image).to_string_lossy().into_owned())
+            .collect()
     };
     let s = capture.scene;
     let scale = 0.5 / s.half;

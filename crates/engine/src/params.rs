@@ -20,7 +20,16 @@ pub struct ParamGroup {
 impl ParamGroup {
     pub fn dense(name: &'static str, values: Vec<f32>, adam: Adam) -> Self {
         let n = values.len();
-        ParamGroup { name, values, grads: vec![0.0; n], moment1: vec![0.0; n], moment2: vec![0.0; n], touched: Vec::new(), adam, frozen: false }
+        ParamGroup {
+            name,
+            values,
+            grads: vec![0.0; n],
+            moment1: vec![0.0; n],
+            moment2: vec![0.0; n],
+            touched: Vec::new(),
+            adam,
+            frozen: false,
+        }
     }
 
     /// # Panics

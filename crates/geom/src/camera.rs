@@ -103,10 +103,7 @@ impl Lens {
     pub fn distort(&self, u: DVec2) -> DVec2 {
         let r2 = u.length_squared();
         let prism = |p: &[f64; 2]| {
-            DVec2::new(
-                2.0 * p[0] * u.x * u.y + p[1] * (r2 + 2.0 * u.x * u.x),
-                2.0 * p[1] * u.x * u.y + p[0] * (r2 + 2.0 * u.y * u.y),
-            )
+            DVec2::new(2.0 * p[0] * u.x * u.y + p[1] * (r2 + 2.0 * u.x * u.x), 2.0 * p[1] * u.x * u.y + p[0] * (r2 + 2.0 * u.y * u.y))
         };
         match self {
             Lens::Pinhole | Lens::Equirectangular => u,

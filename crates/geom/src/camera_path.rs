@@ -65,10 +65,7 @@ pub fn interpolate(poses: &[Pose], frames: usize) -> Vec<Pose> {
             let at = |j: isize| poses[(k as isize + j).clamp(0, n as isize - 1) as usize].translation;
             let (p0, p1, p2, p3) = (at(-1), at(0), at(1), at(2));
             let translation = 0.5
-                * (2.0 * p1
-                    + (p2 - p0) * u
-                    + (2.0 * p0 - 5.0 * p1 + 4.0 * p2 - p3) * u * u
-                    + (3.0 * p1 - p0 - 3.0 * p2 + p3) * u * u * u);
+                * (2.0 * p1 + (p2 - p0) * u + (2.0 * p0 - 5.0 * p1 + 4.0 * p2 - p3) * u * u + (3.0 * p1 - p0 - 3.0 * p2 + p3) * u * u * u);
             let q = DQuat::from_mat3(&poses[k].rotation).slerp(DQuat::from_mat3(&poses[k + 1].rotation), u);
             Pose { rotation: DMat3::from_quat(q), translation }
         })

@@ -158,14 +158,7 @@ impl<B: SliceKernels> Backward<B, ARITY> for JointStep {
 }
 
 impl<B: SliceKernels, C: CheckpointStrategy> SliceBackend for Autodiff<B, C> {
-    fn slice_op(
-        a: FloatTensor<Self>,
-        b: FloatTensor<Self>,
-        c: FloatTensor<Self>,
-        d: FloatTensor<Self>,
-        n: usize,
-        op: OpRef,
-    ) -> Four<Self> {
+    fn slice_op(a: FloatTensor<Self>, b: FloatTensor<Self>, c: FloatTensor<Self>, d: FloatTensor<Self>, n: usize, op: OpRef) -> Four<Self> {
         let (mut inputs, nodes): (Vec<_>, Vec<_>) = [a, b, c, d].into_iter().map(|t| t.into_parts()).unzip();
         inputs.truncate(n);
         let outputs = B::k_forward(&inputs, &op);

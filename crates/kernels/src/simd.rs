@@ -30,9 +30,7 @@ impl Level {
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
             #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => {
-                is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") && Level::Avx2.is_available()
-            }
+            Level::Avx512 => is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") && Level::Avx2.is_available(),
             #[cfg(not(target_arch = "x86_64"))]
             _ => false,
         }
@@ -55,9 +53,7 @@ pub fn level() -> Level {
         _ => {
             let best = *Level::available().last().unwrap_or(&Level::Portable);
             let wanted = std::env::var("DIORAMA_SIMD").ok();
-            let chosen = wanted
-                .and_then(|w| Level::available().into_iter().find(|l| l.name() == w))
-                .unwrap_or(best);
+            let chosen = wanted.and_then(|w| Level::available().into_iter().find(|l| l.name() == w)).unwrap_or(best);
             ACTIVE.store(chosen as u8, Ordering::Relaxed);
             chosen
         }

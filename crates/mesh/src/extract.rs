@@ -69,7 +69,8 @@ pub fn extract(field: &dyn FieldQuery, grid: &Grid, level: f32, progress: &mut d
     }
     mesher.push(&empty);
     // The empty layer lies one cell outside: pull what it cut back onto the box.
-    let world = |p: &[f32; 3]| std::array::from_fn(|k| (grid.min[k] + (p[k] - 1.0) * cell).clamp(grid.min[k], grid.max[k].max(grid.min[k] + cell)));
+    let world =
+        |p: &[f32; 3]| std::array::from_fn(|k| (grid.min[k] + (p[k] - 1.0) * cell).clamp(grid.min[k], grid.max[k].max(grid.min[k] + cell)));
     let positions = mesher.positions.iter().map(world).collect();
     Mesh { positions, faces: mesher.faces, ..Mesh::default() }
 }
@@ -111,9 +112,27 @@ mod tests {
 
     const GRID: Grid = Grid { min: [-1.0; 3], max: [1.0; 3], resolution: 48 };
 
+    /// Distance from a point to the mesh's triangles.
     fn nearest(mesh: &Mesh, p: [f32; 3]) -> f32 {
-        let d2 = |q: &[f32; 3]| (0..3).map(|k| (q[k] - p[k]) * (q[k] - p[k])).sum::<f32>();
-        mesh.positions.iter().map(d2).fold(f32::INFINITY, f32::min).sqrt()
+        mesh.faces.iter().map(|f| triangle_distance(p, f.map(|i| mesh.positions[i as usize]))).fold(f32::INFINITY, f32::min)
+    }
+
+    /// Distance to a triangle: to its plane where the foot lies inside, else to the nearest edge.
+    fn triangle_distance(p: [f32; 3], t: [[f32; 3]; 3]) -> f32 {
+        use diorama_geom::mesh::{cross, sub};
+        let dot = |a: [f32; 3], b: [f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+        let n = cross(sub(t[1], t[0]), sub(t[2], t[0]));
+        let inside = (0..3).all(|k| dot(cross(sub(t[(k + 1) % 3], t[k]), sub(p, t[k])), n) >= 0.0);
+        if inside && dot(n, n) > 0.0 {
+            return (dot(sub(p, t[0]), n) / dot(n, n).sqrt()).abs();
+        }
+        let edge = |a: [f32; 3], b: [f32; 3]| {
+            let d = sub(b, a);
+            let s = (dot(sub(p, a), d) / dot(d, d).max(1e-20)).clamp(0.0, 1.0);
+            let q = sub(p, std::array::from_fn(|k| a[k] + s * d[k]));
+            dot(q, q).sqrt()
+        };
+        edge(t[0], t[1]).min(edge(t[1], t[2])).min(edge(t[2], t[0]))
     }
 
     #[test]
@@ -125,12 +144,12 @@ mod tests {
         for p in &mesh.positions {
             assert!(shape.distance(*p).abs() <= 0.5 * cell);
         }
-        // Surface to mesh: the nearest vertex lies within half a voxel of the tangent plane's nearest point.
+        // Surface to mesh.
         for i in 0..500 {
             let z = 1.0 - (2.0 * i as f32 + 1.0) / 500.0;
             let (r, a) = ((1.0 - z * z).sqrt(), i as f32 * 2.399_963);
             let p = [0.7 * r * a.cos(), 0.7 * r * a.sin(), 0.7 * z];
-            assert!(nearest(&mesh, p) <= 1.0 * cell, "a hole near {p:?}");
+            assert!(nearest(&mesh, p) <= 0.5 * cell, "a hole near {p:?}");
         }
     }
 
@@ -147,6 +166,12 @@ mod tests {
         for c in 0..8 {
             let corner: [f32; 3] = std::array::from_fn(|k| if c >> k & 1 == 1 { half[k] } else { -half[k] });
             assert!(nearest(&mesh, corner) <= 1.2 * cell, "{}", nearest(&mesh, corner) / cell);
+        }
+        // Face centres lie on the mesh.
+        for k in 0..6 {
+            let mut p = [0.01, 0.02, 0.03];
+            p[k / 2] = if k % 2 == 0 { half[k / 2] } else { -half[k / 2] };
+            assert!(nearest(&mesh, p) <= 0.5 * cell);
         }
         // Faces outward: positive volume close to the box's.
         let volume: f32 = mesh

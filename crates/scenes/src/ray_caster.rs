@@ -1,29 +1,58 @@
 //! Primitives, procedural textures, one sun with hard shadows, and a box filter over sub-pixels.
 
+use diorama_geom::color::{srgb_from_linear, u8_from_unit};
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, ImageU8, Pose, Ray};
-use diorama_geom::color::{srgb_from_linear, u8_from_unit};
 use rayon::prelude::*;
 
 /// Solid shapes.
 #[derive(Clone, Copy, Debug)]
 pub enum Shape {
-    Sphere { center: DVec3, radius: f64 },
+    Sphere {
+        center: DVec3,
+        radius: f64,
+    },
     /// Axis-aligned, turned by `angle` about z through its centre.
-    Box { center: DVec3, half: DVec3, angle: f64 },
+    Box {
+        center: DVec3,
+        half: DVec3,
+        angle: f64,
+    },
     /// Upright, with caps.
-    Cylinder { center: DVec3, radius: f64, half_height: f64 },
+    Cylinder {
+        center: DVec3,
+        radius: f64,
+        half_height: f64,
+    },
 }
 
 /// Procedural colour of a surface point, linear.
 #[derive(Clone, Copy, Debug)]
 pub enum Texture {
-    Checker { a: DVec3, b: DVec3, size: f64 },
-    Stripes { a: DVec3, b: DVec3, axis: DVec3, size: f64 },
+    Checker {
+        a: DVec3,
+        b: DVec3,
+        size: f64,
+    },
+    Stripes {
+        a: DVec3,
+        b: DVec3,
+        axis: DVec3,
+        size: f64,
+    },
     /// Rings around the vertical axis through `center`.
-    Rings { a: DVec3, b: DVec3, center: DVec3, size: f64 },
+    Rings {
+        a: DVec3,
+        b: DVec3,
+        center: DVec3,
+        size: f64,
+    },
     /// Round dots on a cubic lattice.
-    Dots { a: DVec3, b: DVec3, size: f64 },
+    Dots {
+        a: DVec3,
+        b: DVec3,
+        size: f64,
+    },
 }
 
 /// A shape with its surface.

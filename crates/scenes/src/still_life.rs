@@ -62,18 +62,18 @@ pub fn scene_box() -> SceneBox {
     SceneBox { center: DVec3::ZERO, half: 1.0, aabb_scale: 1 }
 }
 
-/// Renders all photographs, exactly posed.
-pub fn photographs() -> Vec<Photo> {
+/// Renders `views` photographs of `size` pixels a side, exactly posed.
+pub fn photographs(views: usize, size: u32) -> Vec<Photo> {
     let scene = scene();
-    let camera = Camera::pinhole(SIZE, SIZE, 0.75);
-    (0..VIEWS)
+    let camera = Camera::pinhole(size, size, 0.75);
+    (0..views)
         .into_par_iter()
         .map(|i| {
             let (ring, k) = (i % 2, i / 2);
-            let angle = (k as f64 + 0.5 * ring as f64) / (VIEWS / 2) as f64 * std::f64::consts::TAU;
+            let angle = (k as f64 + 0.5 * ring as f64) / views.div_ceil(2) as f64 * std::f64::consts::TAU;
             let elevation: f64 = [0.35, 0.85][ring];
             let direction = DVec3::new(angle.cos() * elevation.cos(), angle.sin() * elevation.cos(), elevation.sin());
-            let pose = Pose::look_at(direction * 2.7 + DVec3::new(0.0, 0.0, -0.12), DVec3::new(0.0, 0.0, -0.12), DVec3::Z);
+            let pose = Pose::look_at(direction * 3.0 + DVec3::new(0.0, 0.0, -0.12), DVec3::new(0.0, 0.0, -0.12), DVec3::Z);
             Photo { name: format!("view_{i:02}"), camera, world_from_camera: pose, image: scene.render(&camera, &pose, 4) }
         })
         .collect()
@@ -85,7 +85,7 @@ mod tests {
 
     #[test]
     fn a_constant_image_scores_at_most_twelve_decibels() {
-        let photos = photographs();
+        let photos = photographs(VIEWS, SIZE / 2);
         let on_white = |p: &[u8]| -> [f64; 3] {
             let a = p[3] as f64 / 255.0;
             std::array::from_fn(|k| p[k] as f64 / 255.0 * a + 1.0 - a)
@@ -100,7 +100,7 @@ mod tests {
 
     #[test]
     fn every_view_shows_the_still_life_whole() {
-        for p in photographs() {
+        for p in photographs(16, SIZE) {
             let border = |x: usize, y: usize| p.image.pixel(x, y)[3];
             let n = SIZE as usize;
             assert!((0..n).all(|i| border(i, 0) == 0 && border(i, n - 1) == 0 && border(0, i) == 0 && border(n - 1, i) == 0), "{}", p.name);

@@ -11,10 +11,16 @@ pub fn run(a: &CompareArgs) -> Result<Outcome> {
         println!("{}", serde_json::to_string(&table).expect("plain values"));
         return Ok(Outcome::Done);
     }
-    println!("{:<24} {:<9} {:>8} {:>9} {:>11} {:>11} {:>7} {:>7} {:>8}", "run", "method", "steps", "seconds", "rays", "parameters", "psnr", "ssim", "mse");
+    println!(
+        "{:<24} {:<9} {:>8} {:>9} {:>11} {:>11} {:>7} {:>7} {:>8}",
+        "run", "method", "steps", "seconds", "rays", "parameters", "psnr", "ssim", "mse"
+    );
     for c in &table {
         let run = c.run.display().to_string();
-        println!("{run:<24} {:<9} {:>8} {:>9.1} {:>11} {:>11} {:>7.2} {:>7.4} {:>8.5}", c.method, c.steps, c.seconds, c.rays, c.parameters, c.psnr, c.ssim, c.mse);
+        println!(
+            "{run:<24} {:<9} {:>8} {:>9.1} {:>11} {:>11} {:>7.2} {:>7.4} {:>8.5}",
+            c.method, c.steps, c.seconds, c.rays, c.parameters, c.psnr, c.ssim, c.mse
+        );
     }
     println!("{}", a.out.display());
     Ok(Outcome::Done)

@@ -36,7 +36,10 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
     if a.json {
         println!("{}", serde_json::to_string(&report).expect("a report is JSON"));
     } else {
-        println!("{} views: psnr {:.2} dB (worst {:.2}, affine {:.2}), ssim {:.4}, mse {:.5}", report.views, report.psnr, report.psnr_min, report.psnr_affine, report.ssim, report.mse);
+        println!(
+            "{} views: psnr {:.2} dB (worst {:.2}, affine {:.2}), ssim {:.4}, mse {:.5}",
+            report.views, report.psnr, report.psnr_min, report.psnr_affine, report.ssim, report.mse
+        );
         if let Some(p) = report.psnr_mean_image {
             println!("the mean training image in place of renders: {p:.2} dB");
         }

@@ -25,7 +25,13 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
     let level = match &a.level[..] {
         "auto" => None,
         // Densities per unit of the input become densities per unit of the world.
-        n => Some(n.parse::<f32>().ok().filter(|v| v.is_finite() && *v > 0.0).map(|v| v / scale).ok_or_else(|| PipelineError::Usage(format!("--level {n}: expected auto or a number above 0")))?),
+        n => Some(
+            n.parse::<f32>()
+                .ok()
+                .filter(|v| v.is_finite() && *v > 0.0)
+                .map(|v| v / scale)
+                .ok_or_else(|| PipelineError::Usage(format!("--level {n}: expected auto or a number above 0")))?,
+        ),
     };
     let clip = a.clip.as_deref().map(|c| parse_clip(c, &model.capture.world_from_capture)).transpose()?;
     let options = ExportOptions { format, out: a.out.clone(), resolution: a.resolution, level, faces: a.faces, clip, floaters: a.floaters };
@@ -39,7 +45,16 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
     if a.json {
         println!("{}", serde_json::to_string(&made).expect("plain values"));
     } else {
-        println!("{}: {} vertices, {} faces, {} KiB, {:.1} s, level {:.2}{}", made.file.display(), made.vertices, made.faces, made.bytes >> 10, made.seconds, made.level, if made.watertight { ", watertight" } else { "" });
+        println!(
+            "{}: {} vertices, {} faces, {} KiB, {:.1} s, level {:.2}{}",
+            made.file.display(),
+            made.vertices,
+            made.faces,
+            made.bytes >> 10,
+            made.seconds,
+            made.level,
+            if made.watertight { ", watertight" } else { "" }
+        );
     }
     Ok(Outcome::Done)
 }

@@ -45,7 +45,10 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
     })?;
     let seconds = start.elapsed().as_secs_f64();
     if a.json {
-        println!("{}", serde_json::json!({ "run": a.run, "frames": frames, "seconds": seconds, "images": images, "video": a.video, "interrupted": interrupted }));
+        println!(
+            "{}",
+            serde_json::json!({ "run": a.run, "frames": frames, "seconds": seconds, "images": images, "video": a.video, "interrupted": interrupted })
+        );
     } else {
         println!("{frames} frames in {seconds:.1} s");
         images.iter().chain(a.video.iter()).for_each(|p| println!("{}", p.display()));

@@ -49,7 +49,14 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
     if a.json {
         println!("{object}");
     } else {
-        println!("{}: {} steps in {:.1} s, {:.0} rays/s, psnr {:.2} dB on training rays", a.out.display(), summary.step, summary.seconds, summary.rays as f64 / seconds, summary.psnr);
+        println!(
+            "{}: {} steps in {:.1} s, {:.0} rays/s, psnr {:.2} dB on training rays",
+            a.out.display(),
+            summary.step,
+            summary.seconds,
+            summary.rays as f64 / seconds,
+            summary.psnr
+        );
         println!("next: diorama eval {}", a.out.display());
     }
     Ok(if summary.interrupted { Outcome::Interrupted } else { Outcome::Done })
@@ -65,7 +72,12 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
         let c = read_config(&a.out)?;
         if let Some(d) = &a.data {
             if std::path::absolute(d).ok() != std::path::absolute(&c.data.path).ok() {
-                return Err(PipelineError::Usage(format!("--resume: {} was trained on {}, not on {}", a.out.display(), c.data.path.display(), d.display())));
+                return Err(PipelineError::Usage(format!(
+                    "--resume: {} was trained on {}, not on {}",
+                    a.out.display(),
+                    c.data.path.display(),
+                    d.display()
+                )));
             }
         }
         c
@@ -83,7 +95,16 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
         }
     };
     if a.resume {
-        let fixed = [("--method", a.method.is_some()), ("--downscale", a.downscale.is_some()), ("--split", a.split.is_some()), ("--background", a.background.is_some()), ("--seed", a.seed.is_some()), ("--format", a.format.is_some()), ("--config", a.config.is_some()), ("--preset", a.preset.is_some())];
+        let fixed = [
+            ("--method", a.method.is_some()),
+            ("--downscale", a.downscale.is_some()),
+            ("--split", a.split.is_some()),
+            ("--background", a.background.is_some()),
+            ("--seed", a.seed.is_some()),
+            ("--format", a.format.is_some()),
+            ("--config", a.config.is_some()),
+            ("--preset", a.preset.is_some()),
+        ];
         if let Some((flag, _)) = fixed.iter().find(|f| f.1) {
             return Err(PipelineError::Usage(format!("{flag} cannot change on --resume; start a new run with another --out")));
         }

@@ -121,7 +121,13 @@ fn plain(encoding: Frequency, widths: &[usize], outer: f32, rate: f32, seed: u64
 }
 
 fn frequency_field(
-    net: FieldNet, encoding: Frequency, directions: DirectionCode, outer: f32, rate: f32, appearance: Option<Appearance>, seed: u64,
+    net: FieldNet,
+    encoding: Frequency,
+    directions: DirectionCode,
+    outer: f32,
+    rate: f32,
+    appearance: Option<Appearance>,
+    seed: u64,
 ) -> Field {
     let adam = Adam { rate, beta2: 0.999, epsilon: 1e-8, ..Adam::default() };
     Field {

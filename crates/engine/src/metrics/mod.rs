@@ -28,11 +28,16 @@ pub fn compare(rendered: &Image, photo: &Image, counts: impl Fn(usize, usize) ->
     let pixels: Vec<usize> = (0..photo.width * photo.height).filter(|i| counts(i % photo.width, i / photo.width)).collect();
     let c = photo.channels;
     let error = |f: &dyn Fn(usize, f64) -> f64| {
-        let sum: f64 = pixels.iter().flat_map(|i| (0..c).map(move |k| i * c + k)).map(|e| (f(e % c, rendered.data[e] as f64) - photo.data[e] as f64).powi(2)).sum();
+        let sum: f64 = pixels
+            .iter()
+            .flat_map(|i| (0..c).map(move |k| i * c + k))
+            .map(|e| (f(e % c, rendered.data[e] as f64) - photo.data[e] as f64).powi(2))
+            .sum();
         sum / (pixels.len() * c).max(1) as f64
     };
     let mse = error(&|_, v| v);
-    let fits: Vec<(f64, f64)> = (0..c).map(|k| affine_fit(pixels.iter().map(|i| (rendered.data[i * c + k] as f64, photo.data[i * c + k] as f64)))).collect();
+    let fits: Vec<(f64, f64)> =
+        (0..c).map(|k| affine_fit(pixels.iter().map(|i| (rendered.data[i * c + k] as f64, photo.data[i * c + k] as f64)))).collect();
     let affine = error(&|k, v| fits[k].0 * v + fits[k].1);
     let ssim = ssim::cpu::ssim(photo.width, photo.height, c, &rendered.data, &photo.data);
     Scores { mse, psnr: psnr(mse), ssim, psnr_affine: psnr(affine) }

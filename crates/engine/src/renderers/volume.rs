@@ -19,10 +19,19 @@ pub enum Backdrop<'a> {
 /// How samples are placed.
 #[derive(Clone, Copy)]
 pub enum Sampling<'a> {
-    Occupancy { grid: &'a Occupancy, max_samples: usize },
-    Stratified { samples: usize },
+    Occupancy {
+        grid: &'a Occupancy,
+        max_samples: usize,
+    },
+    Stratified {
+        samples: usize,
+    },
     /// `samples` for the coarse field decide where `more` go for the main one.
-    Hierarchical { coarse: &'a Field, samples: usize, more: usize },
+    Hierarchical {
+        coarse: &'a Field,
+        samples: usize,
+        more: usize,
+    },
 }
 
 /// A field ready to be looked at.

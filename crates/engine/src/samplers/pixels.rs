@@ -2,8 +2,8 @@
 
 use super::RayBatch;
 use diorama_geom::rng::Rng;
-use diorama_kernels::ops::{pixel_gather, ray_aabb, ray_generation};
 use diorama_kernels::ops::ray_generation::PosedCamera;
+use diorama_kernels::ops::{pixel_gather, ray_aabb, ray_generation};
 use rayon::prelude::*;
 
 /// Access to training pixels, wherever they lie.
@@ -145,7 +145,8 @@ mod tests {
     }
 
     fn draw_with(map: Option<&ErrorMap>) -> RayBatch {
-        let camera = PosedCamera { camera: Camera::pinhole(8, 4, 1.0), pose: Pose::look_at(DVec3::new(2.0, 0.5, 0.5), DVec3::splat(0.5), DVec3::Z) };
+        let camera =
+            PosedCamera { camera: Camera::pinhole(8, 4, 1.0), pose: Pose::look_at(DVec3::new(2.0, 0.5, 0.5), DVec3::splat(0.5), DVec3::Z) };
         let mut batch = RayBatch::default();
         batch.resize(4096);
         let o = DrawOptions { cameras: &[camera, camera], first: 0, rng: Rng::new(1, 1), near: 0.1, cube: (0.0, 1.0), error_map: map };
@@ -176,9 +177,8 @@ mod tests {
             map.record(1, 0.9, 0.9, 1.0);
         }
         map.refresh();
-        let share = |b: &RayBatch| {
-            b.images.iter().zip(b.pixels.chunks_exact(2)).filter(|(i, p)| **i == 1 && p[0] > 6.0 && p[1] > 3.0).count()
-        };
+        let share =
+            |b: &RayBatch| b.images.iter().zip(b.pixels.chunks_exact(2)).filter(|(i, p)| **i == 1 && p[0] > 6.0 && p[1] > 3.0).count();
         assert!(share(&draw_with(Some(&map))) > 3 * share(&draw_with(None)));
     }
 }

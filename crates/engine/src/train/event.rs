@@ -14,14 +14,42 @@ pub struct StepReport {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Event {
     /// The run begins or goes on at `step`.
-    Started { step: u64, steps: Option<u64>, seconds: Option<f64> },
+    Started {
+        step: u64,
+        steps: Option<u64>,
+        seconds: Option<f64>,
+    },
     /// Means since the last such event; totals are from the start of the run.
-    Progress { step: u64, seconds: f64, progress: f64, loss: f64, mse: f64, psnr: f64, rays: u64, samples: u64, rays_per_s: f64 },
+    Progress {
+        step: u64,
+        seconds: f64,
+        progress: f64,
+        loss: f64,
+        mse: f64,
+        psnr: f64,
+        rays: u64,
+        samples: u64,
+        rays_per_s: f64,
+    },
     /// Held-out views were judged.
-    Evaluated { step: u64, seconds: f64, psnr: f64, mse: f64 },
-    Saved { step: u64 },
+    Evaluated {
+        step: u64,
+        seconds: f64,
+        psnr: f64,
+        mse: f64,
+    },
+    Saved {
+        step: u64,
+    },
     /// A loss that is not finite; the last checkpoint is restored and the rate lowered.
-    Recovered { step: u64, to_step: u64 },
+    Recovered {
+        step: u64,
+        to_step: u64,
+    },
     Note(String),
-    Finished { step: u64, seconds: f64, interrupted: bool },
+    Finished {
+        step: u64,
+        seconds: f64,
+        interrupted: bool,
+    },
 }

@@ -49,7 +49,9 @@ pub struct Summary {
 pub enum RunError<E> {
     Save(E),
     /// The loss was not finite twice; the last good checkpoint is of this step.
-    Diverged { step: u64 },
+    Diverged {
+        step: u64,
+    },
 }
 
 /// Where a run begins: zero, or what a checkpoint says.
@@ -63,7 +65,11 @@ pub struct Origin {
 
 /// Trains until the budget is spent or `interrupt` is set; a last checkpoint is always written.
 pub fn run<T: Trainee>(
-    options: &RunOptions, origin: Origin, trainee: &mut T, interrupt: &AtomicBool, events: &mut dyn FnMut(&Event),
+    options: &RunOptions,
+    origin: Origin,
+    trainee: &mut T,
+    interrupt: &AtomicBool,
+    events: &mut dyn FnMut(&Event),
 ) -> Result<Summary, RunError<T::Error>> {
     let Origin { mut step, seconds: before, mut rays, mut samples } = origin;
     events(&Event::Started { step, steps: options.steps, seconds: options.seconds });
@@ -102,7 +108,8 @@ pub fn run<T: Trainee>(
             events(&p);
             since = Window::new(seconds);
         }
-        let due = clock.seconds() - last_save > options.save_every_seconds || options.save_every_steps.is_some_and(|n| step.is_multiple_of(n));
+        let due =
+            clock.seconds() - last_save > options.save_every_seconds || options.save_every_steps.is_some_and(|n| step.is_multiple_of(n));
         if due {
             last_save = clock.seconds();
             trainee.save(step, last_save).map_err(RunError::Save)?;
@@ -213,7 +220,14 @@ mod tests {
     }
 
     fn options() -> RunOptions {
-        RunOptions { steps: Some(10), seconds: None, log_every: 4, save_every_seconds: 1e9, save_every_steps: Some(5), evaluate_every: Some(5) }
+        RunOptions {
+            steps: Some(10),
+            seconds: None,
+            log_every: 4,
+            save_every_seconds: 1e9,
+            save_every_steps: Some(5),
+            evaluate_every: Some(5),
+        }
     }
 
     #[test]

@@ -53,7 +53,13 @@ pub fn compare(runs: &[PathBuf], out: &Path, note: &mut dyn FnMut(&str)) -> Resu
             seconds: model.origin.seconds,
             rays: model.origin.rays,
             samples: model.origin.samples,
-            parameters: model.field.groups().iter().chain(model.coarse.iter().flat_map(|c| c.groups()).collect::<Vec<_>>().iter()).map(|g| g.values.len()).sum(),
+            parameters: model
+                .field
+                .groups()
+                .iter()
+                .chain(model.coarse.iter().flat_map(|c| c.groups()).collect::<Vec<_>>().iter())
+                .map(|g| g.values.len())
+                .sum(),
             psnr: report.psnr,
             ssim: report.ssim,
             mse: report.mse,

@@ -292,10 +292,9 @@ impl Config {
 /// Paths of all leaves.
 fn keys(value: &toml::Value, prefix: &str) -> Vec<String> {
     match value {
-        toml::Value::Table(t) => t
-            .iter()
-            .flat_map(|(k, v)| keys(v, &if prefix.is_empty() { k.clone() } else { format!("{prefix}.{k}") }))
-            .collect(),
+        toml::Value::Table(t) => {
+            t.iter().flat_map(|(k, v)| keys(v, &if prefix.is_empty() { k.clone() } else { format!("{prefix}.{k}") })).collect()
+        }
         _ => vec![prefix.to_string()],
     }
 }
@@ -347,7 +346,14 @@ mod tests {
     #[test]
     fn values_that_make_no_sense_are_refused() {
         let c = Config::new(Method::Ngp, "x".into());
-        for (k, v) in [("field.features", "3"), ("loss.color", "l7"), ("optim.rate", "fast"), ("optim.rate", "inf"), ("data.downscale", "0"), ("device", "cuda")] {
+        for (k, v) in [
+            ("field.features", "3"),
+            ("loss.color", "l7"),
+            ("optim.rate", "fast"),
+            ("optim.rate", "inf"),
+            ("data.downscale", "0"),
+            ("device", "cuda"),
+        ] {
             assert!(c.clone().set(k, v).is_err(), "{k} = {v}");
         }
     }

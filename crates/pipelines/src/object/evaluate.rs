@@ -68,7 +68,8 @@ pub fn reference_photo(model: &ObjectModel, full: &ImageU8) -> Image {
 pub fn score_view(model: &ObjectModel, i: usize, full: &ImageU8) -> ScoredView {
     let photo = reference_photo(model, full);
     let view = model.tracer().view(&model.posed(i), &mut |_| {});
-    let mask = model.capture.frames[i].mask.as_ref().and_then(|m| photo::load_mask(m).ok()).map(|m| m.downsampled(photo.width, photo.height));
+    let mask =
+        model.capture.frames[i].mask.as_ref().and_then(|m| photo::load_mask(m).ok()).map(|m| m.downsampled(photo.width, photo.height));
     let mut shown = view.rgb.clone();
     shown.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     let scores = metrics::compare(&shown, &photo, |x, y| mask.as_ref().is_none_or(|m| m.pixel(x, y)[0] >= 128));

@@ -253,7 +253,11 @@ impl ObjectModel {
         let mut load = |name: &str, into: &mut Vec<f32>| -> Result<()> {
             let v = c.take(name).ok_or_else(|| wrong(format!("{name} is missing")))?;
             if v.len() != into.len() {
-                return Err(wrong(format!("{name} has {} numbers where the configuration needs {}; use the configuration that it was trained with", v.len(), into.len())));
+                return Err(wrong(format!(
+                    "{name} has {} numbers where the configuration needs {}; use the configuration that it was trained with",
+                    v.len(),
+                    into.len()
+                )));
             }
             *into = v;
             Ok(())

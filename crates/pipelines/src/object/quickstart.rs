@@ -31,12 +31,12 @@ pub struct Made {
     pub interrupted: bool,
 }
 
-/// Writes the still life as a capture with `transforms.json` into `folder`.
-pub fn write_capture(folder: &Path) -> Result<()> {
+/// Writes the still life as a capture with `transforms.json` into `folder`: `views` photographs of `size` pixels a side.
+pub fn write_capture(folder: &Path, views: usize, size: u32) -> Result<()> {
     let images = folder.join("images");
     std::fs::create_dir_all(&images).map_err(DataError::io(&images, "create"))?;
     let mut frames = Vec::new();
-    for (i, p) in still_life::photographs().into_iter().enumerate() {
+    for (i, p) in still_life::photographs(views, size).into_iter().enumerate() {
         let image = images.join(format!("{}.png", p.name));
         photo::save_png(&image, &p.image)?;
         frames.push(Frame {
@@ -60,12 +60,17 @@ pub fn write_capture(folder: &Path) -> Result<()> {
 
 /// Generates, trains, scores, films, exports and reports, all into `folder`.
 pub fn quickstart(
-    folder: &Path, seconds: f64, force: bool, interrupt: &AtomicBool, note: &mut dyn FnMut(&str), events: &mut dyn FnMut(&Event),
+    folder: &Path,
+    seconds: f64,
+    force: bool,
+    interrupt: &AtomicBool,
+    note: &mut dyn FnMut(&str),
+    events: &mut dyn FnMut(&Event),
 ) -> Result<Made> {
     let mut run = RunFolder::create(folder, force)?;
     note("rendering the still life");
     let data = folder.join("capture");
-    write_capture(&data)?;
+    write_capture(&data, still_life::VIEWS, still_life::SIZE)?;
     let mut config = Config::new(Method::Ngp, data);
     config.run.steps = 0;
     config.run.seconds = seconds;
@@ -99,7 +104,15 @@ pub fn quickstart(
     };
     render::render(&model, &options, interrupt, &mut |_, _| {})?;
     note("extracting the mesh");
-    let options = ExportOptions { format: Format::Glb, out: folder.join("still_life.glb"), resolution: 192, level: None, faces: 60_000, clip: None, floaters: 0.05 };
+    let options = ExportOptions {
+        format: Format::Glb,
+        out: folder.join("still_life.glb"),
+        resolution: 192,
+        level: None,
+        faces: 60_000,
+        clip: None,
+        floaters: 0.05,
+    };
     let mesh = export::export(&model, &options, &mut |_, _| {})?;
     let page = folder.join("report.html");
     report::write(&page, &summary, &scores, &mesh)?;

@@ -48,7 +48,11 @@ pub fn load_capture(config: &Config) -> Result<Capture> {
 ///
 /// Capture → pixels → model → loop of steps → checkpoint; `events` hears of all of it.
 pub fn train(
-    config: &Config, folder: &mut RunFolder, resume: bool, interrupt: &AtomicBool, events: &mut dyn FnMut(&Event),
+    config: &Config,
+    folder: &mut RunFolder,
+    resume: bool,
+    interrupt: &AtomicBool,
+    events: &mut dyn FnMut(&Event),
 ) -> Result<(ObjectModel, Summary)> {
     let capture = if resume { folder.capture()? } else { load_capture(config)? };
     for note in &capture.notes {
@@ -64,9 +68,13 @@ pub fn train(
     let has_alpha = store.has_alpha;
     let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
     if resume {
-        let (c, note) = checkpoint::load(&folder.checkpoints())?;
-        model.restore(c, &checkpoint::latest(&folder.checkpoints()))?;
-        note.into_iter().for_each(|n| events(&Event::Note(n)));
+        if checkpoint::exists(&folder.checkpoints()) {
+            let (c, note) = checkpoint::load(&folder.checkpoints())?;
+            model.restore(c, &checkpoint::latest(&folder.checkpoints()))?;
+            note.into_iter().for_each(|n| events(&Event::Note(n)));
+        } else {
+            events(&Event::Note("the run was stopped before its first checkpoint: it begins again".into()));
+        }
         folder.cut_metrics(model.origin.step)?;
     } else {
         folder.write_description(config, &model.capture)?;
@@ -210,14 +218,22 @@ impl<'a> Trainer<'a> {
             let (until, block) = OCCUPANCY_WARMUP;
             let rng = Rng::new(m.config.seed, OCCUPANCY);
             grid.update(&m.field, &rng, step, s.occupancy_points, if step <= until { block } else { 1 });
-
         }
         let rays = MarchRays { origins: &b.batch.origins, dirs: &b.batch.dirs, near_far: &b.batch.near_far, jitter: &b.batch.jitter };
         march::cpu::march(&grid.bits, &rays, &grid.march_config(s.max_samples), &mut b.march, &mut b.marched);
         march::cpu::positions(&rays, &b.marched, &mut b.positions);
         let per_ray = b.marched.t.len() as f64 / b.batch.len() as f64;
         m.samples_per_ray = if step == 0 { per_ray } else { 0.9 * m.samples_per_ray + 0.1 * per_ray };
-        let loss = train_field(&mut m.field, &m.config, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, m.corrections.is_some().then_some(&mut b.d_positions));
+        let loss = train_field(
+            &mut m.field,
+            &m.config,
+            &b.batch,
+            &b.marched,
+            &b.positions,
+            &b.background,
+            &mut b.field,
+            m.corrections.is_some().then_some(&mut b.d_positions),
+        );
         (loss, b.marched.t.len() as u64)
     }
 
@@ -303,8 +319,14 @@ fn positions(batch: &RayBatch, marched: &Marched, out: &mut Vec<f32>) {
 
 #[allow(clippy::too_many_arguments)]
 fn train_field(
-    field: &mut Field, config: &Config, batch: &RayBatch, marched: &Marched, positions: &[f32], background: &[f32],
-    buffers: &mut FieldBuffers, d_positions: Option<&mut Vec<f32>>,
+    field: &mut Field,
+    config: &Config,
+    batch: &RayBatch,
+    marched: &Marched,
+    positions: &[f32],
+    background: &[f32],
+    buffers: &mut FieldBuffers,
+    d_positions: Option<&mut Vec<f32>>,
 ) -> f64 {
     let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
     let color = if config.loss.color == "huber" { ColorLoss::Huber(0.1) } else { ColorLoss::Mse };

@@ -103,7 +103,8 @@ pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> 
             if held.is_empty() {
                 return Err(PipelineError::Usage("the run holds no views out; choose another --path".into()));
             }
-            let views = held.iter().map(|&i| PathView { camera: model.posed(i).camera, world_from_camera: frames[i].world_from_camera }).collect();
+            let views =
+                held.iter().map(|&i| PathView { camera: model.posed(i).camera, world_from_camera: frames[i].world_from_camera }).collect();
             CameraPath { views, fps: o.fps as f64 }
         }
     })
@@ -117,13 +118,20 @@ fn view_camera(base: &Camera, size: Option<(u32, u32)>, fov: Option<f64>) -> Cam
 }
 
 /// Renders a path; returns the number of frames and whether it was interrupted. `progress` is told (frame, of).
-pub fn render(model: &ObjectModel, o: &RenderOptions, interrupt: &AtomicBool, progress: &mut dyn FnMut(usize, usize)) -> Result<(usize, bool)> {
+pub fn render(
+    model: &ObjectModel,
+    o: &RenderOptions,
+    interrupt: &AtomicBool,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<(usize, bool)> {
     let path = path_views(model, o)?;
     if let Some(folder) = &o.images {
         std::fs::create_dir_all(folder).map_err(DataError::io(folder, "create"))?;
     }
     let mut video = match (&o.video, path.views.first()) {
-        (Some(file), Some(v)) => Some(Video::create(file, v.camera.width as usize, v.camera.height as usize, path.fps.round().max(1.0) as u32)?),
+        (Some(file), Some(v)) => {
+            Some(Video::create(file, v.camera.width as usize, v.camera.height as usize, path.fps.round().max(1.0) as u32)?)
+        }
         _ => None,
     };
     let total = path.views.len();

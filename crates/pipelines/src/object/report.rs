@@ -9,11 +9,8 @@ use std::path::Path;
 
 /// Writes the page.
 pub fn write(path: &Path, summary: &Summary, scores: &Report, mesh: &Exported) -> Result<()> {
-    let rows: String = scores
-        .per_view
-        .iter()
-        .map(|v| format!("<tr><td>{}</td><td>{:.2}</td><td>{:.4}</td></tr>\n", v.name, v.psnr, v.ssim))
-        .collect();
+    let rows: String =
+        scores.per_view.iter().map(|v| format!("<tr><td>{}</td><td>{:.2}</td><td>{:.4}</td></tr>\n", v.name, v.psnr, v.ssim)).collect();
     let html = format!(
         "<!doctype html>\n<html lang=\"en\"><meta charset=\"utf-8\"><title>diorama quickstart</title>\n\
 <style>body{{font:16px sans-serif;max-width:60em;margin:2em auto;padding:0 1em}}img,video{{max-width:100%}}td,th{{padding:.2em 1em;text-align:left}}</style>\n\

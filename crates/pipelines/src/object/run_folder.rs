@@ -27,9 +27,12 @@ impl RunFolder {
     /// A folder for a new run. What an earlier run left there is removed only with `force`.
     pub fn create(path: &Path, force: bool) -> Result<RunFolder> {
         if path.join("config.toml").exists() && !force {
-            return Err(DataError::input(path, "already holds a run; give --resume to go on, --force to replace it, or another --out").into());
+            return Err(
+                DataError::input(path, "already holds a run; give --resume to go on, --force to replace it, or another --out").into()
+            );
         }
-        let occupied = path.is_dir() && !force && path.read_dir().map_err(DataError::io(path, "read"))?.flatten().any(|e| e.file_name() != ".lock");
+        let occupied =
+            path.is_dir() && !force && path.read_dir().map_err(DataError::io(path, "read"))?.flatten().any(|e| e.file_name() != ".lock");
         if occupied {
             return Err(DataError::input(path, "is not empty and holds no run; give --force or another --out").into());
         }
@@ -105,10 +108,20 @@ impl RunFolder {
     /// Appends what an event says to the metrics.
     pub fn log(&mut self, event: &Event) -> Result<()> {
         let row = match *event {
-            Event::Progress { step, seconds, loss, mse, psnr, rays, samples, rays_per_s, .. } => {
-                Row { step, seconds, loss: Some(loss), mse: Some(mse), psnr: Some(psnr), rays: Some(rays), samples: Some(samples), rays_per_s: Some(rays_per_s), ..Row::default() }
+            Event::Progress { step, seconds, loss, mse, psnr, rays, samples, rays_per_s, .. } => Row {
+                step,
+                seconds,
+                loss: Some(loss),
+                mse: Some(mse),
+                psnr: Some(psnr),
+                rays: Some(rays),
+                samples: Some(samples),
+                rays_per_s: Some(rays_per_s),
+                ..Row::default()
+            },
+            Event::Evaluated { step, seconds, psnr, mse } => {
+                Row { step, seconds, val_psnr: Some(psnr), val_mse: Some(mse), ..Row::default() }
             }
-            Event::Evaluated { step, seconds, psnr, mse } => Row { step, seconds, val_psnr: Some(psnr), val_mse: Some(mse), ..Row::default() },
             Event::Recovered { to_step, .. } => {
                 self.metrics = None;
                 return self.cut_metrics(to_step);
@@ -237,7 +250,7 @@ pub fn load_model(path: &Path) -> Result<(ObjectModel, Vec<String>)> {
     let capture = read_capture(path)?;
     let mut model = ObjectModel::new(config, capture, false)?;
     let folder = path.join("checkpoints");
-    if !checkpoint::latest(&folder).exists() {
+    if !checkpoint::exists(&folder) {
         return Err(DataError::input(path, "holds no checkpoint yet; train it first").into());
     }
     let (c, note) = checkpoint::load(&folder)?;

@@ -17,10 +17,7 @@ struct Factors {
 
 fn factors(a: &Adam, t: u32) -> Factors {
     let (b1, b2) = (a.beta1 as f64, a.beta2 as f64);
-    Factors {
-        step: (a.rate as f64 / (1.0 - b1.powi(t as i32))) as f32,
-        root: (1.0 / (1.0 - b2.powi(t as i32))).sqrt() as f32,
-    }
+    Factors { step: (a.rate as f64 / (1.0 - b1.powi(t as i32))) as f32, root: (1.0 / (1.0 - b2.powi(t as i32))).sqrt() as f32 }
 }
 
 /// One dense step `t ≥ 1`.

@@ -69,12 +69,7 @@ impl SliceOp for CompositeOp {
     fn forward(&self, i: &[In]) -> Vec<Out> {
         let (r, c) = (self.offsets.len() - 1, i[1].shape[1]);
         let out = cpu::forward(&self.packed(), i[0].data, i[1].data, c, i[2].data);
-        vec![
-            (out.color, vec![r, c]),
-            (out.depth, vec![r]),
-            (out.opacity, vec![r]),
-            (out.weights, vec![self.t.len()]),
-        ]
+        vec![(out.color, vec![r, c]), (out.depth, vec![r]), (out.opacity, vec![r]), (out.weights, vec![self.t.len()])]
     }
     fn backward(&self, i: &[In], d: &[Option<&[f32]>]) -> Vec<Option<Vec<f32>>> {
         let d = cpu::Upstream { color: d[0], depth: d[1], opacity: d[2], weights: d[3] };
@@ -92,17 +87,15 @@ impl SliceOp for CompositeOp {
 /// # Panics
 /// When `C` exceeds [`MAX_CHANNELS`].
 pub fn composite(
-    samples: Packed, sigma: Tensor<1>, features: Tensor<2>, background: Tensor<2>,
+    samples: Packed,
+    sigma: Tensor<1>,
+    features: Tensor<2>,
+    background: Tensor<2>,
 ) -> (Tensor<2>, Tensor<1>, Tensor<1>, Tensor<1>) {
     assert!(features.dims()[1] <= MAX_CHANNELS, "composite: more than {MAX_CHANNELS} channels");
     let op = CompositeOp { offsets: samples.offsets.into(), t: samples.t.into(), dt: samples.dt.into() };
     let out = burn_op::apply(op, vec![sigma.into_dispatch(), features.into_dispatch(), background.into_dispatch()]);
     let mut it = out.into_iter();
     let mut next = || it.next().expect("four outputs");
-    (
-        Tensor::from_dispatch(next()),
-        Tensor::from_dispatch(next()),
-        Tensor::from_dispatch(next()),
-        Tensor::from_dispatch(next()),
-    )
+    (Tensor::from_dispatch(next()), Tensor::from_dispatch(next()), Tensor::from_dispatch(next()), Tensor::from_dispatch(next()))
 }

@@ -42,7 +42,12 @@ pub fn forward(p: &Packed, sigma: &[f64], features: &[f64], c: usize, background
 /// `∂w_j/∂σ_i = −δ_i w_j` for `j > i`, `δ_i T_{i+1}` for `j = i`.
 #[allow(clippy::too_many_arguments)]
 pub fn backward(
-    p: &Packed, sigma: &[f64], features: &[f64], c: usize, background: &[f64], d: &Composited<f64>,
+    p: &Packed,
+    sigma: &[f64],
+    features: &[f64],
+    c: usize,
+    background: &[f64],
+    d: &Composited<f64>,
 ) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
     let (mut ds, mut df, mut db) = (vec![0.0; sigma.len()], vec![0.0; features.len()], vec![0.0; background.len()]);
     let out = forward(p, sigma, features, c, background);
@@ -75,10 +80,7 @@ pub fn backward(
 pub fn transmittance_at(p: &Packed, sigma: &[f64], t_query: &[f64]) -> Vec<f64> {
     (0..p.rays())
         .map(|r| {
-            let depth: f64 = p
-                .range(r)
-                .map(|i| sigma[i] * (t_query[r] - p.t[i] as f64).clamp(0.0, p.dt[i] as f64))
-                .sum();
+            let depth: f64 = p.range(r).map(|i| sigma[i] * (t_query[r] - p.t[i] as f64).clamp(0.0, p.dt[i] as f64)).sum();
             (-depth).exp()
         })
         .collect()

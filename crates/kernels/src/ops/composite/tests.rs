@@ -67,7 +67,12 @@ fn reference_gradients_match_central_differences() {
     let s = scene(4, 9);
     let (n, c) = (s.t.len(), 2);
     let (sigma, f, b) = (wide(&s.sigma), wide(&random(n * c, 1)), wide(&random(4 * c, 2)));
-    let d = Composited { color: wide(&random(4 * c, 3)), depth: wide(&random(4, 4)), opacity: wide(&random(4, 5)), weights: wide(&random(n, 6)) };
+    let d = Composited {
+        color: wide(&random(4 * c, 3)),
+        depth: wide(&random(4, 4)),
+        opacity: wide(&random(4, 5)),
+        weights: wide(&random(n, 6)),
+    };
     let loss = |s: &[f64], f: &[f64], b: &[f64], p: &Packed| {
         let o = reference::forward(p, s, f, c, b);
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();

@@ -10,7 +10,8 @@ fn mid(p: &Packed, i: usize) -> f64 {
 pub fn forward(p: &Packed, w: &[f64]) -> Vec<f64> {
     (0..p.rays())
         .map(|r| {
-            let pairs: f64 = p.range(r).flat_map(|i| p.range(r).map(move |j| (i, j))).map(|(i, j)| w[i] * w[j] * (mid(p, i) - mid(p, j)).abs()).sum();
+            let pairs: f64 =
+                p.range(r).flat_map(|i| p.range(r).map(move |j| (i, j))).map(|(i, j)| w[i] * w[j] * (mid(p, i) - mid(p, j)).abs()).sum();
             pairs + p.range(r).map(|i| w[i] * w[i] * p.dt[i] as f64 / 3.0).sum::<f64>()
         })
         .collect()

@@ -5,7 +5,12 @@ use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
 fn variants() -> Vec<Frequency> {
     let f = Frequency { dims: 3, bands: 10, include_input: false, pi: true, window: None };
-    vec![f, Frequency { include_input: true, pi: false, ..f }, Frequency { window: Some(4.3), bands: 6, ..f }, Frequency { dims: 2, bands: 0, include_input: true, ..f }]
+    vec![
+        f,
+        Frequency { include_input: true, pi: false, ..f },
+        Frequency { window: Some(4.3), bands: 6, ..f },
+        Frequency { dims: 2, bands: 0, include_input: true, ..f },
+    ]
 }
 
 #[test]

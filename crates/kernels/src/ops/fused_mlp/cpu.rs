@@ -91,7 +91,12 @@ pub fn forward_block(mlp: &Mlp, params: &[f32], inputs: &[&[f32]], n: usize, act
 /// # Shapes
 /// inputs and d_inputs: `[n, K_i]`; d_params: `[params_len]`.
 pub fn backward_block(
-    mlp: &Mlp, prepared: &Prepared, inputs: &[&[f32]], n: usize, acts: &mut Activations, d_params: &mut [f32],
+    mlp: &Mlp,
+    prepared: &Prepared,
+    inputs: &[&[f32]],
+    n: usize,
+    acts: &mut Activations,
+    d_params: &mut [f32],
     d_inputs: &mut [Option<&mut [f32]>],
 ) {
     let mut input_seeded = [false; 8];
@@ -160,9 +165,7 @@ pub fn forward(mlp: &Mlp, params: &[f32], inputs: &[&[f32]], n: usize, out: &mut
 }
 
 /// Gradients of parameters and inputs, overwritten, for a gradient `[n, width]` of the last layer.
-pub fn backward(
-    mlp: &Mlp, params: &[f32], inputs: &[&[f32]], n: usize, d_out: &[f32], d_params: &mut [f32], d_inputs: &mut [Vec<f32>],
-) {
+pub fn backward(mlp: &Mlp, params: &[f32], inputs: &[&[f32]], n: usize, d_out: &[f32], d_params: &mut [f32], d_inputs: &mut [Vec<f32>]) {
     let width = mlp.layers.last().map_or(0, |l| l.width);
     assert!(d_out.len() == n * width && params.len() == mlp.params_len(), "fused mlp: shapes");
     d_params.fill(0.0);

@@ -234,7 +234,15 @@ pub fn jacobian_backward(grid: &HashGrid, points: &[f32], d_jacobian: &[f32], d_
             for c in 0..8usize {
                 let bit = |k: usize| (c >> k) & 1 == 1;
                 let w = |k: usize| if bit(k) { f[k] } else { 1.0 - f[k] };
-                let s = |k: usize| if clamped[k] { 0.0 } else if bit(k) { n } else { -n };
+                let s = |k: usize| {
+                    if clamped[k] {
+                        0.0
+                    } else if bit(k) {
+                        n
+                    } else {
+                        -n
+                    }
+                };
                 let dw = [s(0) * w(1) * w(2), w(0) * s(1) * w(2), w(0) * w(1) * s(2)];
                 for k in 0..width {
                     own[idx[c] * width + k] += dw[0] * d[k * 3] + dw[1] * d[k * 3 + 1] + dw[2] * d[k * 3 + 2];

@@ -55,11 +55,8 @@ impl HashGrid {
     pub fn new(config: HashGridConfig) -> HashGrid {
         assert!(config.levels > 0 && [1, 2, 4, 8].contains(&config.features), "bad hash grid {config:?}");
         assert!((4..=28).contains(&config.log2_size) && config.base > 0, "bad hash grid {config:?}");
-        let growth = if config.levels > 1 {
-            (config.finest as f64 / config.base as f64).powf(1.0 / (config.levels - 1) as f64)
-        } else {
-            1.0
-        };
+        let growth =
+            if config.levels > 1 { (config.finest as f64 / config.base as f64).powf(1.0 / (config.levels - 1) as f64) } else { 1.0 };
         let mut offset = 0;
         let levels = (0..config.levels)
             .map(|l| {

@@ -76,9 +76,7 @@ fn reference_gradients_match_central_differences() {
     assert_gradient("table", &dt, &t, 1e-6, |x| loss(&p, x));
     let dj = wide(&random(6 * grid.output_dims(), 4));
     let g = reference::jacobian_backward(&grid, &p, &dj);
-    assert_gradient("jacobian", &g, &t, 1e-6, |x| {
-        reference::jacobian(&grid, &p, x).iter().zip(&dj).map(|(a, b)| a * b).sum()
-    });
+    assert_gradient("jacobian", &g, &t, 1e-6, |x| reference::jacobian(&grid, &p, x).iter().zip(&dj).map(|(a, b)| a * b).sum());
 }
 
 #[test]

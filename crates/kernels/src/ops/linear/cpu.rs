@@ -63,8 +63,18 @@ pub fn forward(m: usize, k: usize, n: usize, x: &[f32], w: &[f32], bias: &[f32],
 /// Gradients of x, w and b, overwritten, given the layer's output.
 #[allow(clippy::too_many_arguments)]
 pub fn backward(
-    m: usize, k: usize, n: usize, x: &[f32], w: &[f32], kind: BiasKind, a: Activation, out: &[f32], d: &[f32],
-    dx: &mut [f32], dw: &mut [f32], db: &mut [f32],
+    m: usize,
+    k: usize,
+    n: usize,
+    x: &[f32],
+    w: &[f32],
+    kind: BiasKind,
+    a: Activation,
+    out: &[f32],
+    d: &[f32],
+    dx: &mut [f32],
+    dw: &mut [f32],
+    db: &mut [f32],
 ) {
     dw.fill(0.0);
     db.fill(0.0);

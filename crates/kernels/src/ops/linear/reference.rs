@@ -51,7 +51,15 @@ pub fn forward(m: usize, k: usize, n: usize, x: &[f64], w: &[f64], b: &[f64], ki
 /// Gradients of x, w and b.
 #[allow(clippy::too_many_arguments)]
 pub fn backward(
-    m: usize, k: usize, n: usize, x: &[f64], w: &[f64], b: &[f64], kind: BiasKind, a: Activation, d: &[f64],
+    m: usize,
+    k: usize,
+    n: usize,
+    x: &[f64],
+    w: &[f64],
+    b: &[f64],
+    kind: BiasKind,
+    a: Activation,
+    d: &[f64],
 ) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
     let pre = pre(m, k, n, x, w, b, kind);
     let (mut dx, mut dw, mut db) = (vec![0.0; m * k], vec![0.0; k * n], vec![0.0; b.len()]);

@@ -3,8 +3,7 @@ use crate::burn_op::values;
 use burn::tensor::{Device, TensorData};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
-const ALL: [Activation; 5] =
-    [Activation::None, Activation::Relu, Activation::Sigmoid, Activation::Softplus, Activation::TruncatedExp];
+const ALL: [Activation; 5] = [Activation::None, Activation::Relu, Activation::Sigmoid, Activation::Softplus, Activation::TruncatedExp];
 const KINDS: [BiasKind; 3] = [BiasKind::None, BiasKind::Shared, BiasKind::PerRow];
 
 fn bias_len(kind: BiasKind, m: usize, n: usize) -> usize {

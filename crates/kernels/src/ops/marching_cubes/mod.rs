@@ -45,7 +45,7 @@ fn triangles_of_case(inside: usize) -> Vec<[u8; 3]> {
                 }
                 let enter = edge_between(ring[k], ring[(k + 1) % 4]);
                 let end = (k + 1..k + 4).find(|&m| !is_in(m + 1)).expect("corner k is outside");
-                next[edge_between(ring[end % 4], ring[(end + 1) % 4])] = enter;
+                next[enter] = edge_between(ring[end % 4], ring[(end + 1) % 4]);
             }
         }
     }
@@ -62,9 +62,26 @@ fn triangles_of_case(inside: usize) -> Vec<[u8; 3]> {
             ring.push(e as u8);
             e = next[e];
         }
-        for k in 1..ring.len() - 1 {
-            out.push([ring[0], ring[k], ring[k + 1]]);
-        }
+        cut_ears(ring, &mut out);
     }
     out
+}
+
+/// Whether two cell edges lie on one face of the cell.
+fn share_a_face(e: u8, f: u8) -> bool {
+    let corners = |e: u8| edge_corners(e as usize);
+    let ((a, b), (c, d)) = (corners(e), corners(f));
+    (0..3).any(|axis| [a, b, c, d].iter().all(|q| q >> axis & 1 == a >> axis & 1))
+}
+
+/// Triangulates a ring of crossings. A diagonal within a face of the cell could coincide with one of the
+/// neighbouring cell and leave an edge with four triangles, so ears are cut along other diagonals while there are any.
+fn cut_ears(mut ring: Vec<u8>, out: &mut Vec<[u8; 3]>) {
+    while ring.len() > 3 {
+        let n = ring.len();
+        let ear = (0..n).find(|&i| !share_a_face(ring[(i + n - 1) % n], ring[(i + 1) % n])).unwrap_or(0);
+        out.push([ring[(ear + n - 1) % n], ring[ear], ring[(ear + 1) % n]]);
+        ring.remove(ear);
+    }
+    out.push([ring[0], ring[1], ring[2]]);
 }

@@ -80,14 +80,20 @@ struct Shared<'a> {
 /// # Panics
 /// When shapes do not fit.
 pub fn run(
-    input: &StepInput, positions: Positions, codes: &mut [RayCode], loss: Option<&dyn RayLoss>, buffers: &mut StepBuffers,
-    out: &mut StepOutput, d_params: &mut [f32],
+    input: &StepInput,
+    positions: Positions,
+    codes: &mut [RayCode],
+    loss: Option<&dyn RayLoss>,
+    buffers: &mut StepBuffers,
+    out: &mut StepOutput,
+    d_params: &mut [f32],
 ) {
     let (r, s) = (input.samples.rays(), input.samples.samples());
     let mlp = &input.net.mlp;
     assert!(input.background.len() == r * 3 && input.params.len() == mlp.params_len(), "ngp field: shapes");
     assert_eq!(codes.len() + 1, mlp.input_widths.len(), "ngp field: codes");
-    for (v, n) in [(&mut out.rgb, r * 3), (&mut out.opacity, r), (&mut out.depth, r), (&mut out.weights, s), (&mut out.d_background, r * 3)] {
+    for (v, n) in [(&mut out.rgb, r * 3), (&mut out.opacity, r), (&mut out.depth, r), (&mut out.weights, s), (&mut out.d_background, r * 3)]
+    {
         v.resize(n, 0.0);
     }
     let shared = Shared {
@@ -168,7 +174,12 @@ fn group_bounds(p: &Packed, count: usize) -> Vec<usize> {
 }
 
 fn run_block(
-    input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::ops::Range<usize>, loss: Option<&dyn RayLoss>, group: &mut Group,
+    input: &StepInput,
+    shared: &Shared,
+    prepared: &Prepared,
+    rays: std::ops::Range<usize>,
+    loss: Option<&dyn RayLoss>,
+    group: &mut Group,
 ) {
     let p = &input.samples;
     let net = input.net;
@@ -288,9 +299,7 @@ fn write_head(net: &FieldNet, head: Head, channels: usize, out: &[f32], d: &[f32
     }
 }
 
-fn backward(
-    input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::ops::Range<usize>, s0: usize, n: usize, group: &mut Group,
-) {
+fn backward(input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::ops::Range<usize>, s0: usize, n: usize, group: &mut Group) {
     let net = input.net;
     let widths = &net.mlp.input_widths;
     for head in [net.sigma, net.rgb] {

@@ -39,12 +39,8 @@ impl RayLoss for Linear {
 fn ngp_net(features: usize) -> FieldNet {
     let l = |inputs: Vec<Source>, width, relu| Layer { inputs, width, relu, bias: false };
     use Source::{Input, Layer as L};
-    let layers = vec![
-        l(vec![Input(0)], 32, true),
-        l(vec![L(0)], 16, false),
-        l(vec![L(1), Input(1), Input(2)], 32, true),
-        l(vec![L(2)], 16, false),
-    ];
+    let layers =
+        vec![l(vec![Input(0)], 32, true), l(vec![L(0)], 16, false), l(vec![L(1), Input(1), Input(2)], 32, true), l(vec![L(2)], 16, false)];
     FieldNet {
         mlp: Mlp::new(vec![features, 16, 5], layers),
         sigma: Head { layer: 1, channel: 0, activation: Activation::TruncatedExp, shift: 0.5 },
@@ -78,10 +74,8 @@ fn fused_equals_composed_with_hash_features_codes_and_all_gradients() {
         let mut d_params = vec![0.0; params.len()];
         let mut out = StepOutput::default();
         let input = StepInput { net: &net, params: &params, samples: p, background: &bg };
-        let mut codes = [
-            RayCode { values: &sh, width: 16, gradient: Some(&mut d_sh) },
-            RayCode { values: &emb, width: 5, gradient: Some(&mut d_emb) },
-        ];
+        let mut codes =
+            [RayCode { values: &sh, width: 16, gradient: Some(&mut d_sh) }, RayCode { values: &emb, width: 5, gradient: Some(&mut d_emb) }];
         let positions = Positions::Features { data: &mut features, levels: 4, width: 2 };
         run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
 

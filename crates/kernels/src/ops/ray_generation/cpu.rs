@@ -23,9 +23,7 @@ pub fn forward(cameras: &[PosedCamera], index: &[u32], pixels: &[f32], origins: 
 ///
 /// # Shapes
 /// as [`forward`]; dirs are its result.
-pub fn backward(
-    cameras: &[PosedCamera], index: &[u32], pixels: &[f32], dirs: &[f32], d_origins: &[f32], d_dirs: &[f32], out: &mut [f64],
-) {
+pub fn backward(cameras: &[PosedCamera], index: &[u32], pixels: &[f32], dirs: &[f32], d_origins: &[f32], d_dirs: &[f32], out: &mut [f64]) {
     assert_eq!(out.len(), cameras.len() * CORRECTION, "rays: corrections");
     let per_ray: Vec<[f64; CORRECTION]> = (0..index.len())
         .into_par_iter()

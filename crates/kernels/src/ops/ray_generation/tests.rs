@@ -45,8 +45,7 @@ fn reference_gradient_matches_central_differences_of_corrected_cameras() {
     let (go, gd) = (wide(&random(36, 2)), wide(&random(36, 3)));
     let g = reference::backward(&c, &index, &pixels, &go, &gd);
     assert_gradient("corrections", &g, &[0.0; 21], 1e-5, |x| {
-        let moved: Vec<PosedCamera> =
-            c.iter().zip(x.chunks_exact(7)).map(|(c, d)| c.corrected(d.try_into().unwrap())).collect();
+        let moved: Vec<PosedCamera> = c.iter().zip(x.chunks_exact(7)).map(|(c, d)| c.corrected(d.try_into().unwrap())).collect();
         let (o, d) = reference::forward(&moved, &index, &pixels);
         o.iter().zip(&go).chain(d.iter().zip(&gd)).map(|(a, b)| a * b).sum()
     });

@@ -55,12 +55,15 @@ pub fn backward(degree: usize, dirs: &[f32], d_out: &[f32], g: &mut [f32]) {
         }
         if degree > 3 {
             let (xx, yy, zz) = (x * x, y * y, z * z);
-            gx += -6.0 * C3 * x * y * o[9] + C31 * y * z * o[10] + C32 * (1.0 - 5.0 * zz) * o[13]
-                + 2.0 * C33 * x * z * o[14] + 3.0 * C3 * (yy - xx) * o[15];
-            gy += 3.0 * C3 * (yy - xx) * o[9] + C31 * x * z * o[10] + C32 * (1.0 - 5.0 * zz) * o[11]
-                - 2.0 * C33 * y * z * o[14] + 6.0 * C3 * x * y * o[15];
-            gz += C31 * x * y * o[10] - 10.0 * C32 * y * z * o[11] + C30 * (15.0 * zz - 3.0) * o[12]
-                - 10.0 * C32 * x * z * o[13] + C33 * (xx - yy) * o[14];
+            gx += -6.0 * C3 * x * y * o[9]
+                + C31 * y * z * o[10]
+                + C32 * (1.0 - 5.0 * zz) * o[13]
+                + 2.0 * C33 * x * z * o[14]
+                + 3.0 * C3 * (yy - xx) * o[15];
+            gy += 3.0 * C3 * (yy - xx) * o[9] + C31 * x * z * o[10] + C32 * (1.0 - 5.0 * zz) * o[11] - 2.0 * C33 * y * z * o[14]
+                + 6.0 * C3 * x * y * o[15];
+            gz += C31 * x * y * o[10] - 10.0 * C32 * y * z * o[11] + C30 * (15.0 * zz - 3.0) * o[12] - 10.0 * C32 * x * z * o[13]
+                + C33 * (xx - yy) * o[14];
         }
         g.copy_from_slice(&[gx, gy, gz]);
     }

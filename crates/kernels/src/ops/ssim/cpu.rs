@@ -77,7 +77,12 @@ pub fn ssim(w: usize, h: usize, c: usize, x: &[f32], y: &[f32]) -> f64 {
         .into_par_iter()
         .map(|k| {
             let m = maps(w, h, c, k, x, y);
-            (0..n).map(|i| { let [a1, a2, b1, b2] = m.factors(i); a1 * a2 / (b1 * b2) }).sum()
+            (0..n)
+                .map(|i| {
+                    let [a1, a2, b1, b2] = m.factors(i);
+                    a1 * a2 / (b1 * b2)
+                })
+                .sum()
         })
         .collect();
     sums.iter().sum::<f64>() / (n * c) as f64

@@ -1,0 +1,117 @@
+//! Every switch of the configuration changes the result, or is listed here with the reason why not.
+
+use diorama_pipelines::object::config::{Config, Method};
+use diorama_pipelines::object::quickstart::write_capture;
+use diorama_pipelines::object::recipe;
+use diorama_pipelines::object::run_folder::RunFolder;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+/// Switches that leave the parameters alone.
+const NEUTRAL: [(&str, &str); 9] = [
+    ("device", "this build has one"),
+    ("data.path", "names the capture"),
+    ("data.format", "tested with the importers"),
+    ("data.memory_budget", "must not change the result: tested in pixel_store"),
+    ("run.seconds", "the other budget: tested in train::run"),
+    ("run.log_every", "tested in train::run"),
+    ("run.save_every_seconds", "must not change the result"),
+    ("run.save_every_steps", "must not change the result: tested in kill_and_resume"),
+    ("run.evaluate_every", "must not change the result: tested in train::run"),
+];
+
+/// Switch, value, and what must be on for it to matter.
+const SWITCHES: [(&str, &str, &[(&str, &str)]); 39] = [
+    ("method", "mlp", &[]),
+    ("background", "black", &[]),
+    ("seed", "2", &[]),
+    ("data.downscale", "2", &[]),
+    ("data.split", "all", &[]),
+    ("field.levels", "5", &[]),
+    ("field.features", "4", &[]),
+    ("field.log2_size", "9", &[]),
+    ("field.base", "8", &[]),
+    ("field.finest", "64", &[]),
+    ("field.appearance", "4", &[]),
+    ("field.contraction", "true", &[]),
+    ("loss.color", "mse", &[]),
+    ("loss.distortion", "0.1", &[]),
+    ("loss.alpha", "0.1", &[]),
+    ("optim.rate", "0.02", &[]),
+    ("optim.final_scale", "0.5", &[]),
+    ("optim.warmup", "0.5", &[]),
+    ("optim.decay_from", "0.9", &[]),
+    ("optim.weight_decay", "0.1", &[]),
+    ("sampling.rays", "128", &[]),
+    ("sampling.batch_samples", "65536", &[]),
+    ("sampling.samples", "16", &[("method", "mlp")]),
+    ("sampling.importance", "8", &[("method", "nerf"), ("sampling.samples", "8"), ("sampling.rays", "16")]),
+    ("sampling.max_samples", "16", &[]),
+    ("sampling.near", "2.0", &[]),
+    ("sampling.occupancy_resolution", "32", &[]),
+    ("sampling.occupancy_points", "512", &[]),
+    ("sampling.occupancy_every", "1", &[]),
+    ("sampling.min_cell_views", "7", &[("sampling.occupancy_resolution", "64")]),
+    ("sampling.error_map", "true", &[]),
+    ("camera.refine", "true", &[]),
+    ("camera.refine_focal", "true", &[("camera.refine", "true")]),
+    ("camera.rate", "0.01", &[("camera.refine", "true")]),
+    ("camera.decay", "1.0", &[("camera.refine", "true")]),
+    ("run.steps", "7", &[]),
+    ("background", "learned", &[]),
+    ("background", "random", &[("method", "mlp")]),
+    ("method", "nerf", &[("sampling.samples", "8"), ("sampling.rays", "16")]),
+];
+
+/// All parameters after a short run.
+fn train(data: &Path, out: &Path, overrides: &[(&str, &str)]) -> Vec<u32> {
+    let mut c = Config::new(Method::Ngp, data.to_path_buf());
+    for (k, v) in [
+        ("field.log2_size", "11"),
+        ("field.levels", "4"),
+        ("sampling.batch_samples", "2048"),
+        ("sampling.occupancy_every", "2"),
+        ("sampling.occupancy_points", "2048"),
+        ("sampling.occupancy_resolution", "16"),
+        ("run.steps", "6"),
+        ("data.split", "every:8"),
+    ] {
+        c.set(k, v).unwrap();
+    }
+    for (k, v) in overrides {
+        c.set(k, v).unwrap();
+    }
+    let mut folder = RunFolder::create(out, true).unwrap();
+    let (model, _) = recipe::train(&c, &mut folder, false, &AtomicBool::new(false), &mut |_| {}).unwrap();
+    let (entries, _) = model.entries();
+    entries.iter().flat_map(|e| e.data).map(|v| v.to_bits()).collect()
+}
+
+#[test]
+fn every_switch_changes_the_result() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, out) = (dir.path().join("data"), dir.path().join("run"));
+    write_capture(&data, 8, 32).unwrap();
+    for (key, value, with) in SWITCHES {
+        let before = train(&data, &out, with);
+        let after = train(&data, &out, &[with, &[(key, value)]].concat());
+        assert!(before != after, "{key} = {value} changed nothing");
+    }
+    // Saving often changes nothing, and neither does running again.
+    assert_eq!(train(&data, &out, &[]), train(&data, &out, &[("run.save_every_steps", "1"), ("run.evaluate_every", "3")]));
+}
+
+#[test]
+fn no_switch_is_forgotten() {
+    let text = Config::new(Method::Ngp, "x".into()).to_toml();
+    let mut section = String::new();
+    for line in text.lines() {
+        if let Some(s) = line.strip_prefix('[') {
+            section = format!("{}.", s.trim_end_matches(']'));
+        } else if let Some((key, _)) = line.split_once(" = ") {
+            let key = format!("{section}{key}");
+            let known = SWITCHES.iter().any(|s| s.0 == key) || NEUTRAL.iter().any(|n| n.0 == key);
+            assert!(known, "{key} is in no test");
+        }
+    }
+}
