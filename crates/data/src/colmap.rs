@@ -46,10 +46,10 @@ pub fn find_model(root: &Path) -> Option<PathBuf> {
     let size = |p: &Path| ["images.bin", "images.txt"].iter().filter_map(|n| std::fs::metadata(p.join(n)).ok()).map(|m| m.len()).max();
     let mut best: Option<(u64, PathBuf)> = None;
     for c in candidates {
-        if let Some(s) = size(&c) {
-            if best.as_ref().is_none_or(|b| s > b.0) {
-                best = Some((s, c));
-            }
+        if let Some(s) = size(&c)
+            && best.as_ref().is_none_or(|b| s > b.0)
+        {
+            best = Some((s, c));
         }
     }
     best.map(|b| b.1)

@@ -31,7 +31,7 @@ impl Video {
         let config = EncoderConfig::new()
             .bitrate(BitRate::from_bps(rate as u32))
             .max_frame_rate(FrameRate::from_hz(fps as f32))
-            .rate_control_mode(RateControlMode::Quality)
+            .rate_control_mode(RateControlMode::Off)
             .skip_frames(false);
         let api = openh264::OpenH264API::from_source();
         let encoder =

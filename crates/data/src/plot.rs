@@ -52,6 +52,7 @@ fn label(v: f64, step: f64) -> String {
     if v.abs() >= 10_000.0 && step >= 1000.0 {
         return format!("{}k", (v / 1000.0).round());
     }
+    let v = if v.abs() < step * 1e-6 { 0.0 } else { v };
     let decimals = (-step.log10().floor()).clamp(0.0, 6.0) as usize;
     format!("{v:.decimals$}")
 }

@@ -73,6 +73,7 @@ pub fn force_level(level: Level) {
 ///
 /// # Safety
 /// Every method may only run on a CPU that has the set; pointers must be valid for `N` floats.
+#[allow(clippy::missing_safety_doc)] // stated once, above
 pub unsafe trait Lane: Copy {
     const N: usize;
     type V: Copy;

@@ -70,15 +70,15 @@ fn finite(v: f64) -> Option<f64> {
 fn configuration(a: &TrainArgs) -> Result<Config> {
     let mut c = if a.resume {
         let c = read_config(&a.out)?;
-        if let Some(d) = &a.data {
-            if std::path::absolute(d).ok() != std::path::absolute(&c.data.path).ok() {
-                return Err(PipelineError::Usage(format!(
-                    "--resume: {} was trained on {}, not on {}",
-                    a.out.display(),
-                    c.data.path.display(),
-                    d.display()
-                )));
-            }
+        if let Some(d) = &a.data
+            && std::path::absolute(d).ok() != std::path::absolute(&c.data.path).ok()
+        {
+            return Err(PipelineError::Usage(format!(
+                "--resume: {} was trained on {}, not on {}",
+                a.out.display(),
+                c.data.path.display(),
+                d.display()
+            )));
         }
         c
     } else {

@@ -188,10 +188,10 @@ impl ObjectModel {
         for (_, g) in self.groups_mut() {
             g.step(t, scale);
         }
-        if !self.config.camera.refine_focal {
-            if let Some(c) = &mut self.corrections {
-                c.values.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);
-            }
+        if !self.config.camera.refine_focal
+            && let Some(c) = &mut self.corrections
+        {
+            c.values.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);
         }
     }
 

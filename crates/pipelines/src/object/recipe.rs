@@ -361,10 +361,10 @@ impl Trainee for Trainer<'_> {
         if self.model.corrections.is_some() {
             self.cameras = self.model.cameras();
         }
-        if step.is_multiple_of(16) {
-            if let Some(map) = &mut self.model.error_map {
-                map.refresh();
-            }
+        if step.is_multiple_of(16)
+            && let Some(map) = &mut self.model.error_map
+        {
+            map.refresh();
         }
         let o = &mut self.model.origin;
         o.rays += rays;

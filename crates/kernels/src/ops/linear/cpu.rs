@@ -85,7 +85,7 @@ pub fn backward(
     gemm::transpose(k, n, w, &mut wt);
     let rows_per_group = m.div_ceil(GROUPS).next_multiple_of(BLOCK);
     let per_row = kind == BiasKind::PerRow;
-    let mut empty = vec![0.0f32; 0];
+    let mut empty = [0.0f32; 0];
     let db_rows = if per_row { &mut *db } else { &mut empty[..] };
     let mut db_chunks: Vec<&mut [f32]> = db_rows.chunks_mut(rows_per_group * n).collect();
     db_chunks.resize_with(m.div_ceil(rows_per_group), Default::default);

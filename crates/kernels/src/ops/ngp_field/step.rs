@@ -119,7 +119,7 @@ pub fn run(
         }
         Positions::Encoded { encoding, points, d_points } => {
             assert_eq!(points.len(), s * 3, "ngp field: points");
-            Shared { encoded: Some((encoding, points, d_points.map(|d| Disjoint::new(d)))), ..shared }
+            Shared { encoded: Some((encoding, points, d_points.map(Disjoint::new))), ..shared }
         }
     };
     if loss.is_some() {
