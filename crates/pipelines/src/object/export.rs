@@ -75,7 +75,7 @@ pub fn export(model: &ObjectModel, o: &ExportOptions, progress: &mut dyn FnMut(u
         let corner = |sign: f64| (s.center + DVec3::splat(sign * s.half)).as_vec3().to_array();
         (corner(-1.0), corner(1.0))
     });
-    if (0..3).any(|k| !(max[k] > min[k])) {
+    if (0..3).any(|k| max[k] <= min[k] || max[k].is_nan() || min[k].is_nan()) {
         return Err(PipelineError::Usage("--clip: each highest coordinate must exceed the lowest".into()));
     }
     let grid = Grid { min, max, resolution: o.resolution };
