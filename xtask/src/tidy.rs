@@ -28,7 +28,7 @@ pub fn run() -> bool {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the workspace");
     let mut breaches = Vec::new();
     let mut files = Vec::new();
-    collect(root, root, &mut files);
+    collect(root, &mut files);
     for f in &files {
         check_file(root, f, &mut breaches);
     }
@@ -37,13 +37,13 @@ pub fn run() -> bool {
     breaches.is_empty()
 }
 
-fn collect(root: &Path, folder: &Path, out: &mut Vec<PathBuf>) {
+fn collect(folder: &Path, out: &mut Vec<PathBuf>) {
     for entry in folder.read_dir().into_iter().flatten().flatten() {
         let path = entry.path();
         let name = entry.file_name();
         if path.is_dir() {
             if ![".git", "target", "runs", "node_modules", ".carry"].contains(&&*name.to_string_lossy()) {
-                collect(root, &path, out);
+                collect(&path, out);
             }
         } else {
             out.push(path);
