@@ -305,6 +305,11 @@ fn folders_of_runs() {
     let before = std::fs::read(run.join("checkpoints/latest.safetensors")).unwrap();
     check(&train(&[]), &["already holds a run", "--resume"]);
     assert_eq!(std::fs::read(run.join("checkpoints/latest.safetensors")).unwrap(), before);
+    // A forced run that cannot begin leaves the earlier one alone.
+    let spoiled = copy();
+    std::fs::write(spoiled.path().join("images/view_03.png"), b"").unwrap();
+    check(&diorama(&["train", spoiled.path().to_str().unwrap(), "--out", r, "--force", "--steps", "1"]), &["0 bytes"]);
+    assert_eq!(std::fs::read(run.join("checkpoints/latest.safetensors")).unwrap(), before);
     check(&diorama(&["train", "--out", r, "--resume", "--method", "nerf"]), &["--method cannot change"]);
     check(&diorama(&["train", "/elsewhere", "--out", r, "--resume"]), &["was trained on"]);
     check(&diorama(&["render", r, "--path", "loop"]), &["orbit, spiral"]);

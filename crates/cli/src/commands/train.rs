@@ -16,6 +16,7 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
         // Read the capture before anything is written.
         recipe::load_capture(&config)?;
     }
+    let existed = a.out.exists();
     let mut folder = if a.resume { RunFolder::open(&a.out)?.0 } else { RunFolder::create(&a.out, a.force)? };
     watch_interrupts();
     let mut progress = Progress::new();
@@ -24,8 +25,8 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
     let (model, summary) = match result {
         Ok(r) => r,
         Err(e) => {
-            // A run that never began leaves nothing behind.
-            if !a.resume && !folder.checkpoints().exists() {
+            // A run that never began leaves nothing behind, and what was there before stays.
+            if !existed && !folder.checkpoints().exists() {
                 drop(folder);
                 let _ = std::fs::remove_dir_all(&a.out);
             }

@@ -24,7 +24,8 @@ pub struct RunFolder {
 }
 
 impl RunFolder {
-    /// A folder for a new run. What an earlier run left there is removed only with `force`.
+    /// A folder for a new run. What an earlier run left there is replaced only with `force`, and only once the
+    /// new run begins ([`RunFolder::write_description`]).
     pub fn create(path: &Path, force: bool) -> Result<RunFolder> {
         if path.join("config.toml").exists() && !force {
             return Err(
@@ -40,12 +41,7 @@ impl RunFolder {
             return Err(DataError::input(path, "is a file; --out must name a folder").into());
         }
         std::fs::create_dir_all(path).map_err(DataError::io(path, "create"))?;
-        let folder = Self::lock(path)?;
-        for name in ["config.toml", "capture.json", "command.txt", "metrics.jsonl", "events.tfevents", "curves.svg", "curves.png"] {
-            let _ = std::fs::remove_file(path.join(name));
-        }
-        let _ = std::fs::remove_dir_all(path.join("checkpoints"));
-        Ok(folder)
+        Self::lock(path)
     }
 
     /// An existing run, with its configuration.
@@ -80,8 +76,12 @@ impl RunFolder {
         read_capture(&self.path)
     }
 
-    /// Writes what the run was started with.
+    /// Clears an earlier run and writes what this one was started with.
     pub fn write_description(&self, config: &Config, capture: &Capture) -> Result<()> {
+        for name in ["config.toml", "capture.json", "command.txt", "metrics.jsonl", "events.tfevents", "curves.svg", "curves.png"] {
+            let _ = std::fs::remove_file(self.path.join(name));
+        }
+        let _ = std::fs::remove_dir_all(self.checkpoints());
         let json = serde_json::to_vec(capture).expect("a capture is JSON");
         atomic::write(&self.path.join("capture.json"), &json)?;
         let command: Vec<String> = std::env::args().collect();
