@@ -47,6 +47,19 @@ enum Command {
     Info(InfoArgs),
     /// What this machine offers, and what each missing part disables
     Doctor(DoctorArgs),
+    /// Measure the kernels and the training step on this machine
+    #[command(subcommand)]
+    Bench(Bench),
+}
+
+#[derive(Subcommand)]
+enum Bench {
+    /// Each op against the machine's own measured limits
+    #[command(after_help = "Example:\n  diorama bench ops --threads 2 --json")]
+    Ops(BenchOpsArgs),
+    /// Where the time of a training step goes; nothing is written
+    #[command(after_help = "Example:\n  diorama bench train capture/ --downscale 4 --steps 200")]
+    Train(BenchTrainArgs),
 }
 
 /// Flags of `train`.
@@ -243,6 +256,44 @@ pub struct DoctorArgs {
     pub json: bool,
 }
 
+/// Flags of `bench ops`.
+#[derive(Args, Clone, Debug)]
+pub struct BenchOpsArgs {
+    #[arg(long)]
+    pub threads: Option<usize>,
+    /// Calls per figure; the median counts
+    #[arg(long, default_value_t = 9)]
+    pub repeats: usize,
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Flags of `bench train`.
+#[derive(Args, Clone, Debug)]
+pub struct BenchTrainArgs {
+    /// Folder of the capture
+    pub data: PathBuf,
+    #[arg(long, default_value = "ngp")]
+    pub method: String,
+    #[arg(long, default_value_t = 1)]
+    pub downscale: u32,
+    #[arg(long, default_value = "file")]
+    pub split: String,
+    /// Steps before the measured ones
+    #[arg(long, default_value_t = 300)]
+    pub warmup: u64,
+    /// Measured steps
+    #[arg(long, default_value_t = 200)]
+    pub steps: u64,
+    #[arg(long)]
+    pub threads: Option<usize>,
+    /// Override a configuration value; may be repeated
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub overrides: Vec<String>,
+    #[arg(long)]
+    pub json: bool,
+}
+
 /// Parses, runs, reports.
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
@@ -261,6 +312,8 @@ pub fn main() -> ExitCode {
         Command::Quickstart(a) => a.json,
         Command::Info(a) => a.json,
         Command::Doctor(a) => a.json,
+        Command::Bench(Bench::Ops(a)) => a.json,
+        Command::Bench(Bench::Train(a)) => a.json,
     };
     let result = match cli.command {
         Command::Train(a) => commands::train::run(&a),
@@ -271,6 +324,8 @@ pub fn main() -> ExitCode {
         Command::Quickstart(a) => commands::quickstart::run(&a),
         Command::Info(a) => commands::info::run(&a),
         Command::Doctor(a) => commands::doctor::run(&a),
+        Command::Bench(Bench::Ops(a)) => commands::bench::ops(&a),
+        Command::Bench(Bench::Train(a)) => commands::bench::train(&a),
     };
     ExitCode::from(match result {
         Ok(Outcome::Done) => 0,

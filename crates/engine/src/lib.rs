@@ -7,4 +7,5 @@ pub mod metrics;
 pub mod params;
 pub mod renderers;
 pub mod samplers;
+pub mod stages;
 pub mod train;

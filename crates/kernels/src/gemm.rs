@@ -1,6 +1,33 @@
 //! Small matrix products on blocks that stay in cache: `C = act(init + A·B)`.
 
 use crate::simd::{self, Lane, Level, Plain};
+use std::cell::RefCell;
+
+/// Arithmetic of a product's operands; sums are always f32.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Precision {
+    #[default]
+    F32,
+    /// Operands rounded to bf16, where the CPU multiplies such tiles; f32 elsewhere.
+    Bf16,
+}
+
+/// Whether [`Precision::Bf16`] differs from f32 on this machine.
+pub fn has_bf16() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    return simd::level() == Level::Avx512 && crate::amx::is_available();
+    #[cfg(not(target_arch = "x86_64"))]
+    return false;
+}
+
+/// Columns beyond which B is packed into panels that stay in the first-level cache.
+const WIDE: usize = 64;
+/// Rows of B per panel.
+const PANEL: usize = 256;
+
+thread_local! {
+    static PACKED: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+}
 
 /// What an output element starts from.
 #[derive(Clone, Copy)]
@@ -36,12 +63,24 @@ impl<'a> View<'a> {
 ///
 /// # Shapes
 /// a: `[m, k]` any strides; b: `[k, n]` row-major, rows `ldb` apart; c: `[m, n]`, rows `ldc` apart.
-/// Sums run over `p` in increasing order, so results do not depend on the thread count.
+/// Sums run over `p` in a fixed order, so results do not depend on the thread count.
 ///
 /// # Panics
 /// When a slice is too short for its shape.
 #[allow(clippy::too_many_arguments)]
-pub fn gemm(m: usize, n: usize, k: usize, a: View, b: &[f32], ldb: usize, c: &mut [f32], ldc: usize, init: Init, relu: bool) {
+pub fn gemm(
+    precision: Precision,
+    m: usize,
+    n: usize,
+    k: usize,
+    a: View,
+    b: &[f32],
+    ldb: usize,
+    c: &mut [f32],
+    ldc: usize,
+    init: Init,
+    relu: bool,
+) {
     if m == 0 || n == 0 {
         return;
     }
@@ -52,6 +91,12 @@ pub fn gemm(m: usize, n: usize, k: usize, a: View, b: &[f32], ldb: usize, c: &mu
         assert!(bias.len() >= n, "gemm: bias is too short");
     }
     let g = Gemm { m, n, k, a, b, ldb, ldc, init, relu };
+    #[cfg(target_arch = "x86_64")]
+    if precision == Precision::Bf16 && has_bf16() {
+        // SAFETY: bounds were asserted above; the CPU and the system allow tiles.
+        return unsafe { crate::amx::run(&g, c) };
+    }
+    let _ = precision;
     // SAFETY: bounds were asserted above; `level()` only names sets that this CPU has.
     unsafe {
         match simd::level() {
@@ -64,16 +109,18 @@ pub fn gemm(m: usize, n: usize, k: usize, a: View, b: &[f32], ldb: usize, c: &mu
     }
 }
 
-struct Gemm<'a> {
-    m: usize,
-    n: usize,
-    k: usize,
-    a: View<'a>,
-    b: &'a [f32],
-    ldb: usize,
-    ldc: usize,
-    init: Init<'a>,
-    relu: bool,
+/// A product whose shapes were checked.
+#[derive(Clone, Copy)]
+pub(crate) struct Gemm<'a> {
+    pub m: usize,
+    pub n: usize,
+    pub k: usize,
+    pub a: View<'a>,
+    pub b: &'a [f32],
+    pub ldb: usize,
+    pub ldc: usize,
+    pub init: Init<'a>,
+    pub relu: bool,
 }
 
 impl Gemm<'_> {
@@ -81,7 +128,7 @@ impl Gemm<'_> {
     #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
     unsafe fn run_avx512(&self, c: &mut [f32]) {
         // SAFETY: compiled for the set; bounds asserted by `gemm`.
-        unsafe { self.run::<simd::Avx512, 6, 4>(c) }
+        unsafe { if self.n > WIDE && self.m >= 48 { self.run_packed::<simd::Avx512, 12, 2>(c) } else { self.run::<simd::Avx512, 6, 4>(c) } }
     }
 
     #[cfg(target_arch = "x86_64")]
@@ -89,6 +136,43 @@ impl Gemm<'_> {
     unsafe fn run_avx2(&self, c: &mut [f32]) {
         // SAFETY: compiled for the set; bounds asserted by `gemm`.
         unsafe { self.run::<simd::Avx2, 6, 2>(c) }
+    }
+
+    /// Copies B panel by panel, so that a panel is read from the first-level cache by all rows.
+    #[inline(always)]
+    unsafe fn run_packed<L: Lane, const MR: usize, const NR: usize>(&self, c: &mut [f32]) {
+        let width = NR * L::N;
+        // Taken out and put back: a closure would not be compiled for the instruction set.
+        let mut panel = PACKED.take();
+        panel.resize(PANEL * width, 0.0);
+        for p in (0..self.k.max(1)).step_by(PANEL) {
+            let rows = PANEL.min(self.k - p);
+            let last = p + rows == self.k;
+            for j in (0..self.n).step_by(width) {
+                let columns = width.min(self.n - j);
+                for r in 0..rows {
+                    let from = (p + r) * self.ldb + j;
+                    panel[r * width..r * width + columns].copy_from_slice(&self.b[from..from + columns]);
+                }
+                let part = Gemm {
+                    n: columns,
+                    k: rows,
+                    a: View { data: self.a.data.get(p * self.a.col..).unwrap_or(&[]), ..self.a },
+                    b: &panel[..],
+                    ldb: width,
+                    init: match self.init {
+                        _ if p > 0 => Init::Accumulate,
+                        Init::Bias(bias) => Init::Bias(&bias[j..]),
+                        init => init,
+                    },
+                    relu: self.relu && last,
+                    ..*self
+                };
+                // SAFETY: a part of the shapes that `gemm` asserted.
+                unsafe { part.run::<L, MR, NR>(&mut c[j..]) };
+            }
+        }
+        PACKED.set(panel);
     }
 
     /// Walks the output in tiles of `MR` rows by `NR` vectors.
@@ -126,6 +210,10 @@ impl Gemm<'_> {
             while i + MR <= self.m {
                 self.tile::<L, MR, NR>(c, i, j);
                 i += MR;
+            }
+            while i + 4 <= self.m {
+                self.tile::<L, 4, NR>(c, i, j);
+                i += 4;
             }
             while i < self.m {
                 self.tile::<L, 1, NR>(c, i, j);
@@ -218,27 +306,77 @@ mod tests {
     #[test]
     fn every_level_and_shape_matches_plain_loops() {
         for level in Level::available() {
-            simd::force_level(level);
-            for (m, n, k) in [(1, 1, 1), (6, 64, 64), (13, 80, 31), (7, 3, 5), (64, 17, 100), (0, 4, 4), (5, 16, 0)] {
-                let a = random(m * k, 1);
-                let at: Vec<f32> = (0..m * k).map(|i| if m > 0 { a[(i % m.max(1)) * k + i / m.max(1)] } else { 0.0 }).collect();
-                let b = random(k * n, 2);
-                let bias = random(n, 3);
-                for relu in [false, true] {
-                    let want: Vec<f64> = (0..m * n)
-                        .map(|e| {
-                            let (i, j) = (e / n, e % n);
-                            let s = bias[j] as f64 + (0..k).map(|p| a[i * k + p] as f64 * b[p * n + j] as f64).sum::<f64>();
-                            if relu { s.max(0.0) } else { s }
-                        })
-                        .collect();
-                    let mut c = vec![9.0; m * n];
-                    gemm(m, n, k, View::rows(&a, k), &b, n, &mut c, n, Init::Bias(&bias), relu);
-                    assert_close("rows", &c, &want, 1e-5);
-                    let mut c: Vec<f32> = (0..m * n).map(|e| bias[e % n]).collect();
-                    gemm(m, n, k, View::transposed(&at, m), &b, n, &mut c, n, Init::Accumulate, relu);
-                    assert_close("transposed", &c, &want, 1e-5);
-                }
+            simd::with_level(level, matches_plain_loops);
+        }
+    }
+
+    fn matches_plain_loops() {
+        for (m, n, k) in [
+            (1, 1, 1),
+            (6, 64, 64),
+            (13, 80, 31),
+            (7, 3, 5),
+            (64, 17, 100),
+            (101, 150, 300),
+            (50, 256, 256),
+            (0, 4, 4),
+            (5, 16, 0),
+            (64, 80, 0),
+        ] {
+            let a = random(m * k, 1);
+            let at: Vec<f32> = (0..m * k).map(|i| if m > 0 { a[(i % m.max(1)) * k + i / m.max(1)] } else { 0.0 }).collect();
+            let b = random(k * n, 2);
+            let bias = random(n, 3);
+            for relu in [false, true] {
+                let want: Vec<f64> = (0..m * n)
+                    .map(|e| {
+                        let (i, j) = (e / n, e % n);
+                        let s = bias[j] as f64 + (0..k).map(|p| a[i * k + p] as f64 * b[p * n + j] as f64).sum::<f64>();
+                        if relu { s.max(0.0) } else { s }
+                    })
+                    .collect();
+                let mut c = vec![9.0; m * n];
+                gemm(Precision::F32, m, n, k, View::rows(&a, k), &b, n, &mut c, n, Init::Bias(&bias), relu);
+                assert_close("rows", &c, &want, 1e-5);
+                let mut c: Vec<f32> = (0..m * n).map(|e| bias[e % n]).collect();
+                gemm(Precision::F32, m, n, k, View::transposed(&at, m), &b, n, &mut c, n, Init::Accumulate, relu);
+                assert_close("transposed", &c, &want, 1e-5);
+            }
+        }
+    }
+
+    #[test]
+    fn bf16_equals_the_product_of_rounded_operands() {
+        if !has_bf16() {
+            println!("no bf16 tiles here");
+            return;
+        }
+        let round = |v: &[f32]| -> Vec<f32> {
+            v.iter()
+                .map(|x| {
+                    let b = x.to_bits();
+                    f32::from_bits((b + 0x7fff + (b >> 16 & 1)) & 0xffff_0000)
+                })
+                .collect()
+        };
+        for (m, n, k) in [(1, 1, 1), (6, 64, 64), (33, 80, 31), (7, 3, 5), (64, 17, 100), (252, 256, 256), (16, 64, 253), (5, 16, 0)] {
+            let (a, b, bias) = (random(m * k, 1), random(k * n, 2), random(n, 3));
+            let at: Vec<f32> = (0..m * k).map(|i| a[(i % m) * k + i / m]).collect();
+            let (ra, rb) = (round(&a), round(&b));
+            for relu in [false, true] {
+                let want: Vec<f64> = (0..m * n)
+                    .map(|e| {
+                        let (i, j) = (e / n, e % n);
+                        let s = bias[j] as f64 + (0..k).map(|p| ra[i * k + p] as f64 * rb[p * n + j] as f64).sum::<f64>();
+                        if relu { s.max(0.0) } else { s }
+                    })
+                    .collect();
+                let mut c = vec![9.0; m * n];
+                gemm(Precision::Bf16, m, n, k, View::rows(&a, k), &b, n, &mut c, n, Init::Bias(&bias), relu);
+                assert_close("rows", &c, &want, 1e-5);
+                let mut c: Vec<f32> = (0..m * n).map(|e| bias[e % n]).collect();
+                gemm(Precision::Bf16, m, n, k, View::transposed(&at, m), &b, n, &mut c, n, Init::Accumulate, relu);
+                assert_close("transposed", &c, &want, 1e-5);
             }
         }
     }

@@ -3,8 +3,12 @@
 //! backward, `cpu.rs`, `tests.rs`.
 #![allow(unsafe_code)]
 
+#[cfg(target_arch = "x86_64")]
+mod amx;
 pub mod burn_op;
 pub mod device;
 pub mod gemm;
+pub mod math;
 pub mod ops;
+pub mod probe;
 pub mod simd;

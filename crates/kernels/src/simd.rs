@@ -1,6 +1,7 @@
 //! One source for every vector width: kernels are generic over [`Lane`], compiled once per
 //! instruction set, and chosen at run time.
 
+use std::cell::Cell;
 use std::sync::atomic::{AtomicU8, Ordering};
 
 /// An instruction set that the kernels are compiled for.
@@ -44,8 +45,15 @@ impl Level {
 
 static ACTIVE: AtomicU8 = AtomicU8::new(0);
 
-/// The level in use: the best available, or what `DIORAMA_SIMD` or [`force_level`] says.
+thread_local! {
+    static FORCED: Cell<Option<Level>> = const { Cell::new(None) };
+}
+
+/// The level in use: the best available, or what `DIORAMA_SIMD` or [`with_level`] says.
 pub fn level() -> Level {
+    if let Some(level) = FORCED.get() {
+        return level;
+    }
     match ACTIVE.load(Ordering::Relaxed) {
         1 => Level::Portable,
         2 => Level::Avx2,
@@ -60,13 +68,16 @@ pub fn level() -> Level {
     }
 }
 
-/// Makes every later kernel use `level`, for tests and benchmarks.
+/// Runs `work` with `level` in every kernel that this thread calls; other threads keep theirs.
 ///
 /// # Panics
 /// When this machine cannot run it.
-pub fn force_level(level: Level) {
+pub fn with_level<R>(level: Level, work: impl FnOnce() -> R) -> R {
     assert!(level.is_available(), "this CPU has no {}", level.name());
-    ACTIVE.store(level as u8, Ordering::Relaxed);
+    let before = FORCED.replace(Some(level));
+    let result = work();
+    FORCED.set(before);
+    result
 }
 
 /// A vector of floats. Methods must be inlined into a function compiled for the instruction set.

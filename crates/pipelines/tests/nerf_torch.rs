@@ -37,7 +37,7 @@ fn nerf_forward_equals_pytorch() {
     let (t, dt, background) = (vec![0.0; n], vec![1e30; n], vec![0.0; n * 3]);
     let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
     let mut buf = FieldBuffers::default();
-    field.render(&Batch { samples, positions: &model, dirs: &dirs, images: None, background: &background }, &mut buf);
+    field.render(&Batch { samples, positions: &model, dirs: &dirs, images: None, background: &background, near_scaling: 0.0 }, &mut buf);
     let dir = tempfile::tempdir().unwrap();
     // The points as the field saw them, after the way through model space.
     let seen: Vec<f32> = model.iter().map(|v| 2.0 * (v - 0.5)).collect();

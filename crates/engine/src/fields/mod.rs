@@ -1,13 +1,17 @@
 //! Radiance fields: an encoding of position, codes of direction and appearance, and a network.
 
 mod presets;
+mod prune;
 
 pub use presets::{baseline, mlp, nerf, ngp};
+pub use prune::Pruning;
 
 use crate::params::ParamGroup;
+use crate::stages::Stages;
 use diorama_geom::contraction::contract;
+use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::composite::Packed;
-use diorama_kernels::ops::fused_mlp::{self, Mlp};
+use diorama_kernels::ops::fused_mlp;
 use diorama_kernels::ops::hash_grid::{self, HashGrid};
 use diorama_kernels::ops::ngp_field::{self, FieldNet, Positions, RayCode, RayLoss, StepBuffers, StepInput, StepOutput};
 use diorama_kernels::ops::{frequency, linear, spherical_harmonics};
@@ -83,6 +87,8 @@ pub struct Batch<'a> {
     pub images: Option<&'a [u32]>,
     /// `[R, 3]`
     pub background: &'a [f32],
+    /// See [`StepInput::near_scaling`].
+    pub near_scaling: f32,
 }
 
 /// Memory kept between evaluations.
@@ -93,8 +99,16 @@ pub struct FieldBuffers {
     direction: Vec<f32>,
     appearance: Vec<f32>,
     d_appearance: Vec<f32>,
+    /// Whether [`Field::prune`] has already encoded what is to be trained on.
+    encoded: bool,
+    sigma: Vec<f32>,
+    alpha: Vec<f32>,
+    kept: Vec<u32>,
+    spare: Vec<f32>,
+    density: prune::DensityBuffers,
     step: StepBuffers,
     pub out: StepOutput,
+    pub stages: Stages,
 }
 
 impl Field {
@@ -157,7 +171,13 @@ impl Field {
         if let Some(a) = &self.appearance {
             codes.push(RayCode { values: &appearance, width: a.dims, gradient: None });
         }
-        let input = StepInput { net: &self.net, params: &self.weights.values, samples: batch.samples, background: batch.background };
+        let input = StepInput {
+            net: &self.net,
+            params: &self.weights.values,
+            samples: batch.samples,
+            background: batch.background,
+            near_scaling: batch.near_scaling,
+        };
         let positions = match (&self.encoding, &self.table) {
             (Encoding::Hash(grid), Some(table)) => {
                 buf.features.resize(batch.samples.samples() * grid.output_dims(), 0.0);
@@ -174,7 +194,10 @@ impl Field {
 
     /// [`Field::render`] with a loss: adds gradients to the groups and, where asked, gives those of the positions.
     pub fn train(&mut self, batch: &Batch, loss: &dyn RayLoss, buf: &mut FieldBuffers, d_positions: Option<&mut Vec<f32>>) {
-        self.unit(batch.positions, &mut buf.unit);
+        let encoded = std::mem::take(&mut buf.encoded);
+        if !encoded {
+            self.unit(batch.positions, &mut buf.unit);
+        }
         self.codes(batch, buf);
         let (direction, appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
         let mut d_appearance = std::mem::take(&mut buf.d_appearance);
@@ -186,16 +209,27 @@ impl Field {
         if let Some(a) = &self.appearance {
             codes.push(RayCode { values: &appearance, width: a.dims, gradient: Some(&mut d_appearance) });
         }
-        let input = StepInput { net: &self.net, params: &self.weights.values, samples: batch.samples, background: batch.background };
+        let input = StepInput {
+            net: &self.net,
+            params: &self.weights.values,
+            samples: batch.samples,
+            background: batch.background,
+            near_scaling: batch.near_scaling,
+        };
         let mut own = Vec::new();
         match (&self.encoding, &mut self.table) {
             (Encoding::Hash(grid), Some(table)) => {
-                buf.features.resize(batch.samples.samples() * grid.output_dims(), 0.0);
-                hash_grid::cpu::forward(grid, &buf.unit, &table.values, &mut buf.features);
+                if !encoded {
+                    buf.features.resize(batch.samples.samples() * grid.output_dims(), 0.0);
+                    hash_grid::cpu::forward(grid, &buf.unit, &table.values, &mut buf.features);
+                    buf.stages.done("encode");
+                }
                 let positions = Positions::Features { data: &mut buf.features, levels: grid.levels.len(), width: grid.config.features };
                 ngp_field::run(&input, positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut self.weights.grads);
+                buf.stages.done("network");
                 if !table.frozen {
                     hash_grid::cpu::backward(grid, &buf.unit, &buf.features, &mut table.grads, Some(&mut table.touched));
+                    buf.stages.done("scatter");
                 }
                 if let Some(d) = d_positions {
                     d.resize(batch.positions.len(), 0.0);
@@ -228,40 +262,35 @@ impl Field {
 
     /// Densities `[N]` (per unit of model space) at model points `[N, 3]`.
     pub fn density(&self, model: &[f32], sigma: &mut [f32]) {
-        // The layers up to the density head read positions alone, and their parameters come first.
         let head = self.net.sigma;
-        let mlp = Mlp::new(self.net.mlp.input_widths[..1].to_vec(), self.net.mlp.layers[..=head.layer].to_vec());
+        let mlp = self.density_net(Precision::F32);
         let params = &self.weights.values[..mlp.params_len()];
         let width = mlp.layers[head.layer].width;
         let (mut unit, mut rows, mut features, mut out) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let mut buffers = prune::DensityBuffers::default();
         const CHUNK: usize = 1 << 16;
         for (points, sigma) in model.chunks(CHUNK * 3).zip(sigma.chunks_mut(CHUNK)) {
             let n = sigma.len();
             self.unit(points, &mut unit);
-            rows.resize(n * mlp.input_widths[0], 0.0);
             match (&self.encoding, &self.table) {
                 (Encoding::Hash(grid), Some(table)) => {
                     features.resize(n * grid.output_dims(), 0.0);
                     hash_grid::cpu::forward(grid, &unit, &table.values, &mut features);
-                    let f = grid.config.features;
-                    rows.par_chunks_mut(grid.output_dims()).enumerate().with_min_len(512).for_each(|(i, row)| {
-                        for (l, o) in row.chunks_exact_mut(f).enumerate() {
-                            o.copy_from_slice(&features[(l * n + i) * f..][..f]);
-                        }
-                    });
+                    self.sigma(grid, &mlp, &features, sigma, &mut buffers);
                 }
                 (Encoding::Frequency(f), _) => {
                     let w = f.output_dims();
+                    rows.resize(n * w, 0.0);
                     rows.par_chunks_mut(w * 256).zip(unit.par_chunks(3 * 256)).for_each(|(o, x)| frequency::cpu::forward(f, x, o));
+                    out.resize(n * width, 0.0);
+                    fused_mlp::cpu::forward(&mlp, params, &[&rows], n, &mut out);
+                    for (s, o) in sigma.iter_mut().zip(out.chunks_exact(width)) {
+                        *s = o[head.channel] + head.shift;
+                    }
+                    linear::cpu::activate(head.activation, sigma);
                 }
                 (Encoding::Hash(_), None) => unreachable!("a hash field has a table"),
             }
-            out.resize(n * width, 0.0);
-            fused_mlp::cpu::forward(&mlp, params, &[&rows], n, &mut out);
-            for (s, o) in sigma.iter_mut().zip(out.chunks_exact(width)) {
-                *s = o[head.channel] + head.shift;
-            }
-            linear::cpu::activate(head.activation, sigma);
         }
     }
 

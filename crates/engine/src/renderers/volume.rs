@@ -146,7 +146,14 @@ impl Tracer<'_> {
         let background = vec![0.0; batch.len() * 3];
         let images = self.appearance.map(|i| vec![i; batch.len()]);
         let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
-        let b = Batch { samples, positions: &positions, dirs: &batch.dirs, images: images.as_deref(), background: &background };
+        let b = Batch {
+            samples,
+            positions: &positions,
+            dirs: &batch.dirs,
+            images: images.as_deref(),
+            background: &background,
+            near_scaling: 0.0,
+        };
         field.render(&b, buf);
     }
 

@@ -72,6 +72,8 @@ pub struct FieldConfig {
     /// Length of the per-image appearance code; 0: none.
     pub appearance: usize,
     pub contraction: bool,
+    /// `auto`: networks multiply in bf16 where the CPU has tiles for it; `f32`.
+    pub precision: String,
 }
 
 /// What the field is trained to do.
@@ -82,6 +84,8 @@ pub struct LossConfig {
     pub color: String,
     pub distortion: f32,
     pub alpha: f32,
+    /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.
+    pub near_scaling: f32,
 }
 
 /// Rates and their course.
@@ -109,6 +113,10 @@ pub struct SamplingConfig {
     /// More samples per ray for the fine network of `nerf`.
     pub importance: usize,
     pub max_samples: usize,
+    /// Samples behind which less than this share of light arrives are not trained on.
+    pub stop: f32,
+    /// Samples of less opacity than this are not trained on.
+    pub min_alpha: f32,
     /// Nearest distance at which matter may be, in inner cubes.
     pub near: f32,
     pub occupancy_resolution: usize,
@@ -187,8 +195,22 @@ impl Config {
                 split: "file".into(),
                 memory_budget: diorama_data::pixel_store::DEFAULT_BUDGET,
             },
-            field: FieldConfig { levels: 16, features: 2, log2_size: 19, base: 16, finest: 0, appearance: 0, contraction: false },
-            loss: LossConfig { color: if ngp { "huber" } else { "mse" }.into(), distortion: 0.0, alpha: 0.0 },
+            field: FieldConfig {
+                levels: 16,
+                features: 2,
+                log2_size: 19,
+                base: 16,
+                finest: 0,
+                appearance: 0,
+                contraction: false,
+                precision: "auto".into(),
+            },
+            loss: LossConfig {
+                color: if ngp { "huber" } else { "mse" }.into(),
+                distortion: 0.0,
+                alpha: 0.0,
+                near_scaling: if ngp { 1.0 } else { 0.0 },
+            },
             optim: OptimConfig {
                 rate,
                 final_scale: if ngp { 0.03 } else { 0.1 },
@@ -202,6 +224,8 @@ impl Config {
                 samples: 64,
                 importance: 128,
                 max_samples: 1024,
+                stop: 1e-4,
+                min_alpha: 1e-3,
                 near: 0.1,
                 occupancy_resolution: 128,
                 occupancy_points: 1 << 17,
@@ -262,6 +286,9 @@ impl Config {
         let f = &self.field;
         if ![1, 2, 4, 8].contains(&f.features) || f.levels == 0 || f.base == 0 || !(4..=24).contains(&f.log2_size) {
             return fail("field: features must be 1, 2, 4 or 8, levels and base at least 1, log2_size 4 to 24");
+        }
+        if !["auto", "f32"].contains(&&f.precision[..]) {
+            return fail("field.precision: expected auto or f32");
         }
         if !["mse", "huber"].contains(&&self.loss.color[..]) {
             return fail("loss.color: expected mse or huber");

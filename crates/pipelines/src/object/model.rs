@@ -14,6 +14,7 @@ use diorama_geom::capture::Split;
 use diorama_geom::field_query::FieldQuery;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Capture, Pose, Similarity};
+use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::hash_grid::HashGridConfig;
@@ -96,7 +97,11 @@ impl ObjectModel {
             o.keep_visible(&cameras, model.config.sampling.min_cell_views);
         }
         let decay = model.config.optim.weight_decay;
-        model.fields_mut().into_iter().for_each(|f| f.weights.adam.weight_decay = decay);
+        let precision = if model.config.field.precision == "auto" { Precision::Bf16 } else { Precision::F32 };
+        for f in model.fields_mut() {
+            f.weights.adam.weight_decay = decay;
+            f.net.mlp.precision = precision;
+        }
         Ok(model)
     }
 
@@ -309,6 +314,7 @@ impl FieldQuery for ObjectModel {
                 dirs: d.as_flattened(),
                 images: None,
                 background: &vec![0.0; n * 3],
+                near_scaling: 0.0,
             };
             self.field.render(&batch, &mut buf);
             out.as_flattened_mut().copy_from_slice(&buf.out.rgb);

@@ -4,15 +4,17 @@ use super::config::{Background, Config, Method};
 use super::evaluate;
 use super::model::ObjectModel;
 use super::run_folder::RunFolder;
+use crate::bench::train::{StageFigure, TrainReport};
 use crate::error::{PipelineError, Result};
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_data::{checkpoint, photo};
-use diorama_engine::fields::{Batch, Field, FieldBuffers};
+use diorama_engine::fields::{Batch, Field, FieldBuffers, Pruning};
 use diorama_engine::losses::{ColorLoss, Photometric};
 use diorama_engine::params::Schedule;
 use diorama_engine::samplers::pixels::{self, DrawOptions, PixelSource};
 use diorama_engine::samplers::{RayBatch, stratified};
+use diorama_engine::stages::Stages;
 use diorama_engine::train::{self, Event, RunError, RunOptions, StepReport, Summary, Trainee};
 use diorama_geom::Capture;
 use diorama_geom::capture::Split;
@@ -22,6 +24,7 @@ use diorama_kernels::ops::march::{self, MarchRays, Marched};
 use diorama_kernels::ops::ray_generation::{self, PosedCamera};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
+use std::time::Instant;
 
 /// Streams of random numbers.
 const PIXELS: u64 = 10;
@@ -58,10 +61,7 @@ pub fn train(
     for note in &capture.notes {
         events(&Event::Note(note.clone()));
     }
-    let train = capture.indices(Split::Train);
-    let frames: Vec<_> = train.iter().map(|&i| &capture.frames[i]).collect();
-    let options = StoreOptions { downscale: config.data.downscale, budget: config.data.memory_budget, scratch: folder.path() };
-    let store = PixelStore::load(&frames, &options, &|| {})?;
+    let store = load_pixels(config, &capture, folder.path())?;
     if store.is_mapped() {
         events(&Event::Note("the photographs exceed the memory budget and are read from a mapped scratch file".into()));
     }
@@ -99,6 +99,49 @@ pub fn train(
     })?;
     folder.draw_curves()?;
     Ok((trainer.model, summary))
+}
+
+/// Where a step's time goes: `warmup` steps, then `steps` measured ones; writes nothing but pixels that do not fit in memory.
+pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> {
+    let capture = load_capture(config)?;
+    let scratch = std::env::temp_dir();
+    let store = load_pixels(config, &capture, &scratch)?;
+    let has_alpha = store.has_alpha;
+    let mut trainer = Trainer::new(ObjectModel::new(config.clone(), capture, has_alpha)?, Photographs(store), &scratch);
+    for step in 0..warmup {
+        trainer.step(step, 0.0);
+    }
+    trainer.buffers.field.stages = Stages::default();
+    let before = (trainer.model.origin, trainer.marched);
+    let begin = Instant::now();
+    for step in warmup..warmup + steps {
+        trainer.step(step, 0.0);
+    }
+    let seconds = begin.elapsed().as_secs_f64();
+    let (o, marched) = (trainer.model.origin, trainer.marched - before.1);
+    let (rays, trained) = ((o.rays - before.0.rays) as f64, (o.samples - before.0.samples) as f64);
+    let stages = &trainer.buffers.field.stages.seconds;
+    let total: f64 = stages.iter().map(|s| s.1).sum();
+    Ok(TrainReport {
+        threads: rayon::current_num_threads(),
+        simd: diorama_kernels::simd::level().name(),
+        steps,
+        seconds,
+        rays_per_s: rays / seconds,
+        marched_per_s: marched as f64 / seconds,
+        trained_per_s: trained / seconds,
+        marched_per_ray: marched as f64 / rays,
+        trained_per_ray: trained / rays,
+        occupied: trainer.model.occupancy.as_ref().map(|o| o.bits.fill()),
+        stages: stages.iter().map(|s| StageFigure { stage: s.0, share: s.1 / total, ms: s.1 * 1e3 / steps as f64 }).collect(),
+    })
+}
+
+fn load_pixels(config: &Config, capture: &Capture, scratch: &Path) -> Result<PixelStore> {
+    let train = capture.indices(Split::Train);
+    let frames: Vec<_> = train.iter().map(|&i| &capture.frames[i]).collect();
+    let options = StoreOptions { downscale: config.data.downscale, budget: config.data.memory_budget, scratch };
+    Ok(PixelStore::load(&frames, &options, &|| {})?)
 }
 
 fn run_options(config: &Config) -> RunOptions {
@@ -152,13 +195,24 @@ struct Trainer<'a> {
     buffers: Buffers,
     schedule: Schedule,
     recovered: bool,
+    /// Samples before any were left out.
+    marched: u64,
 }
 
 impl<'a> Trainer<'a> {
     fn new(model: ObjectModel, photographs: Photographs, checkpoints: &'a Path) -> Self {
         let o = &model.config.optim;
         let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
-        Trainer { cameras: model.cameras(), model, photographs, checkpoints, buffers: Buffers::default(), schedule, recovered: false }
+        Trainer {
+            cameras: model.cameras(),
+            model,
+            photographs,
+            checkpoints,
+            buffers: Buffers::default(),
+            schedule,
+            recovered: false,
+            marched: 0,
+        }
     }
 
     /// As many rays as give about the wanted number of samples.
@@ -185,6 +239,7 @@ impl<'a> Trainer<'a> {
         };
         pixels::draw(&self.photographs, &options, &mut self.buffers.batch);
         self.fill_background(first);
+        self.buffers.field.stages.done("draw");
     }
 
     fn fill_background(&mut self, first: u64) {
@@ -218,10 +273,17 @@ impl<'a> Trainer<'a> {
             let (until, block) = OCCUPANCY_WARMUP;
             let rng = Rng::new(m.config.seed, OCCUPANCY);
             grid.update(&m.field, &rng, step, s.occupancy_points, if step <= until { block } else { 1 });
+            b.field.stages.done("occupancy");
         }
         let rays = MarchRays { origins: &b.batch.origins, dirs: &b.batch.dirs, near_far: &b.batch.near_far, jitter: &b.batch.jitter };
         march::cpu::march(&grid.bits, &rays, &grid.march_config(s.max_samples), &mut b.march, &mut b.marched);
         march::cpu::positions(&rays, &b.marched, &mut b.positions);
+        b.field.stages.done("march");
+        self.marched += b.marched.t.len() as u64;
+        if s.stop > 0.0 || s.min_alpha > 0.0 {
+            let pruning = Pruning { stop: s.stop, min_alpha: s.min_alpha };
+            m.field.prune(&mut b.marched, &mut b.positions, pruning, &mut b.field);
+        }
         let per_ray = b.marched.t.len() as f64 / b.batch.len() as f64;
         m.samples_per_ray = if step == 0 { per_ray } else { 0.9 * m.samples_per_ray + 0.1 * per_ray };
         let loss = train_field(
@@ -331,7 +393,8 @@ fn train_field(
     let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
     let color = if config.loss.color == "huber" { ColorLoss::Huber(0.1) } else { ColorLoss::Mse };
     let loss = Photometric { batch, samples, background, color, distortion: config.loss.distortion, alpha: config.loss.alpha };
-    let b = Batch { samples, positions, dirs: &batch.dirs, images: Some(&batch.images), background };
+    let near_scaling = config.loss.near_scaling;
+    let b = Batch { samples, positions, dirs: &batch.dirs, images: Some(&batch.images), background, near_scaling };
     field.train(&b, &loss, buffers, d_positions);
     buffers.out.loss
 }
@@ -347,6 +410,7 @@ impl Trainee for Trainer<'_> {
             Method::Mlp | Method::Baseline => self.step_stratified(first),
             Method::Nerf => self.step_hierarchical(first),
         };
+        self.buffers.field.stages.done("network");
         let mse = self.score();
         let rays = self.buffers.batch.len() as u64;
         let report = StepReport { loss, mse, rays, samples };
@@ -357,7 +421,9 @@ impl Trainee for Trainer<'_> {
             l.backward(&self.buffers.batch.dirs, &self.buffers.background, &self.buffers.field.out.d_background);
         }
         self.correct_cameras();
+        self.buffers.field.stages.done("score");
         self.model.optimise(step as u32 + 1, self.schedule.scale(progress as f32));
+        self.buffers.field.stages.done("optimise");
         if self.model.corrections.is_some() {
             self.cameras = self.model.cameras();
         }

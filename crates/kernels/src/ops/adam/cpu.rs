@@ -1,6 +1,7 @@
 //! In place, parallel over chunks.
 
 use super::Adam;
+use crate::math::multiversion;
 use rayon::prelude::*;
 
 /// Elements per task, a multiple of [`LINE`].
@@ -45,7 +46,11 @@ pub fn sparse(a: &Adam, t: u32, p: &mut [f32], m: &mut [f32], v: &mut [f32], g: 
     let f = factors(a, t);
     let params = p.par_chunks_mut(CHUNK).zip(m.par_chunks_mut(CHUNK)).zip(v.par_chunks_mut(CHUNK));
     let chunks = params.zip(g.par_chunks_mut(CHUNK)).zip(touched.par_chunks_mut(CHUNK / LINE));
-    chunks.for_each(|((((p, m), v), g), touched)| {
+    chunks.for_each(|((((p, m), v), g), touched)| sparse_chunk(a, f, p, m, v, g, touched));
+}
+
+multiversion! {
+    fn sparse_chunk(a: &Adam, f: Factors, p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &mut [f32], touched: &mut [u8]) {
         for (line, mark) in touched.iter_mut().enumerate() {
             if *mark == 0 {
                 continue;
@@ -67,5 +72,5 @@ pub fn sparse(a: &Adam, t: u32, p: &mut [f32], m: &mut [f32], v: &mut [f32], g: 
                 g[i] = 0.0;
             }
         }
-    });
+    }
 }

@@ -1,6 +1,7 @@
 //! One pass forward, one pass back with a running suffix sum; parallel over rays.
 
 use super::{Composited, Packed};
+use crate::math;
 use rayon::prelude::*;
 
 /// Rays per task.
@@ -27,9 +28,9 @@ pub struct Gradients {
 #[inline]
 pub fn ray_weights(sigma: &[f32], dt: &[f32], weights: &mut [f32]) -> f32 {
     let mut t = 1.0f32;
-    for ((s, d), w) in sigma.iter().zip(dt).zip(weights) {
-        // −expm1 keeps thin samples exact.
-        let alpha = -(-s * d).exp_m1();
+    math::alphas(sigma, dt, weights);
+    for w in weights {
+        let alpha = *w;
         *w = t * alpha;
         t *= 1.0 - alpha;
     }

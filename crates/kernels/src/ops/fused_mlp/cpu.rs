@@ -79,7 +79,7 @@ pub fn forward_block(mlp: &Mlp, params: &[f32], inputs: &[&[f32]], n: usize, act
                 _ => Init::Accumulate,
             };
             let last = q + 1 == layer.inputs.len();
-            gemm(n, width, k, View::rows(x, k), &params[at..], width, out, width, init, layer.relu && last);
+            gemm(mlp.precision, n, width, k, View::rows(x, k), &params[at..], width, out, width, init, layer.relu && last);
             at += k * width;
         }
     }
@@ -121,14 +121,26 @@ pub fn backward_block(
                 Source::Input(i) => inputs[i],
                 Source::Layer(i) => &acts.values[i],
             };
-            gemm(k, width, n, View::transposed(x, k), g, width, &mut d_params[at..at + k * width], width, Init::Accumulate, false);
+            gemm(
+                mlp.precision,
+                k,
+                width,
+                n,
+                View::transposed(x, k),
+                g,
+                width,
+                &mut d_params[at..at + k * width],
+                width,
+                Init::Accumulate,
+                false,
+            );
             let (target, seeded) = match *s {
                 Source::Input(i) => (d_inputs[i].as_deref_mut(), &mut input_seeded[i]),
                 Source::Layer(i) => (Some(&mut before[i][..]), &mut acts.seeded[i]),
             };
             if let Some(target) = target {
                 let init = if *seeded { Init::Accumulate } else { Init::Zero };
-                gemm(n, k, width, View::rows(g, width), &wt[first..], total, target, k, init, false);
+                gemm(mlp.precision, n, k, width, View::rows(g, width), &wt[first..], total, target, k, init, false);
                 *seeded = true;
             }
             at += k * width;

@@ -8,6 +8,7 @@ pub mod reference;
 mod tests;
 
 use crate::burn_op::{self, In, Out, SliceOp};
+use crate::gemm::Precision;
 use burn::tensor::Tensor;
 use diorama_geom::rng::Rng;
 
@@ -33,13 +34,15 @@ pub struct Mlp {
     pub input_widths: Vec<usize>,
     pub layers: Vec<Layer>,
     pub offsets: Vec<usize>,
+    /// Arithmetic of the layers' products.
+    pub precision: Precision,
 }
 
 impl Mlp {
     /// # Panics
     /// When a layer reads an input or layer that does not come before it.
     pub fn new(input_widths: Vec<usize>, layers: Vec<Layer>) -> Mlp {
-        let mut mlp = Mlp { input_widths, layers, offsets: vec![0] };
+        let mut mlp = Mlp { input_widths, layers, offsets: vec![0], precision: Precision::F32 };
         for j in 0..mlp.layers.len() {
             for s in &mlp.layers[j].inputs {
                 let ok = match *s {

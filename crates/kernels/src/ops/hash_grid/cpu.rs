@@ -125,7 +125,7 @@ pub fn backward(grid: &HashGrid, points: &[f32], d_out: &[f32], d_table: &mut [f
     }
     tasks.into_par_iter().with_max_len(1).for_each(|(level, d, own, marks)| match width {
         1 => backward_level::<1>(level, points, d, own, marks),
-        2 => backward_level::<2>(level, points, d, own, marks),
+        2 => backward_level2(level, points, d, own, marks),
         4 => backward_level::<4>(level, points, d, own, marks),
         _ => backward_level::<8>(level, points, d, own, marks),
     });
@@ -153,6 +153,21 @@ fn backward_level<const F: usize>(level: &Level, points: &[f32], d_out: &[f32], 
             }
         }
     }
+}
+
+fn backward_level2(level: &Level, points: &[f32], d_out: &[f32], d_rows: &mut [f32], marks: Option<&mut [u8]>) {
+    #[cfg(target_arch = "x86_64")]
+    if simd::level() == simd::Level::Avx512
+        && let Some(marks) = marks
+    {
+        let whole = points.len() / 3 / 16 * 16;
+        assert!(d_rows.len() >= level.rows * 2 && marks.len() * LINE >= level.rows * 2, "hash grid: level");
+        // SAFETY: the CPU has AVX-512; `whole` points are a multiple of 16 inside both slices; every
+        // row index is below `level.rows`, which both outputs cover.
+        unsafe { x86::backward16(level, &points[..whole * 3], &d_out[..whole * 2], d_rows, marks) };
+        return backward_level::<2>(level, &points[whole * 3..], &d_out[whole * 2..], d_rows, Some(marks));
+    }
+    backward_level::<2>(level, points, d_out, d_rows, marks);
 }
 
 /// Gradient of the points, overwritten.
@@ -257,62 +272,145 @@ mod x86 {
     use super::Level;
     use std::arch::x86_64::*;
 
-    /// Sixteen points at a time, two features per row.
-    ///
-    /// # Safety
-    /// AVX-512F and DQ; a multiple of 16 points; `rows` holds every row of `level`.
-    #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
-    pub unsafe fn forward16(level: &Level, points: &[f32], rows: &[f32], out: &mut [f32]) {
-        // SAFETY: all loads and stores lie inside the slices, see the caller.
-        unsafe {
-            let n = _mm512_set1_ps(level.cells as f32);
-            let last = _mm512_set1_epi32(level.cells as i32 - 1);
-            let (zero, one) = (_mm512_setzero_ps(), _mm512_set1_ps(1.0));
-            let lane3 = _mm512_mullo_epi32(_mm512_set1_epi32(3), _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
-            let low = _mm512_setr_epi32(0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
-            let high = _mm512_setr_epi32(8, 8, 9, 9, 10, 10, 11, 11, 12, 12, 13, 13, 14, 14, 15, 15);
+    /// Indices and weights of the eight corners of sixteen points.
+    #[repr(C, align(64))]
+    struct Corners {
+        rows: [[u32; 16]; 8],
+        weights: [[f32; 16]; 8],
+    }
+
+    /// Constants of a level.
+    struct Hash {
+        n: __m512,
+        last: __m512i,
+        lane3: __m512i,
+        v1: __m512i,
+        v2: __m512i,
+        mask: __m512i,
+        xor: bool,
+    }
+
+    impl Hash {
+        #[inline]
+        #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+        fn new(level: &Level) -> Self {
             let (p1, p2, mask, xor) = if level.dense {
                 let s = level.cells as i32 + 1;
                 (s, s * s, -1i32, false)
             } else {
                 (2_654_435_761u32 as i32, 805_459_861u32 as i32, level.rows as i32 - 1, true)
             };
-            let (v1, v2, vmask) = (_mm512_set1_epi32(p1), _mm512_set1_epi32(p2), _mm512_set1_epi32(mask));
-            let unit = _mm512_set1_epi32(1);
-            let base = rows.as_ptr().cast::<i64>();
-            for g in 0..points.len() / 48 {
-                let src = points.as_ptr().add(g * 48);
-                let axis = |k: i32| {
-                    let x = _mm512_i32gather_ps::<4>(_mm512_add_epi32(lane3, _mm512_set1_epi32(k)), src);
-                    let x = _mm512_mul_ps(_mm512_min_ps(_mm512_max_ps(x, zero), one), n);
-                    let i = _mm512_min_epi32(_mm512_cvttps_epi32(x), last);
-                    (i, _mm512_sub_ps(x, _mm512_cvtepi32_ps(i)))
+            Hash {
+                n: _mm512_set1_ps(level.cells as f32),
+                last: _mm512_set1_epi32(level.cells as i32 - 1),
+                lane3: _mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 33, 36, 39, 42, 45),
+                v1: _mm512_set1_epi32(p1),
+                v2: _mm512_set1_epi32(p2),
+                mask: _mm512_set1_epi32(mask),
+                xor,
+            }
+        }
+
+        /// Corners of the sixteen points at `src`.
+        #[inline]
+        #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+        unsafe fn corners(&self, src: *const f32) -> [(__m512i, __m512); 8] {
+            let (zero, one, unit) = (_mm512_setzero_ps(), _mm512_set1_ps(1.0), _mm512_set1_epi32(1));
+            let axis = |k: i32| {
+                // SAFETY: the caller vouches for 48 floats.
+                let x = unsafe { _mm512_i32gather_ps::<4>(_mm512_add_epi32(self.lane3, _mm512_set1_epi32(k)), src) };
+                let x = _mm512_mul_ps(_mm512_min_ps(_mm512_max_ps(x, zero), one), self.n);
+                let i = _mm512_min_epi32(_mm512_cvttps_epi32(x), self.last);
+                (i, _mm512_sub_ps(x, _mm512_cvtepi32_ps(i)))
+            };
+            let ((ix, fx), (iy, fy), (iz, fz)) = (axis(0), axis(1), axis(2));
+            let y0 = _mm512_mullo_epi32(iy, self.v1);
+            let z0 = _mm512_mullo_epi32(iz, self.v2);
+            let xs = [ix, _mm512_add_epi32(ix, unit)];
+            let ys = [y0, _mm512_add_epi32(y0, self.v1)];
+            let zs = [z0, _mm512_add_epi32(z0, self.v2)];
+            let wx = [_mm512_sub_ps(one, fx), fx];
+            let wy = [_mm512_sub_ps(one, fy), fy];
+            let wz = [_mm512_sub_ps(one, fz), fz];
+            let mut out = [(unit, zero); 8];
+            for (c, out) in out.iter_mut().enumerate() {
+                let (a, b, d) = (c & 1, (c >> 1) & 1, c >> 2);
+                let row = if self.xor {
+                    _mm512_and_epi32(_mm512_xor_epi32(_mm512_xor_epi32(xs[a], ys[b]), zs[d]), self.mask)
+                } else {
+                    _mm512_add_epi32(_mm512_add_epi32(xs[a], ys[b]), zs[d])
                 };
-                let ((ix, fx), (iy, fy), (iz, fz)) = (axis(0), axis(1), axis(2));
-                let y0 = _mm512_mullo_epi32(iy, v1);
-                let z0 = _mm512_mullo_epi32(iz, v2);
-                let xs = [ix, _mm512_add_epi32(ix, unit)];
-                let ys = [y0, _mm512_add_epi32(y0, v1)];
-                let zs = [z0, _mm512_add_epi32(z0, v2)];
-                let wx = [_mm512_sub_ps(one, fx), fx];
-                let wy = [_mm512_sub_ps(one, fy), fy];
-                let wz = [_mm512_sub_ps(one, fz), fz];
-                let (mut lo, mut hi) = (zero, zero);
-                for c in 0..8usize {
-                    let (a, b, d) = (c & 1, (c >> 1) & 1, c >> 2);
-                    let idx = if xor {
-                        _mm512_and_epi32(_mm512_xor_epi32(_mm512_xor_epi32(xs[a], ys[b]), zs[d]), vmask)
-                    } else {
-                        _mm512_add_epi32(_mm512_add_epi32(xs[a], ys[b]), zs[d])
-                    };
-                    let w = _mm512_mul_ps(wx[a], _mm512_mul_ps(wy[b], wz[d]));
-                    let first = _mm512_i32gather_epi64::<8>(_mm512_castsi512_si256(idx), base);
-                    let second = _mm512_i32gather_epi64::<8>(_mm512_extracti64x4_epi64::<1>(idx), base);
+                *out = (row, _mm512_mul_ps(wx[a], _mm512_mul_ps(wy[b], wz[d])));
+            }
+            out
+        }
+    }
+
+    /// Sixteen points at a time, two features per row.
+    ///
+    /// # Safety
+    /// AVX-512F and DQ; a multiple of 16 points; `rows` holds every row of `level`.
+    #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+    pub unsafe fn forward16(level: &Level, points: &[f32], rows: &[f32], out: &mut [f32]) {
+        let hash = Hash::new(level);
+        let low = _mm512_setr_epi32(0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
+        let high = _mm512_setr_epi32(8, 8, 9, 9, 10, 10, 11, 11, 12, 12, 13, 13, 14, 14, 15, 15);
+        let base = rows.as_ptr().cast::<i64>();
+        for g in 0..points.len() / 48 {
+            let (mut lo, mut hi) = (_mm512_setzero_ps(), _mm512_setzero_ps());
+            // SAFETY: all loads and stores lie inside the slices, see the caller.
+            unsafe {
+                for (row, w) in hash.corners(points.as_ptr().add(g * 48)) {
+                    let first = _mm512_i32gather_epi64::<8>(_mm512_castsi512_si256(row), base);
+                    let second = _mm512_i32gather_epi64::<8>(_mm512_extracti64x4_epi64::<1>(row), base);
                     lo = _mm512_fmadd_ps(_mm512_permutexvar_ps(low, w), _mm512_castsi512_ps(first), lo);
                     hi = _mm512_fmadd_ps(_mm512_permutexvar_ps(high, w), _mm512_castsi512_ps(second), hi);
                 }
                 _mm512_storeu_ps(out.as_mut_ptr().add(g * 32), lo);
                 _mm512_storeu_ps(out.as_mut_ptr().add(g * 32 + 16), hi);
+            }
+        }
+    }
+
+    /// Adds the gradients of sixteen points at a time; the rows of the next sixteen are already on their way.
+    ///
+    /// # Safety
+    /// As for [`forward16`]; `marks` covers `rows`.
+    #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+    pub unsafe fn backward16(level: &Level, points: &[f32], d_out: &[f32], rows: &mut [f32], marks: &mut [u8]) {
+        let hash = Hash::new(level);
+        let groups = points.len() / 48;
+        let empty = || Corners { rows: [[0; 16]; 8], weights: [[0.0; 16]; 8] };
+        let mut buffers = [empty(), empty()];
+        let (base, marks) = (rows.as_mut_ptr(), marks.as_mut_ptr());
+        for g in 0..=groups {
+            // SAFETY: all loads and stores lie inside the slices, see the caller.
+            unsafe {
+                if g < groups {
+                    let next = &mut buffers[g % 2];
+                    for (c, (row, w)) in hash.corners(points.as_ptr().add(g * 48)).into_iter().enumerate() {
+                        _mm512_store_si512(next.rows[c].as_mut_ptr().cast(), row);
+                        _mm512_store_ps(next.weights[c].as_mut_ptr(), w);
+                        for row in &next.rows[c] {
+                            _mm_prefetch::<_MM_HINT_ET0>(base.add(*row as usize * 2).cast());
+                        }
+                    }
+                }
+                if g == 0 {
+                    continue;
+                }
+                let now = &buffers[(g - 1) % 2];
+                let d = d_out.as_ptr().add((g - 1) * 32);
+                for p in 0..16 {
+                    let d = _mm_castsi128_ps(_mm_loadl_epi64(d.add(2 * p).cast()));
+                    for c in 0..8 {
+                        let row = now.rows[c][p] as usize;
+                        let at = base.add(row * 2);
+                        let sum = _mm_fmadd_ps(_mm_set1_ps(now.weights[c][p]), d, _mm_castsi128_ps(_mm_loadl_epi64(at.cast())));
+                        _mm_storel_epi64(at.cast(), _mm_castps_si128(sum));
+                        *marks.add(row * 2 / super::LINE) = 1;
+                    }
+                }
             }
         }
     }

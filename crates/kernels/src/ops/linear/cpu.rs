@@ -1,7 +1,8 @@
 //! Blocks of rows through the small matrix product; weight gradients per block group, added in order.
 
 use super::{Activation, BiasKind};
-use crate::gemm::{self, Init, View, gemm};
+use crate::gemm::{self, Init, Precision, View, gemm};
+use crate::math;
 use rayon::prelude::*;
 
 /// Rows per block.
@@ -14,9 +15,9 @@ pub fn activate(a: Activation, values: &mut [f32]) {
     match a {
         Activation::None => {}
         Activation::Relu => values.iter_mut().for_each(|v| *v = v.max(0.0)),
-        Activation::Sigmoid => values.iter_mut().for_each(|v| *v = 1.0 / (1.0 + (-*v).exp())),
+        Activation::Sigmoid => math::sigmoid_in_place(values),
         Activation::Softplus => values.iter_mut().for_each(|v| *v = v.max(0.0) + (-v.abs()).exp().ln_1p()),
-        Activation::TruncatedExp => values.iter_mut().for_each(|v| *v = v.exp()),
+        Activation::TruncatedExp => math::exp_in_place(values),
     }
 }
 
@@ -53,7 +54,7 @@ pub fn forward(m: usize, k: usize, n: usize, x: &[f32], w: &[f32], bias: &[f32],
                 Init::Accumulate
             }
         };
-        gemm(rows, n, k, x, w, n, out, n, init, a == Activation::Relu);
+        gemm(Precision::F32, rows, n, k, x, w, n, out, n, init, a == Activation::Relu);
         if a != Activation::Relu {
             activate(a, out);
         }
@@ -106,8 +107,8 @@ pub fn backward(
                 }
                 let g = &g[..rows * n];
                 let local = start - first;
-                gemm(rows, k, n, View::rows(g, n), &wt, k, &mut dx[local * k..], k, Init::Zero, false);
-                gemm(k, n, rows, View::transposed(&x[start * k..], k), g, n, &mut dw, n, Init::Accumulate, false);
+                gemm(Precision::F32, rows, k, n, View::rows(g, n), &wt, k, &mut dx[local * k..], k, Init::Zero, false);
+                gemm(Precision::F32, k, n, rows, View::transposed(&x[start * k..], k), g, n, &mut dw, n, Init::Accumulate, false);
                 if per_row {
                     db_rows[local * n..(local + rows) * n].copy_from_slice(g);
                 }

@@ -24,6 +24,9 @@ pub struct StepInput<'a> {
     pub samples: Packed<'a>,
     /// `[R, 3]`
     pub background: &'a [f32],
+    /// Distance `D` within which gradients of samples are scaled by `(t / D)²`, so that space close to a
+    /// camera, which few rays share, learns no faster than the rest (Philip and Deschaintre 2023); 0: none.
+    pub near_scaling: f32,
 }
 
 /// What a step gives per ray and per sample.
@@ -233,7 +236,14 @@ fn run_block(
             }
         }
         let g_out = d[0] * bg[0] + d[1] * bg[1] + d[2] * bg[2] - d_opacity;
-        composite::ray_sigma_gradient(&group.sigma[own.clone()], dt, w, t_out, &group.g, g_out, &mut group.d_sigma[own]);
+        composite::ray_sigma_gradient(&group.sigma[own.clone()], dt, w, t_out, &group.g, g_out, &mut group.d_sigma[own.clone()]);
+        for (j, i) in span.clone().enumerate() {
+            let reach = (p.t[i] + 0.5 * dt[j]) / input.near_scaling;
+            if reach < 1.0 {
+                group.d_sigma[own.start + j] *= reach * reach;
+                group.d_rgb[(own.start + j) * 3..][..3].iter_mut().for_each(|d| *d *= reach * reach);
+            }
+        }
         // SAFETY: ray r belongs to this block alone.
         unsafe { shared.d_background.part(r * 3..r * 3 + 3) }.copy_from_slice(&d.map(|d| d * t_out));
     }

@@ -73,7 +73,7 @@ fn fused_equals_composed_with_hash_features_codes_and_all_gradients() {
         let (mut d_sh, mut d_emb) = (vec![9.0; sh.len()], vec![9.0; emb.len()]);
         let mut d_params = vec![0.0; params.len()];
         let mut out = StepOutput::default();
-        let input = StepInput { net: &net, params: &params, samples: p, background: &bg };
+        let input = StepInput { net: &net, params: &params, samples: p, background: &bg, near_scaling: 0.0 };
         let mut codes =
             [RayCode { values: &sh, width: 16, gradient: Some(&mut d_sh) }, RayCode { values: &emb, width: 5, gradient: Some(&mut d_emb) }];
         let positions = Positions::Features { data: &mut features, levels: 4, width: 2 };
@@ -117,7 +117,7 @@ fn fused_equals_composed_with_encoded_positions() {
     let bg = random(210, 9);
     let loss = Linear::new(70, n);
     let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
-    let input = StepInput { net: &net, params: &params, samples: p, background: &bg };
+    let input = StepInput { net: &net, params: &params, samples: p, background: &bg, near_scaling: 0.0 };
     let positions = Positions::Encoded { encoding, points: &points, d_points: Some(&mut d_points) };
     run(&input, positions, &mut [], Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
     let rows = frequency::reference::forward(&encoding, &wide(&points));
@@ -141,7 +141,7 @@ fn the_result_does_not_depend_on_the_thread_count() {
             let loss = Linear::new(200, n);
             let mut d_params = vec![0.0; params.len()];
             let mut out = StepOutput::default();
-            let input = StepInput { net: &net, params: &params, samples: s.packed(), background: &bg };
+            let input = StepInput { net: &net, params: &params, samples: s.packed(), background: &bg, near_scaling: 0.0 };
             let mut codes = [RayCode { values: &sh, width: 16, gradient: None }, RayCode { values: &emb, width: 5, gradient: None }];
             let positions = Positions::Features { data: &mut features, levels: 4, width: 2 };
             run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);

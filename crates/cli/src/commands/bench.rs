@@ -1,0 +1,64 @@
+//! `diorama bench`
+
+use super::{Outcome, use_threads};
+use crate::arguments::{BenchOpsArgs, BenchTrainArgs};
+use diorama_pipelines::bench;
+use diorama_pipelines::object::config::{Config, Method};
+use diorama_pipelines::{PipelineError, Result};
+
+pub fn ops(a: &BenchOpsArgs) -> Result<Outcome> {
+    if a.threads == Some(0) || a.repeats == 0 {
+        return Err(PipelineError::Usage("--threads and --repeats: at least 1".into()));
+    }
+    let optional = |v: Option<f64>, unit: &str| v.map_or(String::new(), |v| format!("{v:8.1} {unit}"));
+    let print = |f: &bench::ops::OpFigure| {
+        let share = f.share_of_peak.map_or(String::new(), |s| format!("{:5.0} % of the multiply-add peak", 100.0 * s));
+        let rate = format!("{}{}", optional(f.gflops, "GFLOP/s"), optional(f.gb_per_s, "GB/s"));
+        println!("{:<30} {:<30} {:>10.1} ns/{:<10} {rate} {share}", f.op, f.shape, f.ns, f.unit);
+    };
+    let report = bench::ops::run(a.threads.unwrap_or(1), a.repeats, &mut |f| {
+        if !a.json {
+            print(f);
+        }
+    });
+    if a.json {
+        println!("{}", serde_json::json!(report));
+    } else {
+        let l = report.limits;
+        println!(
+            "{} thread(s), {}; one thread's limits: {:.0} GFLOP/s multiply-add, {:.1} GB/s read",
+            report.threads, report.simd, l.fma_gflops, l.read_gb_per_s
+        );
+    }
+    Ok(Outcome::Done)
+}
+
+pub fn train(a: &BenchTrainArgs) -> Result<Outcome> {
+    use_threads(a.threads)?;
+    let method: Method = a.method.parse().map_err(|e| PipelineError::Usage(format!("--method {e}")))?;
+    let mut c = Config::new(method, a.data.clone());
+    c.data.downscale = a.downscale;
+    c.data.split = a.split.clone();
+    for o in &a.overrides {
+        let (key, value) = o.split_once('=').ok_or_else(|| PipelineError::Usage(format!("--set {o}: expected KEY=VALUE")))?;
+        c.set(key.trim(), value.trim())?;
+    }
+    c.check()?;
+    let r = bench::train::run(&c, a.warmup, a.steps.max(1))?;
+    if a.json {
+        println!("{}", serde_json::json!(r));
+        return Ok(Outcome::Done);
+    }
+    for s in &r.stages {
+        println!("{:<12} {:>8.2} ms/step {:>6.1} %", s.stage, s.ms, 100.0 * s.share);
+    }
+    println!("{} steps in {:.1} s on {} thread(s), {}", r.steps, r.seconds, r.threads, r.simd);
+    println!(
+        "{:.0} rays/s; per ray {:.1} samples marched, {:.1} trained; {:.0} samples/s trained",
+        r.rays_per_s, r.marched_per_ray, r.trained_per_ray, r.trained_per_s
+    );
+    if let Some(o) = r.occupied {
+        println!("{:.1} % of the occupancy grid's cells are occupied", 100.0 * o);
+    }
+    Ok(Outcome::Done)
+}

@@ -1,0 +1,21 @@
+//! What the machine and the kernels reach: each op against the machine's own measured limits, and where
+//! a training step's time goes.
+
+pub mod ops;
+pub mod train;
+
+use std::time::Instant;
+
+/// Median seconds of `f` over `repeats` calls, after one call that does not count.
+pub fn median_seconds(repeats: usize, mut f: impl FnMut()) -> f64 {
+    f();
+    let mut times: Vec<f64> = (0..repeats.max(1))
+        .map(|_| {
+            let begin = Instant::now();
+            f();
+            begin.elapsed().as_secs_f64()
+        })
+        .collect();
+    times.sort_by(f64::total_cmp);
+    times[times.len() / 2]
+}
