@@ -11,4 +11,5 @@ pub mod gemm;
 pub mod math;
 pub mod ops;
 pub mod probe;
+pub mod scatter_max;
 pub mod simd;

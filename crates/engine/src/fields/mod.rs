@@ -1,10 +1,10 @@
 //! Radiance fields: an encoding of position, codes of direction and appearance, and a network.
 
 mod presets;
-mod prune;
+mod visible;
 
 pub use presets::{baseline, mlp, nerf, ngp};
-pub use prune::Pruning;
+pub use visible::{Pruning, VisibleBuffers};
 
 use crate::params::ParamGroup;
 use crate::stages::Stages;
@@ -99,13 +99,9 @@ pub struct FieldBuffers {
     direction: Vec<f32>,
     appearance: Vec<f32>,
     d_appearance: Vec<f32>,
-    /// Whether [`Field::prune`] has already encoded what is to be trained on.
+    /// Whether [`Field::visible`] has already encoded the samples that come next.
     encoded: bool,
-    sigma: Vec<f32>,
-    alpha: Vec<f32>,
-    kept: Vec<u32>,
-    spare: Vec<f32>,
-    density: prune::DensityBuffers,
+    pub visible: VisibleBuffers,
     step: StepBuffers,
     pub out: StepOutput,
     pub stages: Stages,
@@ -161,7 +157,10 @@ impl Field {
 
     /// Composites a batch into `buf.out`.
     pub fn render(&self, batch: &Batch, buf: &mut FieldBuffers) {
-        self.unit(batch.positions, &mut buf.unit);
+        let encoded = std::mem::take(&mut buf.encoded);
+        if !encoded {
+            self.unit(batch.positions, &mut buf.unit);
+        }
         self.codes(batch, buf);
         let (direction, appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
         let mut codes = Vec::new();
@@ -180,8 +179,10 @@ impl Field {
         };
         let positions = match (&self.encoding, &self.table) {
             (Encoding::Hash(grid), Some(table)) => {
-                buf.features.resize(batch.samples.samples() * grid.output_dims(), 0.0);
-                hash_grid::cpu::forward(grid, &buf.unit, &table.values, &mut buf.features);
+                if !encoded {
+                    buf.features.resize(batch.samples.samples() * grid.output_dims(), 0.0);
+                    hash_grid::cpu::forward(grid, &buf.unit, &table.values, &mut buf.features);
+                }
                 Positions::Features { data: &mut buf.features, levels: grid.levels.len(), width: grid.config.features }
             }
             (Encoding::Frequency(f), _) => Positions::Encoded { encoding: *f, points: &buf.unit, d_points: None },
@@ -267,7 +268,7 @@ impl Field {
         let params = &self.weights.values[..mlp.params_len()];
         let width = mlp.layers[head.layer].width;
         let (mut unit, mut rows, mut features, mut out) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-        let mut buffers = prune::DensityBuffers::default();
+        let mut buffers = Vec::new();
         const CHUNK: usize = 1 << 16;
         for (points, sigma) in model.chunks(CHUNK * 3).zip(sigma.chunks_mut(CHUNK)) {
             let n = sigma.len();

@@ -1,7 +1,7 @@
-//! Volume rendering of whole images: front to back in waves, so that rays stop where they are opaque.
+//! Volume rendering of whole images.
 
 use crate::background::LearnedBackground;
-use crate::fields::{Batch, Field, FieldBuffers};
+use crate::fields::{Batch, Field, FieldBuffers, Pruning};
 use crate::samplers::occupancy::Occupancy;
 use crate::samplers::{RayBatch, pixels, stratified};
 use diorama_geom::Image;
@@ -45,8 +45,8 @@ pub struct Tracer<'a> {
     pub cube: (f32, f32),
     /// Only what lies in this box (lowest and highest corner, model space) is shown.
     pub clip: Option<([f32; 3], [f32; 3])>,
-    /// Rays end when less than this share of light passes.
-    pub stop: f32,
+    /// Samples that are left out where an occupancy grid places them.
+    pub pruning: Pruning,
     /// Training image whose appearance is worn; none: the mean.
     pub appearance: Option<u32>,
 }
@@ -63,9 +63,7 @@ pub struct View {
 }
 
 /// Rays per chunk of an image.
-const CHUNK: usize = 1 << 14;
-/// Samples per ray in the first wave and at most.
-const WAVE: (usize, usize) = (24, 96);
+const CHUNK: usize = 1 << 12;
 
 /// Colour, opacity and `Σ w t` of rays.
 #[derive(Clone, Debug, Default)]
@@ -110,7 +108,19 @@ impl Tracer<'_> {
             diorama_kernels::ops::ray_aabb::cpu::intersect(&batch.origins, &batch.dirs, min, max, self.near, &mut batch.near_far);
         }
         let mut out = match self.sampling {
-            Sampling::Occupancy { grid, max_samples } => self.waves(grid, max_samples, batch, buf),
+            Sampling::Occupancy { grid, max_samples } => {
+                let rays = MarchRays {
+                    origins: &batch.origins,
+                    dirs: &batch.dirs,
+                    near_far: &batch.near_far,
+                    jitter: &batch.jitter,
+                    resumed: false,
+                };
+                let (mut marched, mut positions) = (Marched::default(), Vec::new());
+                self.field.visible(&grid.bits, &rays, &grid.march_config(max_samples), self.pruning, &mut marched, &mut positions, buf);
+                self.composite(self.field, batch, &marched, &positions, buf);
+                taken(buf)
+            }
             Sampling::Stratified { samples } => {
                 let mut marched = Marched::default();
                 stratified::stratified(batch, samples, None, &mut marched);
@@ -140,67 +150,19 @@ impl Tracer<'_> {
     }
 
     fn evaluate(&self, field: &Field, batch: &RayBatch, marched: &Marched, buf: &mut FieldBuffers) {
-        let rays = MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter };
+        let rays =
+            MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
         let mut positions = Vec::new();
         march::cpu::positions(&rays, marched, &mut positions);
+        self.composite(field, batch, marched, &positions, buf);
+    }
+
+    fn composite(&self, field: &Field, batch: &RayBatch, marched: &Marched, positions: &[f32], buf: &mut FieldBuffers) {
         let background = vec![0.0; batch.len() * 3];
         let images = self.appearance.map(|i| vec![i; batch.len()]);
         let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
-        let b = Batch {
-            samples,
-            positions: &positions,
-            dirs: &batch.dirs,
-            images: images.as_deref(),
-            background: &background,
-            near_scaling: 0.0,
-        };
+        let b = Batch { samples, positions, dirs: &batch.dirs, images: images.as_deref(), background: &background, near_scaling: 0.0 };
         field.render(&b, buf);
-    }
-
-    fn waves(&self, grid: &Occupancy, max_samples: usize, batch: &RayBatch, buf: &mut FieldBuffers) -> Traced {
-        let n = batch.len();
-        let mut out = Traced { rgb: vec![0.0; n * 3], opacity: vec![0.0; n], depth: vec![0.0; n] };
-        let mut pass = vec![1.0f32; n];
-        let mut alive: Vec<u32> = (0..n as u32).filter(|&r| batch.near_far[r as usize * 2] < batch.near_far[r as usize * 2 + 1]).collect();
-        let mut start: Vec<f32> = batch.near_far.iter().step_by(2).copied().collect();
-        let (mut wave, mut done) = (RayBatch::default(), 0);
-        let (mut scratch, mut marched) = (march::cpu::MarchScratch::default(), Marched::default());
-        let mut size = WAVE.0;
-        while !alive.is_empty() && done < max_samples {
-            wave.resize(alive.len());
-            for (i, &r) in alive.iter().enumerate() {
-                let r = r as usize;
-                wave.origins[i * 3..i * 3 + 3].copy_from_slice(&batch.origins[r * 3..r * 3 + 3]);
-                wave.dirs[i * 3..i * 3 + 3].copy_from_slice(&batch.dirs[r * 3..r * 3 + 3]);
-                wave.near_far[i * 2] = start[r];
-                wave.near_far[i * 2 + 1] = batch.near_far[r * 2 + 1];
-                wave.jitter[i] = 0.5;
-            }
-            let rays = MarchRays { origins: &wave.origins, dirs: &wave.dirs, near_far: &wave.near_far, jitter: &wave.jitter };
-            march::cpu::march(&grid.bits, &rays, &grid.march_config(size), &mut scratch, &mut marched);
-            self.evaluate(self.field, &wave, &marched, buf);
-            let mut i = 0;
-            alive.retain(|&r| {
-                let r = r as usize;
-                for k in 0..3 {
-                    out.rgb[r * 3 + k] += pass[r] * buf.out.rgb[i * 3 + k];
-                }
-                out.depth[r] += pass[r] * buf.out.depth[i];
-                pass[r] *= 1.0 - buf.out.opacity[i];
-                let (a, b) = (marched.offsets[i] as usize, marched.offsets[i + 1] as usize);
-                if b > a {
-                    start[r] = marched.t[b - 1] + marched.dt[b - 1];
-                }
-                i += 1;
-                b - a == size && pass[r] > self.stop
-            });
-            done += size;
-            size = (size * 2).min(WAVE.1);
-        }
-        for (o, p) in out.opacity.iter_mut().zip(&pass) {
-            *o = 1.0 - p;
-        }
-        out
     }
 }
 
@@ -232,7 +194,7 @@ mod tests {
             near: 0.1,
             cube: (0.0, 1.0),
             clip: None,
-            stop: 0.0,
+            pruning: Pruning { stop: 0.0, min_alpha: 0.0, min_weight: 0.0 },
             appearance: None,
         };
         let view = tracer.view(&camera, &mut |_| {});
@@ -244,7 +206,8 @@ mod tests {
             batch.jitter[i] = 0.5;
         }
         pixels::rays(&[camera], 0.1, (0.0, 1.0), &mut batch);
-        let rays = MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter };
+        let rays =
+            MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
         let mut marched = Marched::default();
         march::cpu::march(&occupancy.bits, &rays, &occupancy.march_config(4096), &mut Default::default(), &mut marched);
         let mut buf = FieldBuffers::default();
@@ -272,7 +235,7 @@ mod tests {
             near: 0.1,
             cube: (0.0, 1.0),
             clip: None,
-            stop: 1e-4,
+            pruning: Pruning { stop: 1e-4, min_alpha: 0.0, min_weight: 0.0 },
             appearance: None,
         };
         assert!(tracer.view(&camera, &mut |_| {}).opacity.data[40 + 2] > 0.9);

@@ -6,6 +6,8 @@ use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::march::{MarchConfig, OccupancyBits};
 use diorama_kernels::ops::ray_generation::PosedCamera;
+use diorama_kernels::scatter_max::scatter_max;
+use rayon::prelude::*;
 
 /// Smallest step of marching: the diagonal of the model cube in 1024 steps.
 pub const MIN_STEP: f32 = 1.732_050_8 / 1024.0;
@@ -19,6 +21,9 @@ const UNSEEN: f32 = -1.0;
 /// Density that stands for "not sampled yet": occupied until it is.
 const UNKNOWN: f32 = f32::MAX;
 
+/// Cells or points per task.
+const TASK: usize = 1 << 12;
+
 /// Cells per axis of the blocks in which visibility is decided.
 const SEEN_BLOCK: usize = 8;
 
@@ -27,6 +32,8 @@ pub struct Occupancy {
     pub bits: OccupancyBits,
     /// Decayed maximum density per cell.
     pub density: Vec<f32>,
+    /// Highest density seen in each cell since the last update; 0 where nobody looked.
+    pub fresh: Vec<f32>,
     /// Cells that some camera sees.
     live: Vec<u32>,
     /// How much of a stored density survives an update of its cell.
@@ -38,7 +45,7 @@ impl Occupancy {
         let bits = OccupancyBits::full(resolution, cascades);
         let density = vec![UNKNOWN; bits.cells()];
         let live = (0..bits.cells() as u32).collect();
-        Occupancy { bits, density, live, decay: 0.8 }
+        Occupancy { fresh: vec![0.0; bits.cells()], bits, density, live, decay: 0.8 }
     }
 
     /// The marching that belongs to this grid. `max_samples` bounds the samples of a ray.
@@ -81,63 +88,69 @@ impl Occupancy {
     }
 
     fn refresh_bits(&mut self) {
-        let (mut sum, mut known) = (0.0f64, 0usize);
-        for d in &self.density {
-            if *d >= 0.0 && *d != UNKNOWN {
-                sum += *d as f64;
-                known += 1;
-            }
-        }
+        let parts: Vec<(f64, usize)> = self.density.par_chunks(TASK).map(known_sum).collect();
+        let (sum, known) = parts.iter().fold((0.0, 0), |a, p| (a.0 + p.0, a.1 + p.1));
         let threshold = (THRESHOLD / MIN_STEP).min((sum / known.max(1) as f64) as f32);
-        for (word, cells) in self.bits.bits.iter_mut().zip(self.density.chunks_exact(64)) {
-            *word = cells.iter().enumerate().fold(0, |w, (i, d)| w | ((*d > threshold) as u64) << i);
-        }
+        self.bits.bits.par_chunks_mut(TASK / 64).zip(self.density.par_chunks(TASK)).for_each(|(words, density)| {
+            for (word, cells) in words.iter_mut().zip(density.chunks_exact(64)) {
+                *word = cells.iter().enumerate().fold(0, |w, (i, d)| w | ((*d > threshold) as u64) << i);
+            }
+        });
     }
 
-    /// Samples the field at `count` random points of cells and refreshes the bits. Blocks of `block³`
-    /// cells share one sample (1 once the field has settled). Half of the points go to occupied cells.
+    /// Notes densities `[N]` that were met in `cells` `[N]`, but for negative ones; they count at the next update.
+    pub fn record(&mut self, cells: &[u32], sigma: &[f32]) {
+        scatter_max(cells, sigma, &mut self.fresh);
+    }
+
+    /// Samples the field at `count` random points of the cells that a camera sees, folds in what was
+    /// recorded and refreshes the bits. Blocks of `block³` cells share one point (1 once the field has settled).
     pub fn update(&mut self, field: &Field, rng: &Rng, counter: u64, count: usize, block: usize) {
         if self.live.is_empty() {
             return;
         }
         let n = self.bits.resolution;
-        let mut cells = Vec::with_capacity(count);
-        let mut points = Vec::with_capacity(count * 3);
-        for i in 0..count as u64 {
-            let base = (counter * count as u64 + i) * 8;
-            let mut cell = self.live[rng.below(base, self.live.len() as u64) as usize] as usize;
-            if i % 2 == 1 {
-                // Look a few times for an occupied cell.
-                for k in 1..4 {
-                    if self.bits.get(cell) {
-                        break;
-                    }
-                    cell = self.live[rng.below(base + k, self.live.len() as u64) as usize] as usize;
+        let mut points = vec![0.0; count * 3];
+        let mut cells = vec![0u32; count];
+        let live = &self.live;
+        points.par_chunks_mut(TASK * 3).zip(cells.par_chunks_mut(TASK)).enumerate().for_each(|(task, (points, cells))| {
+            for (i, (point, cell)) in points.chunks_exact_mut(3).zip(cells).enumerate() {
+                let base = (counter * count as u64 + (task * TASK + i) as u64) * 4;
+                let at = live[rng.below(base, live.len() as u64) as usize] as usize;
+                let c = at / n.pow(3);
+                let (low, size) = OccupancyBits::cube(c);
+                let corner = [at % n, at / n % n, at / n / n % n].map(|v| v / block * block);
+                for k in 0..3 {
+                    let u = rng.uniform(base + 1 + k as u64);
+                    point[k] = low + (corner[k] as f32 + u * block as f32) * size / n as f32;
                 }
+                *cell = (((c * n + corner[2]) * n + corner[1]) * n + corner[0]) as u32;
             }
-            let c = cell / n.pow(3);
-            let (low, size) = OccupancyBits::cube(c);
-            let scale = size / n as f32;
-            let at = [cell % n, cell / n % n, cell / n / n % n].map(|v| v / block * block);
-            for (k, a) in at.iter().enumerate() {
-                points.push(low + (*a as f32 + rng.uniform(base + 5 + k as u64) * block as f32) * scale);
-            }
-            cells.push(((c * n + at[2]) * n + at[1]) * n + at[0]);
-        }
+        });
         let mut sigma = vec![0.0; count];
         field.density(&points, &mut sigma);
-        for (&cell, &s) in cells.iter().zip(&sigma) {
-            for k in 0..block.pow(3) {
-                let d = &mut self.density[cell + k % block + n * (k / block % block) + n * n * (k / block / block)];
-                if *d == UNKNOWN {
-                    *d = s;
-                } else if *d >= 0.0 {
-                    *d = (*d * self.decay).max(s);
-                }
-            }
+        for k in 0..block.pow(3) as u32 {
+            let (n, b) = (n as u32, block as u32);
+            let offset = k % b + n * (k / b % b) + n * n * (k / b / b);
+            let of_block: Vec<u32> = cells.iter().map(|c| c + offset).collect();
+            scatter_max(&of_block, &sigma, &mut self.fresh);
         }
+        let decay = self.decay;
+        self.density.par_chunks_mut(TASK).zip(self.fresh.par_chunks_mut(TASK)).for_each(|(density, fresh)| {
+            for (d, f) in density.iter_mut().zip(fresh) {
+                let looked = *f > 0.0 && *d >= 0.0;
+                let folded = if *d == UNKNOWN { *f } else { (*d * decay).max(*f) };
+                *d = if looked { folded } else { *d };
+                *f = 0.0;
+            }
+        });
         self.refresh_bits();
     }
+}
+
+/// Sum and number of the densities that were ever sampled.
+fn known_sum(density: &[f32]) -> (f64, usize) {
+    density.iter().filter(|d| **d >= 0.0 && **d != UNKNOWN).fold((0.0, 0), |(s, n), d| (s + *d as f64, n + 1))
 }
 
 /// Whether a ball may be seen: its centre projects into the image, widened by the ball's radius.

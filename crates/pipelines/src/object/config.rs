@@ -228,7 +228,7 @@ impl Config {
                 min_alpha: 1e-3,
                 near: 0.1,
                 occupancy_resolution: 128,
-                occupancy_points: 1 << 17,
+                occupancy_points: 1 << 16,
                 occupancy_every: 16,
                 min_cell_views: 2,
                 error_map: false,

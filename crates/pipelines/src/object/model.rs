@@ -4,7 +4,7 @@ use super::config::{Background, Config, Method};
 use crate::error::{PipelineError, Result};
 use diorama_data::checkpoint::{Checkpoint, Entry};
 use diorama_engine::background::LearnedBackground;
-use diorama_engine::fields::{self, Batch, Field, FieldBuffers};
+use diorama_engine::fields::{self, Batch, Field, FieldBuffers, Pruning};
 use diorama_engine::params::ParamGroup;
 use diorama_engine::renderers::volume::{Backdrop, Sampling, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
@@ -168,7 +168,7 @@ impl ObjectModel {
             near: s.near,
             cube: self.cube(),
             clip: None,
-            stop: STOP,
+            pruning: Pruning { stop: STOP, min_alpha: 0.0, min_weight: 0.0 },
             appearance: None,
         }
     }
@@ -216,6 +216,7 @@ impl ObjectModel {
         }
         if let Some(o) = &self.occupancy {
             add("occupancy".into(), &o.density);
+            add("occupancy.fresh".into(), &o.fresh);
         }
         if let Some(m) = &self.error_map {
             add("error_map".into(), &m.errors);
@@ -276,6 +277,7 @@ impl ObjectModel {
         }
         if let Some(o) = &mut self.occupancy {
             load("occupancy", &mut o.density)?;
+            load("occupancy.fresh", &mut o.fresh)?;
             o.refresh();
         }
         if let Some(m) = &mut self.error_map {

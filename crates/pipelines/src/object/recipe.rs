@@ -183,7 +183,6 @@ struct Buffers {
     fine: Marched,
     positions: Vec<f32>,
     d_positions: Vec<f32>,
-    march: march::cpu::MarchScratch,
     field: FieldBuffers,
 }
 
@@ -275,15 +274,18 @@ impl<'a> Trainer<'a> {
             grid.update(&m.field, &rng, step, s.occupancy_points, if step <= until { block } else { 1 });
             b.field.stages.done("occupancy");
         }
-        let rays = MarchRays { origins: &b.batch.origins, dirs: &b.batch.dirs, near_far: &b.batch.near_far, jitter: &b.batch.jitter };
-        march::cpu::march(&grid.bits, &rays, &grid.march_config(s.max_samples), &mut b.march, &mut b.marched);
-        march::cpu::positions(&rays, &b.marched, &mut b.positions);
-        b.field.stages.done("march");
-        self.marched += b.marched.t.len() as u64;
-        if s.stop > 0.0 || s.min_alpha > 0.0 {
-            let pruning = Pruning { stop: s.stop, min_alpha: s.min_alpha };
-            m.field.prune(&mut b.marched, &mut b.positions, pruning, &mut b.field);
-        }
+        let rays = MarchRays {
+            origins: &b.batch.origins,
+            dirs: &b.batch.dirs,
+            near_far: &b.batch.near_far,
+            jitter: &b.batch.jitter,
+            resumed: false,
+        };
+        let pruning = Pruning { stop: s.stop, min_alpha: s.min_alpha, min_weight: 0.0 };
+        let march = grid.march_config(s.max_samples);
+        m.field.visible(&grid.bits, &rays, &march, pruning, &mut b.marched, &mut b.positions, &mut b.field);
+        b.field.visible.seen().for_each(|(cells, sigma)| grid.record(cells, sigma));
+        self.marched += b.field.visible.marched() as u64;
         let per_ray = b.marched.t.len() as f64 / b.batch.len() as f64;
         m.samples_per_ray = if step == 0 { per_ray } else { 0.9 * m.samples_per_ray + 0.1 * per_ray };
         let loss = train_field(
@@ -375,7 +377,7 @@ impl<'a> Trainer<'a> {
 }
 
 fn positions(batch: &RayBatch, marched: &Marched, out: &mut Vec<f32>) {
-    let rays = MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter };
+    let rays = MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
     march::cpu::positions(&rays, marched, out);
 }
 

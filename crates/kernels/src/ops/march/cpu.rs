@@ -12,6 +12,7 @@ struct Piece {
     counts: Vec<u32>,
     t: Vec<f32>,
     dt: Vec<f32>,
+    cells: Vec<u32>,
 }
 
 /// Buffers that a march keeps between calls.
@@ -36,6 +37,7 @@ pub fn march(grid: &OccupancyBits, rays: &MarchRays, config: &MarchConfig, scrat
         piece.counts.clear();
         piece.t.clear();
         piece.dt.clear();
+        piece.cells.clear();
         for r in task * RAYS..((task + 1) * RAYS).min(n) {
             let before = piece.t.len();
             march_ray(grid, rays, r, config, piece);
@@ -45,6 +47,7 @@ pub fn march(grid: &OccupancyBits, rays: &MarchRays, config: &MarchConfig, scrat
     out.offsets.clear();
     out.t.clear();
     out.dt.clear();
+    out.cells.clear();
     out.offsets.push(0);
     let mut total = 0;
     for piece in pieces {
@@ -54,6 +57,7 @@ pub fn march(grid: &OccupancyBits, rays: &MarchRays, config: &MarchConfig, scrat
         }
         out.t.extend_from_slice(&piece.t);
         out.dt.extend_from_slice(&piece.dt);
+        out.cells.extend_from_slice(&piece.cells);
     }
 }
 
@@ -64,7 +68,7 @@ fn march_ray(grid: &OccupancyBits, rays: &MarchRays, r: usize, config: &MarchCon
     let (near, far, jitter) = (rays.near_far[r * 2], rays.near_far[r * 2 + 1], rays.jitter[r]);
     let n = grid.resolution;
     let step = |t: f32| (t * config.cone).clamp(config.dt_min, config.dt_max);
-    let mut t = (near + (jitter - 0.5) * step(near)).max(near);
+    let mut t = if rays.resumed { near } else { (near + (jitter - 0.5) * step(near)).max(near) };
     let mut count = 0;
     while t < far && count < config.max_samples {
         let dt = step(t);
@@ -82,7 +86,9 @@ fn march_ray(grid: &OccupancyBits, rays: &MarchRays, r: usize, config: &MarchCon
         }
         let scale = n as f32 / size;
         let cell = x.map(|v| (((v - low) * scale) as usize).min(n - 1));
-        if grid.get(((c * n + cell[2]) * n + cell[1]) * n + cell[0]) {
+        let index = ((c * n + cell[2]) * n + cell[1]) * n + cell[0];
+        if grid.get(index) {
+            piece.cells.push(index as u32);
             piece.t.push(t);
             piece.dt.push(dt);
             count += 1;

@@ -78,6 +78,8 @@ pub struct MarchRays<'a> {
     pub near_far: &'a [f32],
     /// Offset of the samples within a step, in [0, 1), `[R]`.
     pub jitter: &'a [f32],
+    /// Whether the rays go on from an earlier march: the first sample then begins at near itself.
+    pub resumed: bool,
 }
 
 /// Packed samples that marching writes.
@@ -89,4 +91,6 @@ pub struct Marched {
     pub t: Vec<f32>,
     /// `[S]`
     pub dt: Vec<f32>,
+    /// Occupied cell that each sample was found in, `[S]`; empty for samples placed without a grid.
+    pub cells: Vec<u32>,
 }

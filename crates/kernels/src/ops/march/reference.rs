@@ -20,8 +20,10 @@ pub fn march(grid: &OccupancyBits, rays: &MarchRays, config: &MarchConfig) -> Ma
         let (near, far) = (rays.near_far[r * 2] as f64, rays.near_far[r * 2 + 1] as f64);
         let jitter = rays.jitter[r] as f64;
         let step = |t: f64| (t * config.cone as f64).clamp(config.dt_min as f64, config.dt_max as f64);
-        let (mut t, mut count) = (near + (jitter - 0.5) * step(near), 0);
-        t = t.max(near);
+        let (mut t, mut count) = (near, 0);
+        if !rays.resumed {
+            t = t.max(near + (jitter - 0.5) * step(near));
+        }
         while t < far && count < config.max_samples {
             let dt = step(t);
             let mid = t + 0.5 * dt;
@@ -33,7 +35,9 @@ pub fn march(grid: &OccupancyBits, rays: &MarchRays, config: &MarchConfig) -> Ma
             let (low, size) = OccupancyBits::cube(c);
             let (low, size, n) = (low as f64, size as f64, grid.resolution);
             let cell: [usize; 3] = std::array::from_fn(|k| (((x[k] - low) / size * n as f64) as usize).min(n - 1));
-            if grid.get(((c * n + cell[2]) * n + cell[1]) * n + cell[0]) {
+            let cell_index = ((c * n + cell[2]) * n + cell[1]) * n + cell[0];
+            if grid.get(cell_index) {
+                out.cells.push(cell_index as u32);
                 out.t.push(t as f32);
                 out.dt.push(dt as f32);
                 count += 1;

@@ -20,7 +20,7 @@ fn rays(n: usize, half: f32) -> Rays {
 
 impl Rays {
     fn view(&self) -> MarchRays<'_> {
-        MarchRays { origins: &self.origins, dirs: &self.dirs, near_far: &self.near_far, jitter: &self.jitter }
+        MarchRays { origins: &self.origins, dirs: &self.dirs, near_far: &self.near_far, jitter: &self.jitter, resumed: false }
     }
 }
 

@@ -150,3 +150,30 @@ fn the_result_does_not_depend_on_the_thread_count() {
     };
     assert_eq!(run_with(1), run_with(3));
 }
+
+#[test]
+fn near_samples_learn_with_the_square_of_their_distance() {
+    let encoding = Frequency { dims: 3, bands: 2, include_input: true, pi: true, window: None };
+    let net = FieldNet {
+        mlp: Mlp::chain(vec![encoding.output_dims()], &[32, 16], true),
+        sigma: Head { layer: 1, channel: 3, activation: Activation::Softplus, shift: -1.0 },
+        rgb: Head { layer: 1, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    };
+    let s = scene(20, 3);
+    let n = s.t.len();
+    let (points, bg, params) = (random(n * 3, 5), random(60, 9), net.mlp.init(&Rng::new(1, 1)));
+    let gradient = |near_scaling: f32| {
+        let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
+        let input = StepInput { net: &net, params: &params, samples: s.packed(), background: &bg, near_scaling };
+        let positions = Positions::Encoded { encoding, points: &points, d_points: Some(&mut d_points) };
+        run(&input, positions, &mut [], Some(&Linear::new(20, n)), &mut StepBuffers::default(), &mut out, &mut d_params);
+        d_points
+    };
+    let plain = gradient(0.0);
+    let reach = |i: usize| s.t[i] + 0.5 * s.dt[i];
+    let mut sorted: Vec<f32> = (0..n).map(reach).collect();
+    sorted.sort_by(f32::total_cmp);
+    let near = sorted[n / 2];
+    let want: Vec<f64> = (0..n * 3).map(|e| plain[e] as f64 * ((reach(e / 3) / near).min(1.0) as f64).powi(2)).collect();
+    assert_close("d points", &gradient(near), &want, 1e-4);
+}

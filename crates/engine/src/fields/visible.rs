@@ -1,0 +1,427 @@
+//! Marching that leaves out samples that cannot matter before the costly part of a step: those behind
+//! opaque matter (instant-ngp ends rays where the transmittance falls below 1e-4) and those that hold next
+//! to nothing (nerfacc, Li et al. 2023, the alpha threshold). Rays advance in waves, each one marched,
+//! encoded and put through the density layers, so that hidden samples are not even encoded.
+
+use super::{Encoding, Field, FieldBuffers};
+use diorama_kernels::math;
+use diorama_kernels::ops::fused_mlp::Mlp;
+use diorama_kernels::ops::fused_mlp::cpu::{Activations, forward_block};
+use diorama_kernels::ops::hash_grid::{self, HashGrid};
+use diorama_kernels::ops::linear;
+use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched, OccupancyBits};
+use rayon::prelude::*;
+
+/// Rows per block of the density network, samples and rays per task.
+const BLOCK: usize = 256;
+const TASK: usize = 4096;
+const RAYS: usize = 64;
+/// Samples per ray in the first wave and at most.
+const WAVE: (usize, usize) = (24, 96);
+
+/// Stands for a sample that is left out, and for the density of one that no light reaches.
+const DROPPED: f32 = -1.0;
+
+/// Which samples are left out.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pruning {
+    /// Samples behind which less than this share of light arrives.
+    pub stop: f32,
+    /// Samples of less opacity than this.
+    pub min_alpha: f32,
+    /// Samples of less weight in the pixel than this.
+    pub min_weight: f32,
+}
+
+/// Rays that still have light, and where they go on.
+#[derive(Default)]
+struct Crew {
+    rays: Vec<u32>,
+    origins: Vec<f32>,
+    dirs: Vec<f32>,
+    near_far: Vec<f32>,
+    jitter: Vec<f32>,
+    resumed: bool,
+}
+
+/// One advance of a crew.
+#[derive(Default)]
+struct Wave {
+    /// Most samples per ray.
+    size: usize,
+    crew: Crew,
+    /// Share of light that is left after the wave, per ray.
+    light: Vec<f32>,
+    marched: Marched,
+    positions: Vec<f32>,
+    unit: Vec<f32>,
+    features: Vec<f32>,
+    sigma: Vec<f32>,
+    /// Opacities, or [`DROPPED`].
+    alpha: Vec<f32>,
+    /// Samples that stay, per ray.
+    counts: Vec<u32>,
+    /// Samples that stay, and where they go.
+    kept: Vec<(u32, u32)>,
+}
+
+/// Memory kept between calls.
+#[derive(Default)]
+pub struct VisibleBuffers {
+    waves: Vec<Wave>,
+    used: usize,
+    march: march::cpu::MarchScratch,
+    pool: Vec<(Vec<f32>, Activations)>,
+    next: Vec<u32>,
+}
+
+impl VisibleBuffers {
+    /// Cells `[N]` and densities `[N]` of all samples of the last march, wave by wave; densities that no
+    /// light reaches are negative.
+    pub fn seen(&self) -> impl Iterator<Item = (&[u32], &[f32])> {
+        self.waves[..self.used].iter().map(|w| (&w.marched.cells[..], &w.sigma[..]))
+    }
+
+    /// Samples that were marched to.
+    pub fn marched(&self) -> usize {
+        self.waves[..self.used].iter().map(|w| w.sigma.len()).sum()
+    }
+}
+
+impl Field {
+    /// Marches through occupied cells and keeps what [`Pruning`] leaves: packed samples and their positions.
+    /// Their encoding stays in `buf` for [`Field::train`] or [`Field::render`], which must come next.
+    /// A field without a hash grid keeps every sample.
+    #[allow(clippy::too_many_arguments)]
+    pub fn visible(
+        &self,
+        grid: &OccupancyBits,
+        rays: &MarchRays,
+        config: &MarchConfig,
+        pruning: Pruning,
+        samples: &mut Marched,
+        positions: &mut Vec<f32>,
+        buf: &mut FieldBuffers,
+    ) {
+        let v = &mut buf.visible;
+        v.used = 0;
+        let (Encoding::Hash(encoding), Some(table)) = (&self.encoding, &self.table) else {
+            march::cpu::march(grid, rays, config, &mut v.march, samples);
+            march::cpu::positions(rays, samples, positions);
+            return;
+        };
+        let net = self.density_net(self.net.mlp.precision);
+        let (mut size, mut done) = (WAVE.0, 0);
+        while done < config.max_samples {
+            size = size.min(config.max_samples - done);
+            if v.waves.len() == v.used {
+                v.waves.push(Wave::default());
+            }
+            let (before, rest) = v.waves.split_at_mut(v.used);
+            let wave = &mut rest[0];
+            wave.board(rays, before.last(), pruning.stop);
+            wave.size = size;
+            if wave.crew.rays.is_empty() {
+                break;
+            }
+            v.used += 1;
+            let own = wave.crew.view();
+            march::cpu::march(grid, &own, &MarchConfig { max_samples: size, ..*config }, &mut v.march, &mut wave.marched);
+            march::cpu::positions(&own, &wave.marched, &mut wave.positions);
+            buf.stages.done("march");
+            let n = wave.marched.t.len();
+            self.unit(&wave.positions, &mut wave.unit);
+            wave.features.resize(n * encoding.output_dims(), 0.0);
+            hash_grid::cpu::forward(encoding, &wave.unit, &table.values, &mut wave.features);
+            buf.stages.done("encode");
+            wave.sigma.resize(n, 0.0);
+            wave.alpha.resize(n, 0.0);
+            self.sigma(encoding, &net, &wave.features, &mut wave.sigma, &mut v.pool);
+            buf.stages.done("density");
+            wave.walk(pruning);
+            buf.stages.done("prune");
+            done += size;
+            size = (size * 2).min(WAVE.1);
+        }
+        let total = place(&mut v.waves[..v.used], &mut v.next, rays.jitter.len(), &mut samples.offsets);
+        let waves = &v.waves[..v.used];
+        gather(waves, 1, total, &mut samples.t, |w| &w.marched.t);
+        gather(waves, 1, total, &mut samples.dt, |w| &w.marched.dt);
+        gather(waves, 3, total, positions, |w| &w.positions);
+        gather(waves, 3, total, &mut buf.unit, |w| &w.unit);
+        let f = encoding.config.features;
+        buf.features.resize(total * encoding.output_dims(), 0.0);
+        if total > 0 {
+            buf.features.par_chunks_mut(total * f).enumerate().for_each(|(l, out)| {
+                for w in waves {
+                    let level = &w.features[l * w.sigma.len() * f..];
+                    for &(from, to) in &w.kept {
+                        let (from, to) = (from as usize * f, to as usize * f);
+                        out[to..to + f].copy_from_slice(&level[from..from + f]);
+                    }
+                }
+            });
+        }
+        buf.encoded = true;
+        buf.stages.done("prune");
+    }
+
+    /// The layers up to the density head, which read positions alone; their parameters come first.
+    pub(super) fn density_net(&self, precision: diorama_kernels::gemm::Precision) -> Mlp {
+        let all = &self.net.mlp;
+        Mlp { precision, ..Mlp::new(all.input_widths[..1].to_vec(), all.layers[..=self.net.sigma.layer].to_vec()) }
+    }
+
+    /// Densities `[N]` of level-major features `[L, N, F]`.
+    pub(super) fn sigma(&self, grid: &HashGrid, mlp: &Mlp, features: &[f32], sigma: &mut [f32], pool: &mut Vec<(Vec<f32>, Activations)>) {
+        let (n, f, dims) = (sigma.len(), grid.config.features, grid.output_dims());
+        let head = self.net.sigma;
+        let width = mlp.layers[head.layer].width;
+        let params = &self.weights.values[..mlp.params_len()];
+        let tasks = n.div_ceil(TASK);
+        if pool.len() < tasks {
+            pool.resize_with(tasks, Default::default);
+        }
+        sigma.par_chunks_mut(TASK).zip(pool).enumerate().for_each(|(task, (sigma, (rows, acts)))| {
+            rows.resize(BLOCK * dims, 0.0);
+            for (b, sigma) in sigma.chunks_mut(BLOCK).enumerate() {
+                let first = task * TASK + b * BLOCK;
+                for l in 0..dims / f {
+                    let part = &features[(l * n + first) * f..(l * n + first + sigma.len()) * f];
+                    for (row, v) in rows.chunks_exact_mut(dims).zip(part.chunks_exact(f)) {
+                        row[l * f..(l + 1) * f].copy_from_slice(v);
+                    }
+                }
+                forward_block(mlp, params, &[&rows[..sigma.len() * dims]], sigma.len(), acts);
+                for (s, o) in sigma.iter_mut().zip(acts.values[head.layer].chunks_exact(width)) {
+                    *s = o[head.channel] + head.shift;
+                }
+                linear::cpu::activate(head.activation, sigma);
+            }
+        });
+    }
+}
+
+impl Crew {
+    fn clear(&mut self) {
+        self.rays.clear();
+        [&mut self.origins, &mut self.dirs, &mut self.near_far, &mut self.jitter].into_iter().for_each(Vec::clear);
+    }
+
+    fn take(&mut self, all: &MarchRays, ray: usize, start: f32) {
+        self.rays.push(ray as u32);
+        self.origins.extend_from_slice(&all.origins[ray * 3..ray * 3 + 3]);
+        self.dirs.extend_from_slice(&all.dirs[ray * 3..ray * 3 + 3]);
+        self.near_far.extend([start, all.near_far[ray * 2 + 1]]);
+        self.jitter.push(all.jitter[ray]);
+    }
+
+    fn view(&self) -> MarchRays<'_> {
+        MarchRays { origins: &self.origins, dirs: &self.dirs, near_far: &self.near_far, jitter: &self.jitter, resumed: self.resumed }
+    }
+}
+
+impl Wave {
+    /// Takes in all rays that the wave before used up with light left; the first wave takes those with an extent.
+    fn board(&mut self, rays: &MarchRays, before: Option<&Wave>, stop: f32) {
+        self.crew.clear();
+        self.light.clear();
+        self.crew.resumed = before.is_some();
+        let Some(w) = before else {
+            let with_extent = |r: &usize| rays.near_far[r * 2] < rays.near_far[r * 2 + 1];
+            (0..rays.jitter.len()).filter(with_extent).for_each(|r| self.crew.take(rays, r, rays.near_far[r * 2]));
+            return self.light.resize(self.crew.rays.len(), 1.0);
+        };
+        for (i, &r) in w.crew.rays.iter().enumerate() {
+            let (a, b) = (w.marched.offsets[i] as usize, w.marched.offsets[i + 1] as usize);
+            if b - a == w.size && w.light[i] >= stop {
+                self.crew.take(rays, r as usize, w.marched.t[b - 1] + w.marched.dt[b - 1]);
+                self.light.push(w.light[i]);
+            }
+        }
+    }
+
+    /// Lets light through: opacities, what is dropped, and the light that is left.
+    fn walk(&mut self, pruning: Pruning) {
+        self.counts.clear();
+        self.counts.resize(self.crew.rays.len(), 0);
+        let offsets = &self.marched.offsets;
+        let (mut sigma, mut alpha) = (&mut self.sigma[..], &mut self.alpha[..]);
+        let mut tasks = Vec::with_capacity(self.counts.len().div_ceil(RAYS));
+        for (k, (light, counts)) in self.light.chunks_mut(RAYS).zip(self.counts.chunks_mut(RAYS)).enumerate() {
+            let offsets = &offsets[k * RAYS..=k * RAYS + light.len()];
+            let n = (offsets[light.len()] - offsets[0]) as usize;
+            let (own_sigma, rest_sigma) = sigma.split_at_mut(n);
+            let (own_alpha, rest_alpha) = alpha.split_at_mut(n);
+            (sigma, alpha) = (rest_sigma, rest_alpha);
+            tasks.push((offsets, light, counts, own_sigma, own_alpha));
+        }
+        let dt = &self.marched.dt;
+        tasks.into_par_iter().for_each(|(offsets, light, counts, sigma, alpha)| {
+            let first = offsets[0] as usize;
+            math::alphas(sigma, &dt[first..first + sigma.len()], alpha);
+            for (r, span) in offsets.windows(2).enumerate() {
+                for i in span[0] as usize - first..span[1] as usize - first {
+                    if light[r] < pruning.stop {
+                        (sigma[i], alpha[i]) = (DROPPED, DROPPED);
+                        continue;
+                    }
+                    let weight = light[r] * alpha[i];
+                    light[r] -= weight;
+                    if alpha[i] < pruning.min_alpha || weight < pruning.min_weight {
+                        alpha[i] = DROPPED;
+                    } else {
+                        counts[r] += 1;
+                    }
+                }
+            }
+        });
+    }
+}
+
+/// Decides where kept samples go, so that those of a ray lie together, and returns their number.
+fn place(waves: &mut [Wave], next: &mut Vec<u32>, rays: usize, offsets: &mut Vec<u32>) -> usize {
+    offsets.clear();
+    offsets.resize(rays + 1, 0);
+    for w in waves.iter() {
+        w.crew.rays.iter().zip(&w.counts).for_each(|(r, c)| offsets[*r as usize + 1] += c);
+    }
+    for r in 0..rays {
+        offsets[r + 1] += offsets[r];
+    }
+    next.clear();
+    next.extend_from_slice(&offsets[..rays]);
+    for w in waves {
+        w.kept.clear();
+        for (i, r) in w.crew.rays.iter().enumerate() {
+            let to = &mut next[*r as usize];
+            for s in w.marched.offsets[i]..w.marched.offsets[i + 1] {
+                if w.alpha[s as usize] >= 0.0 {
+                    w.kept.push((s, *to));
+                    *to += 1;
+                }
+            }
+        }
+    }
+    offsets[rays] as usize
+}
+
+/// Collects rows of `width` numbers of the kept samples.
+fn gather(waves: &[Wave], width: usize, total: usize, out: &mut Vec<f32>, of: impl Fn(&Wave) -> &[f32]) {
+    out.resize(total * width, 0.0);
+    for w in waves {
+        let from = of(w);
+        for &(s, to) in &w.kept {
+            let (s, to) = (s as usize * width, to as usize * width);
+            out[to..to + width].copy_from_slice(&from[s..s + width]);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fields;
+    use diorama_geom::rng::Rng;
+    use diorama_kernels::ops::hash_grid::HashGridConfig;
+
+    const RAYS: usize = 40;
+
+    struct Scene {
+        field: Field,
+        grid: OccupancyBits,
+        origins: Vec<f32>,
+        dirs: Vec<f32>,
+        near_far: Vec<f32>,
+        jitter: Vec<f32>,
+    }
+
+    /// Rays through a field of varying density, some of which miss it.
+    fn scene() -> Scene {
+        let config = HashGridConfig { levels: 4, features: 2, log2_size: 10, base: 4, finest: 32 };
+        let mut field = fields::ngp(config, 1.0, false, 1e-2, 0, 0, 1);
+        let rng = Rng::new(3, 3);
+        let table = &mut field.table.as_mut().expect("a hash field").values;
+        table.iter_mut().enumerate().for_each(|(i, v)| *v = rng.normal(i as u64) * 2.0);
+        field.net.sigma.shift = 1.5;
+        let mut grid = OccupancyBits::full(16, 1);
+        (0..grid.cells()).filter(|i| rng.uniform((1 << 20) + *i as u64) < 0.3).for_each(|i| grid.set(i, false));
+        let mut s = Scene { field, grid, origins: Vec::new(), dirs: Vec::new(), near_far: Vec::new(), jitter: Vec::new() };
+        for r in 0..RAYS as u64 {
+            let u = |k: u64| rng.uniform((1 << 30) + r * 8 + k);
+            s.origins.extend([u(0), u(1), -0.5]);
+            let d = [u(2) - 0.5, u(3) - 0.5, 2.0];
+            let l = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
+            s.dirs.extend(d.map(|v| v / l));
+            s.near_far.extend(if r % 9 == 4 { [1.0, 0.0] } else { [0.4, 2.0] });
+            s.jitter.push(u(4));
+        }
+        s
+    }
+
+    impl Scene {
+        fn rays(&self) -> MarchRays<'_> {
+            let (origins, dirs, near_far, jitter) = (&self.origins[..], &self.dirs[..], &self.near_far[..], &self.jitter[..]);
+            MarchRays { origins, dirs, near_far, jitter, resumed: false }
+        }
+
+        fn config(&self) -> MarchConfig {
+            MarchConfig { cone: 1.0 / 256.0, dt_min: 0.004, dt_max: 0.1, max_samples: 1000 }
+        }
+
+        fn visible(&self, pruning: Pruning) -> (Marched, Vec<f32>, FieldBuffers) {
+            let (mut samples, mut positions, mut buf) = Default::default();
+            self.field.visible(&self.grid, &self.rays(), &self.config(), pruning, &mut samples, &mut positions, &mut buf);
+            (samples, positions, buf)
+        }
+
+        fn plain(&self) -> (Marched, Vec<f32>) {
+            let (mut samples, mut positions) = Default::default();
+            march::cpu::march(&self.grid, &self.rays(), &self.config(), &mut Default::default(), &mut samples);
+            march::cpu::positions(&self.rays(), &samples, &mut positions);
+            (samples, positions)
+        }
+    }
+
+    #[test]
+    fn waves_without_pruning_equal_one_march() {
+        let s = scene();
+        let (got, positions, buf) = s.visible(Pruning { stop: 0.0, min_alpha: 0.0, min_weight: 0.0 });
+        let (want, at) = s.plain();
+        assert!(want.offsets.windows(2).any(|w| w[1] - w[0] > 3 * WAVE.0 as u32), "several waves are wanted");
+        assert_eq!((&got.offsets, &got.t, &got.dt), (&want.offsets, &want.t, &want.dt));
+        assert_eq!(positions, at);
+        let Encoding::Hash(grid) = &s.field.encoding else { unreachable!() };
+        let mut features = vec![0.0; buf.features.len()];
+        hash_grid::cpu::forward(grid, &buf.unit, &s.field.table.as_ref().expect("a hash field").values, &mut features);
+        assert_eq!(buf.features, features);
+        assert_eq!(buf.visible.marched(), want.t.len());
+    }
+
+    #[test]
+    fn what_is_dropped_is_hidden_or_thin() {
+        let s = scene();
+        let (all, at) = s.plain();
+        let mut sigma = vec![0.0; all.t.len()];
+        s.field.density(&at, &mut sigma);
+        let pruning = Pruning { stop: 0.3, min_alpha: 0.01, min_weight: 0.006 };
+        let (got, _, buf) = s.visible(pruning);
+        let mut want = Vec::new();
+        for w in all.offsets.windows(2) {
+            let mut light = 1.0;
+            for i in w[0] as usize..w[1] as usize {
+                let alpha = 1.0 - (-sigma[i] * all.dt[i]).exp();
+                if light >= pruning.stop && alpha >= pruning.min_alpha && light * alpha >= pruning.min_weight {
+                    want.push(all.t[i]);
+                }
+                light *= 1.0 - alpha;
+            }
+        }
+        assert!(want.len() > 50 && want.len() < all.t.len() / 2, "{} of {}", want.len(), all.t.len());
+        // Rounding may move a sample across a threshold.
+        let missing = want.iter().filter(|t| !got.t.contains(t)).count();
+        assert!(missing <= 2 && got.t.len().abs_diff(want.len()) <= 2, "{missing} of {} and {}", want.len(), got.t.len());
+        let met: usize = buf.visible.seen().map(|(_, s)| s.iter().filter(|s| **s >= 0.0).count()).sum();
+        assert!(met >= got.t.len() && met < buf.visible.marched(), "only what light reaches is told");
+    }
+}
