@@ -394,7 +394,9 @@ mod tests {
         let Encoding::Hash(grid) = &s.field.encoding else { unreachable!() };
         let mut features = vec![0.0; buf.features.len()];
         hash_grid::cpu::forward(grid, &buf.unit, &s.field.table.as_ref().expect("a hash field").values, &mut features);
-        assert_eq!(buf.features, features);
+        // Groups of sixteen and what is left over round differently.
+        let off = buf.features.iter().zip(&features).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(off < 1e-4, "{off}");
         assert_eq!(buf.visible.marched(), want.t.len());
     }
 
