@@ -60,6 +60,9 @@ enum Bench {
     /// Where the time of a training step goes; nothing is written
     #[command(after_help = "Example:\n  diorama bench train capture/ --downscale 4 --steps 200")]
     Train(BenchTrainArgs),
+    /// Frames per second of a run's held-out views, and what the fast quality costs
+    #[command(after_help = "Example:\n  diorama bench render runs/chair --json")]
+    Render(BenchRenderArgs),
 }
 
 /// Flags of `train`.
@@ -126,6 +129,9 @@ pub struct EvalArgs {
     /// train, val or test
     #[arg(long, default_value = "test")]
     pub on: String,
+    /// full, or fast as for previews
+    #[arg(long, default_value = "full")]
+    pub quality: String,
     /// Write each render beside its photograph into RUN/eval
     #[arg(long)]
     pub save_images: bool,
@@ -165,6 +171,9 @@ pub struct RenderArgs {
     /// Show only what lies in x0,y0,z0,x1,y1,z1 (the input's frame)
     #[arg(long, allow_hyphen_values = true)]
     pub clip: Option<String>,
+    /// full, or fast for previews
+    #[arg(long, default_value = "full")]
+    pub quality: String,
     #[arg(long)]
     pub threads: Option<usize>,
     #[arg(long)]
@@ -294,6 +303,20 @@ pub struct BenchTrainArgs {
     pub json: bool,
 }
 
+/// Flags of `bench render`.
+#[derive(Args, Clone, Debug)]
+pub struct BenchRenderArgs {
+    /// Folder of the run
+    pub run: PathBuf,
+    /// Calls per view; the median counts
+    #[arg(long, default_value_t = 5)]
+    pub repeats: usize,
+    #[arg(long)]
+    pub threads: Option<usize>,
+    #[arg(long)]
+    pub json: bool,
+}
+
 /// Parses, runs, reports.
 pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
@@ -314,6 +337,7 @@ pub fn main() -> ExitCode {
         Command::Doctor(a) => a.json,
         Command::Bench(Bench::Ops(a)) => a.json,
         Command::Bench(Bench::Train(a)) => a.json,
+        Command::Bench(Bench::Render(a)) => a.json,
     };
     let result = match cli.command {
         Command::Train(a) => commands::train::run(&a),
@@ -326,6 +350,7 @@ pub fn main() -> ExitCode {
         Command::Doctor(a) => commands::doctor::run(&a),
         Command::Bench(Bench::Ops(a)) => commands::bench::ops(&a),
         Command::Bench(Bench::Train(a)) => commands::bench::train(&a),
+        Command::Bench(Bench::Render(a)) => commands::bench::render(&a),
     };
     ExitCode::from(match result {
         Ok(Outcome::Done) => 0,

@@ -1,9 +1,10 @@
 //! `diorama bench`
 
 use super::{Outcome, use_threads};
-use crate::arguments::{BenchOpsArgs, BenchTrainArgs};
+use crate::arguments::{BenchOpsArgs, BenchRenderArgs, BenchTrainArgs};
 use diorama_pipelines::bench;
 use diorama_pipelines::object::config::{Config, Method};
+use diorama_pipelines::object::run_folder;
 use diorama_pipelines::{PipelineError, Result};
 
 pub fn ops(a: &BenchOpsArgs) -> Result<Outcome> {
@@ -59,6 +60,22 @@ pub fn train(a: &BenchTrainArgs) -> Result<Outcome> {
     );
     if let Some(o) = r.occupied {
         println!("{:.1} % of the occupancy grid's cells are occupied", 100.0 * o);
+    }
+    Ok(Outcome::Done)
+}
+
+pub fn render(a: &BenchRenderArgs) -> Result<Outcome> {
+    use_threads(a.threads)?;
+    let (model, notes) = run_folder::load_model(&a.run)?;
+    notes.iter().for_each(|n| eprintln!("note: {n}"));
+    let report = bench::render::run(&model, a.repeats)?;
+    if a.json {
+        println!("{}", serde_json::json!(report));
+        return Ok(Outcome::Done);
+    }
+    println!("{} views of {} x {} on {} thread(s), {}", report.views, report.width, report.height, report.threads, report.simd);
+    for (name, q) in [("full", report.full), ("fast", report.fast)] {
+        println!("{name}: {:.2} frames/s, {:.2} dB", q.frames_per_s, q.psnr);
     }
     Ok(Outcome::Done)
 }

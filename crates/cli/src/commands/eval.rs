@@ -16,13 +16,14 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         "test" => Split::Test,
         other => return Err(PipelineError::Usage(format!("--on {other}: expected train, val or test"))),
     };
+    let quality = a.quality.parse().map_err(|e| PipelineError::Usage(format!("--{e}")))?;
     let (model, notes) = run_folder::load_model(&a.run)?;
     notes.iter().for_each(|n| eprintln!("note: {n}"));
     let folder = a.run.join("eval");
     if a.save_images {
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
-    let report = evaluate::evaluate(&model, split, &mut |name, v| {
+    let report = evaluate::evaluate(&model, split, quality, &mut |name, v| {
         eprintln!("{name}: psnr {:.2} ssim {:.3}", v.scores.psnr, v.scores.ssim);
         if a.save_images {
             let (r, p) = (v.view.rgb.to_u8(), v.photo.to_u8());

@@ -19,6 +19,7 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
     }
     let layers = a.layers.iter().map(|l| l.parse().map_err(usage)).collect::<Result<Vec<_>>>()?;
     let path = a.path.parse().map_err(usage)?;
+    let quality = a.quality.parse().map_err(usage)?;
     let (model, notes) = run_folder::load_model(&a.run)?;
     notes.iter().for_each(|n| eprintln!("note: {n}"));
     let images = a.images.clone().or_else(|| a.video.is_none().then(|| a.run.join("render")));
@@ -33,6 +34,7 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
         video: a.video.clone(),
         fps: a.fps,
         clip,
+        quality,
     };
     watch_interrupts();
     let start = Instant::now();

@@ -345,7 +345,7 @@ mod tests {
         table.iter_mut().enumerate().for_each(|(i, v)| *v = rng.normal(i as u64) * 2.0);
         field.net.sigma.shift = 1.5;
         let mut grid = OccupancyBits::full(16, 1);
-        (0..grid.cells()).filter(|i| rng.uniform((1 << 20) + *i as u64) < 0.3).for_each(|i| grid.set(i, false));
+        grid.fill_with(|i| rng.uniform((1 << 20) + i as u64) > 0.3);
         let mut s = Scene { field, grid, origins: Vec::new(), dirs: Vec::new(), near_far: Vec::new(), jitter: Vec::new() };
         for r in 0..RAYS as u64 {
             let u = |k: u64| rng.uniform((1 << 30) + r * 8 + k);

@@ -49,6 +49,48 @@ pub struct Tracer<'a> {
     pub pruning: Pruning,
     /// Training image whose appearance is worn; none: the mean.
     pub appearance: Option<u32>,
+    /// Pixels are interpolated where traced neighbours differ by no more than this; 0: all are traced.
+    pub tolerance: f32,
+}
+
+/// How much care a view gets.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Quality {
+    /// Every pixel is traced, no sample that light reaches is left out.
+    #[default]
+    Full,
+    /// For previews: rays end earlier, faint samples and pixels between like neighbours are left out.
+    Fast,
+}
+
+impl Quality {
+    /// What is left out of a view.
+    pub fn pruning(self) -> Pruning {
+        match self {
+            Quality::Full => Pruning { stop: 1e-4, min_alpha: 0.0, min_weight: 0.0 },
+            Quality::Fast => Pruning { stop: 2e-2, min_alpha: 0.0, min_weight: 4e-3 },
+        }
+    }
+
+    /// The [`Tracer::tolerance`].
+    pub fn tolerance(self) -> f32 {
+        match self {
+            Quality::Full => 0.0,
+            Quality::Fast => 0.03,
+        }
+    }
+}
+
+impl std::str::FromStr for Quality {
+    type Err = String;
+
+    fn from_str(s: &str) -> Result<Self, String> {
+        match s {
+            "full" => Ok(Quality::Full),
+            "fast" => Ok(Quality::Fast),
+            _ => Err(format!("quality {s:?}: expected full or fast")),
+        }
+    }
 }
 
 /// Layers of a rendered view.
@@ -64,6 +106,8 @@ pub struct View {
 
 /// Rays per chunk of an image.
 const CHUNK: usize = 1 << 12;
+/// Pixels between those that are traced first where pixels may be interpolated.
+const COARSEST: usize = 4;
 
 /// Colour, opacity and `Σ w t` of rays.
 #[derive(Clone, Debug, Default)]
@@ -79,27 +123,49 @@ impl Tracer<'_> {
         let (w, h) = (camera.camera.width as usize, camera.camera.height as usize);
         let mut out = View { rgb: Image::zeros(w, h, 3), opacity: Image::zeros(w, h, 1), depth: Image::zeros(w, h, 1) };
         let (mut batch, mut buf) = (RayBatch::default(), FieldBuffers::default());
-        let rows = (CHUNK / w).max(1);
-        for first in (0..h).step_by(rows) {
-            let n = rows.min(h - first) * w;
-            batch.resize(n);
-            for i in 0..n {
-                batch.pixels[i * 2] = (i % w) as f32 + 0.5;
-                batch.pixels[i * 2 + 1] = (first + i / w) as f32 + 0.5;
+        let mut wanted = Vec::with_capacity(w * h);
+        let coarsest = if self.tolerance > 0.0 { COARSEST } else { 1 };
+        wanted.extend((0..w * h).filter(|i| (i % w).is_multiple_of(coarsest) && (i / w).is_multiple_of(coarsest)).map(|i| i as u32));
+        self.pixels(camera, &wanted, &mut batch, &mut buf, &mut out, progress);
+        let mut stride = coarsest;
+        while stride > 1 {
+            wanted.clear();
+            between(&mut out, stride, self.tolerance, &mut wanted);
+            self.pixels(camera, &wanted, &mut batch, &mut buf, &mut out, progress);
+            stride /= 2;
+        }
+        out
+    }
+
+    /// Traces the listed pixels of a view; `progress` is told how many rows' worth.
+    fn pixels(
+        &self,
+        camera: &PosedCamera,
+        wanted: &[u32],
+        batch: &mut RayBatch,
+        buf: &mut FieldBuffers,
+        out: &mut View,
+        progress: &mut dyn FnMut(usize),
+    ) {
+        let w = out.rgb.width;
+        for part in wanted.chunks(CHUNK) {
+            batch.resize(part.len());
+            for (i, &p) in part.iter().enumerate() {
+                batch.pixels[i * 2] = (p as usize % w) as f32 + 0.5;
+                batch.pixels[i * 2 + 1] = (p as usize / w) as f32 + 0.5;
                 batch.images[i] = 0;
                 batch.jitter[i] = 0.5;
             }
-            pixels::rays(std::slice::from_ref(camera), self.near, self.cube, &mut batch);
-            let traced = self.trace(&mut batch, &mut buf);
-            let at = first * w;
-            out.rgb.data[at * 3..(at + n) * 3].copy_from_slice(&traced.rgb);
-            out.opacity.data[at..at + n].copy_from_slice(&traced.opacity);
-            for (d, (t, o)) in out.depth.data[at..at + n].iter_mut().zip(traced.depth.iter().zip(&traced.opacity)) {
-                *d = if *o > 1e-3 { t / o } else { 0.0 };
+            pixels::rays(std::slice::from_ref(camera), self.near, self.cube, batch);
+            let traced = self.trace(batch, buf);
+            for (i, &p) in part.iter().enumerate() {
+                let (p, o) = (p as usize, traced.opacity[i]);
+                out.rgb.data[p * 3..p * 3 + 3].copy_from_slice(&traced.rgb[i * 3..i * 3 + 3]);
+                out.opacity.data[p] = o;
+                out.depth.data[p] = if o > 1e-3 { traced.depth[i] / o } else { 0.0 };
             }
-            progress(first + n / w);
+            progress(part.len() / w);
         }
-        out
     }
 
     /// Traces the rays of a batch, whose origins, directions and extents are set.
@@ -166,6 +232,51 @@ impl Tracer<'_> {
     }
 }
 
+/// Fills pixels half way between those `stride` apart: interpolated where the corners around them are alike,
+/// else listed in `wanted`.
+fn between(view: &mut View, stride: usize, tolerance: f32, wanted: &mut Vec<u32>) {
+    let (w, h, half) = (view.rgb.width, view.rgb.height, stride / 2);
+    for y in (0..h).step_by(half) {
+        for x in (0..w).step_by(half) {
+            let (dx, dy) = (x % stride, y % stride);
+            if dx == 0 && dy == 0 {
+                continue;
+            }
+            let (x0, y0) = (x - dx, y - dy);
+            let (x1, y1) = (x0 + stride, y0 + stride);
+            let at = y * w + x;
+            if x1 >= w || y1 >= h {
+                wanted.push(at as u32);
+                continue;
+            }
+            let corners = [y0 * w + x0, y0 * w + x1, y1 * w + x0, y1 * w + x1];
+            let alike = |data: &[f32], channels: usize, k: usize, slack: f32| {
+                let v = corners.map(|c| data[c * channels + k]);
+                v.iter().copied().fold(f32::MIN, f32::max) - v.iter().copied().fold(f32::MAX, f32::min) <= slack
+            };
+            let depth = view.depth.data[corners[0]];
+            let flat = (0..3).all(|k| alike(&view.rgb.data, 3, k, tolerance))
+                && alike(&view.opacity.data, 1, 0, tolerance)
+                && alike(&view.depth.data, 1, 0, tolerance * depth);
+            if !flat {
+                wanted.push(at as u32);
+                continue;
+            }
+            let of = |dx: usize| if dx == 0 { [1.0, 0.0] } else { [0.5, 0.5] };
+            let (fx, fy) = (of(dx), of(dy));
+            let weights = [fy[0] * fx[0], fy[0] * fx[1], fy[1] * fx[0], fy[1] * fx[1]];
+            let mix = |data: &mut [f32], channels: usize| {
+                for k in 0..channels {
+                    data[at * channels + k] = corners.iter().zip(weights).map(|(c, w)| w * data[c * channels + k]).sum();
+                }
+            };
+            mix(&mut view.rgb.data, 3);
+            mix(&mut view.opacity.data, 1);
+            mix(&mut view.depth.data, 1);
+        }
+    }
+}
+
 fn taken(buf: &mut FieldBuffers) -> Traced {
     let o = &mut buf.out;
     Traced { rgb: std::mem::take(&mut o.rgb), opacity: std::mem::take(&mut o.opacity), depth: std::mem::take(&mut o.depth) }
@@ -196,6 +307,7 @@ mod tests {
             clip: None,
             pruning: Pruning { stop: 0.0, min_alpha: 0.0, min_weight: 0.0 },
             appearance: None,
+            tolerance: 0.0,
         };
         let view = tracer.view(&camera, &mut |_| {});
         let mut batch = RayBatch::default();
@@ -237,6 +349,7 @@ mod tests {
             clip: None,
             pruning: Pruning { stop: 1e-4, min_alpha: 0.0, min_weight: 0.0 },
             appearance: None,
+            tolerance: 0.0,
         };
         assert!(tracer.view(&camera, &mut |_| {}).opacity.data[40 + 2] > 0.9);
         tracer.clip = Some(([0.45, 0.0, 0.45], [0.55, 1.0, 0.55]));

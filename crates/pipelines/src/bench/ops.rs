@@ -193,12 +193,11 @@ fn rays(t: &mut Table, pool: &rayon::ThreadPool) {
         pool.install(|| ray_generation::cpu::forward(&[camera], &index, &pixels, &mut origins, &mut dirs));
     });
     let mut grid = OccupancyBits::full(128, 1);
-    for cell in 0..grid.cells() {
-        // A ball's shell, as after some training.
+    // A ball's shell, as after some training.
+    grid.fill_with(|cell| {
         let at = [cell % 128, cell / 128 % 128, cell / 16384].map(|v| (v as f32 - 63.5) / 64.0);
-        let r = at.iter().map(|v| v * v).sum::<f32>().sqrt();
-        grid.set(cell, (0.4..0.6).contains(&r));
-    }
+        (0.4..0.6).contains(&at.iter().map(|v| v * v).sum::<f32>().sqrt())
+    });
     let near_far: Vec<f32> = (0..n).flat_map(|_| [0.1, 3.0]).collect();
     let jitter = vec![0.5; n];
     let rays = MarchRays { origins: &origins, dirs: &dirs, near_far: &near_far, jitter: &jitter, resumed: false };

@@ -4,6 +4,7 @@ use super::evaluate;
 use super::run_folder::{charts, load_model, read_rows};
 use crate::error::Result;
 use diorama_data::{DataError, atomic, photo, plot};
+use diorama_engine::renderers::volume::Quality;
 use diorama_geom::ImageU8;
 use diorama_geom::capture::Split;
 use serde::Serialize;
@@ -35,7 +36,7 @@ pub fn compare(runs: &[PathBuf], out: &Path, note: &mut dyn FnMut(&str)) -> Resu
         let (model, _) = load_model(run)?;
         let mut views = Vec::new();
         let mut photos = Vec::new();
-        let report = evaluate::evaluate(&model, Split::Test, &mut |_, v| {
+        let report = evaluate::evaluate(&model, Split::Test, Quality::Full, &mut |_, v| {
             if views.len() < 4 {
                 views.push(v.view.rgb.to_u8());
                 photos.push(v.photo.to_u8());

@@ -4,7 +4,7 @@ use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
 use diorama_data::photo;
 use diorama_engine::metrics::{self, Scores};
-use diorama_engine::renderers::volume::View;
+use diorama_engine::renderers::volume::{Quality, View};
 use diorama_geom::capture::Split;
 use diorama_geom::{Capture, Image, ImageU8};
 use serde::Serialize;
@@ -65,9 +65,9 @@ pub fn reference_photo(model: &ObjectModel, full: &ImageU8) -> Image {
 }
 
 /// Renders frame `i` and scores it against `full`, its photograph at full size.
-pub fn score_view(model: &ObjectModel, i: usize, full: &ImageU8) -> ScoredView {
+pub fn score_view(model: &ObjectModel, i: usize, full: &ImageU8, quality: Quality) -> ScoredView {
     let photo = reference_photo(model, full);
-    let view = model.tracer().view(&model.posed(i), &mut |_| {});
+    let view = model.tracer(quality).view(&model.posed(i), &mut |_| {});
     let mask =
         model.capture.frames[i].mask.as_ref().and_then(|m| photo::load_mask(m).ok()).map(|m| m.downsampled(photo.width, photo.height));
     let mut shown = view.rgb.clone();
@@ -77,7 +77,12 @@ pub fn score_view(model: &ObjectModel, i: usize, full: &ImageU8) -> ScoredView {
 }
 
 /// Scores all views of a split; `each` sees every view as it is done.
-pub fn evaluate(model: &ObjectModel, split: Split, each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>) -> Result<Report> {
+pub fn evaluate(
+    model: &ObjectModel,
+    split: Split,
+    quality: Quality,
+    each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
+) -> Result<Report> {
     let frames = held_out(&model.capture, split);
     if frames.is_empty() {
         return Err(PipelineError::Usage("the run holds no views out; train with --split every:8 or judge --on train".into()));
@@ -87,7 +92,7 @@ pub fn evaluate(model: &ObjectModel, split: Split, each: &mut dyn FnMut(&str, &S
     for i in frames {
         let frame = &model.capture.frames[i];
         let full = photo::load(&frame.image)?;
-        let scored = score_view(model, i, &full);
+        let scored = score_view(model, i, &full, quality);
         if let Some(mean) = mean.as_ref().filter(|m| (m.width, m.height) == (scored.photo.width, scored.photo.height)) {
             mean_scores.push(metrics::compare(mean, &scored.photo, |_, _| true).psnr);
         }

@@ -4,9 +4,9 @@ use super::config::{Background, Config, Method};
 use crate::error::{PipelineError, Result};
 use diorama_data::checkpoint::{Checkpoint, Entry};
 use diorama_engine::background::LearnedBackground;
-use diorama_engine::fields::{self, Batch, Field, FieldBuffers, Pruning};
+use diorama_engine::fields::{self, Batch, Field, FieldBuffers};
 use diorama_engine::params::ParamGroup;
-use diorama_engine::renderers::volume::{Backdrop, Sampling, Tracer};
+use diorama_engine::renderers::volume::{Backdrop, Quality, Sampling, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::pixels::ErrorMap;
 use diorama_engine::train::Origin;
@@ -21,9 +21,6 @@ use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::march::OccupancyBits;
 use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
 use std::collections::HashMap;
-
-/// Rays below this transmittance end, in renders for scores and files.
-pub const STOP: f32 = 1e-4;
 
 /// Fields, occupancy and corrections of one run, with the capture they belong to.
 pub struct ObjectModel {
@@ -154,7 +151,7 @@ impl ObjectModel {
     }
 
     /// Ready to render, wearing the mean appearance.
-    pub fn tracer(&self) -> Tracer<'_> {
+    pub fn tracer(&self, quality: Quality) -> Tracer<'_> {
         let s = &self.config.sampling;
         let sampling = match (&self.occupancy, &self.coarse) {
             (Some(grid), _) => Sampling::Occupancy { grid, max_samples: s.max_samples },
@@ -168,8 +165,9 @@ impl ObjectModel {
             near: s.near,
             cube: self.cube(),
             clip: None,
-            pruning: Pruning { stop: STOP, min_alpha: 0.0, min_weight: 0.0 },
+            pruning: quality.pruning(),
             appearance: None,
+            tolerance: quality.tolerance(),
         }
     }
 

@@ -9,6 +9,7 @@ use super::report;
 use super::run_folder::RunFolder;
 use crate::error::Result;
 use diorama_data::{DataError, photo, transforms_json};
+use diorama_engine::renderers::volume::Quality;
 use diorama_engine::train::{Event, Summary};
 use diorama_geom::capture::{ColorSpace, Frame, Split};
 use diorama_geom::{Capture, ImageU8, Similarity};
@@ -81,7 +82,7 @@ pub fn quickstart(
     let (model, summary) = recipe::train(&config, &mut run, false, interrupt, events)?;
     note("scoring held-out views");
     let mut pairs: Vec<Vec<ImageU8>> = vec![Vec::new(), Vec::new()];
-    let scores = evaluate::evaluate(&model, Split::Test, &mut |_, v| {
+    let scores = evaluate::evaluate(&model, Split::Test, Quality::Full, &mut |_, v| {
         if pairs[0].len() < 4 {
             pairs[0].push(v.photo.to_u8());
             pairs[1].push(v.view.rgb.to_u8());
@@ -101,6 +102,7 @@ pub fn quickstart(
         video: Some(video.clone()),
         fps: 20,
         clip: None,
+        quality: Quality::Full,
     };
     render::render(&model, &options, interrupt, &mut |_, _| {})?;
     note("extracting the mesh");

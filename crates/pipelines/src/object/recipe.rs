@@ -12,6 +12,7 @@ use diorama_data::{checkpoint, photo};
 use diorama_engine::fields::{Batch, Field, FieldBuffers, Pruning};
 use diorama_engine::losses::{ColorLoss, Photometric};
 use diorama_engine::params::Schedule;
+use diorama_engine::renderers::volume::Quality;
 use diorama_engine::samplers::pixels::{self, DrawOptions, PixelSource};
 use diorama_engine::samplers::{RayBatch, stratified};
 use diorama_engine::stages::Stages;
@@ -468,7 +469,7 @@ impl Trainee for Trainer<'_> {
         let mut scores = Vec::new();
         for i in few {
             if let Ok(image) = photo::load(&self.model.capture.frames[i].image) {
-                scores.push(evaluate::score_view(&self.model, i, &image).scores);
+                scores.push(evaluate::score_view(&self.model, i, &image, Quality::Full).scores);
             }
         }
         let n = scores.len().max(1) as f64;

@@ -5,7 +5,7 @@ use crate::error::{PipelineError, Result};
 use diorama_data::camera_path_json::{self, CameraPath};
 use diorama_data::mp4::Video;
 use diorama_data::{DataError, photo};
-use diorama_engine::renderers::volume::View;
+use diorama_engine::renderers::volume::{Quality, View};
 use diorama_geom::camera_path::{self, PathView};
 use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
@@ -81,6 +81,7 @@ pub struct RenderOptions {
     pub fps: u32,
     /// Only what lies in this box (world) is shown.
     pub clip: Option<([f32; 3], [f32; 3])>,
+    pub quality: Quality,
 }
 
 /// The views of a path in the world.
@@ -140,7 +141,7 @@ pub fn render(
             return Ok((i, true));
         }
         let posed = model.to_model(v.camera, &v.world_from_camera);
-        let view = trace(model, &posed, o.clip);
+        let view = trace(model, &posed, o);
         for (k, layer) in o.layers.iter().enumerate() {
             let image = draw_layer(model, &posed, &view, *layer);
             if let Some(folder) = &o.images {
@@ -158,9 +159,9 @@ pub fn render(
     Ok((total, false))
 }
 
-fn trace(model: &ObjectModel, camera: &PosedCamera, clip: Option<([f32; 3], [f32; 3])>) -> View {
-    let mut tracer = model.tracer();
-    tracer.clip = clip.map(|(lo, hi)| {
+fn trace(model: &ObjectModel, camera: &PosedCamera, o: &RenderOptions) -> View {
+    let mut tracer = model.tracer(o.quality);
+    tracer.clip = o.clip.map(|(lo, hi)| {
         let to = |p: [f32; 3]| model.model_from_world.point(DVec3::new(p[0] as f64, p[1] as f64, p[2] as f64)).as_vec3().to_array();
         (to(lo), to(hi))
     });

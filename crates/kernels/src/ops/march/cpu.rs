@@ -1,6 +1,6 @@
 //! Parallel over chunks of rays, whose samples are joined in order.
 
-use super::{MarchConfig, MarchRays, Marched, OccupancyBits};
+use super::{BLOCK, MarchConfig, MarchRays, Marched, OccupancyBits};
 use rayon::prelude::*;
 
 /// Rays per task.
@@ -95,9 +95,11 @@ fn march_ray(grid: &OccupancyBits, rays: &MarchRays, r: usize, config: &MarchCon
             t += dt;
             continue;
         }
+        // Past the cell, or past its block if that is empty.
+        let edge = if grid.is_block_empty(c, cell) { BLOCK } else { 1 };
         let mut exit = f32::INFINITY;
         for k in 0..3 {
-            let wall = low + (cell[k] + (d[k] > 0.0) as usize) as f32 / scale;
+            let wall = low + ((cell[k] / edge + (d[k] > 0.0) as usize) * edge) as f32 / scale;
             let e = (wall - o[k]) * inv[k];
             if d[k] != 0.0 && e < exit {
                 exit = e;

@@ -10,22 +10,30 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
+use rayon::prelude::*;
+
+/// Edge of the blocks of cells whose emptiness is known at a glance.
+pub(crate) const BLOCK: usize = 8;
+
 /// Which cells may hold matter, one bit each, `[cascades, z, y, x]`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OccupancyBits {
     pub resolution: usize,
     pub cascades: usize,
-    pub bits: Vec<u64>,
+    bits: Vec<u64>,
+    /// Whether a block of `8³` cells holds an occupied one, `[cascades, z, y, x]`.
+    blocks: Vec<bool>,
 }
 
 impl OccupancyBits {
     /// All cells occupied.
     ///
     /// # Panics
-    /// When the resolution is not a multiple of 4.
+    /// When the resolution is not a multiple of 8.
     pub fn full(resolution: usize, cascades: usize) -> Self {
-        assert!(resolution.is_multiple_of(4) && cascades > 0, "occupancy grid: {resolution}^3 x {cascades}");
-        Self { resolution, cascades, bits: vec![u64::MAX; cascades * resolution.pow(3) / 64] }
+        assert!(resolution.is_multiple_of(BLOCK) && cascades > 0, "occupancy grid: {resolution}^3 x {cascades}");
+        let cells = cascades * resolution.pow(3);
+        Self { resolution, cascades, bits: vec![u64::MAX; cells / 64], blocks: vec![true; cells / BLOCK.pow(3)] }
     }
 
     pub fn cells(&self) -> usize {
@@ -37,13 +45,58 @@ impl OccupancyBits {
         self.bits[cell >> 6] >> (cell & 63) & 1 == 1
     }
 
-    pub fn set(&mut self, cell: usize, occupied: bool) {
-        let bit = 1u64 << (cell & 63);
-        if occupied {
-            self.bits[cell >> 6] |= bit;
-        } else {
-            self.bits[cell >> 6] &= !bit;
-        }
+    /// Whether the block that holds cell `at` of a cascade is empty.
+    #[inline(always)]
+    pub fn is_block_empty(&self, cascade: usize, at: [usize; 3]) -> bool {
+        let n = self.resolution / BLOCK;
+        !self.blocks[((cascade * n + at[2] / BLOCK) * n + at[1] / BLOCK) * n + at[0] / BLOCK]
+    }
+
+    /// Decides anew about every cell, but for those of a coarser cascade that a finer one covers: they are
+    /// occupied where the finer cells are.
+    pub fn fill_with(&mut self, occupied: impl Fn(usize) -> bool + Sync) {
+        const WORDS: usize = 64;
+        self.bits.par_chunks_mut(WORDS).enumerate().for_each(|(chunk, words)| {
+            for (w, word) in words.iter_mut().enumerate() {
+                let first = (chunk * WORDS + w) * 64;
+                *word = (0..64).fold(0, |bits, i| bits | (occupied(first + i) as u64) << i);
+            }
+        });
+        (1..self.cascades).for_each(|c| self.pool(c));
+        let (n, bits) = (self.resolution, &self.bits);
+        let edge = n / BLOCK;
+        self.blocks.par_chunks_mut(edge).enumerate().for_each(|(row, blocks)| {
+            let (y, z) = (row % edge * BLOCK, row / edge * BLOCK);
+            for (x, block) in blocks.iter_mut().enumerate() {
+                // Eight cells along x are one byte of a word.
+                *block = (0..BLOCK * BLOCK).any(|k| {
+                    let cell = ((z + k / BLOCK) * n + y + k % BLOCK) * n + x * BLOCK;
+                    bits[cell >> 6] >> (cell & 63) & 0xff != 0
+                });
+            }
+        });
+    }
+
+    /// Takes over the cascade before `cascade` into the cells that it covers.
+    fn pool(&mut self, cascade: usize) {
+        let n = self.resolution;
+        let words = n.pow(3) / 64;
+        let (finer, own) = self.bits[(cascade - 1) * words..(cascade + 1) * words].split_at_mut(words);
+        let get = |x: usize, y: usize, z: usize| {
+            let cell = (z * n + y) * n + x;
+            finer[cell >> 6] >> (cell & 63) & 1 == 1
+        };
+        let inner = n / 4..3 * n / 4;
+        own.par_chunks_mut(n * n / 64).enumerate().filter(|(z, _)| inner.contains(z)).for_each(|(z, slice)| {
+            for y in inner.clone() {
+                for x in inner.clone() {
+                    let first = [x, y, z].map(|v| 2 * (v - n / 4));
+                    let any = (0..8).any(|k| get(first[0] + k % 2, first[1] + k / 2 % 2, first[2] + k / 4));
+                    let (word, bit) = ((y * n + x) / 64, (y * n + x) % 64);
+                    slice[word] = slice[word] & !(1 << bit) | (any as u64) << bit;
+                }
+            }
+        });
     }
 
     /// Share of occupied cells.
