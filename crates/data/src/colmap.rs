@@ -2,7 +2,7 @@
 
 use crate::error::{self, DataError, Result};
 use crate::import::{Imported, locate};
-use diorama_geom::capture::{ColorSpace, Frame, Split};
+use diorama_geom::capture::Frame;
 use diorama_geom::glam::DVec3;
 use diorama_geom::transform::rotation_from_quaternion;
 use diorama_geom::{Camera, Capture, Lens, Pose};
@@ -82,20 +82,8 @@ pub fn read(root: &Path) -> Result<Imported> {
             out.missing.push(im.name);
             continue;
         };
-        out.frames.push(Frame {
-            name: Path::new(&im.name).with_extension("").to_string_lossy().into_owned(),
-            image,
-            camera,
-            world_from_camera: pose,
-            mask: None,
-            depth: None,
-            time: None,
-            session: None,
-            labels: None,
-            conditioning: Vec::new(),
-            split: Split::Train,
-            color_space: ColorSpace::Srgb,
-        });
+        let name = Path::new(&im.name).with_extension("").to_string_lossy().into_owned();
+        out.frames.push(Frame::new(name, image, camera, pose));
     }
     Ok(out)
 }

@@ -3,7 +3,7 @@
 
 use crate::error::{self, DataError, Result};
 use crate::import::Imported;
-use diorama_geom::capture::{ColorSpace, Frame, Split};
+use diorama_geom::capture::Frame;
 use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::{Camera, Lens, Pose};
 use std::path::{Path, PathBuf};
@@ -43,20 +43,8 @@ pub fn read(root: &Path) -> Result<Imported> {
             return Err(DataError::input(&file, format!("pose {i}: height {h}, width {w}, focal length {f} are not plausible")));
         }
         let camera = Camera { width: w as u32, height: h as u32, fx: f, fy: f, cx: 0.5 * w, cy: 0.5 * h, lens: Lens::Pinhole };
-        out.frames.push(Frame {
-            name: image.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
-            image,
-            camera,
-            world_from_camera: pose,
-            mask: None,
-            depth: None,
-            time: None,
-            session: None,
-            labels: None,
-            conditioning: Vec::new(),
-            split: Split::Train,
-            color_space: ColorSpace::Srgb,
-        });
+        let name = image.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        out.frames.push(Frame::new(name, image, camera, pose));
     }
     Ok(out)
 }

@@ -94,10 +94,15 @@ pub fn load(path: &Path) -> Result<ImageU8> {
     Ok(ImageU8 { width, height, channels, data })
 }
 
+/// How names of instant-ngp's masks begin; in them, what is not black is to be ignored.
+pub const DYNAMIC_MASK: &str = "dynamic_mask_";
+
 /// Decodes a mask to one channel: 0 where the pixel is to be ignored.
 pub fn load_mask(path: &Path) -> Result<ImageU8> {
     let im = load(path)?;
-    let data = im.data.chunks_exact(im.channels).map(|p| p[0]).collect();
+    let marks_ignored = path.file_name().is_some_and(|n| n.to_string_lossy().starts_with(DYNAMIC_MASK));
+    let counts = |p: &[u8]| if marks_ignored { 255 * p[..3.min(p.len())].iter().all(|v| *v == 0) as u8 } else { p[0] };
+    let data = im.data.chunks_exact(im.channels).map(counts).collect();
     Ok(ImageU8 { width: im.width, height: im.height, channels: 1, data })
 }
 

@@ -176,26 +176,13 @@ fn to_rgba(im: &ImageU8) -> Vec<u8> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use diorama_geom::capture::{ColorSpace, Split};
+
     use diorama_geom::{Camera, Pose};
 
     fn frame(dir: &Path, name: &str, w: usize, h: usize, value: u8) -> Frame {
         let image = dir.join(name);
         photo::save_png(&image, &ImageU8 { width: w, height: h, channels: 3, data: vec![value; w * h * 3] }).unwrap();
-        Frame {
-            name: name.into(),
-            image,
-            camera: Camera::pinhole(w as u32, h as u32, 1.0),
-            world_from_camera: Pose::IDENTITY,
-            mask: None,
-            depth: None,
-            time: None,
-            session: None,
-            labels: None,
-            conditioning: vec![],
-            split: Split::Train,
-            color_space: ColorSpace::Srgb,
-        }
+        Frame::new(name, image, Camera::pinhole(w as u32, h as u32, 1.0), Pose::IDENTITY)
     }
 
     #[test]

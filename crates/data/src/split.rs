@@ -81,26 +81,10 @@ pub fn apply(rule: &SplitRule, frames: &mut [Frame], has_own: bool, seed: u64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use diorama_geom::capture::ColorSpace;
     use diorama_geom::{Camera, Pose};
 
     fn frames(n: usize) -> Vec<Frame> {
-        (0..n)
-            .map(|i| Frame {
-                name: i.to_string(),
-                image: "x".into(),
-                camera: Camera::pinhole(4, 4, 1.0),
-                world_from_camera: Pose::IDENTITY,
-                mask: None,
-                depth: None,
-                time: None,
-                session: None,
-                labels: None,
-                conditioning: vec![],
-                split: Split::Train,
-                color_space: ColorSpace::Srgb,
-            })
-            .collect()
+        (0..n).map(|i| Frame::new(i.to_string(), "x", Camera::pinhole(4, 4, 1.0), Pose::IDENTITY)).collect()
     }
 
     #[test]

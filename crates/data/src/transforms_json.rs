@@ -4,7 +4,7 @@
 use crate::error::{DataError, Result};
 use crate::import::{Imported, locate};
 use crate::json::{self, Object};
-use diorama_geom::capture::{ColorSpace, Frame, Split};
+use diorama_geom::capture::{Frame, Split};
 use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::{Camera, Lens, Pose, SceneBox, Similarity};
 use std::path::Path;
@@ -80,25 +80,20 @@ fn read_frames(head: &Object, root: &Path, split: Split, out: &mut Imported) -> 
             out.missing.push(name.to_string());
             continue;
         };
-        let mask = optional_file(&frame, "mask_path", root)?;
+        let mask = optional_file(&frame, "mask_path", root)?.or_else(|| dynamic_mask(&image));
         let depth = optional_file(&frame, "depth_file_path", root)?;
         let camera = read_camera(head, &frame, &image, &mut sizes)?;
-        out.frames.push(Frame {
-            name: Path::new(name).with_extension("").to_string_lossy().trim_start_matches("./").to_string(),
-            image,
-            camera,
-            world_from_camera: pose,
-            mask,
-            depth,
-            time: frame.number("time")?,
-            session: frame.number("session")?.map(|s| s as u32),
-            labels: None,
-            conditioning: Vec::new(),
-            split,
-            color_space: ColorSpace::Srgb,
-        });
+        let title = Path::new(name).with_extension("").to_string_lossy().trim_start_matches("./").to_string();
+        let (time, session) = (frame.number("time")?, frame.number("session")?.map(|s| s as u32));
+        out.frames.push(Frame { mask, depth, time, session, split, ..Frame::new(title, image, camera, pose) });
     }
     Ok(())
+}
+
+/// instant-ngp's mask, which lies beside the photograph and is named after it.
+fn dynamic_mask(image: &Path) -> Option<std::path::PathBuf> {
+    let name = format!("{}{}.png", crate::photo::DYNAMIC_MASK, image.file_stem()?.to_str()?);
+    Some(image.with_file_name(name)).filter(|f| f.is_file())
 }
 
 fn optional_file(frame: &Object, key: &str, root: &Path) -> Result<Option<std::path::PathBuf>> {

@@ -2,7 +2,7 @@
 
 use diorama_data::import::{self, Format, ImportOptions};
 use diorama_data::{colmap, photo, transforms_json};
-use diorama_geom::capture::{ColorSpace, Frame, Split};
+use diorama_geom::capture::{Frame, Split};
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, Capture, ImageU8, Lens, Pose, SceneBox, Similarity};
 use std::path::{Path, PathBuf};
@@ -15,20 +15,10 @@ fn capture(root: &Path) -> Capture {
             photo::save_png(&image, &ImageU8 { width: 20, height: 16, channels: 3, data: vec![40 * i as u8; 960] }).unwrap();
             let a = i as f64;
             let lens = [Lens::Pinhole, Lens::Brown { k: [0.05, -0.01, 0.002, 0.0, 0.0, 0.0], p: [1e-3, -2e-3] }][i % 2];
-            Frame {
-                name: format!("images/a {i}"),
-                image,
-                camera: Camera { cx: 9.5, lens, ..Camera::pinhole(20, 16, 0.9) },
-                world_from_camera: Pose::look_at(DVec3::new(3.0 * a.cos(), 3.0 * a.sin(), 1.0), DVec3::ZERO, DVec3::Z),
-                mask: None,
-                depth: None,
-                time: None,
-                session: None,
-                labels: None,
-                conditioning: vec![],
-                split: if i == 4 { Split::Test } else { Split::Train },
-                color_space: ColorSpace::Srgb,
-            }
+            let camera = Camera { cx: 9.5, lens, ..Camera::pinhole(20, 16, 0.9) };
+            let pose = Pose::look_at(DVec3::new(3.0 * a.cos(), 3.0 * a.sin(), 1.0), DVec3::ZERO, DVec3::Z);
+            let split = if i == 4 { Split::Test } else { Split::Train };
+            Frame { split, ..Frame::new(format!("images/a {i}"), image, camera, pose) }
         })
         .collect();
     let scene = SceneBox { center: DVec3::new(0.1, 0.2, 0.3), half: 1.25, aabb_scale: 2 };
@@ -107,6 +97,21 @@ fn blender_sets_keep_their_split_and_complete_extensions() {
     // Blender's camera looks along −z with y up: this one looks along +y of the world, right is +x.
     let r = c.frames[0].world_from_camera.rotation;
     assert!((r.z_axis - DVec3::Y).length() < 1e-9 && (r.x_axis - DVec3::X).length() < 1e-9 && (r.y_axis + DVec3::Z).length() < 1e-9);
+}
+
+#[test]
+fn a_mask_of_instant_ngp_hides_what_is_not_black() {
+    let dir = tempfile::tempdir().unwrap();
+    let c = capture(dir.path());
+    transforms_json::write(&dir.path().join("transforms.json"), dir.path(), &c).unwrap();
+    let photo_file = &c.frames[1].image;
+    let mask = photo_file.with_file_name(format!("dynamic_mask_{}.png", photo_file.file_stem().unwrap().to_str().unwrap()));
+    let data = (0..20 * 16).flat_map(|i| if i % 20 < 5 { [0, 90, 0] } else { [0; 3] }).collect();
+    photo::save_png(&mask, &ImageU8 { width: 20, height: 16, channels: 3, data }).unwrap();
+    let read = import::import(dir.path(), &ImportOptions::default()).unwrap();
+    assert_eq!(read.frames.iter().filter(|f| f.mask.is_some()).count(), 1);
+    let m = photo::load_mask(read.frames[1].mask.as_ref().unwrap()).unwrap();
+    assert_eq!((m.pixel(4, 3)[0], m.pixel(5, 3)[0]), (0, 255));
 }
 
 /// The folder of real captures, or a line that says that the test was skipped.

@@ -27,6 +27,26 @@ pub struct Frame {
     pub color_space: ColorSpace,
 }
 
+impl Frame {
+    /// A training photograph about which no more is known than where it was taken.
+    pub fn new(name: impl Into<String>, image: impl Into<PathBuf>, camera: Camera, world_from_camera: Pose) -> Frame {
+        Frame {
+            name: name.into(),
+            image: image.into(),
+            camera,
+            world_from_camera,
+            mask: None,
+            depth: None,
+            time: None,
+            session: None,
+            labels: None,
+            conditioning: Vec::new(),
+            split: Split::Train,
+            color_space: ColorSpace::Srgb,
+        }
+    }
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ColorSpace {

@@ -207,7 +207,7 @@ impl Config {
             },
             loss: LossConfig {
                 color: if ngp { "huber" } else { "mse" }.into(),
-                distortion: 0.0,
+                distortion: if ngp { 1e-2 } else { 0.0 },
                 alpha: 0.0,
                 near_scaling: if ngp { 1.0 } else { 0.0 },
             },

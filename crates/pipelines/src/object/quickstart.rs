@@ -11,7 +11,7 @@ use crate::error::Result;
 use diorama_data::{DataError, photo, transforms_json};
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::train::{Event, Summary};
-use diorama_geom::capture::{ColorSpace, Frame, Split};
+use diorama_geom::capture::{Frame, Split};
 use diorama_geom::{Capture, ImageU8, Similarity};
 use diorama_scenes::still_life;
 use serde::Serialize;
@@ -40,20 +40,8 @@ pub fn write_capture(folder: &Path, views: usize, size: u32) -> Result<()> {
     for (i, p) in still_life::photographs(views, size).into_iter().enumerate() {
         let image = images.join(format!("{}.png", p.name));
         photo::save_png(&image, &p.image)?;
-        frames.push(Frame {
-            name: p.name,
-            image,
-            camera: p.camera,
-            world_from_camera: p.world_from_camera,
-            mask: None,
-            depth: None,
-            time: None,
-            session: None,
-            labels: None,
-            conditioning: Vec::new(),
-            split: if i % 8 == 0 { Split::Test } else { Split::Train },
-            color_space: ColorSpace::Srgb,
-        });
+        let split = if i % 8 == 0 { Split::Test } else { Split::Train };
+        frames.push(Frame { split, ..Frame::new(p.name, image, p.camera, p.world_from_camera) });
     }
     let capture = Capture { frames, world_from_capture: Similarity::IDENTITY, scene: still_life::scene_box(), notes: Vec::new() };
     Ok(transforms_json::write(&folder.join("transforms.json"), folder, &capture)?)
