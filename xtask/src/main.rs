@@ -31,6 +31,13 @@ fn installed(tool: &str) -> bool {
     Command::new("cargo").args([tool, "--version"]).stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
 }
 
+/// The libraries' tests with a lesser instruction set than this machine's best.
+fn libraries_at(level: &str) -> bool {
+    println!("\n$ DIORAMA_SIMD={level} cargo test --release --workspace --lib");
+    let args = ["test", "--release", "--workspace", "--lib", "--", "--quiet"];
+    Command::new("cargo").args(args).env("DIORAMA_SIMD", level).status().is_ok_and(|s| s.success())
+}
+
 /// Everything that must pass before a change lands.
 fn ci() -> bool {
     let mut ok = step("tidy", tidy::run());
@@ -38,6 +45,10 @@ fn ci() -> bool {
     ok &= step("clippy", cargo(&["clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"]));
     let (passed, failed, skipped) = tests();
     ok &= step("tests", failed == 0 && passed > 0);
+    for level in ["portable", "avx2"] {
+        // A level that this machine lacks falls back to the best it has.
+        ok &= step(level, libraries_at(level));
+    }
     ok &= step("docs", cargo(&["doc", "--release", "--workspace", "--no-deps"]));
     for (tool, args) in [("deny", &["deny", "check", "licenses", "bans", "sources"][..]), ("typos", &["typos"][..])] {
         if installed(tool) {

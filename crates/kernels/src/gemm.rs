@@ -104,6 +104,8 @@ pub fn gemm(
             Level::Avx512 => g.run_avx512(c),
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => g.run_avx2(c),
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => g.run::<simd::Neon, 6, 4>(c),
             _ => g.run::<Plain, 4, 2>(c),
         }
     }

@@ -50,6 +50,9 @@ pub fn fma_peak(rounds: usize) -> f64 {
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Level::Avx2 => (8, |r| unsafe { chains_avx2(r) }),
+        // SAFETY: as above.
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => (4, |r| unsafe { chains::<simd::Neon>(r) }),
         // SAFETY: plain Rust.
         _ => (8, |r| unsafe { chains::<Plain>(r) }),
     };

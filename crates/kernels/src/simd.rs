@@ -11,8 +11,10 @@ pub enum Level {
     Portable = 1,
     /// AVX2 with FMA, 8 floats.
     Avx2 = 2,
-    /// AVX-512F, 16 floats.
+    /// AVX-512 (F, DQ, BW, VL), 16 floats.
     Avx512 = 3,
+    /// NEON, 4 floats; every 64-bit ARM has it.
+    Neon = 4,
 }
 
 impl Level {
@@ -21,6 +23,7 @@ impl Level {
             Level::Portable => "portable",
             Level::Avx2 => "avx2",
             Level::Avx512 => "avx512",
+            Level::Neon => "neon",
         }
     }
 
@@ -31,15 +34,22 @@ impl Level {
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
             #[cfg(target_arch = "x86_64")]
-            Level::Avx512 => is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") && Level::Avx2.is_available(),
-            #[cfg(not(target_arch = "x86_64"))]
+            Level::Avx512 => {
+                is_x86_feature_detected!("avx512f")
+                    && is_x86_feature_detected!("avx512dq")
+                    && is_x86_feature_detected!("avx512bw")
+                    && is_x86_feature_detected!("avx512vl")
+                    && Level::Avx2.is_available()
+            }
+            #[cfg(target_arch = "aarch64")]
+            Level::Neon => true,
             _ => false,
         }
     }
 
     /// The levels that this machine can run, slowest first.
     pub fn available() -> Vec<Level> {
-        [Level::Portable, Level::Avx2, Level::Avx512].into_iter().filter(|l| l.is_available()).collect()
+        [Level::Portable, Level::Avx2, Level::Avx512, Level::Neon].into_iter().filter(|l| l.is_available()).collect()
     }
 }
 
@@ -58,6 +68,7 @@ pub fn level() -> Level {
         1 => Level::Portable,
         2 => Level::Avx2,
         3 => Level::Avx512,
+        4 => Level::Neon,
         _ => {
             let best = *Level::available().last().unwrap_or(&Level::Portable);
             let wanted = std::env::var("DIORAMA_SIMD").ok();
@@ -131,48 +142,65 @@ unsafe impl Lane for Plain {
 #[cfg(target_arch = "x86_64")]
 pub use x86::{Avx2, Avx512};
 
+#[cfg(target_arch = "aarch64")]
+pub use arm::Neon;
+
+#[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
+macro_rules! lane {
+    ($(#[$doc:meta])* $name:ident, $n:literal, $v:ty, $set:ident, $load:ident, $store:ident, $fma:expr, $max:ident) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy)]
+        pub struct $name;
+        // SAFETY: callers uphold the trait's contract: right CPU, valid pointers.
+        #[allow(unused_unsafe)]
+        unsafe impl Lane for $name {
+            const N: usize = $n;
+            type V = $v;
+            #[inline(always)]
+            unsafe fn splat(x: f32) -> $v {
+                // SAFETY: see the impl.
+                unsafe { $set(x) }
+            }
+            #[inline(always)]
+            unsafe fn load(p: *const f32) -> $v {
+                // SAFETY: see the impl.
+                unsafe { $load(p) }
+            }
+            #[inline(always)]
+            unsafe fn store(p: *mut f32, v: $v) {
+                // SAFETY: see the impl.
+                unsafe { $store(p, v) }
+            }
+            #[inline(always)]
+            unsafe fn fma(a: $v, b: $v, c: $v) -> $v {
+                // SAFETY: see the impl.
+                unsafe { ($fma)(a, b, c) }
+            }
+            #[inline(always)]
+            unsafe fn max(a: $v, b: $v) -> $v {
+                // SAFETY: see the impl.
+                unsafe { $max(a, b) }
+            }
+        }
+    };
+}
+
+#[cfg(target_arch = "aarch64")]
+mod arm {
+    use super::Lane;
+    use std::arch::aarch64::*;
+
+    lane!(
+        /// 128-bit vectors.
+        Neon, 4, float32x4_t, vdupq_n_f32, vld1q_f32, vst1q_f32, |a, b, c| vfmaq_f32(c, a, b), vmaxq_f32
+    );
+}
+
 #[cfg(target_arch = "x86_64")]
 mod x86 {
     use super::Lane;
     use std::arch::x86_64::*;
 
-    macro_rules! lane {
-        ($(#[$doc:meta])* $name:ident, $n:literal, $v:ty, $set:ident, $load:ident, $store:ident, $fma:ident, $max:ident) => {
-            $(#[$doc])*
-            #[derive(Clone, Copy)]
-            pub struct $name;
-            // SAFETY: callers uphold the trait's contract: right CPU, valid pointers.
-            unsafe impl Lane for $name {
-                const N: usize = $n;
-                type V = $v;
-                #[inline(always)]
-                unsafe fn splat(x: f32) -> $v {
-                    // SAFETY: see the impl.
-                    unsafe { $set(x) }
-                }
-                #[inline(always)]
-                unsafe fn load(p: *const f32) -> $v {
-                    // SAFETY: see the impl.
-                    unsafe { $load(p) }
-                }
-                #[inline(always)]
-                unsafe fn store(p: *mut f32, v: $v) {
-                    // SAFETY: see the impl.
-                    unsafe { $store(p, v) }
-                }
-                #[inline(always)]
-                unsafe fn fma(a: $v, b: $v, c: $v) -> $v {
-                    // SAFETY: see the impl.
-                    unsafe { $fma(a, b, c) }
-                }
-                #[inline(always)]
-                unsafe fn max(a: $v, b: $v) -> $v {
-                    // SAFETY: see the impl.
-                    unsafe { $max(a, b) }
-                }
-            }
-        };
-    }
     lane!(
         /// 256-bit vectors.
         Avx2, 8, __m256, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_max_ps

@@ -145,10 +145,17 @@ impl Field {
         }
         let total = place(&mut v.waves[..v.used], &mut v.next, rays.jitter.len(), &mut samples.offsets);
         let waves = &v.waves[..v.used];
-        gather(waves, 1, total, &mut samples.t, |w| &w.marched.t);
-        gather(waves, 1, total, &mut samples.dt, |w| &w.marched.dt);
-        gather(waves, 3, total, positions, |w| &w.positions);
-        gather(waves, 3, total, &mut buf.unit, |w| &w.unit);
+        let (t, dt, unit) = (&mut samples.t, &mut samples.dt, &mut buf.unit);
+        rayon::join(
+            || {
+                gather(waves, 1, total, t, |w| &w.marched.t);
+                gather(waves, 3, total, positions, |w| &w.positions);
+            },
+            || {
+                gather(waves, 1, total, dt, |w| &w.marched.dt);
+                gather(waves, 3, total, unit, |w| &w.unit);
+            },
+        );
         let f = encoding.config.features;
         buf.features.resize(total * encoding.output_dims(), 0.0);
         if total > 0 {
