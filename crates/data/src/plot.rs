@@ -93,11 +93,15 @@ fn marks(chart: &Chart, top: f64) -> Vec<Mark> {
     out.push(Mark::Line { points: vec![(left, up), (left, down), (right, down)], color: ink, width: 1.0 });
     out.push(Mark::Text { at: ((left + right) / 2.0, down + 26.0), text: chart.x.clone(), anchor: 0.5, color: ink });
     out.push(Mark::Text { at: (left - 56.0, up - 14.0), text: chart.y.clone(), anchor: 0.0, color: ink });
+    // The names stand where the curves do not end.
+    let at_the_right: Vec<f64> = all.iter().filter(|p| px(p.0) > 0.25 * left + 0.75 * right).map(|p| py(p.1)).collect();
+    let end = at_the_right.iter().sum::<f64>() / at_the_right.len().max(1) as f64;
+    let names = if end < 0.5 * (up + down) { down - 4.0 - 13.0 * chart.series.len() as f64 } else { up + 4.0 };
     for (i, s) in chart.series.iter().enumerate() {
         let color = COLORS[i % COLORS.len()];
         let points = s.points.iter().filter(|p| p.0.is_finite() && p.1.is_finite()).map(|p| (px(p.0), py(p.1))).collect();
         out.push(Mark::Line { points, color, width: 2.0 });
-        out.push(Mark::Text { at: (right - 4.0, up + 4.0 + 13.0 * i as f64), text: s.name.clone(), anchor: 1.0, color });
+        out.push(Mark::Text { at: (right - 4.0, names + 13.0 * i as f64), text: s.name.clone(), anchor: 1.0, color });
     }
     out
 }
