@@ -22,7 +22,12 @@ fn every_level_trains_alike_and_tells_its_figures() {
         let text = String::from_utf8_lossy(&out.stderr);
         assert!(out.status.success() && text.contains(level.name()), "{}: {text}", level.name());
         let v: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
-        println!("{}: {:.0} rays/s, {:.0} samples/s", level.name(), v["rays_per_s"].as_f64().unwrap(), v["samples_per_s"].as_f64().unwrap());
+        println!(
+            "{}: {:.0} rays/s, {:.0} samples/s",
+            level.name(),
+            v["rays_per_s"].as_f64().unwrap(),
+            v["samples_per_s"].as_f64().unwrap()
+        );
         losses.push(v["psnr_train"].as_f64().unwrap());
     }
     assert!(losses[0] > 12.0, "80 steps teach something: {losses:?}");

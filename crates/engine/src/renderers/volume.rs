@@ -68,7 +68,7 @@ impl Quality {
     pub fn pruning(self) -> Pruning {
         match self {
             Quality::Full => Pruning { stop: 1e-4, min_alpha: 0.0, min_weight: 0.0 },
-            Quality::Fast => Pruning { stop: 2e-2, min_alpha: 0.0, min_weight: 4e-3 },
+            Quality::Fast => Pruning { stop: 1e-2, min_alpha: 4e-3, min_weight: 5e-4 },
         }
     }
 
@@ -355,5 +355,66 @@ mod tests {
         tracer.clip = Some(([0.45, 0.0, 0.45], [0.55, 1.0, 0.55]));
         let v = tracer.view(&camera, &mut |_| {});
         assert!(v.opacity.data[40] > 0.9 && v.opacity.data[42] == 0.0);
+    }
+
+    fn picture(w: usize, h: usize, f: impl Fn(usize, usize) -> f32) -> View {
+        let mut v = View { rgb: Image::zeros(w, h, 3), opacity: Image::zeros(w, h, 1), depth: Image::zeros(w, h, 1) };
+        for i in 0..w * h {
+            v.rgb.data[i * 3..i * 3 + 3].fill(f(i % w, i / w));
+            (v.opacity.data[i], v.depth.data[i]) = (1.0, 2.0);
+        }
+        v
+    }
+
+    #[test]
+    fn pixels_are_interpolated_where_neighbours_agree_and_traced_where_not() {
+        let (w, h) = (17, 13);
+        let ramp = |x: usize, y: usize| 0.001 * x as f32 + 0.002 * y as f32;
+        let mut v = picture(w, h, |x, y| if x % 4 == 0 && y % 4 == 0 { ramp(x, y) } else { 9.0 });
+        let mut wanted = Vec::new();
+        for stride in [4, 2] {
+            wanted.clear();
+            between(&mut v, stride, 0.05, &mut wanted);
+            // Lattice cells that reach beyond the picture have no corners to go by.
+            assert!(wanted.iter().all(|&p| p as usize % w >= 16 || p as usize / w >= 12), "{wanted:?}");
+            wanted.iter().for_each(|&p| v.rgb.data[p as usize * 3..][..3].fill(ramp(p as usize % w, p as usize / w)));
+        }
+        for i in (0..w * h).filter(|i| i % w < 16 && i / w < 12) {
+            assert!((v.rgb.data[i * 3] - ramp(i % w, i / w)).abs() < 1e-6, "pixel {i}");
+        }
+        let mut edge = picture(w, h, |x, _| (x > 7) as u8 as f32);
+        wanted.clear();
+        between(&mut edge, 4, 0.05, &mut wanted);
+        assert!(wanted.contains(&(2 * w as u32 + 6)) && !wanted.contains(&(2 * w as u32 + 2)), "{wanted:?}");
+    }
+
+    #[test]
+    fn a_fast_view_is_close_to_a_full_one() {
+        let grid = HashGridConfig { levels: 3, features: 2, log2_size: 10, base: 4, finest: 16 };
+        let mut field = fields::ngp(grid, 1.0, false, 1e-2, 0, 0, 1);
+        field.net.sigma.shift = 3.0;
+        let occupancy = Occupancy::new(16, 1);
+        let pose = Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z);
+        let camera = PosedCamera { camera: Camera::pinhole(40, 32, 0.6), pose };
+        let draw = |quality: Quality| {
+            let tracer = Tracer {
+                field: &field,
+                sampling: Sampling::Occupancy { grid: &occupancy, max_samples: 1024 },
+                backdrop: Backdrop::Color([0.2, 0.5, 0.9]),
+                near: 0.1,
+                cube: (0.0, 1.0),
+                clip: None,
+                pruning: quality.pruning(),
+                appearance: None,
+                tolerance: quality.tolerance(),
+            };
+            let mut rays = 0;
+            let view = tracer.view(&camera, &mut |rows| rays += rows * 40);
+            (view.rgb.data, rays)
+        };
+        let ((full, all), (fast, some)) = (draw(Quality::Full), draw(Quality::Fast));
+        let mse = full.iter().zip(&fast).map(|(a, b)| (a - b).powi(2)).sum::<f32>() / full.len() as f32;
+        assert!(mse > 0.0 && mse < 1e-3, "{mse}");
+        assert!(some < all, "{some} of {all} pixels");
     }
 }
