@@ -178,7 +178,7 @@ impl Config {
     pub fn new(method: Method, path: PathBuf) -> Config {
         let ngp = method == Method::Ngp;
         let (rate, rays, steps) = match method {
-            Method::Ngp => (1e-2, 0, 6000),
+            Method::Ngp => (1.5e-2, 0, 6000),
             Method::Nerf => (5e-4, 512, 20_000),
             Method::Mlp => (1e-3, 128, 40_000),
             Method::Baseline => (1e-3, 256, 4000),
@@ -225,7 +225,7 @@ impl Config {
                 importance: 128,
                 max_samples: 1024,
                 stop: 1e-4,
-                min_alpha: 1e-3,
+                min_alpha: 3e-3,
                 near: 0.1,
                 occupancy_resolution: 128,
                 occupancy_points: 1 << 16,

@@ -37,6 +37,9 @@ const FINE: u64 = 14;
 /// Steps during which an occupancy sample stands for a block of cells, and that block's edge.
 const OCCUPANCY_WARMUP: (u64, usize) = (256, 2);
 
+/// Steps between which the samples per step grow from a quarter to all.
+const BATCH_RAMP: (u64, u64) = (256, 1024);
+
 /// Reads the capture that a configuration names.
 pub fn load_capture(config: &Config) -> Result<Capture> {
     let split = config.data.split.parse().map_err(PipelineError::Usage)?;
@@ -215,18 +218,21 @@ impl<'a> Trainer<'a> {
         }
     }
 
-    /// As many rays as give about the wanted number of samples.
-    fn rays(&self) -> usize {
+    /// As many rays as give about the wanted number of samples, fewer while coarse steps in quick succession
+    /// teach more.
+    fn rays(&self, step: u64) -> usize {
         let s = &self.model.config.sampling;
         if s.rays > 0 {
             return s.rays;
         }
-        let n = s.batch_samples as f64 / self.model.samples_per_ray.max(1.0);
+        let (from, until) = BATCH_RAMP;
+        let grown = step.saturating_sub(from) as f64 / (until - from) as f64;
+        let n = s.batch_samples as f64 * (0.25 + 0.75 * grown.min(1.0)) / self.model.samples_per_ray.max(1.0);
         (n as usize).clamp(64, 1 << 14).next_multiple_of(64)
     }
 
-    fn draw(&mut self, first: u64) {
-        let n = self.rays();
+    fn draw(&mut self, step: u64, first: u64) {
+        let n = self.rays(step);
         let m = &self.model;
         self.buffers.batch.resize(n);
         let options = DrawOptions {
@@ -407,7 +413,7 @@ impl Trainee for Trainer<'_> {
 
     fn step(&mut self, step: u64, progress: f64) -> StepReport {
         let first = self.model.origin.rays;
-        self.draw(first);
+        self.draw(step, first);
         let (loss, samples) = match self.model.config.method {
             Method::Ngp => self.step_ngp(step),
             Method::Mlp | Method::Baseline => self.step_stratified(first),
