@@ -19,6 +19,10 @@ const RAYS: usize = 64;
 /// Samples per ray in the first wave and at most.
 const WAVE: (usize, usize) = (24, 96);
 
+/// Density per inner cube, a little below what fields start from: what is denser is never left out as too thin,
+/// else a field whose steps are short could lose all of its samples before it has learned anything.
+const THIN: f32 = 0.7;
+
 /// Stands for a sample that is left out, and for the density of one that no light reaches.
 const DROPPED: f32 = -1.0;
 
@@ -27,7 +31,7 @@ const DROPPED: f32 = -1.0;
 pub struct Pruning {
     /// Samples behind which less than this share of light arrives.
     pub stop: f32,
-    /// Samples of less opacity than this.
+    /// Samples of less opacity than this, unless they are denser than [`THIN`].
     pub min_alpha: f32,
     /// Samples of less weight in the pixel than this.
     pub min_weight: f32,
@@ -275,7 +279,7 @@ impl Wave {
                     }
                     let weight = light[r] * alpha[i];
                     light[r] -= weight;
-                    if alpha[i] < pruning.min_alpha || weight < pruning.min_weight {
+                    if alpha[i] < pruning.min_alpha.min(THIN * dt[first + i]) || weight < pruning.min_weight {
                         alpha[i] = DROPPED;
                     } else {
                         counts[r] += 1;
@@ -413,14 +417,14 @@ mod tests {
         let (all, at) = s.plain();
         let mut sigma = vec![0.0; all.t.len()];
         s.field.density(&at, &mut sigma);
-        let pruning = Pruning { stop: 0.3, min_alpha: 0.01, min_weight: 0.006 };
+        let pruning = Pruning { stop: 0.3, min_alpha: 0.0015, min_weight: 0.006 };
         let (got, _, buf) = s.visible(pruning);
         let mut want = Vec::new();
         for w in all.offsets.windows(2) {
             let mut light = 1.0;
             for i in w[0] as usize..w[1] as usize {
                 let alpha = 1.0 - (-sigma[i] * all.dt[i]).exp();
-                if light >= pruning.stop && alpha >= pruning.min_alpha && light * alpha >= pruning.min_weight {
+                if light >= pruning.stop && alpha >= pruning.min_alpha.min(THIN * all.dt[i]) && light * alpha >= pruning.min_weight {
                     want.push(all.t[i]);
                 }
                 light *= 1.0 - alpha;

@@ -68,7 +68,7 @@ impl Quality {
     pub fn pruning(self) -> Pruning {
         match self {
             Quality::Full => Pruning { stop: 1e-4, min_alpha: 0.0, min_weight: 0.0 },
-            Quality::Fast => Pruning { stop: 1e-2, min_alpha: 4e-3, min_weight: 5e-4 },
+            Quality::Fast => Pruning { stop: 2e-2, min_alpha: 4e-3, min_weight: 4e-3 },
         }
     }
 
