@@ -45,7 +45,7 @@ const SWITCHES: [(&str, &str, &[(&str, &str)]); 43] = [
     ("optim.decay_from", "0.9", &[]),
     ("optim.weight_decay", "0.1", &[]),
     ("sampling.rays", "128", &[]),
-    ("sampling.batch_samples", "65536", &[]),
+    ("sampling.batch_samples", "1048576", &[]),
     ("sampling.samples", "16", &[("method", "mlp")]),
     ("sampling.importance", "8", &[("method", "nerf"), ("sampling.samples", "8"), ("sampling.rays", "16")]),
     ("sampling.max_samples", "16", &[]),

@@ -19,10 +19,6 @@ const RAYS: usize = 64;
 /// Samples per ray in the first wave and at most.
 const WAVE: (usize, usize) = (24, 96);
 
-/// Density per inner cube, a little below what fields start from: what is denser is never left out as too thin,
-/// else a field whose steps are short could lose all of its samples before it has learned anything.
-const THIN: f32 = 0.7;
-
 /// Stands for a sample that is left out, and for the density of one that no light reaches.
 const DROPPED: f32 = -1.0;
 
@@ -31,8 +27,10 @@ const DROPPED: f32 = -1.0;
 pub struct Pruning {
     /// Samples behind which less than this share of light arrives.
     pub stop: f32,
-    /// Samples of less opacity than this, unless they are denser than [`THIN`].
+    /// Samples of less opacity than this, unless they are denser than `thin`.
     pub min_alpha: f32,
+    /// Density per inner cube from which a sample is never left out for its opacity, however short its step.
+    pub thin: f32,
     /// Samples of less weight in the pixel than this.
     pub min_weight: f32,
 }
@@ -84,6 +82,15 @@ impl VisibleBuffers {
     /// light reaches are negative.
     pub fn seen(&self) -> impl Iterator<Item = (&[u32], &[f32])> {
         self.waves[..self.used].iter().map(|w| (&w.marched.cells[..], &w.sigma[..]))
+    }
+
+    /// Share of light that passes all samples of the last march, left out or not, per ray `[R]`.
+    pub fn light(&self, rays: usize) -> Vec<f32> {
+        let mut light = vec![1.0; rays];
+        for w in &self.waves[..self.used] {
+            w.crew.rays.iter().zip(&w.light).for_each(|(r, l)| light[*r as usize] = *l);
+        }
+        light
     }
 
     /// Samples that were marched to.
@@ -279,7 +286,7 @@ impl Wave {
                     }
                     let weight = light[r] * alpha[i];
                     light[r] -= weight;
-                    if alpha[i] < pruning.min_alpha.min(THIN * dt[first + i]) || weight < pruning.min_weight {
+                    if alpha[i] < pruning.min_alpha.min(pruning.thin * dt[first + i]) || weight < pruning.min_weight {
                         alpha[i] = DROPPED;
                     } else {
                         counts[r] += 1;
@@ -397,7 +404,7 @@ mod tests {
     #[test]
     fn waves_without_pruning_equal_one_march() {
         let s = scene();
-        let (got, positions, buf) = s.visible(Pruning { stop: 0.0, min_alpha: 0.0, min_weight: 0.0 });
+        let (got, positions, buf) = s.visible(Pruning { stop: 0.0, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 });
         let (want, at) = s.plain();
         assert!(want.offsets.windows(2).any(|w| w[1] - w[0] > 3 * WAVE.0 as u32), "several waves are wanted");
         assert_eq!((&got.offsets, &got.t, &got.dt), (&want.offsets, &want.t, &want.dt));
@@ -417,14 +424,15 @@ mod tests {
         let (all, at) = s.plain();
         let mut sigma = vec![0.0; all.t.len()];
         s.field.density(&at, &mut sigma);
-        let pruning = Pruning { stop: 0.3, min_alpha: 0.0015, min_weight: 0.006 };
+        let pruning = Pruning { stop: 0.3, min_alpha: 0.0015, thin: 0.7, min_weight: 0.006 };
         let (got, _, buf) = s.visible(pruning);
         let mut want = Vec::new();
         for w in all.offsets.windows(2) {
             let mut light = 1.0;
             for i in w[0] as usize..w[1] as usize {
                 let alpha = 1.0 - (-sigma[i] * all.dt[i]).exp();
-                if light >= pruning.stop && alpha >= pruning.min_alpha.min(THIN * all.dt[i]) && light * alpha >= pruning.min_weight {
+                if light >= pruning.stop && alpha >= pruning.min_alpha.min(pruning.thin * all.dt[i]) && light * alpha >= pruning.min_weight
+                {
                     want.push(all.t[i]);
                 }
                 light *= 1.0 - alpha;
@@ -436,5 +444,16 @@ mod tests {
         assert!(missing <= 2 && got.t.len().abs_diff(want.len()) <= 2, "{missing} of {} and {}", want.len(), got.t.len());
         let met: usize = buf.visible.seen().map(|(_, s)| s.iter().filter(|s| **s >= 0.0).count()).sum();
         assert!(met >= got.t.len() && met < buf.visible.marched(), "only what light reaches is told");
+    }
+
+    #[test]
+    fn a_field_that_knows_nothing_keeps_its_samples_however_short_the_steps() {
+        let mut s = scene();
+        s.field = fields::ngp(HashGridConfig { levels: 4, features: 2, log2_size: 10, base: 4, finest: 32 }, 1.0, false, 1e-2, 0, 0, 1);
+        let config = MarchConfig { cone: 0.0, dt_min: 0.0005, dt_max: 0.0005, max_samples: 1000 };
+        let pruning = Pruning { stop: 1e-4, min_alpha: 0.003, thin: 0.7, min_weight: 0.0 };
+        let (mut samples, mut positions, mut buf) = (Marched::default(), Vec::new(), FieldBuffers::default());
+        s.field.visible(&s.grid, &s.rays(), &config, pruning, &mut samples, &mut positions, &mut buf);
+        assert!(samples.t.len() > 1000 && samples.t.len() == buf.visible.marched(), "{} of {}", samples.t.len(), buf.visible.marched());
     }
 }

@@ -67,8 +67,8 @@ impl Quality {
     /// What is left out of a view.
     pub fn pruning(self) -> Pruning {
         match self {
-            Quality::Full => Pruning { stop: 1e-4, min_alpha: 0.0, min_weight: 0.0 },
-            Quality::Fast => Pruning { stop: 2e-2, min_alpha: 4e-3, min_weight: 4e-3 },
+            Quality::Full => Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
+            Quality::Fast => Pruning { stop: 3e-2, min_alpha: 1e-2, thin: f32::INFINITY, min_weight: 1e-2 },
         }
     }
 
@@ -76,7 +76,7 @@ impl Quality {
     pub fn tolerance(self) -> f32 {
         match self {
             Quality::Full => 0.0,
-            Quality::Fast => 0.03,
+            Quality::Fast => 0.05,
         }
     }
 }
@@ -115,6 +115,21 @@ pub struct Traced {
     pub rgb: Vec<f32>,
     pub opacity: Vec<f32>,
     pub depth: Vec<f32>,
+}
+
+impl Traced {
+    /// Scales each ray to the opacity `1 − light` that it has with the samples that were left out.
+    fn make_up(&mut self, light: &[f32], stop: f32) {
+        for (r, light) in light.iter().enumerate() {
+            let full = if *light < stop { 1.0 } else { 1.0 - light };
+            let kept = self.opacity[r];
+            if kept > 1e-3 && full > kept {
+                let by = full / kept;
+                self.rgb[r * 3..r * 3 + 3].iter_mut().for_each(|v| *v *= by);
+                (self.opacity[r], self.depth[r]) = (full, self.depth[r] * by);
+            }
+        }
+    }
 }
 
 impl Tracer<'_> {
@@ -185,7 +200,11 @@ impl Tracer<'_> {
                 let (mut marched, mut positions) = (Marched::default(), Vec::new());
                 self.field.visible(&grid.bits, &rays, &grid.march_config(max_samples), self.pruning, &mut marched, &mut positions, buf);
                 self.composite(self.field, batch, &marched, &positions, buf);
-                taken(buf)
+                let mut out = taken(buf);
+                if self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0 {
+                    out.make_up(&buf.visible.light(batch.len()), self.pruning.stop);
+                }
+                out
             }
             Sampling::Stratified { samples } => {
                 let mut marched = Marched::default();
@@ -305,7 +324,7 @@ mod tests {
             near: 0.1,
             cube: (0.0, 1.0),
             clip: None,
-            pruning: Pruning { stop: 0.0, min_alpha: 0.0, min_weight: 0.0 },
+            pruning: Pruning { stop: 0.0, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             appearance: None,
             tolerance: 0.0,
         };
@@ -347,7 +366,7 @@ mod tests {
             near: 0.1,
             cube: (0.0, 1.0),
             clip: None,
-            pruning: Pruning { stop: 1e-4, min_alpha: 0.0, min_weight: 0.0 },
+            pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             appearance: None,
             tolerance: 0.0,
         };

@@ -40,6 +40,14 @@ const OCCUPANCY_WARMUP: (u64, usize) = (256, 2);
 /// Steps between which the samples per step grow from a quarter to all.
 const BATCH_RAMP: (u64, u64) = (256, 1024);
 
+/// How much longer the steps of a march are at first, and the training step from which they have their own length:
+/// what a scene is roughly like is learned from few samples per ray and so from many rays.
+const MARCH_RAMP: (f32, u64) = (16.0, 1024);
+
+/// Density per inner cube, a little below what fields start from: what is denser is trained on however short its
+/// step, else a field could lose all of its samples before it has learned anything.
+const THIN: f32 = 0.7;
+
 /// Reads the capture that a configuration names.
 pub fn load_capture(config: &Config) -> Result<Capture> {
     let split = config.data.split.parse().map_err(PipelineError::Usage)?;
@@ -288,8 +296,10 @@ impl<'a> Trainer<'a> {
             jitter: &b.batch.jitter,
             resumed: false,
         };
-        let pruning = Pruning { stop: s.stop, min_alpha: s.min_alpha, min_weight: 0.0 };
-        let march = grid.march_config(s.max_samples);
+        let pruning = Pruning { stop: s.stop, min_alpha: s.min_alpha, thin: THIN, min_weight: 0.0 };
+        let (stretch, until) = MARCH_RAMP;
+        let stretch = stretch.powf(1.0 - step.min(until) as f32 / until as f32);
+        let march = grid.march_config(s.max_samples).stretched(stretch);
         m.field.visible(&grid.bits, &rays, &march, pruning, &mut b.marched, &mut b.positions, &mut b.field);
         b.field.visible.seen().for_each(|(cells, sigma)| grid.record(cells, sigma));
         self.marched += b.field.visible.marched() as u64;

@@ -120,6 +120,13 @@ pub struct MarchConfig {
     pub max_samples: usize,
 }
 
+impl MarchConfig {
+    /// The same marching with steps `by` times as long.
+    pub fn stretched(self, by: f32) -> Self {
+        MarchConfig { cone: self.cone * by, dt_min: self.dt_min * by, dt_max: self.dt_max * by, ..self }
+    }
+}
+
 /// Rays in model space.
 #[derive(Clone, Copy, Debug)]
 pub struct MarchRays<'a> {
