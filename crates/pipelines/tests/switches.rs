@@ -50,7 +50,7 @@ const SWITCHES: [(&str, &str, &[(&str, &str)]); 43] = [
     ("sampling.importance", "8", &[("method", "nerf"), ("sampling.samples", "8"), ("sampling.rays", "16")]),
     ("sampling.max_samples", "16", &[]),
     ("sampling.stop", "0.5", &[]),
-    ("sampling.min_alpha", "0.1", &[]),
+    ("sampling.min_alpha", "0.1", &[("optim.rate", "0.3")]),
     ("sampling.near", "2.0", &[]),
     ("sampling.occupancy_resolution", "32", &[]),
     ("sampling.occupancy_points", "512", &[]),
