@@ -63,6 +63,9 @@ enum Bench {
     /// Frames per second of a run's held-out views, and what the fast quality costs
     #[command(after_help = "Example:\n  diorama bench render runs/chair --json")]
     Render(BenchRenderArgs),
+    /// Every op on a GPU against its f64 reference; exit code 1 if one is wrong
+    #[command(after_help = "Example:\n  diorama bench check --device vulkan")]
+    Check(BenchCheckArgs),
 }
 
 /// Flags of `train`.
@@ -317,8 +320,19 @@ pub struct BenchRenderArgs {
     pub json: bool,
 }
 
+/// Flags of `bench check`.
+#[derive(Args, Clone, Debug)]
+pub struct BenchCheckArgs {
+    /// cuda, vulkan, metal or webgpu
+    #[arg(long)]
+    pub device: String,
+    #[arg(long)]
+    pub json: bool,
+}
+
 /// Parses, runs, reports.
 pub fn main() -> ExitCode {
+    diorama_kernels::device::quiet_drivers();
     let cli = match Cli::try_parse() {
         Ok(c) => c,
         Err(e) => {
@@ -338,6 +352,7 @@ pub fn main() -> ExitCode {
         Command::Bench(Bench::Ops(a)) => a.json,
         Command::Bench(Bench::Train(a)) => a.json,
         Command::Bench(Bench::Render(a)) => a.json,
+        Command::Bench(Bench::Check(a)) => a.json,
     };
     let result = match cli.command {
         Command::Train(a) => commands::train::run(&a),
@@ -351,6 +366,7 @@ pub fn main() -> ExitCode {
         Command::Bench(Bench::Ops(a)) => commands::bench::ops(&a),
         Command::Bench(Bench::Train(a)) => commands::bench::train(&a),
         Command::Bench(Bench::Render(a)) => commands::bench::render(&a),
+        Command::Bench(Bench::Check(a)) => commands::bench::check(&a),
     };
     ExitCode::from(match result {
         Ok(Outcome::Done) => 0,

@@ -30,3 +30,76 @@ pub fn cpu() -> Cpu {
         features,
     }
 }
+
+/// How a GPU is reached.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Api {
+    Cuda,
+    Vulkan,
+    Metal,
+    WebGpu,
+}
+
+impl Api {
+    /// Best first.
+    pub const ALL: [Api; 4] = [Api::Cuda, Api::Vulkan, Api::Metal, Api::WebGpu];
+
+    /// The name that `--device` takes, which is also the feature's.
+    pub fn name(self) -> &'static str {
+        match self {
+            Api::Cuda => "cuda",
+            Api::Vulkan => "vulkan",
+            Api::Metal => "metal",
+            Api::WebGpu => "webgpu",
+        }
+    }
+
+    /// Whether this build can reach it.
+    pub fn is_built(self) -> bool {
+        match self {
+            Api::Cuda => cfg!(feature = "cuda"),
+            Api::Vulkan => cfg!(feature = "vulkan"),
+            Api::Metal => cfg!(feature = "metal"),
+            Api::WebGpu => cfg!(feature = "webgpu"),
+        }
+    }
+}
+
+impl std::str::FromStr for Api {
+    type Err = String;
+
+    fn from_str(s: &str) -> Result<Self, String> {
+        Api::ALL.into_iter().find(|a| a.name() == s).ok_or_else(|| format!("device {s:?}: expected cpu, cuda, vulkan, metal or webgpu"))
+    }
+}
+
+/// A GPU that was found.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GpuInfo {
+    pub api: Api,
+    /// What it calls itself.
+    pub name: String,
+    /// Whether the CPU plays it.
+    pub software: bool,
+}
+
+/// GPUs that this build can use on this machine, one per API, best first; never fails.
+pub fn gpus() -> Vec<GpuInfo> {
+    #[cfg(feature = "gpu")]
+    let found = |api| crate::gpu::Gpu::open(api).ok().map(|g| GpuInfo { api, name: g.name, software: g.software });
+    #[cfg(not(feature = "gpu"))]
+    let found = |_| None;
+    Api::ALL.into_iter().filter(|a| a.is_built()).filter_map(found).collect()
+}
+
+/// Keeps Mesa's device-select layer, which asks the desktop for the preferred GPU, from complaining aloud where
+/// there is no desktop; devices are chosen here anyway.
+///
+/// Must be called before the program starts a thread.
+pub fn quiet_drivers() {
+    let is_set = |name| std::env::var_os(name).is_some();
+    if cfg!(feature = "gpu") && !is_set("XDG_RUNTIME_DIR") && !is_set("NODEVICE_SELECT") {
+        // SAFETY: no other thread reads the environment yet.
+        unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
+    }
+}

@@ -8,6 +8,8 @@ mod amx;
 pub mod burn_op;
 pub mod device;
 pub mod gemm;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod math;
 pub mod ops;
 pub mod probe;

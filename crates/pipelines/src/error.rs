@@ -15,6 +15,9 @@ pub enum PipelineError {
     /// The loss was not finite twice.
     #[error("the loss was not finite twice: stopped at step {step}; {checkpoint} is the last good checkpoint; lower --set optim.rate")]
     Diverged { step: u64, checkpoint: String },
+    /// A device failed or computed wrongly.
+    #[error("{0}")]
+    Device(String),
 }
 
 impl PipelineError {
@@ -23,7 +26,7 @@ impl PipelineError {
         match self {
             PipelineError::Data(e) => e.is_input(),
             PipelineError::Usage(_) => true,
-            PipelineError::Diverged { .. } => false,
+            PipelineError::Diverged { .. } | PipelineError::Device(_) => false,
         }
     }
 
@@ -34,6 +37,7 @@ impl PipelineError {
             PipelineError::Data(_) => "io",
             PipelineError::Usage(_) => "usage",
             PipelineError::Diverged { .. } => "diverged",
+            PipelineError::Device(_) => "device",
         }
     }
 }

@@ -1,7 +1,7 @@
 //! `diorama bench`
 
 use super::{Outcome, use_threads};
-use crate::arguments::{BenchOpsArgs, BenchRenderArgs, BenchTrainArgs};
+use crate::arguments::{BenchCheckArgs, BenchOpsArgs, BenchRenderArgs, BenchTrainArgs};
 use diorama_pipelines::bench;
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::run_folder;
@@ -76,6 +76,33 @@ pub fn render(a: &BenchRenderArgs) -> Result<Outcome> {
     println!("{} views of {} x {} on {} thread(s), {}", report.views, report.width, report.height, report.threads, report.simd);
     for (name, q) in [("full", report.full), ("fast", report.fast)] {
         println!("{name}: {:.2} frames/s, {:.2} dB", q.frames_per_s, q.psnr);
+    }
+    Ok(Outcome::Done)
+}
+
+pub fn check(a: &BenchCheckArgs) -> Result<Outcome> {
+    let r = bench::check::run(&a.device)?;
+    let wrong = r.lines.iter().filter(|l| l.fault.is_some()).count();
+    if a.json {
+        println!("{}", serde_json::json!(r));
+    } else {
+        for l in &r.lines {
+            let error = l.error.map_or("FAILED ".into(), |e| format!("{e:.1e}"));
+            println!("{error}  {:<20} {:<18} {:<28} {}", l.op, l.result, l.shape, l.fault.as_deref().unwrap_or(""));
+        }
+        let atomics = if r.native_atomics { "native f32 atomics" } else { "exchanged f32 atomics" };
+        let kind = if r.software { "software" } else { "hardware" };
+        println!(
+            "{} ({}, {kind}, {atomics}): {} of {} right in {:.1} s",
+            r.device,
+            r.name,
+            r.lines.len() - wrong,
+            r.lines.len(),
+            r.seconds
+        );
+    }
+    if wrong > 0 {
+        return Err(PipelineError::Device(format!("{wrong} of {} results on {} are wrong", r.lines.len(), r.device)));
     }
     Ok(Outcome::Done)
 }

@@ -2,11 +2,16 @@
 
 use super::Outcome;
 use crate::arguments::DoctorArgs;
+use diorama_kernels::device::Api;
 use diorama_pipelines::Result;
 use std::process::{Command, Stdio};
 
 pub fn run(a: &DoctorArgs) -> Result<Outcome> {
     let cpu = diorama_kernels::device::cpu();
+    let gpus = diorama_kernels::device::gpus();
+    let devices: Vec<&str> = std::iter::once("cpu").chain(gpus.iter().map(|g| g.api.name())).collect();
+    let about: Vec<_> =
+        gpus.iter().map(|g| serde_json::json!({ "device": g.api.name(), "name": g.name, "software": g.software })).collect();
     let (total, available) = memory();
     let ffmpeg = tool("ffmpeg", "-version");
     let colmap = tool("colmap", "-h");
@@ -19,7 +24,8 @@ pub fn run(a: &DoctorArgs) -> Result<Outcome> {
             "cores": cpu.cores,
             "memory_bytes": total,
             "memory_available_bytes": available,
-            "devices": ["cpu"],
+            "devices": devices,
+            "gpus": about,
             "ffmpeg": ffmpeg,
             "colmap": colmap,
             "test_data": data,
@@ -31,7 +37,15 @@ pub fn run(a: &DoctorArgs) -> Result<Outcome> {
     println!("cpu        {} cores, {} kernels ({})", cpu.cores, cpu.level.name(), cpu.features.join(" "));
     let gib = |b: Option<u64>| b.map_or("unknown".into(), |b| format!("{:.1} GiB", b as f64 / (1u64 << 30) as f64));
     println!("memory     {}, {} available", gib(total), gib(available));
-    println!("devices    cpu (this build has no GPU kernels)");
+    let reach: Vec<_> = Api::ALL.into_iter().filter(|a| a.is_built()).map(Api::name).collect();
+    match &reach[..] {
+        [] => println!("devices    cpu (this build has no GPU kernels; build it with --features vulkan or cuda)"),
+        _ if gpus.is_empty() => println!("devices    cpu (no GPU found by {})", reach.join(", ")),
+        _ => println!("devices    cpu"),
+    }
+    for g in &gpus {
+        println!("           {}: {}{}", g.api.name(), g.name, if g.software { " (software)" } else { "" });
+    }
     let line = |name: &str, found: &Option<String>, without: &str| match found {
         Some(v) => println!("{name:<10} {v}"),
         None => println!("{name:<10} not found: {without}"),

@@ -1,6 +1,7 @@
 //! What the machine and the kernels reach: each op against the machine's own measured limits, and where
 //! a training step's time goes, and how fast views are drawn.
 
+pub mod check;
 pub mod ops;
 pub mod render;
 pub mod train;

@@ -1,6 +1,7 @@
 //! Everything that a run depends on, as written to `config.toml`.
 
 use crate::error::{PipelineError, Result};
+use diorama_kernels::device::Api;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -294,7 +295,9 @@ impl Config {
             return fail("loss.color: expected mse or huber");
         }
         if !matches!(&self.device[..], "auto" | "cpu") {
-            return Err(PipelineError::Usage(format!("device {:?} is not available in this build; use auto or cpu", self.device)));
+            let api: Api = self.device.parse().map_err(PipelineError::Usage)?;
+            let why = if api.is_built() { "training does not run on GPUs yet" } else { "this build cannot reach it" };
+            return Err(PipelineError::Usage(format!("device {}: {why}; use --device auto or cpu", self.device)));
         }
         let s = &self.sampling;
         if s.samples < 2 || s.max_samples == 0 || s.batch_samples < 64 || s.occupancy_every == 0 {

@@ -5,6 +5,8 @@
 //! moments included (as instant-ngp does for its table), and clears the gradients it has used.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

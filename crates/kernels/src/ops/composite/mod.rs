@@ -2,6 +2,8 @@
 //! `w_i = T_i (1 − e^{−σ_i δ_i})`, `T_{i+1} = T_i e^{−σ_i δ_i}`, `Ĉ = Σ w_i c_i + T_out · background`.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 pub(crate) mod tests;

@@ -2,6 +2,8 @@
 //! `Σ_ij w_i w_j |m_i − m_j| + ⅓ Σ_i w_i² δ_i` with interval midpoints `m` and lengths `δ`.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

@@ -3,6 +3,8 @@
 //! input optional, and a band window for coarse-to-fine training (Park et al. 2021, eq. 8).
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

@@ -3,6 +3,8 @@
 //! by side, which covers skip connections and split heads.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

@@ -8,6 +8,8 @@
 //! Features are level-major, `[L, S, F]`, so that a level's slice of the table stays in cache.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

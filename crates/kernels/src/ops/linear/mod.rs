@@ -1,6 +1,8 @@
 //! A fully connected layer, `y = act(x W + b)`, of any width, with one bias for all rows or one per row.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

@@ -6,6 +6,8 @@
 //! and whose cells are no smaller than its step.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

@@ -9,6 +9,8 @@
 //! composition of the others'.
 
 mod disjoint;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 pub mod step;
 #[cfg(test)]

@@ -2,6 +2,8 @@
 //! clipped to `near ≥ near_plane`; an empty interval (`near = far = 0`) when the ray misses.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

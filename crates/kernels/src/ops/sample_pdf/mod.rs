@@ -2,6 +2,8 @@
 //! the piecewise-constant density given by weights over bins. Not differentiated, as in NeRF.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

@@ -1,14 +1,14 @@
 //! Closed polynomials, up to degree 4.
 
-const C1: f32 = 0.488_602_5;
-const C2: f32 = 1.092_548_4;
-const C20: f32 = 0.946_174_7;
-const C22: f32 = 0.546_274_2;
-const C3: f32 = 0.590_043_6;
-const C31: f32 = 2.890_611_4;
-const C32: f32 = 0.457_045_8;
-const C30: f32 = 0.373_176_33;
-const C33: f32 = 1.445_305_7;
+pub(super) const C1: f32 = 0.488_602_5;
+pub(super) const C2: f32 = 1.092_548_4;
+pub(super) const C20: f32 = 0.946_174_7;
+pub(super) const C22: f32 = 0.546_274_2;
+pub(super) const C3: f32 = 0.590_043_6;
+pub(super) const C31: f32 = 2.890_611_4;
+pub(super) const C32: f32 = 0.457_045_8;
+pub(super) const C30: f32 = 0.373_176_33;
+pub(super) const C33: f32 = 1.445_305_7;
 
 /// directions `[N, 3]` to out `[N, degree²]`, all of it written.
 pub fn forward(degree: usize, dirs: &[f32], out: &mut [f32]) {

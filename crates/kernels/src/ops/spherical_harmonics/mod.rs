@@ -2,6 +2,8 @@
 //! Condon–Shortley phase, order `l² + l + m` (Sloan 2013).
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

@@ -2,6 +2,8 @@
 //! `C₂ = 0.03²`, windows inside the image only, mean over positions and channels.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

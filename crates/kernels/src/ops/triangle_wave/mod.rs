@@ -2,6 +2,8 @@
 //! `y_k = 2 |((2ᵏ x + ½) mod 2) − 1| − 1` for band `k` with the mathematical (non-negative) modulus.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

@@ -2,6 +2,8 @@
 //! names eight rows of a feature table, and a point takes their trilinear mix.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

@@ -1,0 +1,41 @@
+//! Adding f32 from many units at once.
+
+use cubecl::prelude::*;
+
+/// A cell that f32 can be added to.
+#[cube]
+pub trait Accumulate: 'static + Send + Sync {
+    type Cell: CubePrimitive;
+
+    fn add(cell: &Atomic<Self::Cell>, value: f32);
+}
+
+/// The device's own addition.
+pub struct Native;
+
+/// Exchange of the bits, which every device has.
+pub struct Swap;
+
+#[cube]
+impl Accumulate for Native {
+    type Cell = f32;
+
+    fn add(cell: &Atomic<f32>, value: f32) {
+        cell.fetch_add(value);
+    }
+}
+
+#[cube]
+impl Accumulate for Swap {
+    type Cell = u32;
+
+    fn add(cell: &Atomic<u32>, value: f32) {
+        // What was there is taken out, summed and put back; what others put there meanwhile comes out of that
+        // and is carried on.
+        let mut carry = value;
+        while carry != 0.0 {
+            let sum = f32::reinterpret(cell.exchange(0u32)) + carry;
+            carry = f32::reinterpret(cell.exchange(u32::reinterpret(sum)));
+        }
+    }
+}

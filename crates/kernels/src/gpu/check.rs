@@ -1,0 +1,597 @@
+//! Every op on a device against its f64 reference, forward and backward, over empty, single, odd and
+//! ragged shapes.
+
+use super::{Buffer, Gpu, GpuError};
+use crate::device::Api;
+use crate::ops::adam::{self, Adam};
+use crate::ops::composite::{self, Composited, Packed, gpu::GpuComposited, gpu::GpuPacked};
+use crate::ops::fused_mlp::{self, Layer, Mlp, Source};
+use crate::ops::hash_grid::{self, HashGrid, HashGridConfig, gpu::GpuHashGrid};
+use crate::ops::linear::{self, Activation, BiasKind};
+use crate::ops::march::{self, MarchConfig, MarchRays, OccupancyBits};
+use crate::ops::ngp_field::{self, FieldNet, Head};
+use crate::ops::ray_generation::{self, PosedCamera, gpu::GpuCameras};
+use crate::ops::trilinear_corner_grid::{self, Corners, gpu::GpuCorners};
+use crate::ops::{distortion, frequency, pixel_gather, ray_aabb, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave};
+use diorama_geom::glam::DVec3;
+use diorama_geom::rng::Rng;
+use diorama_geom::{Camera, Lens, Pose};
+use diorama_testkit::{compare, random, random_unit, wide};
+
+/// Largest error allowed, relative to the value plus the root mean square of all.
+pub const TOLERANCE: f64 = 1e-3;
+
+/// One line of the table.
+#[derive(Clone, Debug)]
+pub struct Row {
+    pub op: &'static str,
+    /// What was compared, for example `forward` or `d table`.
+    pub result: &'static str,
+    pub shape: String,
+    /// Largest relative error.
+    pub error: f64,
+    /// What is wrong; none: it passed.
+    pub fault: Option<String>,
+}
+
+/// The table so far.
+struct Table<'a> {
+    gpu: &'a Gpu,
+    rows: Vec<Row>,
+}
+
+impl Table<'_> {
+    fn row(&mut self, op: &'static str, result: &'static str, shape: String, outcome: Result<f64, String>) {
+        let (error, fault) = match outcome {
+            Ok(e) => (e, None),
+            Err(e) => (f64::INFINITY, Some(e)),
+        };
+        self.rows.push(Row { op, result, shape, error, fault });
+    }
+
+    fn close(&mut self, op: &'static str, result: &'static str, shape: impl ToString, got: &Buffer, want: &[f64]) -> Result<(), GpuError> {
+        let got = self.gpu.read(got)?;
+        self.row(op, result, shape.to_string(), compare(&got, want, TOLERANCE));
+        Ok(())
+    }
+
+    fn equal(&mut self, op: &'static str, result: &'static str, shape: impl ToString, got: &Buffer, want: &[u32]) -> Result<(), GpuError> {
+        let got = self.gpu.read_u32(got)?;
+        let differs = got.iter().zip(want).position(|(a, b)| a != b);
+        let outcome = match differs {
+            _ if got.len() != want.len() => Err(format!("lengths differ: {} and {}", got.len(), want.len())),
+            Some(i) => Err(format!("element {i}: {} is not {}", got[i], want[i])),
+            None => Ok(0.0),
+        };
+        self.row(op, result, shape.to_string(), outcome);
+        Ok(())
+    }
+}
+
+/// Runs all cases.
+///
+/// # Errors
+/// When the device is lost; wrong results are rows with a fault.
+pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
+    let mut table = Table { gpu, rows: Vec::new() };
+    let cases = [
+        hash_grids,
+        encodings,
+        layers,
+        networks,
+        compositing,
+        distortions,
+        sums,
+        boxes,
+        marches,
+        samples,
+        corners,
+        pixels,
+        steps,
+        cast,
+        images,
+        fields,
+    ];
+    for case in cases {
+        case(gpu, &mut table)?;
+    }
+    Ok(table.rows)
+}
+
+/// The ways in which the device may have to add: its own, or exchanges where it has none; WebGPU needs both,
+/// because browsers have none.
+fn adders(gpu: &Gpu) -> Vec<(&'static str, Gpu)> {
+    let mut all = Vec::new();
+    if gpu.has_native_atomics() {
+        all.push(("d table, native", gpu.clone()));
+    }
+    if !gpu.has_native_atomics() || gpu.api == Api::WebGpu {
+        all.push(("d table, exchanged", gpu.without_native_atomics()));
+    }
+    all
+}
+
+fn hash_grids(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for features in [1, 2, 4, 8] {
+        let grid = HashGrid::new(HashGridConfig { levels: 4, features, log2_size: 9, base: 3, finest: 40 });
+        let on_gpu = GpuHashGrid::new(gpu, &grid);
+        let t = random(grid.params_len(), 2);
+        let t_gpu = gpu.upload(&t);
+        for s in [0, 1, 67, 1000] {
+            let mut p = random_unit(s * 3, 11);
+            if s > 3 {
+                p[..9].copy_from_slice(&[0.0, 1.0, 0.5, -0.3, 0.4, 1.7, 1.0, 1.0, 1.0]);
+            }
+            let (d, dj) = (random(s * grid.output_dims(), 3), random(s * grid.output_dims() * 3, 5));
+            let (p_gpu, d_gpu, dj_gpu) = (gpu.upload(&p), gpu.upload(&d), gpu.upload(&dj));
+            let shape = format!("S={s} L=4 F={features}");
+            let (pw, tw) = (wide(&p), wide(&t));
+            table.close(
+                "hash grid",
+                "forward",
+                &shape,
+                &on_gpu.forward(gpu, &p_gpu, &t_gpu),
+                &hash_grid::reference::forward(&grid, &pw, &tw),
+            )?;
+            let (dp, dt) = hash_grid::reference::backward(&grid, &pw, &tw, &wide(&d));
+            table.close("hash grid", "d points", &shape, &on_gpu.backward_positions(gpu, &p_gpu, &t_gpu, &d_gpu), &dp)?;
+            let jacobian = hash_grid::reference::jacobian(&grid, &pw, &tw);
+            table.close("hash grid", "jacobian", &shape, &on_gpu.jacobian(gpu, &p_gpu, &t_gpu), &jacobian)?;
+            let djt = hash_grid::reference::jacobian_backward(&grid, &pw, &wide(&dj));
+            for (name, adder) in adders(gpu) {
+                let (sum, sum_j) = (gpu.zeros(grid.params_len()), gpu.zeros(grid.params_len()));
+                on_gpu.backward(&adder, &p_gpu, &d_gpu, &sum);
+                table.close("hash grid", name, &shape, &sum, &dt)?;
+                on_gpu.jacobian_backward(&adder, &p_gpu, &dj_gpu, &sum_j);
+                table.close("hash grid jacobian", name, &shape, &sum_j, &djt)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn encodings(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for n in [0, 1, 333] {
+        let shape = format!("N={n}");
+        let x = random(n * 3, 1);
+        let x_gpu = gpu.upload(&x);
+        for f in [
+            frequency::Frequency { dims: 3, bands: 10, include_input: true, pi: false, window: None },
+            frequency::Frequency { dims: 3, bands: 4, include_input: false, pi: true, window: Some(2.5) },
+        ] {
+            let d = random(n * f.output_dims(), 2);
+            table.close(
+                "frequency",
+                "forward",
+                &shape,
+                &frequency::gpu::forward(gpu, &f, &x_gpu),
+                &frequency::reference::forward(&f, &wide(&x)),
+            )?;
+            let want = frequency::reference::backward(&f, &wide(&x), &wide(&d));
+            table.close("frequency", "d x", &shape, &frequency::gpu::backward(gpu, &f, &x_gpu, &gpu.upload(&d)), &want)?;
+        }
+        let d = random(n * 3 * 6, 3);
+        table.close(
+            "triangle wave",
+            "forward",
+            &shape,
+            &triangle_wave::gpu::forward(gpu, 6, &x_gpu),
+            &triangle_wave::reference::forward(6, &wide(&x)),
+        )?;
+        let want = triangle_wave::reference::backward(6, &wide(&x), &wide(&d));
+        table.close("triangle wave", "d x", &shape, &triangle_wave::gpu::backward(gpu, 6, &x_gpu, &gpu.upload(&d)), &want)?;
+        for degree in 1..=4 {
+            let shape = format!("N={n} degree={degree}");
+            let d = random(n * degree * degree, 4);
+            let want = spherical_harmonics::reference::forward(degree, &wide(&x));
+            table.close("spherical harmonics", "forward", &shape, &spherical_harmonics::gpu::forward(gpu, degree, &x_gpu), &want)?;
+            let want = spherical_harmonics::reference::backward(degree, &wide(&x), &wide(&d));
+            let got = spherical_harmonics::gpu::backward(gpu, degree, &x_gpu, &gpu.upload(&d));
+            table.close("spherical harmonics", "d directions", &shape, &got, &want)?;
+        }
+    }
+    Ok(())
+}
+
+fn layers(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    use linear::{gpu as on_gpu, reference};
+    let all = [Activation::None, Activation::Relu, Activation::Sigmoid, Activation::Softplus, Activation::TruncatedExp];
+    for (m, k, n) in [(0, 3, 4), (1, 1, 1), (7, 5, 3), (500, 64, 64), (385, 33, 257)] {
+        for (kind, bias_len) in [(BiasKind::None, 0), (BiasKind::Shared, n), (BiasKind::PerRow, m * n)] {
+            for a in all {
+                let shape = format!("{m}x{k}x{n} {a:?} {kind:?}");
+                let (x, b, d) = (random(m * k, 1), random(bias_len, 3), random(m * n, 4));
+                let w: Vec<f32> = random(k * n, 2).iter().map(|w| w / (k as f32).sqrt()).collect();
+                let (xg, wg, bg) = (gpu.upload(&x), gpu.upload(&w), gpu.upload(&b));
+                let (xd, wd, bd) = (wide(&x), wide(&w), wide(&b));
+                let out = on_gpu::forward(gpu, (m, k, n), &xg, &wg, Some(&bg), kind, a);
+                table.close("linear", "forward", &shape, &out, &reference::forward(m, k, n, &xd, &wd, &bd, kind, a))?;
+                let g = on_gpu::backward(gpu, (m, k, n), &xg, &wg, kind, a, &out, &gpu.upload(&d));
+                let (dx, dw, db) = reference::backward(m, k, n, &xd, &wd, &bd, kind, a, &wide(&d));
+                table.close("linear", "d x", &shape, &g.x, &dx)?;
+                table.close("linear", "d weight", &shape, &g.w, &dw)?;
+                if let Some(bias) = &g.bias {
+                    table.close("linear", "d bias", &shape, bias, &db)?;
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Skip connections, split heads and biases.
+fn branched() -> Mlp {
+    let layer = |inputs: Vec<Source>, width, relu, bias| Layer { inputs, width, relu, bias };
+    Mlp::new(
+        vec![9, 5],
+        vec![
+            layer(vec![Source::Input(0)], 16, true, true),
+            layer(vec![Source::Layer(0), Source::Input(0)], 12, true, false),
+            layer(vec![Source::Layer(1)], 7, false, true),
+            layer(vec![Source::Layer(2), Source::Input(1), Source::Layer(0)], 3, false, true),
+        ],
+    )
+}
+
+fn networks(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for mlp in [Mlp::chain(vec![32], &[64, 64, 16], false), branched()] {
+        for n in [0, 1, 259] {
+            let shape = format!("N={n} {} layers", mlp.layers.len());
+            let params = mlp.init(&Rng::new(3, 1));
+            let inputs: Vec<Vec<f32>> = mlp.input_widths.iter().map(|w| random(n * w, *w as u64)).collect();
+            let d: Vec<Vec<f32>> = mlp.layers.iter().map(|l| random(n * l.width, 8)).collect();
+            let on_gpu: Vec<Buffer> = inputs.iter().map(|i| gpu.upload(i)).collect();
+            let refs: Vec<&Buffer> = on_gpu.iter().collect();
+            let p = gpu.upload(&params);
+            let values = fused_mlp::gpu::forward(gpu, &mlp, &p, &refs, n);
+            let wide_inputs: Vec<Vec<f64>> = inputs.iter().map(|i| wide(i)).collect();
+            let wide_refs: Vec<&[f64]> = wide_inputs.iter().map(|i| &i[..]).collect();
+            let want = fused_mlp::reference::forward(&mlp, &wide(&params), &wide_refs, n);
+            table.close("fused MLP", "forward", &shape, values.last().expect("layers"), want.last().expect("layers"))?;
+            let seeds = d.iter().map(|d| Some(gpu.upload(d))).collect();
+            let (dp, di) = fused_mlp::gpu::backward(gpu, &mlp, &p, &refs, &values, n, seeds);
+            let wide_d: Vec<Vec<f64>> = d.iter().map(|d| wide(d)).collect();
+            let (wp, wi) = fused_mlp::reference::backward(&mlp, &wide(&params), &wide_refs, n, &wide_d);
+            table.close("fused MLP", "d parameters", &shape, &dp, &wp)?;
+            for (got, want) in di.iter().zip(&wi) {
+                table.close("fused MLP", "d input", &shape, got, want)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Ragged rays, empty ones among them, some opaque.
+struct Rays {
+    offsets: Vec<u32>,
+    t: Vec<f32>,
+    dt: Vec<f32>,
+    sigma: Vec<f32>,
+}
+
+impl Rays {
+    fn new(rays: usize) -> Rays {
+        let n = random_unit(rays, 3);
+        let (mut offsets, mut t) = (vec![0u32], Vec::new());
+        for r in 0..rays {
+            let count = if r % 5 == 1 { 0 } else { (n[r] * 40.0) as usize + 1 };
+            t.extend((0..count).map(|i| 0.1 + 0.1 * i as f32));
+            offsets.push(t.len() as u32);
+        }
+        let dt = random_unit(t.len(), 7).iter().map(|s| 0.02 + 0.05 * s).collect();
+        let sigma = random_unit(t.len(), 4).iter().map(|s| s * s * 40.0).collect();
+        Rays { offsets, t, dt, sigma }
+    }
+
+    fn packed(&self) -> Packed<'_> {
+        Packed { offsets: &self.offsets, t: &self.t, dt: &self.dt }
+    }
+}
+
+fn compositing(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    use composite::{gpu as on_gpu, reference};
+    for rays in [0, 1, 130] {
+        for c in [1, 3, 19] {
+            let scene = Rays::new(rays);
+            let (s, shape) = (scene.t.len(), format!("R={rays} C={c}"));
+            let (f, b) = (random(s * c, 1), random(rays * c, 2));
+            let up = |v: &[f32]| gpu.upload(v);
+            let (p, sg, fg, bg) = (GpuPacked::upload(gpu, &scene.packed()), up(&scene.sigma), up(&f), up(&b));
+            let out = on_gpu::forward(gpu, &p, &sg, &fg, c, &bg);
+            let (sd, fd, bd) = (wide(&scene.sigma), wide(&f), wide(&b));
+            let want = reference::forward(&scene.packed(), &sd, &fd, c, &bd);
+            for (name, got, want) in [
+                ("color", &out.color, &want.color),
+                ("depth", &out.depth, &want.depth),
+                ("opacity", &out.opacity, &want.opacity),
+                ("weights", &out.weights, &want.weights),
+            ] {
+                table.close("composite", name, &shape, got, want)?;
+            }
+            let d = [random(rays * c, 4), random(rays, 5), random(rays, 6), random(s, 7)];
+            let [color, depth, opacity, weights] = d.each_ref().map(|v| up(v));
+            let g = on_gpu::backward(gpu, &p, &fg, c, &bg, &out, &GpuComposited { color, depth, opacity, weights });
+            let [color, depth, opacity, weights] = d.each_ref().map(|v| wide(v));
+            let (ds, df, db) = reference::backward(&scene.packed(), &sd, &fd, c, &bd, &Composited { color, depth, opacity, weights });
+            table.close("composite", "d sigma", &shape, &g.sigma, &ds)?;
+            table.close("composite", "d features", &shape, &g.features, &df)?;
+            table.close("composite", "d background", &shape, &g.background, &db)?;
+        }
+    }
+    Ok(())
+}
+
+fn distortions(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for rays in [0, 1, 130] {
+        let scene = Rays::new(rays);
+        let (w, d) = (random_unit(scene.t.len(), 1), random(rays, 2));
+        let (p, wg) = (GpuPacked::upload(gpu, &scene.packed()), gpu.upload(&w));
+        let shape = format!("R={rays}");
+        let want = distortion::reference::forward(&scene.packed(), &wide(&w));
+        table.close("distortion", "forward", &shape, &distortion::gpu::forward(gpu, &p, &wg), &want)?;
+        let want = distortion::reference::backward(&scene.packed(), &wide(&w), &wide(&d));
+        table.close("distortion", "d weights", &shape, &distortion::gpu::backward(gpu, &p, &wg, &gpu.upload(&d)), &want)?;
+    }
+    Ok(())
+}
+
+fn sums(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for n in [0, 1, 255, 256, 10_001] {
+        let counts: Vec<u32> = random_unit(n, 1).iter().map(|v| (v * 40.0) as u32).collect();
+        let got = scan::gpu::exclusive(gpu, &gpu.upload_u32(&counts));
+        table.equal("scan", "exclusive", format!("R={n}"), &got, &scan_of(&counts))?;
+    }
+    let scene = Rays::new(77);
+    let (x, offsets) = (random(scene.t.len(), 2), gpu.upload_u32(&scene.offsets));
+    let got = scan::gpu::inclusive(gpu, &offsets, &gpu.upload(&x));
+    table.close("scan", "inclusive", "R=77", &got, &scan::reference::inclusive(&scene.offsets, &wide(&x)))?;
+    let got = scan::gpu::inclusive_backward(gpu, &offsets, &gpu.upload(&x));
+    table.close("scan", "d inclusive", "R=77", &got, &scan::reference::inclusive_backward(&scene.offsets, &wide(&x)))
+}
+
+/// The reference sums each prefix anew, which is too slow for the longest case.
+fn scan_of(counts: &[u32]) -> Vec<u32> {
+    let mut out = vec![0];
+    counts.iter().for_each(|c| out.push(out[out.len() - 1] + c));
+    out
+}
+
+/// Origins in and around the cube with unit directions.
+fn rays(n: usize) -> [Vec<f32>; 4] {
+    let mut dirs = random(n * 3, 2);
+    for d in dirs.chunks_exact_mut(3) {
+        let l = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
+        d.iter_mut().for_each(|v| *v /= l);
+    }
+    [random_unit(n * 3, 1), dirs, (0..n).flat_map(|_| [0.05, 3.0]).collect(), random_unit(n, 3)]
+}
+
+fn boxes(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for n in [0, 1, 301] {
+        let [origins, mut dirs, ..] = rays(n);
+        if n > 3 {
+            dirs[..6].copy_from_slice(&[0.0, 0.0, 1.0, 0.0, 1.0, 0.0]);
+        }
+        let (min, max) = ([0.2, 0.3, 0.1], [0.8, 0.9, 0.7]);
+        let got = ray_aabb::gpu::intersect(gpu, &gpu.upload(&origins), &gpu.upload(&dirs), min, max, 0.05);
+        let want =
+            ray_aabb::reference::intersect(&wide(&origins), &wide(&dirs), min.map(|v| v as f64), max.map(|v| v as f64), 0.05f32 as f64);
+        table.close("ray and box", "near and far", format!("R={n}"), &got, &want)?;
+    }
+    Ok(())
+}
+
+/// A sample whose midpoint lies on a cell wall may fall to either side: rays that differ are counted, and
+/// no more than one in fifty may.
+fn marches(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for (cascades, cone) in [(1, 0.0), (3, 1.0 / 256.0)] {
+        for n in [0, 1, 300] {
+            let mut grid = OccupancyBits::full(16, cascades);
+            let u = random_unit(grid.cells(), 9);
+            grid.fill_with(|i| u[i] < 0.3 && i / 64 % 3 != 0);
+            let [origins, dirs, near_far, jitter] = rays(n);
+            let r = MarchRays { origins: &origins, dirs: &dirs, near_far: &near_far, jitter: &jitter, resumed: false };
+            let config = MarchConfig { cone, dt_min: 0.005, dt_max: 0.08, max_samples: 200 };
+            let want = march::reference::march(&grid, &r, &config);
+            let on_gpu = march::gpu::GpuRays::upload(gpu, &r);
+            let capacity = want.t.len() + 500;
+            let (packed, cells) = march::gpu::march(gpu, &march::gpu::GpuOccupancy::upload(gpu, &grid), &on_gpu, &config, capacity);
+            let (offsets, t, cells) = (gpu.read_u32(&packed.offsets)?, gpu.read(&packed.t)?, gpu.read_u32(&cells)?);
+            let places = gpu.read(&march::gpu::positions(gpu, &on_gpu, &packed))?;
+            let mut ties = 0;
+            for i in 0..n {
+                let a = offsets[i] as usize..offsets[i + 1] as usize;
+                let b = want.offsets[i] as usize..want.offsets[i + 1] as usize;
+                let same = a.end <= capacity
+                    && a.len() == b.len()
+                    && a.clone().zip(b).all(|(a, b)| {
+                        let mid = want.t[b] + 0.5 * want.dt[b];
+                        let at = (0..3).all(|k| (places[a * 3 + k] - (origins[i * 3 + k] + mid * dirs[i * 3 + k])).abs() < 1e-4);
+                        (t[a] - want.t[b]).abs() < 1e-4 && cells[a] == want.cells[b] && at
+                    });
+                ties += !same as usize;
+            }
+            let outcome = if ties * 50 <= n { Ok(0.0) } else { Err(format!("{ties} of {n} rays differ")) };
+            table.row("march", "samples", format!("R={n} cascades={cascades}"), outcome);
+        }
+    }
+    Ok(())
+}
+
+fn samples(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for (rays, n, m) in [(0, 8, 4), (1, 1, 1), (37, 64, 33)] {
+        let edges: Vec<f32> = (0..rays * (n + 1)).map(|i| (i % (n + 1)) as f32 * 0.1 + 0.5).collect();
+        let (w, u) = (random_unit(rays * n, 1), random_unit(rays * m, 2));
+        let got = sample_pdf::gpu::sample(gpu, n, &gpu.upload(&edges), &gpu.upload(&w), m, &gpu.upload(&u));
+        let want = sample_pdf::reference::sample(n, &wide(&edges), &wide(&w), m, &wide(&u));
+        table.close("sample pdf", "distances", format!("R={rays} N={n} M={m}"), &got, &want)?;
+    }
+    Ok(())
+}
+
+fn corners(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for (s, c) in [(0, 4), (1, 1), (301, 7)] {
+        let voxel: Vec<u32> = random_unit(s, 1).iter().map(|v| (v * 20.0) as u32).collect();
+        let rows: Vec<u32> = random_unit(20 * 8, 2).iter().map(|v| (v * 50.0) as u32).collect();
+        let k = Corners { rows: &rows, voxel: &voxel };
+        let (local, values, d) = (random_unit(s * 3, 3), random(50 * c, 4), random(s * c, 5));
+        let (on_gpu, lg, vg, dg) = (GpuCorners::upload(gpu, &k), gpu.upload(&local), gpu.upload(&values), gpu.upload(&d));
+        let shape = format!("S={s} C={c}");
+        let want = trilinear_corner_grid::reference::forward(&k, &wide(&local), &wide(&values), c);
+        table.close("corner grid", "forward", &shape, &on_gpu.forward(gpu, &lg, &vg, c), &want)?;
+        let (dl, dt) = trilinear_corner_grid::reference::backward(&k, &wide(&local), &wide(&values), c, &wide(&d));
+        for (name, adder) in adders(gpu) {
+            let sum = gpu.zeros(50 * c);
+            table.close("corner grid", "d places", &shape, &on_gpu.backward(&adder, &lg, &vg, c, &dg, &sum), &dl)?;
+            table.close("corner grid", name, &shape, &sum, &dt)?;
+        }
+    }
+    Ok(())
+}
+
+fn pixels(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let bytes: Vec<u8> = random_unit(400, 1).iter().map(|v| (v * 256.0) as u8).collect();
+    let words: Vec<u32> = bytes.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    for n in [0, 1, 67] {
+        let at: Vec<u32> = random_unit(n, 2).iter().map(|v| (v * 100.0) as u32).collect();
+        let offsets: Vec<usize> = at.iter().map(|i| *i as usize * 4).collect();
+        let got = pixel_gather::gpu::gather(gpu, &gpu.upload_u32(&words), &gpu.upload_u32(&at));
+        table.close("pixel gather", "forward", format!("R={n}"), &got, &pixel_gather::reference::gather(&bytes, &offsets))?;
+    }
+    Ok(())
+}
+
+fn steps(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for (n, sparse) in [(1, false), (999, false), (999, true)] {
+        let a = Adam { weight_decay: if sparse { 0.0 } else { 0.1 }, ..Adam::default() };
+        let p = random(n, 1);
+        let (pg, mg, vg) = (gpu.upload(&p), gpu.zeros(n), gpu.zeros(n));
+        let (mut pw, mut mw, mut vw) = (wide(&p), vec![0.0; n], vec![0.0; n]);
+        for t in 1..=3 {
+            let mut g = random(n, 10 + t as u64);
+            g.iter_mut().skip(t as usize % 3).step_by(3).for_each(|g| *g = 0.0);
+            let gg = gpu.upload(&g);
+            adam::gpu::step(gpu, &a, t, sparse, &pg, &mg, &vg, &gg);
+            adam::reference::step(&a, t, sparse, &mut pw, &mut mw, &mut vw, &wide(&g));
+            table.close("adam", "gradient cleared", format!("N={n} sparse={sparse}"), &gg, &vec![0.0; n])?;
+        }
+        table.close("adam", "parameters", format!("N={n} sparse={sparse}"), &pg, &pw)?;
+        table.close("adam", "moments", format!("N={n} sparse={sparse}"), &vg, &vw)?;
+    }
+    Ok(())
+}
+
+/// Every lens, turned and moved.
+fn cameras() -> Vec<PosedCamera> {
+    let lenses = [
+        Lens::Pinhole,
+        Lens::Brown { k: [0.05, -0.02, 0.004, 0.01, 0.0, 0.0], p: [1e-3, -1e-3] },
+        Lens::Fisheye { k: [0.02, -0.003, 0.0, 0.0], p: [1e-3, 0.0], s: [0.0, 1e-3] },
+        Lens::Fov { omega: 0.7 },
+        Lens::Equirectangular,
+    ];
+    let posed = |(i, lens)| PosedCamera {
+        camera: Camera { lens, ..Camera::pinhole(64, 48, 0.9) },
+        pose: Pose::look_at(DVec3::new(2.0, i as f64, 1.0), DVec3::ZERO, DVec3::Z),
+    };
+    lenses.into_iter().enumerate().map(posed).collect()
+}
+
+fn cast(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let all = cameras();
+    let on_gpu = GpuCameras::upload(gpu, &all);
+    for n in [0, 1, 301] {
+        let index: Vec<u32> = (0..n as u32).map(|i| i % 5).collect();
+        let pixels: Vec<f32> = random_unit(n * 2, 1).iter().map(|v| v * 48.0).collect();
+        let (ig, pg, shape) = (gpu.upload_u32(&index), gpu.upload(&pixels), format!("R={n}"));
+        let (origins, dirs) = on_gpu.forward(gpu, &ig, &pg);
+        let (want_o, want_d) = ray_generation::reference::forward(&all, &index, &wide(&pixels));
+        table.close("ray generation", "origins", &shape, &origins, &want_o)?;
+        table.close("ray generation", "directions", &shape, &dirs, &want_d)?;
+        let (go, gd) = (random(n * 3, 2), random(n * 3, 3));
+        let want = ray_generation::reference::backward(&all, &index, &wide(&pixels), &wide(&go), &wide(&gd));
+        let got = on_gpu.backward(gpu, &ig, &pg, &dirs, &gpu.upload(&go), &gpu.upload(&gd));
+        table.close("ray generation", "d corrections", &shape, &got, &want)?;
+    }
+    Ok(())
+}
+
+fn images(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for (w, h, c) in [(11, 11, 1), (10, 30, 3), (24, 17, 3)] {
+        let (x, y) = (random_unit(w * h * c, 1), random_unit(w * h * c, 2));
+        let (xg, yg, shape) = (gpu.upload(&x), gpu.upload(&y), format!("{w}x{h}x{c}"));
+        let values = gpu.read(&ssim::gpu::forward(gpu, (w, h, c), &xg, &yg))?;
+        let mean = values.iter().sum::<f32>() / values.len() as f32;
+        let want = ssim::reference::ssim(w, h, c, &wide(&x), &wide(&y));
+        let outcome = if want.is_nan() && mean.is_nan() { Ok(0.0) } else { compare(&[mean], &[want], TOLERANCE) };
+        table.row("SSIM", "mean", shape.clone(), outcome);
+        let fits = w >= ssim::WINDOW && h >= ssim::WINDOW;
+        let want = if fits { ssim::reference::gradient(w, h, c, &wide(&x), &wide(&y)) } else { vec![0.0; x.len()] };
+        table.close("SSIM", "d x", &shape, &ssim::gpu::backward(gpu, (w, h, c), &xg, &yg), &want)?;
+    }
+    Ok(())
+}
+
+/// A density network and a colour network that also reads two codes, as instant-ngp's.
+fn field_net(features: usize) -> FieldNet {
+    use Source::{Input, Layer as L};
+    let layer = |inputs: Vec<Source>, width, relu| Layer { inputs, width, relu, bias: false };
+    let layers = vec![
+        layer(vec![Input(0)], 32, true),
+        layer(vec![L(0)], 16, false),
+        layer(vec![L(1), Input(1), Input(2)], 32, true),
+        layer(vec![L(2)], 3, false),
+    ];
+    FieldNet {
+        mlp: Mlp::new(vec![features, 16, 5], layers),
+        sigma: Head { layer: 1, channel: 2, activation: Activation::TruncatedExp, shift: 0.5 },
+        rgb: Head { layer: 3, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    }
+}
+
+fn fields(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let (levels, per_level) = (4, 2);
+    let net = field_net(levels * per_level);
+    let params = net.mlp.init(&Rng::new(1, 1));
+    for rays in [0, 1, 90] {
+        let scene = Rays::new(rays);
+        let (p, s) = (scene.packed(), scene.t.len());
+        let features = random(s * levels * per_level, 6);
+        let codes = [random(rays * 16, 7), random(rays * 5, 8)];
+        let (background, d) = (random(rays * 3, 9), [random(rays * 3, 1), random(rays, 2), random(rays, 3), random(s, 4)]);
+        let rows: Vec<f64> = (0..s)
+            .flat_map(|i| (0..levels * per_level).map(move |k| (i, k)))
+            .map(|(i, k)| features[(k / per_level * s + i) * per_level + k % per_level] as f64)
+            .collect();
+        let spread = |code: &[f32], w: usize| -> Vec<f64> {
+            (0..rays).flat_map(|r| p.range(r).flat_map(move |_| wide(&code[r * w..(r + 1) * w]))).collect()
+        };
+        let (first, second) = (spread(&codes[0], 16), spread(&codes[1], 5));
+        let [color, depth, opacity, weights] = d.each_ref().map(|v| wide(v));
+        let wide_d = Composited { color, depth, opacity, weights };
+        let want = ngp_field::reference::step(&net, &wide(&params), &p, &[&rows, &first, &second], &wide(&background), &wide_d);
+
+        let up = |v: &[f32]| gpu.upload(v);
+        let (on_gpu, pg, fg, bg) = (GpuPacked::upload(gpu, &p), up(&params), up(&features), up(&background));
+        let (ca, cb) = (up(&codes[0]), up(&codes[1]));
+        let step = ngp_field::gpu::forward(gpu, &net, &pg, &on_gpu, &fg, per_level, &[&ca, &cb], &bg);
+        let shape = format!("R={rays} S={s}");
+        table.close("field", "color", &shape, &step.out.color, &want.out.color)?;
+        table.close("field", "weights", &shape, &step.out.weights, &want.out.weights)?;
+        let [color, depth, opacity, weights] = d.each_ref().map(|v| up(v));
+        let d = GpuComposited { color, depth, opacity, weights };
+        let g = ngp_field::gpu::backward(gpu, &net, &pg, &on_gpu, per_level, &bg, &step, &d);
+        table.close("field", "d parameters", &shape, &g.params, &want.d_params)?;
+        table.close("field", "d background", &shape, &g.background, &want.d_background)?;
+        let level_major: Vec<f64> = (0..levels * s * per_level)
+            .map(|i| want.d_inputs[0][i / per_level % s * levels * per_level + i / (s * per_level) * per_level + i % per_level])
+            .collect();
+        table.close("field", "d features", &shape, &g.features, &level_major)?;
+        for (i, w) in [16, 5].into_iter().enumerate() {
+            let d = &want.d_inputs[i + 1];
+            let summed: Vec<f64> = (0..rays * w).map(|e| p.range(e / w).map(|k| d[k * w + e % w]).sum()).collect();
+            table.close("field", "d code", &shape, &g.codes[i], &summed)?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,198 @@
+//! GPUs through CubeCL: one kernel source for Vulkan, Metal, WebGPU and CUDA. Ops keep their kernels in
+//! `ops/<op>/gpu.rs`; data stays in [`Buffer`]s on the device until it is read.
+
+mod atomics;
+pub mod check;
+
+use crate::device::Api;
+pub use atomics::{Accumulate, Native, Swap};
+use cubecl::client::Client;
+use cubecl::device::{WgpuBackend, WgpuDevice, WgpuDeviceKind};
+use cubecl::ir::features::AtomicUsage;
+use cubecl::prelude::*;
+use cubecl::server::Handle;
+
+/// Units per cube of the kernels that treat one element per unit.
+pub const CUBE: u32 = 256;
+/// Most cubes along one axis that every API allows.
+const MAX_CUBES: u32 = 65_535;
+
+/// Why a device cannot be used.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum GpuError {
+    #[error("device {0}: this build cannot reach it; build it with `cargo build --release --features {0}`, or use --device cpu")]
+    NotBuilt(&'static str),
+    #[error("device {0}: none found on this machine; check its driver, or use --device cpu")]
+    NoDevice(&'static str),
+    #[error("device {0}: could not be opened: {1}; use --device cpu")]
+    Open(&'static str, String),
+    #[error("device {0}: {1}")]
+    Lost(String, String),
+}
+
+/// An open device.
+#[derive(Clone)]
+pub struct Gpu {
+    pub api: Api,
+    /// What the device calls itself.
+    pub name: String,
+    /// Whether the CPU plays the device.
+    pub software: bool,
+    pub(crate) client: Client,
+    /// Whether f32 can be added atomically; else exchanges serve.
+    pub(crate) native_atomics: bool,
+    /// Whether kernels use memory shared by a cube. Mesa's software Vulkan before 23 crashes on it as SPIR-V
+    /// declares it, and gains nothing from it.
+    pub(crate) shared: bool,
+}
+
+/// Numbers of four bytes each in the memory of a device.
+#[derive(Clone)]
+pub struct Buffer {
+    handle: Handle,
+    len: usize,
+}
+
+impl Buffer {
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// For a launch.
+    pub(crate) fn arg(&self) -> BufferArg {
+        // SAFETY: `len` is the length that the handle was made with.
+        unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len.max(1)) }
+    }
+}
+
+impl Gpu {
+    /// Opens the best device of an API: discrete before integrated before software.
+    ///
+    /// # Errors
+    /// When the build lacks the API, the machine has no such device, or it cannot be opened.
+    pub fn open(api: Api) -> Result<Gpu, GpuError> {
+        if !api.is_built() {
+            return Err(GpuError::NotBuilt(api.name()));
+        }
+        let (device, software) = find(api).ok_or(GpuError::NoDevice(api.name()))?;
+        let client = quietly(|| device.client()).map_err(|e| GpuError::Open(api.name(), e))?;
+        let add = Type::atomic(f32::elem_type_native().with_vector_size(1));
+        let native_atomics = client.properties().atomic_type_usage(add).contains(AtomicUsage::Add);
+        let name = client.properties().identity.name.clone();
+        Ok(Gpu { shared: !(software && api == Api::Vulkan), api, name, software, client, native_atomics })
+    }
+
+    /// The same device adding without native f32 atomics.
+    pub fn without_native_atomics(&self) -> Gpu {
+        Gpu { native_atomics: false, ..self.clone() }
+    }
+
+    pub fn has_native_atomics(&self) -> bool {
+        self.native_atomics
+    }
+
+    /// Memory for `len` numbers of unknown value.
+    pub fn empty(&self, len: usize) -> Buffer {
+        Buffer { handle: self.client.empty(len.max(1) * 4), len }
+    }
+
+    pub fn zeros(&self, len: usize) -> Buffer {
+        let out = self.empty(len);
+        if len > 0 {
+            // SAFETY: every unit checks its position against the length.
+            unsafe { clear::launch_unchecked(&self.client, units(len), CubeDim::new_1d(CUBE), out.arg(), len as u32) };
+        }
+        out
+    }
+
+    pub fn upload(&self, data: &[f32]) -> Buffer {
+        let bytes = if data.is_empty() { &[0.0][..] } else { data };
+        Buffer { handle: self.client.create_from_slice(f32::as_bytes(bytes)), len: data.len() }
+    }
+
+    pub fn upload_u32(&self, data: &[u32]) -> Buffer {
+        let bytes = if data.is_empty() { &[0][..] } else { data };
+        Buffer { handle: self.client.create_from_slice(u32::as_bytes(bytes)), len: data.len() }
+    }
+
+    /// Waits for the device and brings numbers back.
+    ///
+    /// # Errors
+    /// When the device was lost or ran out of memory.
+    pub fn read(&self, buffer: &Buffer) -> Result<Vec<f32>, GpuError> {
+        Ok(f32::from_bytes(&self.bytes(buffer)?)[..buffer.len].to_vec())
+    }
+
+    /// # Errors
+    /// As [`Gpu::read`].
+    pub fn read_u32(&self, buffer: &Buffer) -> Result<Vec<u32>, GpuError> {
+        Ok(u32::from_bytes(&self.bytes(buffer)?)[..buffer.len].to_vec())
+    }
+
+    fn bytes(&self, buffer: &Buffer) -> Result<Vec<u8>, GpuError> {
+        let bytes = self.client.read_one(buffer.handle.clone());
+        bytes.map(|b| b.to_vec()).map_err(|e| GpuError::Lost(self.name.clone(), format!("{e:?}")))
+    }
+
+    /// Waits until all work is done.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn sync(&self) -> Result<(), GpuError> {
+        cubecl::future::block_on(self.client.sync()).map_err(|e| GpuError::Lost(self.name.clone(), format!("{e:?}")))
+    }
+}
+
+fn find(api: Api) -> Option<(cubecl::Device, bool)> {
+    let on = |kind, backend| WgpuDevice::new(kind).on(backend);
+    let backend = match api {
+        Api::Cuda => return quietly(|| cubecl::Device::cuda(0)).ok()?.ok().map(|d| (d, false)),
+        Api::Vulkan => WgpuBackend::Vulkan,
+        Api::Metal => WgpuBackend::Metal,
+        Api::WebGpu => WgpuBackend::Auto,
+    };
+    let kinds = [
+        WgpuDeviceKind::DiscreteGpu(0),
+        WgpuDeviceKind::IntegratedGpu(0),
+        WgpuDeviceKind::VirtualGpu(0),
+        WgpuDeviceKind::Other(0),
+        WgpuDeviceKind::Cpu,
+    ];
+    kinds.into_iter().find_map(|kind| {
+        let software = matches!(kind, WgpuDeviceKind::Cpu);
+        let device = cubecl::Device::Wgpu(on(kind, backend));
+        let found = quietly(|| !cubecl::Device::enumerate(device.to_id()).is_empty()).unwrap_or(false);
+        found.then_some((device, software))
+    })
+}
+
+/// Runs what may panic in a driver's absence, without its message on the terminal.
+fn quietly<T>(f: impl FnOnce() -> T) -> Result<T, String> {
+    static ONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
+    let _one = ONE.lock();
+    let hook = std::panic::take_hook();
+    std::panic::set_hook(Box::new(|_| {}));
+    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(f));
+    std::panic::set_hook(hook);
+    result.map_err(|e| {
+        let text = e.downcast_ref::<String>().cloned().or_else(|| e.downcast_ref::<&str>().map(|s| s.to_string()));
+        text.unwrap_or_default().lines().next().unwrap_or("the driver failed").to_string()
+    })
+}
+
+/// As many cubes as give one unit to each of `n` elements.
+pub(crate) fn units(n: usize) -> CubeCount {
+    let cubes = (n as u32).div_ceil(CUBE).max(1);
+    if cubes <= MAX_CUBES { CubeCount::Static(cubes, 1, 1) } else { CubeCount::Static(MAX_CUBES, cubes.div_ceil(MAX_CUBES), 1) }
+}
+
+#[cube(launch_unchecked)]
+fn clear(out: &mut [f32], n: u32) {
+    if ABSOLUTE_POS < n as usize {
+        out[ABSOLUTE_POS] = 0.0;
+    }
+}

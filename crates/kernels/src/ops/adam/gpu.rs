@@ -1,0 +1,71 @@
+//! One unit per parameter.
+
+use super::Adam;
+use crate::gpu::{Buffer, CUBE, Gpu, units};
+use cubecl::prelude::*;
+
+/// One step `t ≥ 1`; `sparse` leaves elements without gradient alone. Gradients are cleared.
+#[allow(clippy::too_many_arguments)]
+pub fn step(gpu: &Gpu, a: &Adam, t: u32, sparse: bool, p: &Buffer, m: &Buffer, v: &Buffer, g: &Buffer) {
+    if p.is_empty() {
+        return;
+    }
+    let (b1, b2) = (a.beta1 as f64, a.beta2 as f64);
+    let scale = (a.rate as f64 / (1.0 - b1.powi(t as i32))) as f32;
+    let root = (1.0 / (1.0 - b2.powi(t as i32))).sqrt() as f32;
+    // SAFETY: units past the length stop.
+    unsafe {
+        adam::launch_unchecked(
+            &gpu.client,
+            units(p.len()),
+            CubeDim::new_1d(CUBE),
+            p.arg(),
+            m.arg(),
+            v.arg(),
+            g.arg(),
+            p.len() as u32,
+            scale,
+            root,
+            a.beta1,
+            a.beta2,
+            a.epsilon,
+            a.weight_decay,
+            sparse,
+        );
+    }
+}
+
+#[cube(launch_unchecked)]
+fn adam(
+    p: &mut [f32],
+    m: &mut [f32],
+    v: &mut [f32],
+    g: &mut [f32],
+    n: u32,
+    scale: f32,
+    root: f32,
+    beta1: f32,
+    beta2: f32,
+    epsilon: f32,
+    decay: f32,
+    #[comptime] sparse: bool,
+) {
+    let i = ABSOLUTE_POS;
+    if i >= n as usize {
+        terminate!();
+    }
+    let mut d = g[i];
+    if comptime!(sparse) {
+        if d == 0.0 {
+            terminate!();
+        }
+    } else {
+        d += decay * p[i];
+    }
+    let m1 = beta1 * m[i] + (1.0 - beta1) * d;
+    let v1 = beta2 * v[i] + (1.0 - beta2) * d * d;
+    m[i] = m1;
+    v[i] = v1;
+    p[i] -= scale * m1 / (v1.sqrt() * root + epsilon);
+    g[i] = 0.0;
+}

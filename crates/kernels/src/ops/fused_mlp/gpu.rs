@@ -1,0 +1,130 @@
+//! Layer after layer through `linear`, parameters in one buffer as on the CPU.
+
+use super::{Mlp, Source};
+use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::ops::linear::gpu::{self as linear, Part};
+use crate::ops::linear::{Activation, BiasKind};
+use cubecl::prelude::*;
+
+/// Outputs `[N, width]` of every layer.
+pub fn forward(gpu: &Gpu, mlp: &Mlp, params: &Buffer, inputs: &[&Buffer], n: usize) -> Vec<Buffer> {
+    let mut values: Vec<Buffer> = Vec::new();
+    for (j, layer) in mlp.layers.iter().enumerate() {
+        let x = joined(gpu, mlp, j, inputs, &values, n);
+        let size = (n, mlp.fan_in(j), layer.width);
+        let (w, bias) = parts(mlp, j, params);
+        values.push(linear::forward_part(gpu, size, &x, w, bias, kind(mlp, j), activation(mlp, j)));
+    }
+    values
+}
+
+/// Gradients of the parameters and of each input, given those of layers' outputs; none where a layer's is zero.
+pub fn backward(
+    gpu: &Gpu,
+    mlp: &Mlp,
+    params: &Buffer,
+    inputs: &[&Buffer],
+    values: &[Buffer],
+    n: usize,
+    mut d: Vec<Option<Buffer>>,
+) -> (Buffer, Vec<Buffer>) {
+    let d_params = gpu.zeros(params.len());
+    let d_inputs: Vec<Buffer> = inputs.iter().map(|i| gpu.zeros(i.len())).collect();
+    for (j, layer) in mlp.layers.iter().enumerate().rev() {
+        let Some(d_out) = d[j].take() else { continue };
+        let x = joined(gpu, mlp, j, inputs, values, n);
+        let k = mlp.fan_in(j);
+        let (w, _) = parts(mlp, j, params);
+        let g = linear::before_activation(gpu, activation(mlp, j), &values[j], &d_out);
+        let d_x = linear::backward_part(gpu, (n, k, layer.width), &x, w, &g, Part { buffer: &d_params, at: mlp.offsets[j] });
+        if layer.bias {
+            linear::sum_rows_part(gpu, (n, layer.width), &g, Part { buffer: &d_params, at: mlp.offsets[j] + k * layer.width });
+        }
+        let mut at = 0;
+        for s in &layer.inputs {
+            let width = mlp.source_width(*s);
+            let to = match *s {
+                Source::Input(i) => &d_inputs[i],
+                Source::Layer(i) => d[i].get_or_insert_with(|| gpu.zeros(n * width)),
+            };
+            columns(gpu, n, width, (&d_x, k, at), (to, width, 0), true);
+            at += width;
+        }
+    }
+    (d_params, d_inputs)
+}
+
+fn kind(mlp: &Mlp, j: usize) -> BiasKind {
+    if mlp.layers[j].bias { BiasKind::Shared } else { BiasKind::None }
+}
+
+fn activation(mlp: &Mlp, j: usize) -> Activation {
+    if mlp.layers[j].relu { Activation::Relu } else { Activation::None }
+}
+
+fn parts<'a>(mlp: &Mlp, j: usize, params: &'a Buffer) -> (Part<'a>, Option<Part<'a>>) {
+    let at = mlp.offsets[j];
+    let bias = Part { buffer: params, at: at + mlp.fan_in(j) * mlp.layers[j].width };
+    (Part { buffer: params, at }, mlp.layers[j].bias.then_some(bias))
+}
+
+/// What layer `j` reads, side by side, `[N, K]`.
+fn joined(gpu: &Gpu, mlp: &Mlp, j: usize, inputs: &[&Buffer], values: &[Buffer], n: usize) -> Buffer {
+    let of = |s: Source| match s {
+        Source::Input(i) => inputs[i],
+        Source::Layer(i) => &values[i],
+    };
+    if let [one] = mlp.layers[j].inputs[..] {
+        return of(one).clone();
+    }
+    let k = mlp.fan_in(j);
+    let out = gpu.empty(n * k);
+    let mut at = 0;
+    for s in &mlp.layers[j].inputs {
+        let width = mlp.source_width(*s);
+        columns(gpu, n, width, (of(*s), width, 0), (&out, k, at), false);
+        at += width;
+    }
+    out
+}
+
+/// Copies or adds `width` columns between matrices given as (buffer, width, first column).
+pub(crate) fn columns(gpu: &Gpu, rows: usize, width: usize, from: (&Buffer, usize, usize), to: (&Buffer, usize, usize), add: bool) {
+    if rows * width == 0 {
+        return;
+    }
+    // SAFETY: units past the elements stop; the columns lie within both matrices.
+    unsafe {
+        copy::launch_unchecked(
+            &gpu.client,
+            units(rows * width),
+            CubeDim::new_1d(CUBE),
+            from.0.arg(),
+            to.0.arg(),
+            (rows * width) as u32,
+            width as u32,
+            from.1 as u32,
+            from.2 as u32,
+            to.1 as u32,
+            to.2 as u32,
+            add,
+        );
+    }
+}
+
+#[cube(launch_unchecked)]
+fn copy(from: &[f32], to: &mut [f32], n: u32, width: u32, from_width: u32, from_at: u32, to_width: u32, to_at: u32, #[comptime] add: bool) {
+    let i = ABSOLUTE_POS;
+    if i >= n as usize {
+        terminate!();
+    }
+    let row = i / width as usize;
+    let col = i % width as usize;
+    let v = from[row * from_width as usize + from_at as usize + col];
+    let at = row * to_width as usize + to_at as usize + col;
+    if comptime!(add) {
+        to[at] += v;
+    } else {
+        to[at] = v;
+    }
+}

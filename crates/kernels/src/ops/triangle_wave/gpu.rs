@@ -1,0 +1,76 @@
+//! One unit per number of the input.
+
+use crate::gpu::{Buffer, CUBE, Gpu, units};
+use cubecl::prelude::*;
+
+/// `[N, dims]` to `[N, dims · bands]`.
+pub fn forward(gpu: &Gpu, bands: usize, x: &Buffer) -> Buffer {
+    let out = gpu.empty(x.len() * bands);
+    if !x.is_empty() {
+        // SAFETY: units past the length stop.
+        unsafe {
+            wave::launch_unchecked(&gpu.client, units(x.len()), CubeDim::new_1d(CUBE), x.arg(), out.arg(), x.len() as u32, bands as u32)
+        };
+    }
+    out
+}
+
+/// Gradient of x.
+pub fn backward(gpu: &Gpu, bands: usize, x: &Buffer, d_out: &Buffer) -> Buffer {
+    let out = gpu.empty(x.len());
+    if !x.is_empty() {
+        // SAFETY: units past the length stop.
+        unsafe {
+            slope::launch_unchecked(
+                &gpu.client,
+                units(x.len()),
+                CubeDim::new_1d(CUBE),
+                x.arg(),
+                d_out.arg(),
+                out.arg(),
+                x.len() as u32,
+                bands as u32,
+            );
+        }
+    }
+    out
+}
+
+/// `(v + ½) mod 2` in [0, 2).
+#[cube]
+fn phase(v: f32) -> f32 {
+    let p = (v + 0.5) * 0.5;
+    (p - p.floor()) * 2.0
+}
+
+#[cube(launch_unchecked)]
+fn wave(x: &[f32], out: &mut [f32], len: u32, bands: u32) {
+    let i = ABSOLUTE_POS;
+    if i >= len as usize {
+        terminate!();
+    }
+    let mut v = x[i];
+    for k in 0..bands as usize {
+        out[i * bands as usize + k] = 2.0 * (phase(v) - 1.0).abs() - 1.0;
+        v *= 2.0;
+    }
+}
+
+#[cube(launch_unchecked)]
+fn slope(x: &[f32], d_out: &[f32], out: &mut [f32], len: u32, bands: u32) {
+    let i = ABSOLUTE_POS;
+    if i >= len as usize {
+        terminate!();
+    }
+    let mut s = 1.0f32;
+    let mut g = 0.0f32;
+    for k in 0..bands as usize {
+        let mut d = 2.0 * s * d_out[i * bands as usize + k];
+        if phase(s * x[i]) < 1.0 {
+            d = -d;
+        }
+        g += d;
+        s *= 2.0;
+    }
+    out[i] = g;
+}
