@@ -26,50 +26,28 @@ impl GpuHashGrid {
 
     /// Features `[L, S, F]` of points `[S, 3]`.
     pub fn forward(&self, gpu: &Gpu, points: &Buffer, table: &Buffer) -> Buffer {
-        let (s, n) = self.work(points);
-        let out = gpu.empty(s * self.grid.output_dims());
-        if n > 0 {
-            // SAFETY: units past `n` stop; rows come from the grid that sized the table.
-            unsafe {
-                encode::launch_unchecked(
-                    &gpu.client,
-                    units(n),
-                    CubeDim::new_1d(CUBE),
-                    points.arg(),
-                    self.levels.arg(),
-                    table.arg(),
-                    out.arg(),
-                    s as u32,
-                    n as u32,
-                    self.grid.config.features,
-                );
-            }
-        }
+        let out = gpu.empty(self.work(points).0 * self.grid.output_dims());
+        self.each(gpu, points, table, &out, encode::launch_unchecked);
         out
     }
 
     /// Adds to the gradient of the table.
     pub fn backward(&self, gpu: &Gpu, points: &Buffer, d_out: &Buffer, d_table: &Buffer) {
-        let (s, n) = self.work(points);
-        if n == 0 {
-            return;
-        }
-        let launch = if gpu.native_atomics { scatter::launch_unchecked::<Native> } else { scatter::launch_unchecked::<Swap> };
-        // SAFETY: as in `forward`.
-        unsafe {
-            launch(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                points.arg(),
-                self.levels.arg(),
-                d_out.arg(),
-                d_table.arg(),
-                s as u32,
-                n as u32,
-                self.grid.config.features,
-            );
-        }
+        let kernel = if gpu.native_atomics { scatter::launch_unchecked::<Native> } else { scatter::launch_unchecked::<Swap> };
+        self.each(gpu, points, d_out, d_table, kernel);
+    }
+
+    /// `∂features/∂point`, `[L, S, F, 3]`.
+    pub fn jacobian(&self, gpu: &Gpu, points: &Buffer, table: &Buffer) -> Buffer {
+        let out = gpu.empty(self.work(points).0 * self.grid.output_dims() * 3);
+        self.each(gpu, points, table, &out, differentiate::launch_unchecked);
+        out
+    }
+
+    /// Adds to the gradient of the table, given that of the Jacobian.
+    pub fn jacobian_backward(&self, gpu: &Gpu, points: &Buffer, d_jacobian: &Buffer, d_table: &Buffer) {
+        let kernel = if gpu.native_atomics { scatter_slopes::launch_unchecked::<Native> } else { scatter_slopes::launch_unchecked::<Swap> };
+        self.each(gpu, points, d_jacobian, d_table, kernel);
     }
 
     /// Gradient of the points `[S, 3]`.
@@ -77,7 +55,7 @@ impl GpuHashGrid {
         let (s, _) = self.work(points);
         let out = gpu.empty(s * 3);
         if s > 0 {
-            // SAFETY: as in `forward`.
+            // SAFETY: units past `s` stop; rows come from the grid that sized the table.
             unsafe {
                 slope::launch_unchecked(
                     &gpu.client,
@@ -97,54 +75,31 @@ impl GpuHashGrid {
         out
     }
 
-    /// `∂features/∂point`, `[L, S, F, 3]`.
-    pub fn jacobian(&self, gpu: &Gpu, points: &Buffer, table: &Buffer) -> Buffer {
+    /// Launches a kernel with one unit per level and point, which reads `from` and writes `to`.
+    fn each(&self, gpu: &Gpu, points: &Buffer, from: &Buffer, to: &Buffer, kernel: Kernel) {
         let (s, n) = self.work(points);
-        let out = gpu.empty(s * self.grid.output_dims() * 3);
         if n > 0 {
-            // SAFETY: as in `forward`.
+            // SAFETY: units past `n` stop; rows come from the grid that sized the table.
             unsafe {
-                differentiate::launch_unchecked(
+                kernel(
                     &gpu.client,
                     units(n),
                     CubeDim::new_1d(CUBE),
                     points.arg(),
                     self.levels.arg(),
-                    table.arg(),
-                    out.arg(),
+                    from.arg(),
+                    to.arg(),
                     s as u32,
                     n as u32,
                     self.grid.config.features,
                 );
             }
         }
-        out
-    }
-
-    /// Adds to the gradient of the table, given that of the Jacobian.
-    pub fn jacobian_backward(&self, gpu: &Gpu, points: &Buffer, d_jacobian: &Buffer, d_table: &Buffer) {
-        let (s, n) = self.work(points);
-        if n == 0 {
-            return;
-        }
-        let launch = if gpu.native_atomics { scatter_slopes::launch_unchecked::<Native> } else { scatter_slopes::launch_unchecked::<Swap> };
-        // SAFETY: as in `forward`.
-        unsafe {
-            launch(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                points.arg(),
-                self.levels.arg(),
-                d_jacobian.arg(),
-                d_table.arg(),
-                s as u32,
-                n as u32,
-                self.grid.config.features,
-            );
-        }
     }
 }
+
+/// Points, levels, what is read, what is written, samples, units, features per row.
+type Kernel = unsafe fn(&Client, CubeCount, CubeDim, BufferArg, BufferArg, BufferArg, BufferArg, u32, u32, usize);
 
 /// A coordinate's cell, the place in it, and its slope: cells per unit, 0 where it was clamped.
 #[derive(CubeType)]
@@ -152,6 +107,25 @@ struct Axis {
     cell: u32,
     at: f32,
     slope: f32,
+}
+
+/// Where a point lies in a level.
+#[derive(CubeType)]
+struct Place {
+    level: usize,
+    x: Axis,
+    y: Axis,
+    z: Axis,
+}
+
+/// A corner of a point's cell: first number of its row, weight, and the weight's slopes along the point.
+#[derive(CubeType)]
+struct Corner {
+    row: usize,
+    weight: f32,
+    dx: f32,
+    dy: f32,
+    dz: f32,
 }
 
 #[cube]
@@ -168,24 +142,44 @@ fn locate(x: f32, cells: u32) -> Axis {
 }
 
 #[cube]
-fn weight(at: f32, #[comptime] bit: u32) -> f32 {
-    if comptime!(bit == 1) { at } else { 1.0 - at }
+fn place(points: &[f32], levels: &[u32], level: usize, p: usize) -> Place {
+    let cells = levels[level * LEVEL];
+    Place { level, x: locate(points[p * 3], cells), y: locate(points[p * 3 + 1], cells), z: locate(points[p * 3 + 2], cells) }
 }
 
 #[cube]
-fn slope_of(slope: f32, #[comptime] bit: u32) -> f32 {
-    if comptime!(bit == 1) { slope } else { -slope }
+fn share(a: &Axis, #[comptime] bit: u32) -> f32 {
+    if comptime!(bit == 1) { a.at } else { 1.0 - a.at }
 }
 
-/// Row of a vertex in the table.
 #[cube]
-fn row(levels: &[u32], l: usize, x: u32, y: u32, z: u32) -> usize {
-    let n = levels[l * LEVEL] + 1;
+fn slope_of(a: &Axis, #[comptime] bit: u32) -> f32 {
+    if comptime!(bit == 1) { a.slope } else { -a.slope }
+}
+
+/// Corner `c` lies one cell on along axis `k` where bit `k` of `c` is set.
+#[cube]
+fn corner(place: &Place, levels: &[u32], #[comptime] c: u32, #[comptime] features: usize) -> Corner {
+    let bits = comptime!((c & 1, (c >> 1) & 1, (c >> 2) & 1));
+    let x = place.x.cell + comptime!(bits.0);
+    let y = place.y.cell + comptime!(bits.1);
+    let z = place.z.cell + comptime!(bits.2);
+    let l = place.level * LEVEL;
+    let n = levels[l] + 1;
     let mut row = x + n * (y + n * z);
-    if levels[l * LEVEL + 1] == 0 {
-        row = (x ^ (y * 2_654_435_761u32) ^ (z * 805_459_861u32)) & (levels[l * LEVEL + 3] - 1);
+    if levels[l + 1] == 0 {
+        row = (x ^ (y * 2_654_435_761u32) ^ (z * 805_459_861u32)) & (levels[l + 3] - 1);
     }
-    (levels[l * LEVEL + 2] + row) as usize
+    let wx = share(&place.x, comptime!(bits.0));
+    let wy = share(&place.y, comptime!(bits.1));
+    let wz = share(&place.z, comptime!(bits.2));
+    Corner {
+        row: (levels[l + 2] + row) as usize * features,
+        weight: wx * wy * wz,
+        dx: slope_of(&place.x, comptime!(bits.0)) * wy * wz,
+        dy: slope_of(&place.y, comptime!(bits.1)) * wx * wz,
+        dz: slope_of(&place.z, comptime!(bits.2)) * wx * wy,
+    }
 }
 
 #[cube(launch_unchecked)]
@@ -194,12 +188,7 @@ fn encode(points: &[f32], levels: &[u32], table: &[f32], out: &mut [f32], s: u32
     if unit >= n as usize {
         terminate!();
     }
-    let l = unit / s as usize;
-    let p = unit % s as usize;
-    let cells = levels[l * LEVEL];
-    let x = locate(points[p * 3], cells);
-    let y = locate(points[p * 3 + 1], cells);
-    let z = locate(points[p * 3 + 2], cells);
+    let place = place(points, levels, unit / s as usize, unit % s as usize);
     let mut sum = Array::<f32>::new(f);
     #[unroll]
     for k in 0..f {
@@ -207,12 +196,10 @@ fn encode(points: &[f32], levels: &[u32], table: &[f32], out: &mut [f32], s: u32
     }
     #[unroll]
     for c in 0..8u32 {
-        let bits = comptime!((c & 1, (c >> 1) & 1, (c >> 2) & 1));
-        let w = weight(x.at, comptime!(bits.0)) * weight(y.at, comptime!(bits.1)) * weight(z.at, comptime!(bits.2));
-        let at = row(levels, l, x.cell + comptime!(bits.0), y.cell + comptime!(bits.1), z.cell + comptime!(bits.2)) * f;
+        let corner = corner(&place, levels, c, f);
         #[unroll]
         for k in 0..f {
-            sum[k] += w * table[at + k];
+            sum[k] += corner.weight * table[corner.row + k];
         }
     }
     #[unroll]
@@ -235,20 +222,13 @@ fn scatter<A: Accumulate>(
     if unit >= n as usize {
         terminate!();
     }
-    let l = unit / s as usize;
-    let p = unit % s as usize;
-    let cells = levels[l * LEVEL];
-    let x = locate(points[p * 3], cells);
-    let y = locate(points[p * 3 + 1], cells);
-    let z = locate(points[p * 3 + 2], cells);
+    let place = place(points, levels, unit / s as usize, unit % s as usize);
     #[unroll]
     for c in 0..8u32 {
-        let bits = comptime!((c & 1, (c >> 1) & 1, (c >> 2) & 1));
-        let w = weight(x.at, comptime!(bits.0)) * weight(y.at, comptime!(bits.1)) * weight(z.at, comptime!(bits.2));
-        let at = row(levels, l, x.cell + comptime!(bits.0), y.cell + comptime!(bits.1), z.cell + comptime!(bits.2)) * f;
+        let corner = corner(&place, levels, c, f);
         #[unroll]
         for k in 0..f {
-            A::add(&d_table[at + k], w * d_out[unit * f + k]);
+            A::add(&d_table[corner.row + k], corner.weight * d_out[unit * f + k]);
         }
     }
 }
@@ -263,25 +243,18 @@ fn slope(points: &[f32], levels: &[u32], table: &[f32], d_out: &[f32], out: &mut
     let mut gy = 0.0f32;
     let mut gz = 0.0f32;
     for l in 0..n_levels as usize {
-        let cells = levels[l * LEVEL];
-        let x = locate(points[p * 3], cells);
-        let y = locate(points[p * 3 + 1], cells);
-        let z = locate(points[p * 3 + 2], cells);
+        let place = place(points, levels, l, p);
         #[unroll]
         for c in 0..8u32 {
-            let bits = comptime!((c & 1, (c >> 1) & 1, (c >> 2) & 1));
-            let wx = weight(x.at, comptime!(bits.0));
-            let wy = weight(y.at, comptime!(bits.1));
-            let wz = weight(z.at, comptime!(bits.2));
-            let at = row(levels, l, x.cell + comptime!(bits.0), y.cell + comptime!(bits.1), z.cell + comptime!(bits.2)) * f;
+            let corner = corner(&place, levels, c, f);
             let mut v = 0.0f32;
             #[unroll]
             for k in 0..f {
-                v += table[at + k] * d_out[(l * s as usize + p) * f + k];
+                v += table[corner.row + k] * d_out[(l * s as usize + p) * f + k];
             }
-            gx += v * slope_of(x.slope, comptime!(bits.0)) * wy * wz;
-            gy += v * slope_of(y.slope, comptime!(bits.1)) * wx * wz;
-            gz += v * slope_of(z.slope, comptime!(bits.2)) * wx * wy;
+            gx += v * corner.dx;
+            gy += v * corner.dy;
+            gz += v * corner.dz;
         }
     }
     out[p * 3] = gx;
@@ -295,12 +268,7 @@ fn differentiate(points: &[f32], levels: &[u32], table: &[f32], out: &mut [f32],
     if unit >= n as usize {
         terminate!();
     }
-    let l = unit / s as usize;
-    let p = unit % s as usize;
-    let cells = levels[l * LEVEL];
-    let x = locate(points[p * 3], cells);
-    let y = locate(points[p * 3 + 1], cells);
-    let z = locate(points[p * 3 + 2], cells);
+    let place = place(points, levels, unit / s as usize, unit % s as usize);
     let mut sum = Array::<f32>::new(f * 3);
     #[unroll]
     for k in 0..f * 3 {
@@ -308,19 +276,13 @@ fn differentiate(points: &[f32], levels: &[u32], table: &[f32], out: &mut [f32],
     }
     #[unroll]
     for c in 0..8u32 {
-        let bits = comptime!((c & 1, (c >> 1) & 1, (c >> 2) & 1));
-        let wx = weight(x.at, comptime!(bits.0));
-        let wy = weight(y.at, comptime!(bits.1));
-        let wz = weight(z.at, comptime!(bits.2));
-        let dx = slope_of(x.slope, comptime!(bits.0)) * wy * wz;
-        let dy = slope_of(y.slope, comptime!(bits.1)) * wx * wz;
-        let dz = slope_of(z.slope, comptime!(bits.2)) * wx * wy;
-        let at = row(levels, l, x.cell + comptime!(bits.0), y.cell + comptime!(bits.1), z.cell + comptime!(bits.2)) * f;
+        let corner = corner(&place, levels, c, f);
         #[unroll]
         for k in 0..f {
-            sum[k * 3] += dx * table[at + k];
-            sum[k * 3 + 1] += dy * table[at + k];
-            sum[k * 3 + 2] += dz * table[at + k];
+            let v = table[corner.row + k];
+            sum[k * 3] += corner.dx * v;
+            sum[k * 3 + 1] += corner.dy * v;
+            sum[k * 3 + 2] += corner.dz * v;
         }
     }
     #[unroll]
@@ -343,26 +305,15 @@ fn scatter_slopes<A: Accumulate>(
     if unit >= n as usize {
         terminate!();
     }
-    let l = unit / s as usize;
-    let p = unit % s as usize;
-    let cells = levels[l * LEVEL];
-    let x = locate(points[p * 3], cells);
-    let y = locate(points[p * 3 + 1], cells);
-    let z = locate(points[p * 3 + 2], cells);
+    let place = place(points, levels, unit / s as usize, unit % s as usize);
     #[unroll]
     for c in 0..8u32 {
-        let bits = comptime!((c & 1, (c >> 1) & 1, (c >> 2) & 1));
-        let wx = weight(x.at, comptime!(bits.0));
-        let wy = weight(y.at, comptime!(bits.1));
-        let wz = weight(z.at, comptime!(bits.2));
-        let dx = slope_of(x.slope, comptime!(bits.0)) * wy * wz;
-        let dy = slope_of(y.slope, comptime!(bits.1)) * wx * wz;
-        let dz = slope_of(z.slope, comptime!(bits.2)) * wx * wy;
-        let at = row(levels, l, x.cell + comptime!(bits.0), y.cell + comptime!(bits.1), z.cell + comptime!(bits.2)) * f;
+        let corner = corner(&place, levels, c, f);
         #[unroll]
         for k in 0..f {
             let d = (unit * f + k) * 3;
-            A::add(&d_table[at + k], dx * d_jacobian[d] + dy * d_jacobian[d + 1] + dz * d_jacobian[d + 2]);
+            let g = corner.dx * d_jacobian[d] + corner.dy * d_jacobian[d + 1] + corner.dz * d_jacobian[d + 2];
+            A::add(&d_table[corner.row + k], g);
         }
     }
 }
