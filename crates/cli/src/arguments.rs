@@ -273,6 +273,9 @@ pub struct DoctorArgs {
 pub struct BenchOpsArgs {
     #[arg(long)]
     pub threads: Option<usize>,
+    /// cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "cpu")]
+    pub device: String,
     /// Calls per figure; the median counts
     #[arg(long, default_value_t = 9)]
     pub repeats: usize,

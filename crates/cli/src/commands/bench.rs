@@ -17,6 +17,9 @@ pub fn ops(a: &BenchOpsArgs) -> Result<Outcome> {
         let rate = format!("{}{}", optional(f.gflops, "GFLOP/s"), optional(f.gb_per_s, "GB/s"));
         println!("{:<30} {:<30} {:>10.1} ns/{:<10} {rate} {share}", f.op, f.shape, f.ns, f.unit);
     };
+    if a.device != "cpu" {
+        return gpu_ops(a, &print);
+    }
     let report = bench::ops::run(a.threads.unwrap_or(1), a.repeats, &mut |f| {
         if !a.json {
             print(f);
@@ -32,6 +35,26 @@ pub fn ops(a: &BenchOpsArgs) -> Result<Outcome> {
         );
     }
     Ok(Outcome::Done)
+}
+
+#[cfg(feature = "gpu")]
+fn gpu_ops(a: &BenchOpsArgs, print: &dyn Fn(&bench::ops::OpFigure)) -> Result<Outcome> {
+    let report = bench::gpu_ops::run(&a.device, a.repeats, &mut |f| {
+        if !a.json {
+            print(f);
+        }
+    })?;
+    if a.json {
+        println!("{}", serde_json::json!(report));
+    } else {
+        println!("{} ({}): copies {:.0} GB/s", report.device, report.name, report.copy_gb_per_s);
+    }
+    Ok(Outcome::Done)
+}
+
+#[cfg(not(feature = "gpu"))]
+fn gpu_ops(a: &BenchOpsArgs, _: &dyn Fn(&bench::ops::OpFigure)) -> Result<Outcome> {
+    Err(bench::check::not_built(&a.device))
 }
 
 pub fn train(a: &BenchTrainArgs) -> Result<Outcome> {

@@ -109,6 +109,15 @@ impl Gpu {
         out
     }
 
+    /// Copies as many numbers as both buffers hold.
+    pub fn copy(&self, from: &Buffer, to: &Buffer) {
+        let n = from.len.min(to.len);
+        if n > 0 {
+            // SAFETY: every unit checks its position against the length.
+            unsafe { duplicate::launch_unchecked(&self.client, units(n), CubeDim::new_1d(CUBE), from.arg(), to.arg(), n as u32) };
+        }
+    }
+
     pub fn upload(&self, data: &[f32]) -> Buffer {
         let bytes = if data.is_empty() { &[0.0][..] } else { data };
         Buffer { handle: self.client.create_from_slice(f32::as_bytes(bytes)), len: data.len() }
@@ -194,5 +203,12 @@ pub(crate) fn units(n: usize) -> CubeCount {
 fn clear(out: &mut [f32], n: u32) {
     if ABSOLUTE_POS < n as usize {
         out[ABSOLUTE_POS] = 0.0;
+    }
+}
+
+#[cube(launch_unchecked)]
+fn duplicate(from: &[f32], to: &mut [f32], n: u32) {
+    if ABSOLUTE_POS < n as usize {
+        to[ABSOLUTE_POS] = from[ABSOLUTE_POS];
     }
 }

@@ -60,7 +60,14 @@ pub fn run(device: &str) -> Result<Report> {
 /// Always.
 #[cfg(not(feature = "gpu"))]
 pub fn run(device: &str) -> Result<Report> {
-    let api: diorama_kernels::device::Api = device.parse().map_err(PipelineError::Usage)?;
-    let name = api.name();
-    Err(PipelineError::Usage(format!("device {name}: this build cannot reach it; build it with `cargo build --release --features {name}`")))
+    Err(not_built(device))
+}
+
+/// What a build without GPU kernels says of a device.
+#[cfg(not(feature = "gpu"))]
+pub fn not_built(device: &str) -> PipelineError {
+    PipelineError::Usage(match device.parse::<diorama_kernels::device::Api>() {
+        Ok(api) => format!("device {0}: this build cannot reach it; build it with `cargo build --release --features {0}`", api.name()),
+        Err(e) => e,
+    })
 }

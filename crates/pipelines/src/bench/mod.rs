@@ -2,6 +2,8 @@
 //! a training step's time goes, and how fast views are drawn.
 
 pub mod check;
+#[cfg(feature = "gpu")]
+pub mod gpu_ops;
 pub mod ops;
 pub mod render;
 pub mod train;

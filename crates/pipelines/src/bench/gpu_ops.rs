@@ -1,0 +1,146 @@
+//! `diorama bench ops --device D`: the ops on a GPU beside the rate at which it copies memory.
+
+use super::median_seconds;
+use super::ops::OpFigure;
+use crate::{PipelineError, Result};
+use diorama_geom::rng::Rng;
+use diorama_kernels::gpu::{Buffer, Gpu, GpuError};
+use diorama_kernels::ops::adam::{self, Adam};
+use diorama_kernels::ops::composite::Packed;
+use diorama_kernels::ops::composite::gpu::{self as composite, GpuPacked};
+use diorama_kernels::ops::fused_mlp::{self, Mlp};
+use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
+use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
+use diorama_kernels::ops::linear::{self, Activation, BiasKind};
+use diorama_kernels::ops::spherical_harmonics;
+
+/// Calls between two waits for the device, where it is no software.
+const BATCH: usize = 8;
+
+/// Everything that was measured.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct GpuOpsReport {
+    pub device: &'static str,
+    pub name: String,
+    pub software: bool,
+    /// Bytes read and written per second by a plain copy.
+    pub copy_gb_per_s: f64,
+    pub ops: Vec<OpFigure>,
+}
+
+struct Table<'a> {
+    gpu: &'a Gpu,
+    repeats: usize,
+    ops: Vec<OpFigure>,
+    progress: &'a mut dyn FnMut(&OpFigure),
+}
+
+fn told(e: GpuError) -> PipelineError {
+    match e {
+        GpuError::Lost(..) => PipelineError::Device(e.to_string()),
+        _ => PipelineError::Usage(e.to_string()),
+    }
+}
+
+impl Table<'_> {
+    /// Seconds per call.
+    fn seconds(&self, mut f: impl FnMut()) -> Result<f64> {
+        let mut lost = None;
+        let batch = if self.gpu.software { 1 } else { BATCH };
+        let seconds = median_seconds(self.repeats, || {
+            (0..batch).for_each(|_| f());
+            lost = lost.take().or(self.gpu.sync().err());
+        });
+        lost.map_or(Ok(seconds / batch as f64), |e| Err(told(e)))
+    }
+
+    /// `flops` and `bytes` per unit; 0: not told.
+    fn row(&mut self, op: &str, shape: &str, unit: &'static str, units: usize, flops: f64, bytes: f64, f: impl FnMut()) -> Result<()> {
+        let ns = self.seconds(f)? * 1e9 / units as f64;
+        let rate = |n: f64| (n > 0.0).then_some(n / ns);
+        let figure =
+            OpFigure { op: op.into(), shape: shape.into(), unit, ns, gflops: rate(flops), share_of_peak: None, gb_per_s: rate(bytes) };
+        (self.progress)(&figure);
+        self.ops.push(figure);
+        Ok(())
+    }
+}
+
+fn random(gpu: &Gpu, n: usize, stream: u64) -> Buffer {
+    let rng = Rng::new(7, stream);
+    gpu.upload(&(0..n).map(|i| rng.uniform(i as u64)).collect::<Vec<_>>())
+}
+
+/// Measures the ops on the named device; fewer samples where the CPU plays it.
+///
+/// # Errors
+/// When the device is unknown, not part of the build, absent or lost.
+pub fn run(device: &str, repeats: usize, progress: &mut dyn FnMut(&OpFigure)) -> Result<GpuOpsReport> {
+    let gpu = Gpu::open(device.parse().map_err(PipelineError::Usage)?).map_err(told)?;
+    let samples = if gpu.software { 1 << 14 } else { 1 << 20 };
+    let mut table = Table { gpu: &gpu, repeats, ops: Vec::new(), progress };
+    let n = samples * 32;
+    let (from, to) = (gpu.zeros(n), gpu.empty(n));
+    let copy_gb_per_s = n as f64 * 8.0 / table.seconds(|| gpu.copy(&from, &to))? / 1e9;
+    encodings(&gpu, samples, &mut table)?;
+    networks(&gpu, samples, &mut table)?;
+    rays(&gpu, samples, &mut table)?;
+    let ops = table.ops;
+    Ok(GpuOpsReport { device: gpu.api.name(), software: gpu.software, name: gpu.name, copy_gb_per_s, ops })
+}
+
+fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
+    let grid = HashGrid::new(HashGridConfig { levels: 16, features: 2, log2_size: 19, base: 16, finest: 2048 });
+    let (on_gpu, points, table) = (GpuHashGrid::new(gpu, &grid), random(gpu, s * 3, 1), random(gpu, grid.params_len(), 2));
+    let (d, d_table) = (random(gpu, s * grid.output_dims(), 3), gpu.zeros(grid.params_len()));
+    // Eight rows of two numbers per level and point, and the result.
+    let bytes = 16.0 * (8.0 * 8.0 + 8.0);
+    t.row("hash_grid", "16 x 2^19 x 2, random points", "point", s, 0.0, bytes, || {
+        on_gpu.forward(gpu, &points, &table);
+    })?;
+    t.row("hash_grid, backward", "16 x 2^19 x 2, random points", "point", s, 0.0, bytes + 16.0 * 64.0, || {
+        on_gpu.backward(gpu, &points, &d, &d_table);
+    })?;
+    let (p, m, v) = (random(gpu, grid.params_len(), 4), gpu.zeros(grid.params_len()), gpu.zeros(grid.params_len()));
+    t.row("adam", "all rows touched", "parameter", grid.params_len(), 0.0, 32.0, || {
+        adam::gpu::step(gpu, &Adam::default(), 1, false, &p, &m, &v, &d_table);
+    })?;
+    t.row("spherical_harmonics", "degree 4", "direction", s, 0.0, 76.0, || {
+        spherical_harmonics::gpu::forward(gpu, 4, &points);
+    })
+}
+
+fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
+    let (k, n) = (64, 64);
+    let (x, w, d) = (random(gpu, s * k, 1), random(gpu, k * n, 2), random(gpu, s * n, 3));
+    let (kind, a, flops) = (BiasKind::None, Activation::Relu, (2 * k * n) as f64);
+    let shape = format!("{s}x64x64 f32");
+    t.row("linear", &shape, "row", s, flops, 0.0, || {
+        linear::gpu::forward(gpu, (s, k, n), &x, &w, None, kind, a);
+    })?;
+    t.row("linear, forward and backward", &shape, "row", s, 3.0 * flops, 0.0, || {
+        let out = linear::gpu::forward(gpu, (s, k, n), &x, &w, None, kind, a);
+        linear::gpu::backward(gpu, (s, k, n), &x, &w, kind, a, &out, &d);
+    })?;
+    let mlp = Mlp::chain(vec![32], &[64, 64, 16], false);
+    let (params, input) = (gpu.upload(&mlp.init(&Rng::new(1, 1))), random(gpu, s * 32, 4));
+    t.row("fused_mlp", "32 -> 64 -> 64 -> 16 f32", "sample", s, 2.0 * mlp.macs() as f64, 0.0, || {
+        fused_mlp::gpu::forward(gpu, &mlp, &params, &[&input], s);
+    })
+}
+
+fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
+    let per_ray = 32;
+    let offsets: Vec<u32> = (0..=s / per_ray).map(|r| (r * per_ray) as u32).collect();
+    let (starts, lengths): (Vec<f32>, Vec<f32>) = (0..s).map(|i| ((i % per_ray) as f32 * 0.1, 0.1)).unzip();
+    let p = GpuPacked::upload(gpu, &Packed { offsets: &offsets, t: &starts, dt: &lengths });
+    let (sigma, rgb, background) = (random(gpu, s, 1), random(gpu, s * 3, 2), gpu.zeros(p.rays() * 3));
+    let out = composite::forward(gpu, &p, &sigma, &rgb, 3, &background);
+    let d = composite::forward(gpu, &p, &sigma, &rgb, 3, &background);
+    t.row("composite", "3 channels, 32 samples per ray", "sample", s, 0.0, 28.0, || {
+        composite::forward(gpu, &p, &sigma, &rgb, 3, &background);
+    })?;
+    t.row("composite, backward", "3 channels, 32 samples per ray", "sample", s, 0.0, 52.0, || {
+        composite::backward(gpu, &p, &rgb, 3, &background, &out, &d);
+    })
+}
