@@ -63,6 +63,12 @@ impl Api {
             Api::WebGpu => cfg!(feature = "webgpu"),
         }
     }
+
+    /// What to say where a build cannot reach it.
+    pub fn not_built(self) -> String {
+        let name = self.name();
+        format!("device {name}: this build cannot reach it; build it with `cargo build --release --features {name}`, or use --device cpu")
+    }
 }
 
 impl std::str::FromStr for Api {

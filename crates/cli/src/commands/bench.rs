@@ -18,6 +18,9 @@ pub fn ops(a: &BenchOpsArgs) -> Result<Outcome> {
         println!("{:<30} {:<30} {:>10.1} ns/{:<10} {rate} {share}", f.op, f.shape, f.ns, f.unit);
     };
     if a.device != "cpu" {
+        if a.threads.is_some() {
+            return Err(PipelineError::Usage(format!("--threads is the CPU's; leave it out with --device {}", a.device)));
+        }
         return gpu_ops(a, &print);
     }
     let report = bench::ops::run(a.threads.unwrap_or(1), a.repeats, &mut |f| {

@@ -395,7 +395,8 @@ fn marches(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let want = march::reference::march(&grid, &r, &config);
             let on_gpu = march::gpu::GpuRays::upload(gpu, &r);
             let capacity = want.t.len() + 500;
-            let (packed, cells) = march::gpu::march(gpu, &march::gpu::GpuOccupancy::upload(gpu, &grid), &on_gpu, &config, capacity);
+            let occupancy = march::gpu::GpuOccupancy::upload(gpu, &grid);
+            let (packed, cells) = march::gpu::march(gpu, &occupancy, &on_gpu, &config, capacity);
             let (offsets, t, cells) = (gpu.read_u32(&packed.offsets)?, gpu.read(&packed.t)?, gpu.read_u32(&cells)?);
             let places = gpu.read(&march::gpu::positions(gpu, &on_gpu, &packed))?;
             let mut ties = 0;
@@ -413,6 +414,15 @@ fn marches(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             }
             let outcome = if ties * 50 <= n { Ok(0.0) } else { Err(format!("{ties} of {n} rays differ")) };
             table.row("march", "samples", format!("R={n} cascades={cascades}"), outcome);
+            // With room for half of them, offsets must stop there and what fits must be the same.
+            let half = capacity / 2;
+            let (packed, _) = march::gpu::march(gpu, &occupancy, &on_gpu, &config, half);
+            let bounded: Vec<u32> = offsets.iter().map(|o| (*o).min(half as u32)).collect();
+            table.equal("march", "bounded offsets", format!("R={n} cascades={cascades}"), &packed.offsets, &bounded)?;
+            let kept = *bounded.last().expect("R + 1 offsets") as usize;
+            let same = gpu.read(&packed.t)?[..kept] == t[..kept];
+            let outcome = if same { Ok(0.0) } else { Err("other samples than with room for all".into()) };
+            table.row("march", "bounded samples", format!("R={n} cascades={cascades}"), outcome);
         }
     }
     Ok(())

@@ -20,8 +20,8 @@ const MAX_CUBES: u32 = 65_535;
 /// Why a device cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum GpuError {
-    #[error("device {0}: this build cannot reach it; build it with `cargo build --release --features {0}`, or use --device cpu")]
-    NotBuilt(&'static str),
+    #[error("{}", .0.not_built())]
+    NotBuilt(Api),
     #[error("device {0}: none found on this machine; check its driver, or use --device cpu")]
     NoDevice(&'static str),
     #[error("device {0}: could not be opened: {1}; use --device cpu")]
@@ -76,7 +76,7 @@ impl Gpu {
     /// When the build lacks the API, the machine has no such device, or it cannot be opened.
     pub fn open(api: Api) -> Result<Gpu, GpuError> {
         if !api.is_built() {
-            return Err(GpuError::NotBuilt(api.name()));
+            return Err(GpuError::NotBuilt(api));
         }
         let (device, software) = find(api).ok_or(GpuError::NoDevice(api.name()))?;
         let client = quietly(|| device.client()).map_err(|e| GpuError::Open(api.name(), e))?;

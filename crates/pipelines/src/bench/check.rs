@@ -67,7 +67,7 @@ pub fn run(device: &str) -> Result<Report> {
 #[cfg(not(feature = "gpu"))]
 pub fn not_built(device: &str) -> PipelineError {
     PipelineError::Usage(match device.parse::<diorama_kernels::device::Api>() {
-        Ok(api) => format!("device {0}: this build cannot reach it; build it with `cargo build --release --features {0}`", api.name()),
+        Ok(api) => api.not_built(),
         Err(e) => e,
     })
 }

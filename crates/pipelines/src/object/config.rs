@@ -296,8 +296,10 @@ impl Config {
         }
         if !matches!(&self.device[..], "auto" | "cpu") {
             let api: Api = self.device.parse().map_err(PipelineError::Usage)?;
-            let why = if api.is_built() { "training does not run on GPUs yet" } else { "this build cannot reach it" };
-            return Err(PipelineError::Usage(format!("device {}: {why}; use --device auto or cpu", self.device)));
+            return Err(PipelineError::Usage(format!(
+                "device {}: training does not run on GPUs yet; use --device auto or cpu",
+                api.name()
+            )));
         }
         let s = &self.sampling;
         if s.samples < 2 || s.max_samples == 0 || s.batch_samples < 64 || s.occupancy_every == 0 {

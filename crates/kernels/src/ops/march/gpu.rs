@@ -46,7 +46,7 @@ impl GpuRays {
     }
 }
 
-/// Packed samples, `capacity` of them at most: rays that find no room keep none. Also their cells `[capacity]`.
+/// Packed samples, and the cells `[capacity]` that they lie in. Samples that find no room are left out, the last rays' first.
 pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfig, capacity: usize) -> (GpuPacked, Buffer) {
     let n = rays.jitter.len();
     let counts = gpu.empty(n);
@@ -86,6 +86,10 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
     let offsets = scan::gpu::exclusive(gpu, &counts);
     if n > 0 {
         launch(&offsets, true);
+        // SAFETY: units past the offsets stop.
+        unsafe {
+            bound::launch_unchecked(&gpu.client, units(n + 1), CubeDim::new_1d(CUBE), offsets.arg(), (n + 1) as u32, capacity as u32)
+        };
     }
     (GpuPacked { offsets, t, dt }, cells)
 }
@@ -226,6 +230,14 @@ fn walk(
     }
     if comptime!(!write) {
         counts[r] = count;
+    }
+}
+
+/// Offsets end where the memory does, so that no reader passes it.
+#[cube(launch_unchecked)]
+fn bound(offsets: &mut [u32], n: u32, capacity: u32) {
+    if ABSOLUTE_POS < n as usize {
+        offsets[ABSOLUTE_POS] = min(offsets[ABSOLUTE_POS], capacity);
     }
 }
 
