@@ -61,7 +61,7 @@ enum Work {
 struct Table<'a> {
     report: OpsReport,
     repeats: usize,
-    progress: &'a mut dyn FnMut(&OpFigure),
+    progress: &'a mut (dyn FnMut(&OpFigure) + Send),
 }
 
 impl Table<'_> {
@@ -93,18 +93,20 @@ fn random(n: usize, stream: u64) -> Vec<f32> {
 }
 
 /// Measures all ops on `threads` threads; `progress` hears of each line.
-pub fn run(threads: usize, repeats: usize, progress: &mut dyn FnMut(&OpFigure)) -> OpsReport {
+pub fn run(threads: usize, repeats: usize, progress: &mut (dyn FnMut(&OpFigure) + Send)) -> OpsReport {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a thread pool");
     let report = OpsReport { threads, simd: diorama_kernels::simd::level().name(), limits: limits(), ops: Vec::new() };
-    // The table's progress hook stays on this thread; the pool runs the closures' parallel loops.
     let mut table = Table { report, repeats, progress };
-    networks(&mut table, &pool);
-    encodings(&mut table, &pool);
-    rays(&mut table, &pool);
+    // All of it on a thread of the pool: entering the pool takes a sleeping thread's wake-up, as long as a small op.
+    pool.install(|| {
+        networks(&mut table);
+        encodings(&mut table);
+        rays(&mut table);
+    });
     table.report
 }
 
-fn networks(t: &mut Table, pool: &rayon::ThreadPool) {
+fn networks(t: &mut Table) {
     for width in [64, 256] {
         let (m, k, n) = (4096, width, width);
         let (x, w, d) = (random(m * k, 1), random(k * n, 2), random(m * n, 3));
@@ -112,14 +114,12 @@ fn networks(t: &mut Table, pool: &rayon::ThreadPool) {
         let shape = format!("{m}x{width}x{width} f32");
         let flops = (2 * k * n) as f64;
         t.row("linear", &shape, "row", m, Work::Flops(flops), || {
-            pool.install(|| linear::cpu::forward(m, k, n, &x, &w, &[], BiasKind::None, Activation::Relu, &mut out));
+            linear::cpu::forward(m, k, n, &x, &w, &[], BiasKind::None, Activation::Relu, &mut out);
         });
         t.row("linear, forward and backward", &shape, "row", m, Work::Flops(3.0 * flops), || {
-            pool.install(|| {
-                linear::cpu::forward(m, k, n, &x, &w, &[], BiasKind::None, Activation::Relu, &mut out);
-                let (kind, a) = (BiasKind::None, Activation::Relu);
-                linear::cpu::backward(m, k, n, &x, &w, kind, a, &out, &d, &mut dx, &mut dw, &mut []);
-            });
+            linear::cpu::forward(m, k, n, &x, &w, &[], BiasKind::None, Activation::Relu, &mut out);
+            let (kind, a) = (BiasKind::None, Activation::Relu);
+            linear::cpu::backward(m, k, n, &x, &w, kind, a, &out, &d, &mut dx, &mut dw, &mut []);
         });
     }
     for (name, inputs, widths) in [("fused_mlp", 32, &[64, 64, 16][..]), ("fused_mlp", 60, &[256, 256, 256, 16])] {
@@ -139,16 +139,16 @@ fn networks(t: &mut Table, pool: &rayon::ThreadPool) {
             );
             let flops = 2.0 * mlp.macs() as f64;
             t.row(name, &shape, "sample", n, Work::Flops(flops), || {
-                pool.install(|| fused_mlp::cpu::forward(&mlp, &params, &[&x], n, &mut out));
+                fused_mlp::cpu::forward(&mlp, &params, &[&x], n, &mut out);
             });
             t.row(&format!("{name}, backward"), &shape, "sample", n, Work::Flops(3.0 * flops), || {
-                pool.install(|| fused_mlp::cpu::backward(&mlp, &params, &[&x], n, &d, &mut dp, &mut dx));
+                fused_mlp::cpu::backward(&mlp, &params, &[&x], n, &d, &mut dp, &mut dx);
             });
         }
     }
 }
 
-fn encodings(t: &mut Table, pool: &rayon::ThreadPool) {
+fn encodings(t: &mut Table) {
     let grid = HashGrid::new(HashGridConfig { levels: 16, features: 2, log2_size: 19, base: 16, finest: 2048 });
     let n = 1 << 17;
     let points: Vec<f32> = random(n * 3, 1).iter().map(|v| 0.5 + 0.5 * v).collect();
@@ -159,30 +159,30 @@ fn encodings(t: &mut Table, pool: &rayon::ThreadPool) {
     // Eight rows of two floats per level; backward reads and writes them.
     let bytes = (16 * 8 * 8) as f64;
     t.row("hash_grid", "16 x 2^19 x 2, random points", "point", n, Work::Bytes(bytes), || {
-        pool.install(|| hash_grid::cpu::forward(&grid, &points, &table, &mut out));
+        hash_grid::cpu::forward(&grid, &points, &table, &mut out);
     });
     t.row("hash_grid, backward", "16 x 2^19 x 2, random points", "point", n, Work::Bytes(2.0 * bytes), || {
-        pool.install(|| hash_grid::cpu::backward(&grid, &points, &d, &mut d_table, Some(&mut touched)));
+        hash_grid::cpu::backward(&grid, &points, &d, &mut d_table, Some(&mut touched));
     });
     let (mut p, mut m, mut v) = (table.clone(), vec![0.0; table.len()], vec![0.0; table.len()]);
     let a = Adam::default();
     t.row("adam, touched rows", "all rows touched", "parameter", p.len(), Work::Bytes(32.0), || {
         touched.fill(1);
-        pool.install(|| adam::cpu::sparse(&a, 1, &mut p, &mut m, &mut v, &mut d_table, &mut touched));
+        adam::cpu::sparse(&a, 1, &mut p, &mut m, &mut v, &mut d_table, &mut touched);
     });
     let f = Frequency { dims: 3, bands: 10, include_input: true, pi: true, window: None };
     let x = random(n * 3, 4);
     let mut out = vec![0.0; n * f.output_dims()];
     t.row("frequency", "10 bands", "point", n, Work::Bytes(4.0 * (3 + f.output_dims()) as f64), || {
-        pool.install(|| frequency::cpu::forward(&f, &x, &mut out));
+        frequency::cpu::forward(&f, &x, &mut out);
     });
     let mut out = vec![0.0; n * 16];
     t.row("spherical_harmonics", "degree 4", "direction", n, Work::Bytes(4.0 * 19.0), || {
-        pool.install(|| spherical_harmonics::cpu::forward(4, &x, &mut out));
+        spherical_harmonics::cpu::forward(4, &x, &mut out);
     });
 }
 
-fn rays(t: &mut Table, pool: &rayon::ThreadPool) {
+fn rays(t: &mut Table) {
     let n = 4096;
     let camera =
         PosedCamera { camera: Camera::pinhole(64, 64, 0.7), pose: Pose::look_at(DVec3::new(0.5, -1.2, 0.8), DVec3::splat(0.5), DVec3::Z) };
@@ -190,7 +190,7 @@ fn rays(t: &mut Table, pool: &rayon::ThreadPool) {
     let pixels: Vec<f32> = (0..n).flat_map(|i| [(i % 64) as f32 + 0.5, (i / 64) as f32 + 0.5]).collect();
     let (mut origins, mut dirs) = (vec![0.0; n * 3], vec![0.0; n * 3]);
     t.row("ray_generation", "pinhole", "ray", n, Work::Unknown, || {
-        pool.install(|| ray_generation::cpu::forward(&[camera], &index, &pixels, &mut origins, &mut dirs));
+        ray_generation::cpu::forward(&[camera], &index, &pixels, &mut origins, &mut dirs);
     });
     let mut grid = OccupancyBits::full(128, 1);
     // A ball's shell, as after some training.
@@ -204,7 +204,7 @@ fn rays(t: &mut Table, pool: &rayon::ThreadPool) {
     let config = MarchConfig { cone: 0.0, dt_min: 1.732 / 1024.0, dt_max: 1.0, max_samples: 1024 };
     let (mut scratch, mut marched) = (march::cpu::MarchScratch::default(), Marched::default());
     t.row("march", "128^3, a shell", "ray", n, Work::Unknown, || {
-        pool.install(|| march::cpu::march(&grid, &rays, &config, &mut scratch, &mut marched));
+        march::cpu::march(&grid, &rays, &config, &mut scratch, &mut marched);
     });
     let s = marched.t.len();
     let packed = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
@@ -212,16 +212,16 @@ fn rays(t: &mut Table, pool: &rayon::ThreadPool) {
     let rgb = random(s * 3, 2);
     let background = vec![0.0; n * 3];
     t.row("composite", "3 channels", "sample", s, Work::Bytes(4.0 * 7.0), || {
-        pool.install(|| composite::cpu::forward(&packed, &sigma, &rgb, 3, &background));
+        composite::cpu::forward(&packed, &sigma, &rgb, 3, &background);
     });
     let d = random(n * 3, 3);
     let upstream = composite::cpu::Upstream { color: Some(&d), ..Default::default() };
     t.row("composite, backward", "3 channels", "sample", s, Work::Bytes(4.0 * 10.0), || {
-        pool.install(|| composite::cpu::backward(&packed, &sigma, &rgb, 3, &background, &upstream));
+        composite::cpu::backward(&packed, &sigma, &rgb, 3, &background, &upstream);
     });
     let (w, h) = (480, 270);
     let (x, y) = (random(w * h * 3, 1), random(w * h * 3, 2));
     t.row("ssim", "480x270x3", "pixel", w * h, Work::Unknown, || {
-        pool.install(|| ssim::cpu::ssim(w, h, 3, &x, &y));
+        ssim::cpu::ssim(w, h, 3, &x, &y);
     });
 }

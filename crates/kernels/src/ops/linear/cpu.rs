@@ -7,8 +7,12 @@ use rayon::prelude::*;
 
 /// Rows per block.
 const BLOCK: usize = 192;
+/// Rows per block backward, where x, the gradient and what is computed of them stay in cache together.
+const BLOCK_BACKWARD: usize = 96;
 /// Groups of blocks with a weight gradient of their own: fixed, so that results do not depend on threads.
 const GROUPS: usize = 16;
+/// Rows that a group has at least, so that its weight gradient costs less than its products.
+const GROUP_ROWS: usize = 512;
 
 /// Applies an activation in place.
 pub fn activate(a: Activation, values: &mut [f32]) {
@@ -84,7 +88,7 @@ pub fn backward(
     }
     let mut wt = Vec::new();
     gemm::transpose(k, n, w, &mut wt);
-    let rows_per_group = m.div_ceil(GROUPS).next_multiple_of(BLOCK);
+    let rows_per_group = m.div_ceil(GROUPS).max(GROUP_ROWS).next_multiple_of(BLOCK_BACKWARD);
     let per_row = kind == BiasKind::PerRow;
     let mut empty = [0.0f32; 0];
     let db_rows = if per_row { &mut *db } else { &mut empty[..] };
@@ -96,14 +100,16 @@ pub fn backward(
         .enumerate()
         .map(|(group, (dx, db_rows))| {
             let (mut dw, mut db) = (vec![0.0; k * n], vec![0.0; n]);
-            let mut g = vec![0.0; BLOCK * n];
+            let mut g = vec![0.0; BLOCK_BACKWARD * n];
             let first = group * rows_per_group;
             let last = (first + rows_per_group).min(m);
-            for start in (first..last).step_by(BLOCK) {
-                let rows = BLOCK.min(last - start);
+            for start in (first..last).step_by(BLOCK_BACKWARD) {
+                let rows = BLOCK_BACKWARD.min(last - start);
                 let span = start * n..(start + rows) * n;
-                for ((g, d), y) in g.iter_mut().zip(&d[span.clone()]).zip(&out[span]) {
-                    *g = d * slope_from_output(a, *y);
+                let slopes = g.iter_mut().zip(&d[span.clone()]).zip(&out[span]);
+                match a {
+                    Activation::Relu => slopes.for_each(|((g, d), y)| *g = f32::from_bits(d.to_bits() & ((*y > 0.0) as u32).wrapping_neg())),
+                    _ => slopes.for_each(|((g, d), y)| *g = d * slope_from_output(a, *y)),
                 }
                 let g = &g[..rows * n];
                 let local = start - first;
@@ -112,8 +118,10 @@ pub fn backward(
                 if per_row {
                     db_rows[local * n..(local + rows) * n].copy_from_slice(g);
                 }
-                for row in g.chunks_exact(n) {
-                    db.iter_mut().zip(row).for_each(|(b, g)| *b += g);
+                if kind == BiasKind::Shared {
+                    for row in g.chunks_exact(n) {
+                        db.iter_mut().zip(row).for_each(|(b, g)| *b += g);
+                    }
                 }
             }
             (dw, db)

@@ -16,7 +16,7 @@ fn bias_len(kind: BiasKind, m: usize, n: usize) -> usize {
 
 #[test]
 fn matches_the_reference_both_ways() {
-    for (m, k, n) in [(0, 3, 4), (1, 1, 1), (7, 5, 3), (500, 64, 64), (385, 33, 257), (12, 256, 16)] {
+    for (m, k, n) in [(0, 3, 4), (1, 1, 1), (7, 5, 3), (500, 64, 64), (385, 33, 257), (12, 256, 16), (1300, 8, 5)] {
         for kind in KINDS {
             for a in ALL {
                 let (x, mut w, b) = (random(m * k, 1), random(k * n, 2), random(bias_len(kind, m, n), 3));
