@@ -108,7 +108,9 @@ pub fn backward(
                 let span = start * n..(start + rows) * n;
                 let slopes = g.iter_mut().zip(&d[span.clone()]).zip(&out[span]);
                 match a {
-                    Activation::Relu => slopes.for_each(|((g, d), y)| *g = f32::from_bits(d.to_bits() & ((*y > 0.0) as u32).wrapping_neg())),
+                    Activation::Relu => {
+                        slopes.for_each(|((g, d), y)| *g = f32::from_bits(d.to_bits() & ((*y > 0.0) as u32).wrapping_neg()))
+                    }
                     _ => slopes.for_each(|((g, d), y)| *g = d * slope_from_output(a, *y)),
                 }
                 let g = &g[..rows * n];
