@@ -4,6 +4,8 @@ pub mod background;
 pub mod fields;
 pub mod losses;
 pub mod metrics;
+#[cfg(feature = "gpu")]
+pub mod on_gpu;
 pub mod params;
 pub mod renderers;
 pub mod samplers;

@@ -22,6 +22,11 @@ impl Rng {
         Self { key: mix(mix(seed.wrapping_add(GOLDEN)) ^ stream.wrapping_mul(GOLDEN)) }
     }
 
+    /// What the bits at a counter depend on besides it: `mix(key ^ mix(counter · golden + key))`.
+    pub fn key(&self) -> u64 {
+        self.key
+    }
+
     /// 64 random bits at `counter`.
     #[inline]
     pub fn bits(&self, counter: u64) -> u64 {

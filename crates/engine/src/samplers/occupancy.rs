@@ -15,6 +15,9 @@ pub const MIN_STEP: f32 = 1.732_050_8 / 1024.0;
 /// Optical thickness of a smallest step above which a cell is occupied.
 const THRESHOLD: f32 = 0.01;
 
+/// Density above which a cell is occupied, unless the mean of all is lower.
+pub const OCCUPIED: f32 = THRESHOLD / MIN_STEP;
+
 /// Density that stands for "no camera sees this": never sampled, never occupied.
 const UNSEEN: f32 = -1.0;
 
@@ -35,7 +38,7 @@ pub struct Occupancy {
     /// Highest density seen in each cell since the last update; 0 where nobody looked.
     pub fresh: Vec<f32>,
     /// Cells that some camera sees.
-    live: Vec<u32>,
+    pub live: Vec<u32>,
     /// How much of a stored density survives an update of its cell.
     pub decay: f32,
 }
@@ -90,7 +93,7 @@ impl Occupancy {
     fn refresh_bits(&mut self) {
         let parts: Vec<(f64, usize)> = self.density.par_chunks(TASK).map(known_sum).collect();
         let (sum, known) = parts.iter().fold((0.0, 0), |a, p| (a.0 + p.0, a.1 + p.1));
-        let threshold = (THRESHOLD / MIN_STEP).min((sum / known.max(1) as f64) as f32);
+        let threshold = OCCUPIED.min((sum / known.max(1) as f64) as f32);
         let density = &self.density;
         self.bits.fill_with(|cell| density[cell] > threshold);
     }

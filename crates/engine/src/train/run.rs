@@ -22,7 +22,7 @@ pub struct RunOptions {
 pub trait Trainee {
     type Error;
     /// One optimiser step; `progress` in [0, 1] drives the schedules.
-    fn step(&mut self, step: u64, progress: f64) -> StepReport;
+    fn step(&mut self, step: u64, progress: f64) -> Result<StepReport, Self::Error>;
     /// Writes a checkpoint that `step` steps and `seconds` have gone into.
     fn save(&mut self, step: u64, seconds: f64) -> Result<(), Self::Error>;
     /// Goes back to the last checkpoint with a lower rate; the step to go on from, or `None` if that was tried before.
@@ -47,7 +47,8 @@ pub struct Summary {
 /// Why a run failed.
 #[derive(Debug)]
 pub enum RunError<E> {
-    Save(E),
+    /// A step, a checkpoint or going back to one failed.
+    Failed(E),
     /// The loss was not finite twice; the last good checkpoint is of this step.
     Diverged {
         step: u64,
@@ -84,9 +85,9 @@ pub fn run<T: Trainee>(
         if progress >= 1.0 || summary.interrupted {
             break;
         }
-        let report = trainee.step(step, progress);
+        let report = trainee.step(step, progress).map_err(RunError::Failed)?;
         if !report.loss.is_finite() {
-            match trainee.recover().map_err(RunError::Save)? {
+            match trainee.recover().map_err(RunError::Failed)? {
                 Some(to_step) => {
                     events(&Event::Recovered { step, to_step });
                     step = to_step;
@@ -112,7 +113,7 @@ pub fn run<T: Trainee>(
             clock.seconds() - last_save > options.save_every_seconds || options.save_every_steps.is_some_and(|n| step.is_multiple_of(n));
         if due {
             last_save = clock.seconds();
-            trainee.save(step, last_save).map_err(RunError::Save)?;
+            trainee.save(step, last_save).map_err(RunError::Failed)?;
             events(&Event::Saved { step });
         }
         if options.evaluate_every.is_some_and(|n| step.is_multiple_of(n)) {
@@ -130,7 +131,7 @@ pub fn run<T: Trainee>(
         events(&p);
     }
     let seconds = clock.seconds();
-    trainee.save(step, seconds).map_err(RunError::Save)?;
+    trainee.save(step, seconds).map_err(RunError::Failed)?;
     events(&Event::Saved { step });
     summary = Summary { step, seconds: clock.seconds(), rays, samples, ..summary };
     events(&Event::Finished { step, seconds: summary.seconds, interrupted: summary.interrupted });
@@ -198,12 +199,12 @@ mod tests {
 
     impl Trainee for Fake {
         type Error = ();
-        fn step(&mut self, step: u64, _: f64) -> StepReport {
+        fn step(&mut self, step: u64, _: f64) -> Result<StepReport, ()> {
             let bad = self.nan_at.first() == Some(&step);
             if bad {
                 self.nan_at.remove(0);
             }
-            StepReport { loss: if bad { f64::NAN } else { 1.0 }, mse: 0.01, rays: 10, samples: 100 }
+            Ok(StepReport { loss: if bad { f64::NAN } else { 1.0 }, mse: 0.01, rays: 10, samples: 100 })
         }
         fn save(&mut self, step: u64, _: f64) -> Result<(), ()> {
             self.saved.push(step);

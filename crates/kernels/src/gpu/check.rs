@@ -1,14 +1,14 @@
 //! Every op on a device against its f64 reference, forward and backward, over empty, single, odd and
 //! ragged shapes.
 
-use super::{Buffer, Gpu, GpuError};
+use super::{Buffer, Gpu, GpuError, Rows};
 use crate::device::Api;
 use crate::ops::adam::{self, Adam};
 use crate::ops::composite::{self, Composited, Packed, gpu::GpuComposited, gpu::GpuPacked};
 use crate::ops::fused_mlp::{self, Layer, Mlp, Source};
 use crate::ops::hash_grid::{self, HashGrid, HashGridConfig, gpu::GpuHashGrid};
 use crate::ops::linear::{self, Activation, BiasKind};
-use crate::ops::march::{self, MarchConfig, MarchRays, OccupancyBits};
+use crate::ops::march::{self, MarchConfig, MarchRays, OccupancyBits, gpu::Space};
 use crate::ops::ngp_field::{self, FieldNet, Head};
 use crate::ops::ray_generation::{self, PosedCamera, gpu::GpuCameras};
 use crate::ops::trilinear_corner_grid::{self, Corners, gpu::GpuCorners};
@@ -124,25 +124,25 @@ fn hash_grids(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             }
             let (d, dj) = (random(s * grid.output_dims(), 3), random(s * grid.output_dims() * 3, 5));
             let (p_gpu, d_gpu, dj_gpu) = (gpu.upload(&p), gpu.upload(&d), gpu.upload(&dj));
-            let shape = format!("S={s} L=4 F={features}");
+            let (rows, shape) = (Rows::all(gpu, s), format!("S={s} L=4 F={features}"));
             let (pw, tw) = (wide(&p), wide(&t));
             table.close(
                 "hash grid",
                 "forward",
                 &shape,
-                &on_gpu.forward(gpu, &p_gpu, &t_gpu),
+                &on_gpu.forward(gpu, &rows, &p_gpu, &t_gpu),
                 &hash_grid::reference::forward(&grid, &pw, &tw),
             )?;
             let (dp, dt) = hash_grid::reference::backward(&grid, &pw, &tw, &wide(&d));
             table.close("hash grid", "d points", &shape, &on_gpu.backward_positions(gpu, &p_gpu, &t_gpu, &d_gpu), &dp)?;
             let jacobian = hash_grid::reference::jacobian(&grid, &pw, &tw);
-            table.close("hash grid", "jacobian", &shape, &on_gpu.jacobian(gpu, &p_gpu, &t_gpu), &jacobian)?;
+            table.close("hash grid", "jacobian", &shape, &on_gpu.jacobian(gpu, &rows, &p_gpu, &t_gpu), &jacobian)?;
             let djt = hash_grid::reference::jacobian_backward(&grid, &pw, &wide(&dj));
             for (name, adder) in adders(gpu) {
                 let (sum, sum_j) = (gpu.zeros(grid.params_len()), gpu.zeros(grid.params_len()));
-                on_gpu.backward(&adder, &p_gpu, &d_gpu, &sum);
+                on_gpu.backward(&adder, &rows, &p_gpu, &d_gpu, &sum);
                 table.close("hash grid", name, &shape, &sum, &dt)?;
-                on_gpu.jacobian_backward(&adder, &p_gpu, &dj_gpu, &sum_j);
+                on_gpu.jacobian_backward(&adder, &rows, &p_gpu, &dj_gpu, &sum_j);
                 table.close("hash grid jacobian", name, &shape, &sum_j, &djt)?;
             }
         }
@@ -204,9 +204,9 @@ fn layers(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                 let w: Vec<f32> = random(k * n, 2).iter().map(|w| w / (k as f32).sqrt()).collect();
                 let (xg, wg, bg) = (gpu.upload(&x), gpu.upload(&w), gpu.upload(&b));
                 let (xd, wd, bd) = (wide(&x), wide(&w), wide(&b));
-                let out = on_gpu::forward(gpu, (m, k, n), &xg, &wg, Some(&bg), kind, a);
+                let out = on_gpu::forward(gpu, &Rows::all(gpu, m), (k, n), &xg, &wg, Some(&bg), kind, a);
                 table.close("linear", "forward", &shape, &out, &reference::forward(m, k, n, &xd, &wd, &bd, kind, a))?;
-                let g = on_gpu::backward(gpu, (m, k, n), &xg, &wg, kind, a, &out, &gpu.upload(&d));
+                let g = on_gpu::backward(gpu, &Rows::all(gpu, m), (k, n), &xg, &wg, kind, a, &out, &gpu.upload(&d));
                 let (dx, dw, db) = reference::backward(m, k, n, &xd, &wd, &bd, kind, a, &wide(&d));
                 table.close("linear", "d x", &shape, &g.x, &dx)?;
                 table.close("linear", "d weight", &shape, &g.w, &dw)?;
@@ -243,13 +243,13 @@ fn networks(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let on_gpu: Vec<Buffer> = inputs.iter().map(|i| gpu.upload(i)).collect();
             let refs: Vec<&Buffer> = on_gpu.iter().collect();
             let p = gpu.upload(&params);
-            let values = fused_mlp::gpu::forward(gpu, &mlp, &p, &refs, n);
+            let values = fused_mlp::gpu::forward(gpu, &mlp, &p, &refs, &Rows::all(gpu, n));
             let wide_inputs: Vec<Vec<f64>> = inputs.iter().map(|i| wide(i)).collect();
             let wide_refs: Vec<&[f64]> = wide_inputs.iter().map(|i| &i[..]).collect();
             let want = fused_mlp::reference::forward(&mlp, &wide(&params), &wide_refs, n);
             table.close("fused MLP", "forward", &shape, values.last().expect("layers"), want.last().expect("layers"))?;
             let seeds = d.iter().map(|d| Some(gpu.upload(d))).collect();
-            let (dp, di) = fused_mlp::gpu::backward(gpu, &mlp, &p, &refs, &values, n, seeds);
+            let (dp, di) = fused_mlp::gpu::backward(gpu, &mlp, &p, &refs, &values, &Rows::all(gpu, n), seeds);
             let wide_d: Vec<Vec<f64>> = d.iter().map(|d| wide(d)).collect();
             let (wp, wi) = fused_mlp::reference::backward(&mlp, &wide(&params), &wide_refs, n, &wide_d);
             table.close("fused MLP", "d parameters", &shape, &dp, &wp)?;
@@ -396,9 +396,10 @@ fn marches(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let on_gpu = march::gpu::GpuRays::upload(gpu, &r);
             let capacity = want.t.len() + 500;
             let occupancy = march::gpu::GpuOccupancy::upload(gpu, &grid);
-            let (packed, cells) = march::gpu::march(gpu, &occupancy, &on_gpu, &config, capacity);
-            let (offsets, t, cells) = (gpu.read_u32(&packed.offsets)?, gpu.read(&packed.t)?, gpu.read_u32(&cells)?);
-            let places = gpu.read(&march::gpu::positions(gpu, &on_gpu, &packed))?;
+            let marched = march::gpu::march(gpu, &occupancy, &on_gpu, &config, capacity);
+            let packed = &marched.packed;
+            let (offsets, t, cells) = (gpu.read_u32(&packed.offsets)?, gpu.read(&packed.t)?, gpu.read_u32(&marched.cells)?);
+            let places = gpu.read(&march::gpu::positions(gpu, &on_gpu, packed, Space::Model))?;
             let mut ties = 0;
             for i in 0..n {
                 let a = offsets[i] as usize..offsets[i + 1] as usize;
@@ -416,7 +417,10 @@ fn marches(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             table.row("march", "samples", format!("R={n} cascades={cascades}"), outcome);
             // With room for half of them, offsets must stop there and what fits must be the same.
             let half = capacity / 2;
-            let (packed, _) = march::gpu::march(gpu, &occupancy, &on_gpu, &config, half);
+            let marched = march::gpu::march(gpu, &occupancy, &on_gpu, &config, half);
+            let packed = &marched.packed;
+            let cut: Vec<u32> = offsets.iter().skip(1).map(|o| (*o > half as u32) as u32).collect();
+            table.equal("march", "rays cut", format!("R={n} cascades={cascades}"), &marched.cut, &cut)?;
             let bounded: Vec<u32> = offsets.iter().map(|o| (*o).min(half as u32)).collect();
             table.equal("march", "bounded offsets", format!("R={n} cascades={cascades}"), &packed.offsets, &bounded)?;
             let kept = *bounded.last().expect("R + 1 offsets") as usize;
@@ -584,13 +588,14 @@ fn fields(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let up = |v: &[f32]| gpu.upload(v);
         let (on_gpu, pg, fg, bg) = (GpuPacked::upload(gpu, &p), up(&params), up(&features), up(&background));
         let (ca, cb) = (up(&codes[0]), up(&codes[1]));
-        let step = ngp_field::gpu::forward(gpu, &net, &pg, &on_gpu, &fg, per_level, &[&ca, &cb], &bg);
+        let rows = ngp_field::gpu::to_rows(gpu, &on_gpu.rows(), &fg, per_level, levels * per_level);
+        let step = ngp_field::gpu::forward(gpu, &net, &pg, &on_gpu, &rows, &[&ca, &cb], &bg);
         let shape = format!("R={rays} S={s}");
         table.close("field", "color", &shape, &step.out.color, &want.out.color)?;
         table.close("field", "weights", &shape, &step.out.weights, &want.out.weights)?;
         let [color, depth, opacity, weights] = d.each_ref().map(|v| up(v));
         let d = GpuComposited { color, depth, opacity, weights };
-        let g = ngp_field::gpu::backward(gpu, &net, &pg, &on_gpu, per_level, &bg, &step, &d);
+        let g = ngp_field::gpu::backward(gpu, &net, &pg, &on_gpu, per_level, &bg, &step, &d, 0.0);
         table.close("field", "d parameters", &shape, &g.params, &want.d_params)?;
         table.close("field", "d background", &shape, &g.background, &want.d_background)?;
         let level_major: Vec<f64> = (0..levels * s * per_level)

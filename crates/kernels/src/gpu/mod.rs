@@ -3,6 +3,7 @@
 
 mod atomics;
 pub mod check;
+pub(crate) mod random;
 
 use crate::device::Api;
 pub use atomics::{Accumulate, Native, Swap};
@@ -69,6 +70,33 @@ impl Buffer {
     }
 }
 
+/// Rows of a matrix of which only the device knows how many are in use.
+#[derive(Clone)]
+pub struct Rows {
+    /// As many as there is memory for.
+    pub most: usize,
+    live: Buffer,
+    at: usize,
+}
+
+impl Rows {
+    /// All of `n` rows.
+    pub fn all(gpu: &Gpu, n: usize) -> Rows {
+        Rows { most: n, live: gpu.upload_u32(&[n as u32]), at: 0 }
+    }
+
+    /// As many as number `at` of `live` says, which is at most `most`.
+    pub fn counted(most: usize, live: &Buffer, at: usize) -> Rows {
+        assert!(at < live.len(), "rows: no number {at}");
+        Rows { most, live: live.clone(), at }
+    }
+
+    /// The count and its place, for a launch.
+    pub(crate) fn arg(&self) -> (BufferArg, u32) {
+        (self.live.arg(), self.at as u32)
+    }
+}
+
 impl Gpu {
     /// Opens the best device of an API: discrete before integrated before software.
     ///
@@ -95,6 +123,11 @@ impl Gpu {
         self.native_atomics
     }
 
+    /// Bytes of the largest piece of memory that can be had.
+    pub fn largest_buffer(&self) -> u64 {
+        self.client.properties().memory.max_page_size
+    }
+
     /// Memory for `len` numbers of unknown value.
     pub fn empty(&self, len: usize) -> Buffer {
         Buffer { handle: self.client.empty(len.max(1) * 4), len }
@@ -116,6 +149,17 @@ impl Gpu {
             // SAFETY: every unit checks its position against the length.
             unsafe { duplicate::launch_unchecked(&self.client, units(n), CubeDim::new_1d(CUBE), from.arg(), to.arg(), n as u32) };
         }
+    }
+
+    /// Marks that are set in either buffer.
+    pub fn either(&self, a: &Buffer, b: &Buffer) -> Buffer {
+        let n = a.len.min(b.len);
+        let out = self.empty(n);
+        if n > 0 {
+            // SAFETY: every unit checks its position against the length.
+            unsafe { unite::launch_unchecked(&self.client, units(n), CubeDim::new_1d(CUBE), a.arg(), b.arg(), out.arg(), n as u32) };
+        }
+        out
     }
 
     pub fn upload(&self, data: &[f32]) -> Buffer {
@@ -210,5 +254,12 @@ fn clear(out: &mut [f32], n: u32) {
 fn duplicate(from: &[f32], to: &mut [f32], n: u32) {
     if ABSOLUTE_POS < n as usize {
         to[ABSOLUTE_POS] = from[ABSOLUTE_POS];
+    }
+}
+
+#[cube(launch_unchecked)]
+fn unite(a: &[u32], b: &[u32], out: &mut [u32], n: u32) {
+    if ABSOLUTE_POS < n as usize {
+        out[ABSOLUTE_POS] = a[ABSOLUTE_POS] | b[ABSOLUTE_POS];
     }
 }

@@ -4,7 +4,7 @@ use super::median_seconds;
 use super::ops::OpFigure;
 use crate::{PipelineError, Result};
 use diorama_geom::rng::Rng;
-use diorama_kernels::gpu::{Buffer, Gpu, GpuError};
+use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::composite::gpu::{self as composite, GpuPacked};
@@ -92,14 +92,15 @@ pub fn run(device: &str, repeats: usize, progress: &mut dyn FnMut(&OpFigure)) ->
 fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let grid = HashGrid::new(HashGridConfig { levels: 16, features: 2, log2_size: 19, base: 16, finest: 2048 });
     let (on_gpu, points, table) = (GpuHashGrid::new(gpu, &grid), random(gpu, s * 3, 1), random(gpu, grid.params_len(), 2));
+    let rows = Rows::all(gpu, s);
     let (d, d_table) = (random(gpu, s * grid.output_dims(), 3), gpu.zeros(grid.params_len()));
     // Eight rows of two numbers per level and point, and the result.
     let bytes = 16.0 * (8.0 * 8.0 + 8.0);
     t.row("hash_grid", "16 x 2^19 x 2, random points", "point", s, 0.0, bytes, || {
-        on_gpu.forward(gpu, &points, &table);
+        on_gpu.forward(gpu, &rows, &points, &table);
     })?;
     t.row("hash_grid, backward", "16 x 2^19 x 2, random points", "point", s, 0.0, bytes + 16.0 * 64.0, || {
-        on_gpu.backward(gpu, &points, &d, &d_table);
+        on_gpu.backward(gpu, &rows, &points, &d, &d_table);
     })?;
     let (p, m, v) = (random(gpu, grid.params_len(), 4), gpu.zeros(grid.params_len()), gpu.zeros(grid.params_len()));
     t.row("adam", "all rows touched", "parameter", grid.params_len(), 0.0, 32.0, || {
@@ -111,21 +112,21 @@ fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
 }
 
 fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
-    let (k, n) = (64, 64);
+    let (k, n, rows) = (64, 64, Rows::all(gpu, s));
     let (x, w, d) = (random(gpu, s * k, 1), random(gpu, k * n, 2), random(gpu, s * n, 3));
     let (kind, a, flops) = (BiasKind::None, Activation::Relu, (2 * k * n) as f64);
     let shape = format!("{s}x64x64 f32");
     t.row("linear", &shape, "row", s, flops, 0.0, || {
-        linear::gpu::forward(gpu, (s, k, n), &x, &w, None, kind, a);
+        linear::gpu::forward(gpu, &rows, (k, n), &x, &w, None, kind, a);
     })?;
     t.row("linear, forward and backward", &shape, "row", s, 3.0 * flops, 0.0, || {
-        let out = linear::gpu::forward(gpu, (s, k, n), &x, &w, None, kind, a);
-        linear::gpu::backward(gpu, (s, k, n), &x, &w, kind, a, &out, &d);
+        let out = linear::gpu::forward(gpu, &rows, (k, n), &x, &w, None, kind, a);
+        linear::gpu::backward(gpu, &rows, (k, n), &x, &w, kind, a, &out, &d);
     })?;
     let mlp = Mlp::chain(vec![32], &[64, 64, 16], false);
     let (params, input) = (gpu.upload(&mlp.init(&Rng::new(1, 1))), random(gpu, s * 32, 4));
     t.row("fused_mlp", "32 -> 64 -> 64 -> 16 f32", "sample", s, 2.0 * mlp.macs() as f64, 0.0, || {
-        fused_mlp::gpu::forward(gpu, &mlp, &params, &[&input], s);
+        fused_mlp::gpu::forward(gpu, &mlp, &params, &[&input], &rows);
     })
 }
 

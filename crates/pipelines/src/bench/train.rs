@@ -19,6 +19,8 @@ pub struct StageFigure {
 pub struct TrainReport {
     pub threads: usize,
     pub simd: &'static str,
+    /// `cpu`, or what the GPU calls itself.
+    pub device: String,
     pub steps: u64,
     pub seconds: f64,
     pub rays_per_s: f64,

@@ -108,6 +108,7 @@ pub struct OptimConfig {
 pub struct SamplingConfig {
     /// Rays per step; 0: as many as give `batch_samples` samples.
     pub rays: usize,
+    /// Samples per step; 0: 2^15 on CPUs, 2^18 on GPUs.
     pub batch_samples: usize,
     /// Samples per ray of the methods without an occupancy grid.
     pub samples: usize,
@@ -221,7 +222,7 @@ impl Config {
             },
             sampling: SamplingConfig {
                 rays,
-                batch_samples: 1 << 15,
+                batch_samples: 0,
                 samples: 64,
                 importance: 128,
                 max_samples: 1024,
@@ -295,15 +296,11 @@ impl Config {
             return fail("loss.color: expected mse or huber");
         }
         if !matches!(&self.device[..], "auto" | "cpu") {
-            let api: Api = self.device.parse().map_err(PipelineError::Usage)?;
-            return Err(PipelineError::Usage(format!(
-                "device {}: training does not run on GPUs yet; use --device auto or cpu",
-                api.name()
-            )));
+            self.device.parse::<Api>().map_err(PipelineError::Usage)?;
         }
         let s = &self.sampling;
-        if s.samples < 2 || s.max_samples == 0 || s.batch_samples < 64 || s.occupancy_every == 0 {
-            return fail("sampling: samples at least 2, max_samples and occupancy_every at least 1, batch_samples at least 64");
+        if s.samples < 2 || s.max_samples == 0 || (1..64).contains(&s.batch_samples) || s.occupancy_every == 0 {
+            return fail("sampling: samples at least 2, max_samples and occupancy_every at least 1, batch_samples 0 or at least 64");
         }
         if s.occupancy_resolution == 0 || !s.occupancy_resolution.is_multiple_of(16) {
             return fail("sampling.occupancy_resolution: must be a multiple of 16");

@@ -2,6 +2,7 @@
 
 pub mod compare;
 pub mod config;
+pub mod device;
 pub mod evaluate;
 pub mod export;
 pub mod model;

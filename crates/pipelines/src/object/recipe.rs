@@ -1,6 +1,7 @@
 //! Training, from top to bottom.
 
 use super::config::{Background, Config, Method};
+use super::device::{self, Drawing, Opened};
 use super::evaluate;
 use super::model::ObjectModel;
 use super::run_folder::RunFolder;
@@ -69,6 +70,8 @@ pub fn train(
     interrupt: &AtomicBool,
     events: &mut dyn FnMut(&Event),
 ) -> Result<(ObjectModel, Summary)> {
+    let opened = device::open(config)?;
+    opened.note().into_iter().for_each(|n| events(&Event::Note(n)));
     let capture = if resume { folder.capture()? } else { load_capture(config)? };
     for note in &capture.notes {
         events(&Event::Note(note.clone()));
@@ -94,7 +97,7 @@ pub fn train(
     let options = run_options(config);
     let origin = model.origin;
     let checkpoints = folder.checkpoints();
-    let mut trainer = Trainer::new(model, Photographs(store), &checkpoints);
+    let mut trainer = Trainer::new(model, Photographs(store), &checkpoints, opened)?;
     let mut log_error = None;
     let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
         if let Err(e) = folder.log(e) {
@@ -106,7 +109,7 @@ pub fn train(
         return Err(e);
     }
     let summary = result.map_err(|e| match e {
-        RunError::Save(e) => e,
+        RunError::Failed(e) => e,
         RunError::Diverged { step } => PipelineError::Diverged { step, checkpoint: checkpoint::latest(&checkpoints).display().to_string() },
     })?;
     folder.draw_curves()?;
@@ -119,16 +122,19 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
     let scratch = std::env::temp_dir();
     let store = load_pixels(config, &capture, &scratch)?;
     let has_alpha = store.has_alpha;
-    let mut trainer = Trainer::new(ObjectModel::new(config.clone(), capture, has_alpha)?, Photographs(store), &scratch);
+    let model = ObjectModel::new(config.clone(), capture, has_alpha)?;
+    let mut trainer = Trainer::new(model, Photographs(store), &scratch, device::open(config)?)?;
     for step in 0..warmup {
-        trainer.step(step, 0.0);
+        trainer.step(step, 0.0)?;
     }
+    trainer.settle()?;
     trainer.buffers.field.stages = Stages::default();
     let before = (trainer.model.origin, trainer.marched);
     let begin = Instant::now();
     for step in warmup..warmup + steps {
-        trainer.step(step, 0.0);
+        trainer.step(step, 0.0)?;
     }
+    trainer.settle()?;
     let seconds = begin.elapsed().as_secs_f64();
     let (o, marched) = (trainer.model.origin, trainer.marched - before.1);
     let (rays, trained) = ((o.rays - before.0.rays) as f64, (o.samples - before.0.samples) as f64);
@@ -137,6 +143,7 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
     Ok(TrainReport {
         threads: rayon::current_num_threads(),
         simd: diorama_kernels::simd::level().name(),
+        device: trainer.device.name(),
         steps,
         seconds,
         rays_per_s: rays / seconds,
@@ -169,7 +176,16 @@ fn run_options(config: &Config) -> RunOptions {
     }
 }
 
-struct Photographs(PixelStore);
+/// The training photographs.
+pub(super) struct Photographs(PixelStore);
+
+impl Photographs {
+    /// Bytes of all pixels.
+    #[cfg(feature = "gpu")]
+    pub fn bytes(&self) -> u64 {
+        (0..self.0.len()).map(|i| self.0.size(i)).map(|(w, h)| w as u64 * h as u64 * 4).sum()
+    }
+}
 
 impl PixelSource for Photographs {
     fn images(&self) -> usize {
@@ -208,14 +224,17 @@ struct Trainer<'a> {
     recovered: bool,
     /// Samples before any were left out.
     marched: u64,
+    device: Opened,
 }
 
 impl<'a> Trainer<'a> {
-    fn new(model: ObjectModel, photographs: Photographs, checkpoints: &'a Path) -> Self {
+    fn new(model: ObjectModel, photographs: Photographs, checkpoints: &'a Path, mut device: Opened) -> Result<Self> {
         let o = &model.config.optim;
         let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
-        Trainer {
-            cameras: model.cameras(),
+        let cameras = model.cameras();
+        device.upload(&model, &photographs, &cameras)?;
+        Ok(Trainer {
+            cameras,
             model,
             photographs,
             checkpoints,
@@ -223,7 +242,15 @@ impl<'a> Trainer<'a> {
             schedule,
             recovered: false,
             marched: 0,
-        }
+            device,
+        })
+    }
+
+    /// Waits for a GPU and counts what it has done.
+    fn settle(&mut self) -> Result<()> {
+        let f = self.device.figures(&mut self.model)?;
+        self.marched += f.marched as u64;
+        Ok(())
     }
 
     /// As many rays as give about the wanted number of samples, fewer while coarse steps in quick succession
@@ -235,8 +262,8 @@ impl<'a> Trainer<'a> {
         }
         let (from, until) = BATCH_RAMP;
         let grown = step.saturating_sub(from) as f64 / (until - from) as f64;
-        let n = s.batch_samples as f64 * (0.25 + 0.75 * grown.min(1.0)) / self.model.samples_per_ray.max(1.0);
-        (n as usize).clamp(64, 1 << 14).next_multiple_of(64)
+        let n = self.device.batch_samples(&self.model.config) as f64 * (0.25 + 0.75 * grown.min(1.0)) / self.model.samples_per_ray.max(1.0);
+        (n as usize).clamp(64, self.device.most_rays()).next_multiple_of(64)
     }
 
     fn draw(&mut self, step: u64, first: u64) {
@@ -256,16 +283,20 @@ impl<'a> Trainer<'a> {
         self.buffers.field.stages.done("draw");
     }
 
+    fn is_background_random(&self) -> bool {
+        match self.model.config.background {
+            Background::Random => true,
+            Background::Auto => self.model.config.method == Method::Ngp,
+            _ => false,
+        }
+    }
+
     fn fill_background(&mut self, first: u64) {
+        let random = self.is_background_random();
         let b = &mut self.buffers;
         let n = b.batch.len();
         b.background.resize(n * 3, 0.0);
         let m = &self.model;
-        let random = match m.config.background {
-            Background::Random => true,
-            Background::Auto => m.config.method == Method::Ngp,
-            _ => false,
-        };
         if let Some(l) = &m.learned {
             l.forward(&b.batch.dirs, &mut b.background);
         } else if random {
@@ -297,9 +328,7 @@ impl<'a> Trainer<'a> {
             resumed: false,
         };
         let pruning = Pruning { stop: s.stop, min_alpha: s.min_alpha, thin: THIN, min_weight: 0.0 };
-        let (stretch, until) = MARCH_RAMP;
-        let stretch = stretch.powf(1.0 - step.min(until) as f32 / until as f32);
-        let march = grid.march_config(s.max_samples).stretched(stretch);
+        let march = grid.march_config(s.max_samples).stretched(stretch(step));
         m.field.visible(&grid.bits, &rays, &march, pruning, &mut b.marched, &mut b.positions, &mut b.field);
         b.field.visible.seen().for_each(|(cells, sigma)| grid.record(cells, sigma));
         self.marched += b.field.visible.marched() as u64;
@@ -316,6 +345,27 @@ impl<'a> Trainer<'a> {
             m.corrections.is_some().then_some(&mut b.d_positions),
         );
         (loss, b.marched.t.len() as u64)
+    }
+
+    /// The same on a GPU, which reports after some steps what they came to on average.
+    fn step_gpu(&mut self, step: u64, progress: f64) -> Result<StepReport> {
+        let (rays, m) = (self.rays(step), &self.model);
+        let s = &m.config.sampling;
+        let (until, block) = OCCUPANCY_WARMUP;
+        let seed = m.config.seed;
+        let drawing = Drawing {
+            rays,
+            pixels: Rng::new(seed, PIXELS),
+            background: self.is_background_random().then(|| Rng::new(seed, BACKGROUND)),
+            probes: (step > 0 && step.is_multiple_of(s.occupancy_every)).then(|| Rng::new(seed, OCCUPANCY)),
+            block: if step <= until { block } else { 1 },
+            stretch: stretch(step),
+            thin: THIN,
+            rate_scale: self.schedule.scale(progress as f32) * m.rate_scale,
+        };
+        let figures = self.device.step(&mut self.model, step, &drawing)?;
+        self.marched += figures.marched as u64;
+        Ok(StepReport { loss: figures.loss, mse: figures.mse, rays: rays as u64, samples: figures.trained as u64 })
     }
 
     /// Stratified samples through the one field.
@@ -393,6 +443,12 @@ impl<'a> Trainer<'a> {
     }
 }
 
+/// How much longer a march's steps are at a training step.
+fn stretch(step: u64) -> f32 {
+    let (most, until) = MARCH_RAMP;
+    most.powf(1.0 - step.min(until) as f32 / until as f32)
+}
+
 fn positions(batch: &RayBatch, marched: &Marched, out: &mut Vec<f32>) {
     let rays = MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
     march::cpu::positions(&rays, marched, out);
@@ -421,7 +477,10 @@ fn train_field(
 impl Trainee for Trainer<'_> {
     type Error = PipelineError;
 
-    fn step(&mut self, step: u64, progress: f64) -> StepReport {
+    fn step(&mut self, step: u64, progress: f64) -> Result<StepReport> {
+        if self.device.is_gpu() {
+            return self.step_gpu(step, progress);
+        }
         let first = self.model.origin.rays;
         self.draw(step, first);
         let (loss, samples) = match self.model.config.method {
@@ -434,7 +493,7 @@ impl Trainee for Trainer<'_> {
         let rays = self.buffers.batch.len() as u64;
         let report = StepReport { loss, mse, rays, samples };
         if !loss.is_finite() {
-            return report;
+            return Ok(report);
         }
         if let Some(l) = &mut self.model.learned {
             l.backward(&self.buffers.batch.dirs, &self.buffers.background, &self.buffers.field.out.d_background);
@@ -454,10 +513,12 @@ impl Trainee for Trainer<'_> {
         let o = &mut self.model.origin;
         o.rays += rays;
         o.samples += samples;
-        report
+        Ok(report)
     }
 
     fn save(&mut self, step: u64, seconds: f64) -> Result<()> {
+        self.settle()?;
+        self.device.download(&mut self.model)?;
         if self.model.is_broken() {
             return Err(PipelineError::Diverged { step, checkpoint: checkpoint::latest(self.checkpoints).display().to_string() });
         }
@@ -476,10 +537,14 @@ impl Trainee for Trainer<'_> {
         self.model.restore(c, self.checkpoints)?;
         self.model.rate_scale *= 0.3;
         self.cameras = self.model.cameras();
+        self.device.upload(&self.model, &self.photographs, &self.cameras)?;
         Ok(Some(self.model.origin.step))
     }
 
     fn evaluate(&mut self) -> (f64, f64) {
+        if self.device.download(&mut self.model).is_err() {
+            return (f64::NAN, f64::NAN);
+        }
         let frames = evaluate::held_out(&self.model.capture, Split::Test);
         let few: Vec<usize> = frames.into_iter().take(4).collect();
         let mut scores = Vec::new();

@@ -1,6 +1,6 @@
 //! One unit per ray for weights and densities, one per ray and channel for colours.
 
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
 use cubecl::prelude::*;
 
 /// Packed samples on the device: offsets `[R + 1]`, starts and lengths `[S]`.
@@ -18,6 +18,11 @@ impl GpuPacked {
 
     pub fn rays(&self) -> usize {
         self.offsets.len().saturating_sub(1)
+    }
+
+    /// The samples: as many as the last offset says.
+    pub fn rows(&self) -> Rows {
+        Rows::counted(self.t.len(), &self.offsets, self.rays())
     }
 }
 

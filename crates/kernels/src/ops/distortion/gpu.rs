@@ -6,17 +6,19 @@ use cubecl::prelude::*;
 
 /// Loss per ray `[R]`.
 pub fn forward(gpu: &Gpu, p: &GpuPacked, weights: &Buffer) -> Buffer {
-    let loss = gpu.empty(p.rays());
-    let unused = gpu.empty(weights.len());
-    run(gpu, p, weights, &gpu.zeros(p.rays()), &loss, &unused);
-    loss
+    both(gpu, p, weights, &gpu.zeros(p.rays())).0
 }
 
 /// Gradient of the weights `[S]`, given that of each ray's loss.
 pub fn backward(gpu: &Gpu, p: &GpuPacked, weights: &Buffer, d_loss: &Buffer) -> Buffer {
-    let g = gpu.empty(weights.len());
-    run(gpu, p, weights, d_loss, &gpu.empty(p.rays()), &g);
-    g
+    both(gpu, p, weights, d_loss).1
+}
+
+/// Loss per ray `[R]` and gradient of the weights `[S]` at once.
+pub fn both(gpu: &Gpu, p: &GpuPacked, weights: &Buffer, d_loss: &Buffer) -> (Buffer, Buffer) {
+    let (loss, g) = (gpu.empty(p.rays()), gpu.empty(weights.len()));
+    run(gpu, p, weights, d_loss, &loss, &g);
+    (loss, g)
 }
 
 fn run(gpu: &Gpu, p: &GpuPacked, weights: &Buffer, d_loss: &Buffer, loss: &Buffer, g: &Buffer) {

@@ -1,7 +1,7 @@
 //! One unit per level and point; the table's gradient is added atomically.
 
 use super::HashGrid;
-use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Swap, units};
+use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Rows, Swap, units};
 use cubecl::prelude::*;
 
 /// Numbers that describe a level to the kernels: cells, dense, first row, rows.
@@ -25,29 +25,29 @@ impl GpuHashGrid {
     }
 
     /// Features `[L, S, F]` of points `[S, 3]`.
-    pub fn forward(&self, gpu: &Gpu, points: &Buffer, table: &Buffer) -> Buffer {
+    pub fn forward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: &Buffer) -> Buffer {
         let out = gpu.empty(self.work(points).0 * self.grid.output_dims());
-        self.each(gpu, points, table, &out, encode::launch_unchecked);
+        self.each(gpu, rows, points, table, &out, encode::launch_unchecked);
         out
     }
 
     /// Adds to the gradient of the table.
-    pub fn backward(&self, gpu: &Gpu, points: &Buffer, d_out: &Buffer, d_table: &Buffer) {
+    pub fn backward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, d_out: &Buffer, d_table: &Buffer) {
         let kernel = if gpu.native_atomics { scatter::launch_unchecked::<Native> } else { scatter::launch_unchecked::<Swap> };
-        self.each(gpu, points, d_out, d_table, kernel);
+        self.each(gpu, rows, points, d_out, d_table, kernel);
     }
 
     /// `∂features/∂point`, `[L, S, F, 3]`.
-    pub fn jacobian(&self, gpu: &Gpu, points: &Buffer, table: &Buffer) -> Buffer {
+    pub fn jacobian(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: &Buffer) -> Buffer {
         let out = gpu.empty(self.work(points).0 * self.grid.output_dims() * 3);
-        self.each(gpu, points, table, &out, differentiate::launch_unchecked);
+        self.each(gpu, rows, points, table, &out, differentiate::launch_unchecked);
         out
     }
 
     /// Adds to the gradient of the table, given that of the Jacobian.
-    pub fn jacobian_backward(&self, gpu: &Gpu, points: &Buffer, d_jacobian: &Buffer, d_table: &Buffer) {
+    pub fn jacobian_backward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, d_jacobian: &Buffer, d_table: &Buffer) {
         let kernel = if gpu.native_atomics { scatter_slopes::launch_unchecked::<Native> } else { scatter_slopes::launch_unchecked::<Swap> };
-        self.each(gpu, points, d_jacobian, d_table, kernel);
+        self.each(gpu, rows, points, d_jacobian, d_table, kernel);
     }
 
     /// Gradient of the points `[S, 3]`.
@@ -76,19 +76,22 @@ impl GpuHashGrid {
     }
 
     /// Launches a kernel with one unit per level and point, which reads `from` and writes `to`.
-    fn each(&self, gpu: &Gpu, points: &Buffer, from: &Buffer, to: &Buffer, kernel: Kernel) {
+    fn each(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, from: &Buffer, to: &Buffer, kernel: Kernel) {
         let (s, n) = self.work(points);
         if n > 0 {
-            // SAFETY: units past `n` stop; rows come from the grid that sized the table.
+            let (live, at) = rows.arg();
+            // SAFETY: units past the points in use stop; rows come from the grid that sized the table.
             unsafe {
                 kernel(
                     &gpu.client,
                     units(n),
                     CubeDim::new_1d(CUBE),
+                    live,
                     points.arg(),
                     self.levels.arg(),
                     from.arg(),
                     to.arg(),
+                    at,
                     s as u32,
                     n as u32,
                     self.grid.config.features,
@@ -98,8 +101,8 @@ impl GpuHashGrid {
     }
 }
 
-/// Points, levels, what is read, what is written, samples, units, features per row.
-type Kernel = unsafe fn(&Client, CubeCount, CubeDim, BufferArg, BufferArg, BufferArg, BufferArg, u32, u32, usize);
+/// Points in use, points, levels, what is read, what is written, place of the first, points, units, features per row.
+type Kernel = unsafe fn(&Client, CubeCount, CubeDim, BufferArg, BufferArg, BufferArg, BufferArg, BufferArg, u32, u32, u32, usize);
 
 /// A coordinate's cell, the place in it, and its slope: cells per unit, 0 where it was clamped.
 #[derive(CubeType)]
@@ -183,9 +186,19 @@ fn corner(place: &Place, levels: &[u32], #[comptime] c: u32, #[comptime] feature
 }
 
 #[cube(launch_unchecked)]
-fn encode(points: &[f32], levels: &[u32], table: &[f32], out: &mut [f32], s: u32, n: u32, #[comptime] f: usize) {
+fn encode(
+    live: &[u32],
+    points: &[f32],
+    levels: &[u32],
+    table: &[f32],
+    out: &mut [f32],
+    at: u32,
+    s: u32,
+    n: u32,
+    #[comptime] f: usize,
+) {
     let unit = ABSOLUTE_POS;
-    if unit >= n as usize {
+    if unit >= n as usize || unit % s as usize >= live[at as usize] as usize {
         terminate!();
     }
     let place = place(points, levels, unit / s as usize, unit % s as usize);
@@ -210,16 +223,18 @@ fn encode(points: &[f32], levels: &[u32], table: &[f32], out: &mut [f32], s: u32
 
 #[cube(launch_unchecked)]
 fn scatter<A: Accumulate>(
+    live: &[u32],
     points: &[f32],
     levels: &[u32],
     d_out: &[f32],
     d_table: &[Atomic<A::Cell>],
+    at: u32,
     s: u32,
     n: u32,
     #[comptime] f: usize,
 ) {
     let unit = ABSOLUTE_POS;
-    if unit >= n as usize {
+    if unit >= n as usize || unit % s as usize >= live[at as usize] as usize {
         terminate!();
     }
     let place = place(points, levels, unit / s as usize, unit % s as usize);
@@ -263,9 +278,19 @@ fn slope(points: &[f32], levels: &[u32], table: &[f32], d_out: &[f32], out: &mut
 }
 
 #[cube(launch_unchecked)]
-fn differentiate(points: &[f32], levels: &[u32], table: &[f32], out: &mut [f32], s: u32, n: u32, #[comptime] f: usize) {
+fn differentiate(
+    live: &[u32],
+    points: &[f32],
+    levels: &[u32],
+    table: &[f32],
+    out: &mut [f32],
+    at: u32,
+    s: u32,
+    n: u32,
+    #[comptime] f: usize,
+) {
     let unit = ABSOLUTE_POS;
-    if unit >= n as usize {
+    if unit >= n as usize || unit % s as usize >= live[at as usize] as usize {
         terminate!();
     }
     let place = place(points, levels, unit / s as usize, unit % s as usize);
@@ -293,16 +318,18 @@ fn differentiate(points: &[f32], levels: &[u32], table: &[f32], out: &mut [f32],
 
 #[cube(launch_unchecked)]
 fn scatter_slopes<A: Accumulate>(
+    live: &[u32],
     points: &[f32],
     levels: &[u32],
     d_jacobian: &[f32],
     d_table: &[Atomic<A::Cell>],
+    at: u32,
     s: u32,
     n: u32,
     #[comptime] f: usize,
 ) {
     let unit = ABSOLUTE_POS;
-    if unit >= n as usize {
+    if unit >= n as usize || unit % s as usize >= live[at as usize] as usize {
         terminate!();
     }
     let place = place(points, levels, unit / s as usize, unit % s as usize);

@@ -1,7 +1,8 @@
-//! Products in tiles of 16 × 16 through shared memory.
+//! Products in tiles of 16 × 16 through shared memory. Weight gradients, sums over very many rows, are
+//! formed by slices of rows and then added up.
 
 use super::{Activation, BiasKind};
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
 use cubecl::prelude::*;
 
 /// Edge of a tile.
@@ -9,16 +10,9 @@ const TILE: usize = 16;
 /// Most rows of tiles in one launch.
 const MAX_TILES: usize = 65_535;
 
-/// How a product reads its factors.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-enum Order {
-    /// `A B`, `[M, K] [K, N]`
-    Plain,
-    /// `A Bᵀ`, `[M, K] [N, K]`
-    SecondTurned,
-    /// `Aᵀ B`, `[K, M] [K, N]`
-    FirstTurned,
-}
+/// Rows per slice of a sum over rows, and most slices.
+const SLICE: usize = 1024;
+const MAX_SLICES: usize = 256;
 
 fn code(a: Activation) -> u32 {
     match a {
@@ -43,7 +37,9 @@ impl<'a> From<&'a Buffer> for Part<'a> {
     }
 }
 
-fn product(gpu: &Gpu, order: Order, (m, k, n): (usize, usize, usize), a: &Buffer, b: Part, out: Part) {
+/// `A B`, `[M, K] [K, N]`, or with the second factor turned `A Bᵀ`, `[M, K] [N, K]`.
+fn product(gpu: &Gpu, second_turned: bool, rows: &Rows, (k, n): (usize, usize), a: &Buffer, b: Part, out: Part) {
+    let m = rows.most;
     if m * n == 0 {
         return;
     }
@@ -51,61 +47,113 @@ fn product(gpu: &Gpu, order: Order, (m, k, n): (usize, usize, usize), a: &Buffer
     let (tiles_m, tiles_n) = (m.div_ceil(TILE), n.div_ceil(TILE));
     assert!(tiles_n <= MAX_TILES && tiles_m <= MAX_TILES * MAX_TILES, "linear: {m} x {n}");
     let count = CubeCount::Static(tiles_n as u32, tiles_m.min(MAX_TILES) as u32, tiles_m.div_ceil(MAX_TILES) as u32);
-    let (first, second) = (order == Order::FirstTurned, order == Order::SecondTurned);
+    let (live, at) = rows.arg();
     // SAFETY: the kernel checks rows and columns against the sizes.
     unsafe {
         multiply::launch_unchecked(
             &gpu.client,
             count,
             CubeDim::new_2d(TILE as u32, TILE as u32),
+            live,
             a.arg(),
             b.buffer.arg(),
             out.buffer.arg(),
+            at,
             b.at as u32,
             out.at as u32,
-            m as u32,
             k as u32,
             n as u32,
-            first,
-            second,
+            second_turned,
             gpu.shared,
         );
     }
 }
 
+/// `Xᵀ G`, `[K, N]` for X `[M, K]` and G `[M, N]`.
+fn outer(gpu: &Gpu, rows: &Rows, (k, n): (usize, usize), x: &Buffer, g: &Buffer, out: Part) {
+    assert!(x.len() == rows.most * k && g.len() == rows.most * n && out.buffer.len() >= out.at + k * n, "linear: {k} x {n}");
+    if k * n == 0 {
+        return;
+    }
+    let slices = (rows.most / SLICE).clamp(1, MAX_SLICES);
+    let parts = gpu.empty(slices * k * n);
+    let count = CubeCount::Static(n.div_ceil(TILE) as u32, k.div_ceil(TILE) as u32, slices as u32);
+    let (live, at) = rows.arg();
+    // SAFETY: the kernel checks rows and columns against the sizes.
+    unsafe {
+        gather::launch_unchecked(
+            &gpu.client,
+            count,
+            CubeDim::new_2d(TILE as u32, TILE as u32),
+            live,
+            x.arg(),
+            g.arg(),
+            parts.arg(),
+            at,
+            k as u32,
+            n as u32,
+            slices as u32,
+            gpu.shared,
+        );
+    }
+    add_up(gpu, &parts, slices, k * n, out);
+}
+
+/// Sums of `slices` rows of `n` numbers.
+fn add_up(gpu: &Gpu, parts: &Buffer, slices: usize, n: usize, out: Part) {
+    // SAFETY: units past `n` stop.
+    unsafe {
+        total::launch_unchecked(
+            &gpu.client,
+            units(n),
+            CubeDim::new_1d(CUBE),
+            parts.arg(),
+            out.buffer.arg(),
+            out.at as u32,
+            slices as u32,
+            n as u32,
+        );
+    }
+}
+
 /// [`forward`] with a weight and bias that lie in a larger buffer.
+#[allow(clippy::too_many_arguments)]
 pub(crate) fn forward_part(
     gpu: &Gpu,
-    size: (usize, usize, usize),
+    rows: &Rows,
+    (k, n): (usize, usize),
     x: &Buffer,
     w: Part,
     bias: Option<Part>,
     kind: BiasKind,
     a: Activation,
 ) -> Buffer {
-    let out = gpu.empty(size.0 * size.2);
-    product(gpu, Order::Plain, size, x, w, (&out).into());
-    finish(gpu, &out, size.2, bias, kind, a);
+    let out = gpu.empty(rows.most * n);
+    product(gpu, false, rows, (k, n), x, w, (&out).into());
+    finish(gpu, &out, rows, n, bias, kind, a);
     out
 }
 
-/// `act(x W + b)`, `[M, N]`.
+/// `act(x W + b)`, `[M, N]`, for W `[K, N]`.
+#[allow(clippy::too_many_arguments)]
 pub fn forward(
     gpu: &Gpu,
-    size: (usize, usize, usize),
+    rows: &Rows,
+    size: (usize, usize),
     x: &Buffer,
     w: &Buffer,
     bias: Option<&Buffer>,
     kind: BiasKind,
     a: Activation,
 ) -> Buffer {
-    forward_part(gpu, size, x, w.into(), bias.map(Part::from), kind, a)
+    forward_part(gpu, rows, size, x, w.into(), bias.map(Part::from), kind, a)
 }
 
-pub(crate) fn finish(gpu: &Gpu, out: &Buffer, n: usize, bias: Option<Part>, kind: BiasKind, a: Activation) {
+fn finish(gpu: &Gpu, out: &Buffer, rows: &Rows, n: usize, bias: Option<Part>, kind: BiasKind, a: Activation) {
     if out.is_empty() || (kind == BiasKind::None && a == Activation::None) {
         return;
     }
+    // Bound where there is no bias to read.
     let spare = gpu.empty(1);
     let bias = bias.unwrap_or(Part::from(&spare));
     let bias_kind = match kind {
@@ -113,21 +161,50 @@ pub(crate) fn finish(gpu: &Gpu, out: &Buffer, n: usize, bias: Option<Part>, kind
         BiasKind::Shared => 1,
         BiasKind::PerRow => 2,
     };
-    // SAFETY: units past the length stop.
+    let (live, at) = rows.arg();
+    // SAFETY: units past the rows stop.
     unsafe {
         activate::launch_unchecked(
             &gpu.client,
             units(out.len()),
             CubeDim::new_1d(CUBE),
+            live,
             bias.buffer.arg(),
             out.arg(),
+            at,
             bias.at as u32,
-            out.len() as u32,
             n as u32,
             bias_kind,
             code(a),
         );
     }
+}
+
+/// Channels of a layer's output `[M, width]`, shifted and activated, `[M, channels]`.
+pub(crate) fn head(gpu: &Gpu, rows: &Rows, from: (&Buffer, usize, usize), channels: usize, shift: f32, a: Activation) -> Buffer {
+    let out = gpu.empty(rows.most * channels);
+    let (values, width, first) = from;
+    if !out.is_empty() {
+        let (live, at) = rows.arg();
+        // SAFETY: units past the rows stop; the channels lie within the width.
+        unsafe {
+            pick::launch_unchecked(
+                &gpu.client,
+                units(out.len()),
+                CubeDim::new_1d(CUBE),
+                live,
+                values.arg(),
+                out.arg(),
+                at,
+                width as u32,
+                first as u32,
+                channels as u32,
+                shift,
+                code(a),
+            );
+        }
+    }
+    out
 }
 
 /// Gradients of x, W and the bias.
@@ -141,7 +218,8 @@ pub struct Gradients {
 #[allow(clippy::too_many_arguments)]
 pub fn backward(
     gpu: &Gpu,
-    (m, k, n): (usize, usize, usize),
+    rows: &Rows,
+    (k, n): (usize, usize),
     x: &Buffer,
     w: &Buffer,
     kind: BiasKind,
@@ -149,14 +227,14 @@ pub fn backward(
     out: &Buffer,
     d_out: &Buffer,
 ) -> Gradients {
-    let g = before_activation(gpu, a, out, d_out);
-    let d_w = gpu.zeros(k * n);
-    let d_x = backward_part(gpu, (m, k, n), x, w.into(), &g, (&d_w).into());
+    let g = before_activation(gpu, rows, n, a, out, d_out);
+    let d_w = gpu.empty(k * n);
+    let d_x = backward_part(gpu, rows, (k, n), x, w.into(), &g, (&d_w).into());
     let bias = match kind {
         BiasKind::None => None,
         BiasKind::Shared => {
             let out = gpu.empty(n);
-            sum_rows_part(gpu, (m, n), &g, (&out).into());
+            sum_rows_part(gpu, rows, n, &g, (&out).into());
             Some(out)
         }
         BiasKind::PerRow => Some(g),
@@ -165,19 +243,22 @@ pub fn backward(
 }
 
 /// `d_out · act'`.
-pub(crate) fn before_activation(gpu: &Gpu, a: Activation, out: &Buffer, d_out: &Buffer) -> Buffer {
+pub(crate) fn before_activation(gpu: &Gpu, rows: &Rows, n: usize, a: Activation, out: &Buffer, d_out: &Buffer) -> Buffer {
     let g = gpu.empty(out.len());
     if !out.is_empty() {
-        // SAFETY: units past the length stop.
+        let (live, at) = rows.arg();
+        // SAFETY: units past the rows stop.
         unsafe {
             chain::launch_unchecked(
                 &gpu.client,
                 units(out.len()),
                 CubeDim::new_1d(CUBE),
+                live,
                 out.arg(),
                 d_out.arg(),
                 g.arg(),
-                out.len() as u32,
+                at,
+                n as u32,
                 code(a),
             );
         }
@@ -185,54 +266,61 @@ pub(crate) fn before_activation(gpu: &Gpu, a: Activation, out: &Buffer, d_out: &
     g
 }
 
-/// Gradient of x; that of the weight is written where `d_w` says, unless there are no rows.
-pub(crate) fn backward_part(gpu: &Gpu, (m, k, n): (usize, usize, usize), x: &Buffer, w: Part, g: &Buffer, d_w: Part) -> Buffer {
-    if m > 0 {
-        product(gpu, Order::FirstTurned, (k, m, n), x, g.into(), d_w);
-    }
-    let d_x = gpu.empty(m * k);
-    product(gpu, Order::SecondTurned, (m, n, k), g, w, (&d_x).into());
+/// Gradient of x; that of the weight is written where `d_w` says.
+pub(crate) fn backward_part(gpu: &Gpu, rows: &Rows, (k, n): (usize, usize), x: &Buffer, w: Part, g: &Buffer, d_w: Part) -> Buffer {
+    outer(gpu, rows, (k, n), x, g, d_w);
+    let d_x = gpu.empty(rows.most * k);
+    product(gpu, true, rows, (n, k), g, w, (&d_x).into());
     d_x
 }
 
 /// Sums of columns, the gradient of a shared bias.
-pub(crate) fn sum_rows_part(gpu: &Gpu, (m, n): (usize, usize), g: &Buffer, out: Part) {
-    // SAFETY: units past `n` stop.
+pub(crate) fn sum_rows_part(gpu: &Gpu, rows: &Rows, n: usize, g: &Buffer, out: Part) {
+    let slices = (rows.most / SLICE).clamp(1, MAX_SLICES);
+    let parts = gpu.empty(slices * n);
+    let (live, at) = rows.arg();
+    // SAFETY: units past the slices stop.
     unsafe {
         sum_rows::launch_unchecked(
             &gpu.client,
-            units(n),
+            units(slices * n),
             CubeDim::new_1d(CUBE),
+            live,
             g.arg(),
-            out.buffer.arg(),
-            out.at as u32,
-            m as u32,
+            parts.arg(),
+            at,
+            slices as u32,
             n as u32,
         );
     }
+    add_up(gpu, &parts, slices, n, out);
 }
 
 #[cube(launch_unchecked)]
 fn multiply(
+    live: &[u32],
     a: &[f32],
     b: &[f32],
     out: &mut [f32],
+    at: u32,
     b_at: u32,
     out_at: u32,
-    m: u32,
     k: u32,
     n: u32,
-    #[comptime] first_turned: bool,
     #[comptime] second_turned: bool,
     #[comptime] shared: bool,
 ) {
-    let m = m as usize;
+    let m = live[at as usize] as usize;
     let k = k as usize;
     let n = n as usize;
     let b_at = b_at as usize;
     let tx = UNIT_POS_X as usize;
     let ty = UNIT_POS_Y as usize;
-    let row = (CUBE_POS_Y as usize + CUBE_POS_Z as usize * 65_535usize) * 16usize + ty;
+    let first_row = (CUBE_POS_Y as usize + CUBE_POS_Z as usize * 65_535usize) * 16usize;
+    if first_row >= m {
+        terminate!();
+    }
+    let row = first_row + ty;
     let col = CUBE_POS_X as usize * 16usize + tx;
     let mut sum = 0.0f32;
     if comptime!(shared) {
@@ -243,7 +331,7 @@ fn multiply(
             let kb = step * 16usize + ty;
             let mut va = 0.0f32;
             if row < m && ka < k {
-                va = left_factor(a, row, ka, m, k, first_turned);
+                va = a[row * k + ka];
             }
             let mut vb = 0.0f32;
             if kb < k && col < n {
@@ -260,7 +348,7 @@ fn multiply(
         }
     } else if row < m && col < n {
         for i in 0..k {
-            sum += left_factor(a, row, i, m, k, first_turned) * right_factor(b, b_at, i, col, k, n, second_turned);
+            sum += a[row * k + i] * right_factor(b, b_at, i, col, k, n, second_turned);
         }
     }
     if row < m && col < n {
@@ -269,13 +357,78 @@ fn multiply(
 }
 
 #[cube]
-fn left_factor(a: &[f32], row: usize, i: usize, m: usize, k: usize, #[comptime] turned: bool) -> f32 {
-    if comptime!(turned) { a[i * m + row] } else { a[row * k + i] }
-}
-
-#[cube]
 fn right_factor(b: &[f32], at: usize, i: usize, col: usize, k: usize, n: usize, #[comptime] turned: bool) -> f32 {
     if comptime!(turned) { b[at + col * k + i] } else { b[at + i * n + col] }
+}
+
+/// A slice's part of `Xᵀ G`.
+#[cube(launch_unchecked)]
+fn gather(
+    live: &[u32],
+    x: &[f32],
+    g: &[f32],
+    parts: &mut [f32],
+    at: u32,
+    k: u32,
+    n: u32,
+    slices: u32,
+    #[comptime] shared: bool,
+) {
+    let m = live[at as usize] as usize;
+    let k = k as usize;
+    let n = n as usize;
+    let tx = UNIT_POS_X as usize;
+    let ty = UNIT_POS_Y as usize;
+    let row = CUBE_POS_Y as usize * 16usize + ty;
+    let col = CUBE_POS_X as usize * 16usize + tx;
+    let per = m.div_ceil(slices as usize);
+    let first = min(CUBE_POS_Z as usize * per, m);
+    let end = min(first + per, m);
+    let mut sum = 0.0f32;
+    if comptime!(shared) {
+        let mut left = Shared::<[f32]>::new_slice(256usize);
+        let mut right = Shared::<[f32]>::new_slice(256usize);
+        let left_col = CUBE_POS_Y as usize * 16usize + tx;
+        for step in 0..(end - first).div_ceil(16usize) {
+            let i = first + step * 16usize + ty;
+            let mut vx = 0.0f32;
+            let mut vg = 0.0f32;
+            if i < end && left_col < k {
+                vx = x[i * k + left_col];
+            }
+            if i < end && col < n {
+                vg = g[i * n + col];
+            }
+            left[ty * 16usize + tx] = vx;
+            right[ty * 16usize + tx] = vg;
+            sync_cube();
+            #[unroll]
+            for j in 0..16usize {
+                sum += left[j * 16usize + ty] * right[j * 16usize + tx];
+            }
+            sync_cube();
+        }
+    } else if row < k && col < n {
+        for i in first..end {
+            sum += x[i * k + row] * g[i * n + col];
+        }
+    }
+    if row < k && col < n {
+        parts[(CUBE_POS_Z as usize * k + row) * n + col] = sum;
+    }
+}
+
+#[cube(launch_unchecked)]
+fn total(parts: &[f32], out: &mut [f32], out_at: u32, slices: u32, n: u32) {
+    let i = ABSOLUTE_POS;
+    if i >= n as usize {
+        terminate!();
+    }
+    let mut sum = 0.0f32;
+    for s in 0..slices as usize {
+        sum += parts[s * n as usize + i];
+    }
+    out[out_at as usize + i] = sum;
 }
 
 #[cube]
@@ -297,9 +450,18 @@ fn apply(x: f32, #[comptime] activation: u32) -> f32 {
 }
 
 #[cube(launch_unchecked)]
-fn activate(bias: &[f32], out: &mut [f32], bias_at: u32, len: u32, n: u32, #[comptime] bias_kind: u32, #[comptime] activation: u32) {
+fn activate(
+    live: &[u32],
+    bias: &[f32],
+    out: &mut [f32],
+    at: u32,
+    bias_at: u32,
+    n: u32,
+    #[comptime] bias_kind: u32,
+    #[comptime] activation: u32,
+) {
     let i = ABSOLUTE_POS;
-    if i >= len as usize {
+    if i >= live[at as usize] as usize * n as usize {
         terminate!();
     }
     let mut v = out[i];
@@ -312,12 +474,32 @@ fn activate(bias: &[f32], out: &mut [f32], bias_at: u32, len: u32, n: u32, #[com
     out[i] = apply(v, activation);
 }
 
+#[cube(launch_unchecked)]
+fn pick(
+    live: &[u32],
+    values: &[f32],
+    out: &mut [f32],
+    at: u32,
+    width: u32,
+    first: u32,
+    channels: u32,
+    shift: f32,
+    #[comptime] activation: u32,
+) {
+    let i = ABSOLUTE_POS;
+    let c = channels as usize;
+    if i >= live[at as usize] as usize * c {
+        terminate!();
+    }
+    out[i] = apply(values[i / c * width as usize + first as usize + i % c] + shift, activation);
+}
+
 /// `d_out · act'` from the activated output.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
-fn chain(out: &[f32], d_out: &[f32], g: &mut [f32], len: u32, #[comptime] activation: u32) {
+fn chain(live: &[u32], out: &[f32], d_out: &[f32], g: &mut [f32], at: u32, n: u32, #[comptime] activation: u32) {
     let i = ABSOLUTE_POS;
-    if i >= len as usize {
+    if i >= live[at as usize] as usize * n as usize {
         terminate!();
     }
     let y = out[i];
@@ -340,14 +522,18 @@ fn chain(out: &[f32], d_out: &[f32], g: &mut [f32], len: u32, #[comptime] activa
 }
 
 #[cube(launch_unchecked)]
-fn sum_rows(g: &[f32], out: &mut [f32], out_at: u32, m: u32, n: u32) {
-    let col = ABSOLUTE_POS;
-    if col >= n as usize {
+fn sum_rows(live: &[u32], g: &[f32], parts: &mut [f32], at: u32, slices: u32, n: u32) {
+    let unit = ABSOLUTE_POS;
+    let n = n as usize;
+    if unit >= slices as usize * n {
         terminate!();
     }
+    let m = live[at as usize] as usize;
+    let per = m.div_ceil(slices as usize);
+    let first = min(unit / n * per, m);
     let mut sum = 0.0f32;
-    for row in 0..m as usize {
-        sum += g[row * n as usize + col];
+    for row in first..min(first + per, m) {
+        sum += g[row * n + unit % n];
     }
-    out[out_at as usize + col] = sum;
+    parts[unit] = sum;
 }

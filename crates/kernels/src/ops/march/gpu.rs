@@ -1,6 +1,9 @@
 //! Rays are walked twice, one unit each: first to count their samples, then, with their places known,
 //! to write them. The walk is the CPU's.
 
+pub mod occupancy;
+pub mod prune;
+
 use super::{MarchConfig, OccupancyBits};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use crate::ops::composite::gpu::GpuPacked;
@@ -46,8 +49,39 @@ impl GpuRays {
     }
 }
 
-/// Packed samples, and the cells `[capacity]` that they lie in. Samples that find no room are left out, the last rays' first.
-pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfig, capacity: usize) -> (GpuPacked, Buffer) {
+/// What a march gives.
+pub struct GpuMarched {
+    pub packed: GpuPacked,
+    /// Cells `[capacity]` that the samples lie in.
+    pub cells: Buffer,
+    /// 1 for each ray that lost samples because they found no room, `[R]`.
+    pub cut: Buffer,
+}
+
+/// Coordinates in which positions are given.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Space {
+    /// As the rays'.
+    Model,
+    /// The cube of this width around the model cube's centre as `[0, 1]³`.
+    Cube(f32),
+    /// All of space, contracted around the model cube, as `[0, 1]³`.
+    Contracted,
+}
+
+impl Space {
+    /// Kind and width, for a launch.
+    fn arg(self) -> (u32, f32) {
+        match self {
+            Space::Model => (0, 1.0),
+            Space::Cube(width) => (1, width),
+            Space::Contracted => (2, 1.0),
+        }
+    }
+}
+
+/// Packed samples. Those that find no room are left out, the last rays' first.
+pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfig, capacity: usize) -> GpuMarched {
     let n = rays.jitter.len();
     let counts = gpu.empty(n);
     let (t, dt, cells) = (gpu.empty(capacity), gpu.empty(capacity), gpu.empty(capacity));
@@ -83,22 +117,40 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
     if n > 0 {
         launch(&gpu.zeros(n + 1), false);
     }
-    let offsets = scan::gpu::exclusive(gpu, &counts);
+    let whole = scan::gpu::exclusive(gpu, &counts);
+    let cut = gpu.zeros(n);
     if n > 0 {
-        launch(&offsets, true);
-        // SAFETY: units past the offsets stop.
-        unsafe {
-            bound::launch_unchecked(&gpu.client, units(n + 1), CubeDim::new_1d(CUBE), offsets.arg(), (n + 1) as u32, capacity as u32)
-        };
+        launch(&whole, true);
     }
-    (GpuPacked { offsets, t, dt }, cells)
+    let offsets = bounded(gpu, &whole, &cut, capacity);
+    GpuMarched { packed: GpuPacked { offsets, t, dt }, cells, cut }
+}
+
+/// Offsets that end where the memory does, so that no reader passes it; rays that lose samples are marked.
+fn bounded(gpu: &Gpu, offsets: &Buffer, cut: &Buffer, capacity: usize) -> Buffer {
+    let out = gpu.empty(offsets.len());
+    // SAFETY: units past the offsets stop.
+    unsafe {
+        bound::launch_unchecked(
+            &gpu.client,
+            units(offsets.len()),
+            CubeDim::new_1d(CUBE),
+            offsets.arg(),
+            out.arg(),
+            cut.arg(),
+            offsets.len() as u32,
+            capacity as u32,
+        );
+    }
+    out
 }
 
 /// Midpoints of packed samples `[S, 3]`.
-pub fn positions(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked) -> Buffer {
+pub fn positions(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked, space: Space) -> Buffer {
     let out = gpu.empty(samples.t.len() * 3);
     let n = samples.rays();
     if n > 0 {
+        let (kind, width) = space.arg();
         // SAFETY: offsets bound the samples.
         unsafe {
             place::launch_unchecked(
@@ -112,6 +164,8 @@ pub fn positions(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked) -> Buffer {
                 rays.dirs.arg(),
                 out.arg(),
                 n as u32,
+                width,
+                kind,
             );
         }
     }
@@ -233,25 +287,70 @@ fn walk(
     }
 }
 
-/// Offsets end where the memory does, so that no reader passes it.
 #[cube(launch_unchecked)]
-fn bound(offsets: &mut [u32], n: u32, capacity: u32) {
-    if ABSOLUTE_POS < n as usize {
-        offsets[ABSOLUTE_POS] = min(offsets[ABSOLUTE_POS], capacity);
+fn bound(offsets: &[u32], out: &mut [u32], cut: &mut [u32], n: u32, capacity: u32) {
+    let i = ABSOLUTE_POS;
+    if i >= n as usize {
+        terminate!();
+    }
+    out[i] = min(offsets[i], capacity);
+    if i > 0 && offsets[i] > capacity {
+        cut[i - 1] = 1u32;
+    }
+}
+
+/// Writes a model point as `[0, 1]³` coordinates of a space.
+#[cube]
+fn put(out: &mut [f32], at: usize, x: f32, y: f32, z: f32, width: f32, #[comptime] kind: u32) {
+    if comptime!(kind == 0) {
+        out[at] = x;
+        out[at + 1] = y;
+        out[at + 2] = z;
+    }
+    if comptime!(kind == 1) {
+        out[at] = (x - 0.5) / width + 0.5;
+        out[at + 1] = (y - 0.5) / width + 0.5;
+        out[at + 2] = (z - 0.5) / width + 0.5;
+    }
+    if comptime!(kind == 2) {
+        let cx = 2.0 * (x - 0.5);
+        let cy = 2.0 * (y - 0.5);
+        let cz = 2.0 * (z - 0.5);
+        let m = max(max(cx.abs(), cy.abs()), cz.abs());
+        let mut s = 0.25f32;
+        if m > 1.0 {
+            s = 0.25 * (2.0 - 1.0 / m) / m;
+        }
+        out[at] = cx * s + 0.5;
+        out[at + 1] = cy * s + 0.5;
+        out[at + 2] = cz * s + 0.5;
     }
 }
 
 #[cube(launch_unchecked)]
-fn place(offsets: &[u32], t: &[f32], dt: &[f32], origins: &[f32], dirs: &[f32], out: &mut [f32], rays: u32) {
+fn place(
+    offsets: &[u32],
+    t: &[f32],
+    dt: &[f32],
+    origins: &[f32],
+    dirs: &[f32],
+    out: &mut [f32],
+    rays: u32,
+    width: f32,
+    #[comptime] kind: u32,
+) {
     let r = ABSOLUTE_POS;
     if r >= rays as usize {
         terminate!();
     }
+    let ox = origins[r * 3];
+    let oy = origins[r * 3 + 1];
+    let oz = origins[r * 3 + 2];
+    let dx = dirs[r * 3];
+    let dy = dirs[r * 3 + 1];
+    let dz = dirs[r * 3 + 2];
     for i in offsets[r] as usize..offsets[r + 1] as usize {
         let mid = t[i] + 0.5 * dt[i];
-        #[unroll]
-        for k in 0..3usize {
-            out[i * 3 + k] = origins[r * 3 + k] + mid * dirs[r * 3 + k];
-        }
+        put(out, i * 3, ox + mid * dx, oy + mid * dy, oz + mid * dz, width, kind);
     }
 }

@@ -1,10 +1,12 @@
 //! The standard field as a composition of its parts on the device.
 
+pub mod loss;
+
 use super::{FieldNet, Head};
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Rows, Swap, units};
 use crate::ops::composite::gpu::{self as composite, GpuComposited, GpuPacked};
+use crate::ops::fused_mlp::Mlp;
 use crate::ops::fused_mlp::gpu::{self as mlp, columns};
-use crate::ops::linear::BiasKind;
 use crate::ops::linear::gpu as linear;
 use cubecl::prelude::*;
 
@@ -30,35 +32,38 @@ pub struct GpuStepGradients {
 /// Evaluates and composites packed samples.
 ///
 /// # Shapes
-/// features: `[L, S, F]` with `F` numbers per level; codes: `[R, K_i]`; background: `[R, 3]`.
-#[allow(clippy::too_many_arguments)]
+/// features: `[S, K_0]`; codes: `[R, K_i]`; background: `[R, 3]`.
 pub fn forward(
     gpu: &Gpu,
     net: &FieldNet,
     params: &Buffer,
     p: &GpuPacked,
     features: &Buffer,
-    per_level: usize,
     codes: &[&Buffer],
     background: &Buffer,
 ) -> GpuStep {
-    let s = p.t.len();
-    let rows = gpu.empty(features.len());
-    turn(gpu, features, &rows, s, per_level, net.mlp.input_widths[0], true);
-    let mut inputs = vec![rows];
+    let rows = p.rows();
+    let mut inputs = vec![features.clone()];
     for (code, width) in codes.iter().zip(&net.mlp.input_widths[1..]) {
-        let per_sample = gpu.empty(s * width);
+        let per_sample = gpu.empty(rows.most * width);
         along(gpu, p, code, &per_sample, *width, true);
         inputs.push(per_sample);
     }
-    let values = mlp::forward(gpu, &net.mlp, params, &inputs.iter().collect::<Vec<_>>(), s);
-    let sigma = head(gpu, net, net.sigma, &values, s, 1);
-    let rgb = head(gpu, net, net.rgb, &values, s, 3);
+    let values = mlp::forward(gpu, &net.mlp, params, &inputs.iter().collect::<Vec<_>>(), &rows);
+    let sigma = head(gpu, net, net.sigma, &values, &rows, 1);
+    let rgb = head(gpu, net, net.rgb, &values, &rows, 3);
     let out = composite::forward(gpu, p, &sigma, &rgb, 3, background);
     GpuStep { out, inputs, values, sigma, rgb }
 }
 
-/// Gradients, given those of what compositing gave.
+/// Densities `[S]` of encoded positions `[S, K_0]`; `layers` are the network's up to the density head.
+pub fn density(gpu: &Gpu, net: &FieldNet, layers: &Mlp, params: &Buffer, features: &Buffer, rows: &Rows) -> Buffer {
+    let values = mlp::forward(gpu, layers, params, &[features], rows);
+    head(gpu, net, net.sigma, &values, rows, 1)
+}
+
+/// Gradients, given those of what compositing gave; see [`super::StepInput::near_scaling`].
+#[allow(clippy::too_many_arguments)]
 pub fn backward(
     gpu: &Gpu,
     net: &FieldNet,
@@ -68,20 +73,23 @@ pub fn backward(
     background: &Buffer,
     step: &GpuStep,
     d: &GpuComposited,
+    near_scaling: f32,
 ) -> GpuStepGradients {
-    let s = p.t.len();
+    let rows = p.rows();
     let g = composite::backward(gpu, p, &step.rgb, 3, background, &step.out, d);
+    if near_scaling > 0.0 {
+        soften(gpu, p, &g.sigma, &g.features, near_scaling);
+    }
     let mut seeds: Vec<Option<Buffer>> = net.mlp.layers.iter().map(|_| None).collect();
     for (h, channels, out, d) in [(net.sigma, 1, &step.sigma, &g.sigma), (net.rgb, 3, &step.rgb, &g.features)] {
-        let slope = linear::before_activation(gpu, h.activation, out, d);
+        let slope = linear::before_activation(gpu, &rows, channels, h.activation, out, d);
         let width = net.mlp.layers[h.layer].width;
-        let seed = seeds[h.layer].get_or_insert_with(|| gpu.zeros(s * width));
-        columns(gpu, s, channels, (&slope, channels, 0), (seed, width, h.channel), true);
+        let seed = seeds[h.layer].get_or_insert_with(|| gpu.zeros(rows.most * width));
+        columns(gpu, &rows, channels, (&slope, channels, 0), (seed, width, h.channel), true);
     }
     let inputs: Vec<&Buffer> = step.inputs.iter().collect();
-    let (d_params, d_inputs) = mlp::backward(gpu, &net.mlp, params, &inputs, &step.values, s, seeds);
-    let features = gpu.empty(d_inputs[0].len());
-    turn(gpu, &d_inputs[0], &features, s, per_level, net.mlp.input_widths[0], false);
+    let (d_params, d_inputs) = mlp::backward(gpu, &net.mlp, params, &inputs, &step.values, &rows, seeds);
+    let features = turn(gpu, &rows, &d_inputs[0], per_level, net.mlp.input_widths[0], false);
     let codes = d_inputs[1..].iter().zip(&net.mlp.input_widths[1..]).map(|(d, width)| {
         let sum = gpu.empty(p.rays() * width);
         along(gpu, p, &sum, d, *width, false);
@@ -91,34 +99,103 @@ pub fn backward(
 }
 
 /// Activated channels of a layer, `[S, channels]`.
-fn head(gpu: &Gpu, net: &FieldNet, h: Head, values: &[Buffer], s: usize, channels: usize) -> Buffer {
-    let out = gpu.empty(s * channels);
-    columns(gpu, s, channels, (&values[h.layer], net.mlp.layers[h.layer].width, h.channel), (&out, channels, 0), false);
-    let shift = gpu.upload(&vec![h.shift; channels]);
-    linear::finish(gpu, &out, channels, Some((&shift).into()), BiasKind::Shared, h.activation);
+fn head(gpu: &Gpu, net: &FieldNet, h: Head, values: &[Buffer], rows: &Rows, channels: usize) -> Buffer {
+    linear::head(gpu, rows, (&values[h.layer], net.mlp.layers[h.layer].width, h.channel), channels, h.shift, h.activation)
+}
+
+/// Level-major `[L, S, F]` to row-major features `[S, L F]`.
+pub fn to_rows(gpu: &Gpu, rows: &Rows, features: &Buffer, per_level: usize, dims: usize) -> Buffer {
+    turn(gpu, rows, features, per_level, dims, true)
+}
+
+/// Rows `[R, width]` of `table` `[N, width]` named by `index` `[R]`.
+pub fn look_up(gpu: &Gpu, table: &Buffer, index: &Buffer, width: usize) -> Buffer {
+    let out = gpu.empty(index.len() * width);
+    if !out.is_empty() {
+        // SAFETY: units past the length stop; `index` names rows of the table.
+        unsafe {
+            read_rows::launch_unchecked(
+                &gpu.client,
+                units(out.len()),
+                CubeDim::new_1d(CUBE),
+                table.arg(),
+                index.arg(),
+                out.arg(),
+                out.len() as u32,
+                width as u32,
+            );
+        }
+    }
     out
 }
 
-/// Level-major to row-major features, or back.
-fn turn(gpu: &Gpu, from: &Buffer, to: &Buffer, samples: usize, per_level: usize, dims: usize, to_rows: bool) {
-    if from.is_empty() {
+/// Adds rows `d` `[R, width]` to the gradient of the table.
+pub fn look_up_backward(gpu: &Gpu, d: &Buffer, index: &Buffer, width: usize, d_table: &Buffer) {
+    if d.is_empty() {
         return;
     }
-    // SAFETY: units past the length stop.
+    let launch = if gpu.native_atomics { add_rows::launch_unchecked::<Native> } else { add_rows::launch_unchecked::<Swap> };
+    // SAFETY: as in `look_up`.
     unsafe {
-        transpose::launch_unchecked(
+        launch(
             &gpu.client,
-            units(from.len()),
+            units(d.len()),
             CubeDim::new_1d(CUBE),
-            from.arg(),
-            to.arg(),
-            from.len() as u32,
-            samples as u32,
-            per_level as u32,
-            dims as u32,
-            to_rows,
+            d.arg(),
+            index.arg(),
+            d_table.arg(),
+            d.len() as u32,
+            width as u32,
         );
     }
+}
+
+/// Scales gradients of samples closer than `reach` by the square of their share of it.
+fn soften(gpu: &Gpu, p: &GpuPacked, d_sigma: &Buffer, d_rgb: &Buffer, reach: f32) {
+    let (live, at) = p.rows().arg();
+    if p.t.is_empty() {
+        return;
+    }
+    // SAFETY: units past the samples stop.
+    unsafe {
+        scale_near::launch_unchecked(
+            &gpu.client,
+            units(p.t.len()),
+            CubeDim::new_1d(CUBE),
+            live,
+            p.t.arg(),
+            p.dt.arg(),
+            d_sigma.arg(),
+            d_rgb.arg(),
+            at,
+            reach,
+        );
+    }
+}
+
+/// Level-major to row-major features, or back.
+fn turn(gpu: &Gpu, rows: &Rows, from: &Buffer, per_level: usize, dims: usize, to_rows: bool) -> Buffer {
+    let to = gpu.empty(from.len());
+    if !from.is_empty() {
+        let (live, at) = rows.arg();
+        // SAFETY: units past the rows stop.
+        unsafe {
+            transpose::launch_unchecked(
+                &gpu.client,
+                units(from.len()),
+                CubeDim::new_1d(CUBE),
+                live,
+                from.arg(),
+                to.arg(),
+                at,
+                rows.most as u32,
+                per_level as u32,
+                dims as u32,
+                to_rows,
+            );
+        }
+    }
+    to
 }
 
 /// Copies each ray's code `[R, K]` to its samples `[S, K]`, or sums them back.
@@ -144,9 +221,18 @@ fn along(gpu: &Gpu, p: &GpuPacked, code: &Buffer, samples: &Buffer, width: usize
 }
 
 #[cube(launch_unchecked)]
-fn transpose(from: &[f32], to: &mut [f32], n: u32, samples: u32, per_level: u32, dims: u32, #[comptime] to_rows: bool) {
+fn transpose(
+    live: &[u32],
+    from: &[f32],
+    to: &mut [f32],
+    at: u32,
+    samples: u32,
+    per_level: u32,
+    dims: u32,
+    #[comptime] to_rows: bool,
+) {
     let unit = ABSOLUTE_POS;
-    if unit >= n as usize {
+    if unit >= live[at as usize] as usize * dims as usize {
         terminate!();
     }
     let f = per_level as usize;
@@ -179,5 +265,41 @@ fn share(offsets: &[u32], code: &mut [f32], samples: &mut [f32], n: u32, width: 
     }
     if comptime!(!spread) {
         code[unit] = sum;
+    }
+}
+
+#[cube(launch_unchecked)]
+fn read_rows(table: &[f32], index: &[u32], out: &mut [f32], n: u32, width: u32) {
+    let i = ABSOLUTE_POS;
+    if i >= n as usize {
+        terminate!();
+    }
+    let w = width as usize;
+    out[i] = table[index[i / w] as usize * w + i % w];
+}
+
+#[cube(launch_unchecked)]
+fn add_rows<A: Accumulate>(d: &[f32], index: &[u32], d_table: &[Atomic<A::Cell>], n: u32, width: u32) {
+    let i = ABSOLUTE_POS;
+    if i >= n as usize {
+        terminate!();
+    }
+    let w = width as usize;
+    A::add(&d_table[index[i / w] as usize * w + i % w], d[i]);
+}
+
+#[cube(launch_unchecked)]
+fn scale_near(live: &[u32], t: &[f32], dt: &[f32], d_sigma: &mut [f32], d_rgb: &mut [f32], at: u32, reach: f32) {
+    let i = ABSOLUTE_POS;
+    if i >= live[at as usize] as usize {
+        terminate!();
+    }
+    let share = (t[i] + 0.5 * dt[i]) / reach;
+    if share < 1.0 {
+        d_sigma[i] *= share * share;
+        #[unroll]
+        for k in 0..3usize {
+            d_rgb[i * 3 + k] *= share * share;
+        }
     }
 }

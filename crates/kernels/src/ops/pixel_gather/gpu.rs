@@ -1,7 +1,9 @@
-//! One unit per pixel.
+//! One unit per pixel, or per ray where training pixels are drawn.
 
+use crate::gpu::random::{Wide, below, halves, key, product, sum, uniform, widened};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use cubecl::prelude::*;
+use diorama_geom::rng::Rng;
 
 /// `[R, 4]` for the pixels `at` `[R]` of packed RGBA `[P]`, red in the lowest byte.
 pub fn gather(gpu: &Gpu, pixels: &Buffer, at: &Buffer) -> Buffer {
@@ -21,6 +23,212 @@ pub fn gather(gpu: &Gpu, pixels: &Buffer, at: &Buffer) -> Buffer {
         }
     }
     out
+}
+
+/// Draws of a pixel before a ray whose pixels are all masked is left out.
+const ATTEMPTS: u32 = 5;
+/// Random numbers set aside per ray.
+const NUMBERS: u32 = 16;
+
+/// Photographs on the device.
+pub struct GpuPhotographs {
+    count: usize,
+    /// Width, height and first pixel of each, `[count, 3]`.
+    sizes: Buffer,
+    pixels: Buffer,
+    /// One bit per pixel that may be trained on; none: all may.
+    mask: Option<Buffer>,
+}
+
+/// Drawn pixels.
+pub struct Drawn {
+    /// `[R]`
+    pub images: Buffer,
+    /// Centres, `[R, 2]`.
+    pub pixels: Buffer,
+    /// Straight RGBA, `[R, 4]`.
+    pub target: Buffer,
+    /// In `[0, 1)`, `[R]`.
+    pub jitter: Buffer,
+    /// 1 where masks refused every draw, `[R]`.
+    pub left_out: Buffer,
+    /// `[R, 3]`
+    pub background: Buffer,
+}
+
+/// What transparent pixels are composited on.
+#[derive(Clone, Copy, Debug)]
+pub enum Backdrop {
+    Color([f32; 3]),
+    /// Another colour for every ray.
+    Random(Rng),
+}
+
+impl GpuPhotographs {
+    /// Packed RGBA of all photographs, red in the lowest byte, of the given widths and heights.
+    ///
+    /// # Panics
+    /// When the sizes do not add up to the pixels.
+    pub fn upload(gpu: &Gpu, sizes: &[(u32, u32)], pixels: &[u32], mask: Option<&[u32]>) -> Self {
+        let mut first = 0;
+        let mut rows = Vec::with_capacity(sizes.len() * 3);
+        for (w, h) in sizes {
+            rows.extend([*w, *h, first]);
+            first += w * h;
+        }
+        assert_eq!(first as usize, pixels.len(), "photographs: pixels");
+        let mask = mask.map(|m| gpu.upload_u32(m));
+        GpuPhotographs { count: sizes.len(), sizes: gpu.upload_u32(&rows), pixels: gpu.upload_u32(pixels), mask }
+    }
+
+    /// `n` random training pixels; `first` counts those drawn before.
+    pub fn draw(&self, gpu: &Gpu, n: usize, first: u64, rng: &Rng, backdrop: Backdrop) -> Drawn {
+        let d = Drawn {
+            images: gpu.empty(n),
+            pixels: gpu.empty(n * 2),
+            target: gpu.empty(n * 4),
+            jitter: gpu.empty(n),
+            left_out: gpu.empty(n),
+            background: gpu.empty(n * 3),
+        };
+        let ((key_high, key_low), (high, low)) = (key(rng), halves(first.wrapping_mul(NUMBERS as u64)));
+        let (color, (back_high, back_low), is_random) = match backdrop {
+            Backdrop::Color(c) => (c, (0, 0), false),
+            Backdrop::Random(rng) => ([0.0; 3], key(&rng), true),
+        };
+        let (third_high, third_low) = halves(first.wrapping_mul(3));
+        // Bound where there is no mask to read.
+        let mask = self.mask.as_ref().unwrap_or(&self.sizes);
+        if n > 0 {
+            // SAFETY: units past `n` stop; draws stay within the photographs.
+            unsafe {
+                choose::launch_unchecked(
+                    &gpu.client,
+                    units(n),
+                    CubeDim::new_1d(CUBE),
+                    self.sizes.arg(),
+                    self.pixels.arg(),
+                    mask.arg(),
+                    d.images.arg(),
+                    d.pixels.arg(),
+                    d.target.arg(),
+                    d.jitter.arg(),
+                    d.left_out.arg(),
+                    n as u32,
+                    self.count as u32,
+                    key_high,
+                    key_low,
+                    high,
+                    low,
+                    self.mask.is_some(),
+                );
+                back::launch_unchecked(
+                    &gpu.client,
+                    units(n * 3),
+                    CubeDim::new_1d(CUBE),
+                    d.background.arg(),
+                    (n * 3) as u32,
+                    color[0],
+                    color[1],
+                    color[2],
+                    back_high,
+                    back_low,
+                    third_high,
+                    third_low,
+                    is_random,
+                );
+            }
+        }
+        d
+    }
+}
+
+#[cube(launch_unchecked)]
+fn choose(
+    sizes: &[u32],
+    pixels: &[u32],
+    mask: &[u32],
+    images: &mut [u32],
+    centres: &mut [f32],
+    target: &mut [f32],
+    jitter: &mut [f32],
+    left_out: &mut [u32],
+    n: u32,
+    count: u32,
+    key_high: u32,
+    key_low: u32,
+    high: u32,
+    low: u32,
+    #[comptime] is_masked: bool,
+) {
+    let r = ABSOLUTE_POS;
+    if r >= n as usize {
+        terminate!();
+    }
+    let key = Wide { high: key_high, low: key_low };
+    let base = sum(&Wide { high, low }, &product(&widened(u32::cast_from(r)), &widened(NUMBERS)));
+    jitter[r] = uniform(&key, &base);
+    let mut refused = 1u32;
+    let mut attempt = 0u32;
+    let mut image = 0u32;
+    let mut x = 0u32;
+    let mut y = 0u32;
+    let mut at = 0u32;
+    while refused == 1 && attempt < ATTEMPTS {
+        let draw = sum(&base, &widened(1 + attempt * 3));
+        image = below(&key, &draw, count);
+        let w = sizes[image as usize * 3];
+        let h = sizes[image as usize * 3 + 1];
+        x = min(u32::cast_from(uniform(&key, &sum(&draw, &widened(1u32))) * f32::cast_from(w)), w - 1);
+        y = min(u32::cast_from(uniform(&key, &sum(&draw, &widened(2u32))) * f32::cast_from(h)), h - 1);
+        at = sizes[image as usize * 3 + 2] + y * w + x;
+        refused = 0u32;
+        if comptime!(is_masked) {
+            refused = 1 - ((mask[at as usize / 32] >> (at & 31)) & 1);
+        }
+        attempt += 1;
+    }
+    images[r] = image;
+    centres[r * 2] = f32::cast_from(x) + 0.5;
+    centres[r * 2 + 1] = f32::cast_from(y) + 0.5;
+    left_out[r] = refused;
+    let pixel = pixels[at as usize];
+    #[unroll]
+    for k in 0..4u32 {
+        target[r * 4 + k as usize] = f32::cast_from((pixel >> (k * 8)) & 255) / 255.0;
+    }
+}
+
+#[cube(launch_unchecked)]
+fn back(
+    background: &mut [f32],
+    n: u32,
+    red: f32,
+    green: f32,
+    blue: f32,
+    key_high: u32,
+    key_low: u32,
+    high: u32,
+    low: u32,
+    #[comptime] is_random: bool,
+) {
+    let i = ABSOLUTE_POS;
+    if i >= n as usize {
+        terminate!();
+    }
+    if comptime!(is_random) {
+        let at = sum(&Wide { high, low }, &widened(u32::cast_from(i)));
+        background[i] = uniform(&Wide { high: key_high, low: key_low }, &at);
+    } else {
+        let mut v = red;
+        if i % 3 == 1 {
+            v = green;
+        }
+        if i % 3 == 2 {
+            v = blue;
+        }
+        background[i] = v;
+    }
 }
 
 #[cube(launch_unchecked)]

@@ -1,0 +1,269 @@
+//! A hash grid field in training on a GPU: parameters, photographs and occupancy stay there, and nothing is read
+//! back but [`GpuTrainer::figures`] and, for a checkpoint, [`GpuTrainer::download`].
+
+use crate::background::LearnedBackground;
+use crate::fields::{DirectionCode, Encoding, Field};
+use crate::params::ParamGroup;
+use crate::samplers::occupancy::{OCCUPIED, Occupancy};
+use diorama_geom::rng::Rng;
+use diorama_kernels::gemm::Precision;
+use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
+use diorama_kernels::ops::adam::{self, Adam};
+use diorama_kernels::ops::fused_mlp::Mlp;
+use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
+use diorama_kernels::ops::linear::{self, Activation, BiasKind};
+use diorama_kernels::ops::march::MarchConfig;
+use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
+use diorama_kernels::ops::march::gpu::prune::{self, Limits};
+use diorama_kernels::ops::march::gpu::{self as march, GpuRays, Space};
+use diorama_kernels::ops::ngp_field::FieldNet;
+use diorama_kernels::ops::ngp_field::gpu as field;
+use diorama_kernels::ops::ngp_field::gpu::loss::{self, SUMS, Target, Terms};
+use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, GpuPhotographs};
+use diorama_kernels::ops::ray_generation::PosedCamera;
+use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
+use diorama_kernels::ops::{ray_aabb, spherical_harmonics};
+
+/// Terms of the learned background per channel.
+const SKY: usize = 16;
+
+/// A group of parameters on the device.
+struct GpuGroup {
+    values: Buffer,
+    moment1: Buffer,
+    moment2: Buffer,
+    adam: Adam,
+    sparse: bool,
+    frozen: bool,
+}
+
+impl GpuGroup {
+    fn upload(gpu: &Gpu, g: &ParamGroup) -> Self {
+        GpuGroup {
+            values: gpu.upload(&g.values),
+            moment1: gpu.upload(&g.moment1),
+            moment2: gpu.upload(&g.moment2),
+            adam: g.adam,
+            sparse: !g.touched.is_empty(),
+            frozen: g.frozen,
+        }
+    }
+
+    fn download(&self, gpu: &Gpu, g: &mut ParamGroup) -> Result<(), GpuError> {
+        g.values = gpu.read(&self.values)?;
+        g.moment1 = gpu.read(&self.moment1)?;
+        g.moment2 = gpu.read(&self.moment2)?;
+        Ok(())
+    }
+
+    /// One step `t ≥ 1` along `grads`, which are cleared.
+    fn step(&self, gpu: &Gpu, t: u32, scale: f32, grads: &Buffer) {
+        if !self.frozen {
+            let a = Adam { rate: self.adam.rate * scale, ..self.adam };
+            adam::gpu::step(gpu, &a, t, self.sparse, &self.values, &self.moment1, &self.moment2, grads);
+        }
+    }
+}
+
+/// What a step depends on.
+#[derive(Clone, Copy, Debug)]
+pub struct GpuStep {
+    pub rays: usize,
+    /// Rays drawn before.
+    pub first: u64,
+    pub pixels: Rng,
+    /// Ignored where the background is learned.
+    pub backdrop: Backdrop,
+    pub near: f32,
+    pub march: MarchConfig,
+    pub limits: Limits,
+    pub terms: Terms,
+    pub near_scaling: f32,
+    /// Samples that there is room for, before and after those that cannot matter are left out.
+    pub room: (usize, usize),
+    /// Number of the optimiser step, from 1.
+    pub t: u32,
+    pub rate_scale: f32,
+}
+
+/// Means over some steps.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Figures {
+    pub steps: u64,
+    pub loss: f64,
+    pub mse: f64,
+    /// Samples trained and marched, all steps together.
+    pub trained: f64,
+    pub marched: f64,
+}
+
+/// See the module.
+pub struct GpuTrainer {
+    gpu: Gpu,
+    grid: GpuHashGrid,
+    net: FieldNet,
+    density: Mlp,
+    degree: usize,
+    space: Space,
+    cube: (f32, f32),
+    table: GpuGroup,
+    d_table: Buffer,
+    weights: GpuGroup,
+    appearance: Option<(GpuGroup, usize)>,
+    learned: Option<GpuGroup>,
+    occupancy: GpuOccupancyGrid,
+    photographs: GpuPhotographs,
+    cameras: GpuCameras,
+    sums: Buffer,
+}
+
+impl GpuTrainer {
+    /// Uploads all that training needs; `cube` is the scene's outer cube: lowest corner and edge.
+    ///
+    /// # Panics
+    /// When the field is not a hash grid with directions in spherical harmonics.
+    pub fn new(
+        gpu: Gpu,
+        field: &Field,
+        learned: Option<&LearnedBackground>,
+        occupancy: &Occupancy,
+        photographs: GpuPhotographs,
+        cameras: &[PosedCamera],
+        cube: (f32, f32),
+    ) -> Self {
+        let (Encoding::Hash(grid), Some(table), DirectionCode::SphericalHarmonics(degree)) =
+            (&field.encoding, &field.table, field.directions)
+        else {
+            unreachable!("only hash grid fields are trained on a GPU")
+        };
+        let o = occupancy;
+        GpuTrainer {
+            grid: GpuHashGrid::new(&gpu, grid),
+            net: field.net.clone(),
+            density: field.density_net(Precision::F32),
+            degree,
+            space: if field.contraction { Space::Contracted } else { Space::Cube(field.outer) },
+            cube,
+            d_table: gpu.zeros(table.values.len()),
+            table: GpuGroup::upload(&gpu, table),
+            weights: GpuGroup::upload(&gpu, &field.weights),
+            appearance: field.appearance.as_ref().map(|a| (GpuGroup::upload(&gpu, &a.group), a.dims)),
+            learned: learned.map(|l| GpuGroup::upload(&gpu, &l.group)),
+            occupancy: GpuOccupancyGrid::upload(&gpu, &o.bits, &o.density, &o.fresh, &o.live, o.decay, OCCUPIED),
+            photographs,
+            cameras: GpuCameras::upload(&gpu, cameras),
+            sums: gpu.zeros(SUMS),
+            gpu,
+        }
+    }
+
+    pub fn gpu(&self) -> &Gpu {
+        &self.gpu
+    }
+
+    /// One optimiser step: draw, march, leave out, encode, evaluate, compare, and back.
+    pub fn step(&self, s: &GpuStep) {
+        let gpu = &self.gpu;
+        let drawn = self.photographs.draw(gpu, s.rays, s.first, &s.pixels, s.backdrop);
+        let (origins, dirs) = self.cameras.forward(gpu, &drawn.images, &drawn.pixels);
+        let (low, size) = self.cube;
+        let near_far = ray_aabb::gpu::intersect(gpu, &origins, &dirs, [low; 3], [low + size; 3], s.near);
+        let rays = GpuRays { origins, dirs, near_far, jitter: drawn.jitter, resumed: false };
+        let direction = spherical_harmonics::gpu::forward(gpu, self.degree, &rays.dirs);
+        let every_ray = Rows::all(gpu, s.rays);
+        let sky = self.learned.as_ref().map(|g| {
+            let codes = if self.degree * self.degree == SKY { direction.clone() } else { spherical_harmonics::gpu::forward(gpu, 4, &rays.dirs) };
+            let rgb = linear::gpu::forward(gpu, &every_ray, (SKY, 3), &codes, &g.values, None, BiasKind::None, Activation::Sigmoid);
+            (codes, rgb)
+        });
+        let background = sky.as_ref().map_or(&drawn.background, |(_, rgb)| rgb);
+
+        // All samples in occupied cells: their densities decide which are trained, and keep the grid up to date.
+        let marched = march::march(gpu, &self.occupancy.bits, &rays, &s.march, s.room.0);
+        let all = marched.packed.rows();
+        let points = march::positions(gpu, &rays, &marched.packed, self.space);
+        let features = self.features(&all, &points);
+        let sigma = field::density(gpu, &self.net, &self.density, &self.weights.values, &features, &all);
+        let pruned = prune::prune(gpu, &marched.packed, &sigma, s.limits, &marched.cut, s.room.1);
+        self.occupancy.record(gpu, &all, &marched.cells, &sigma);
+        let samples = &pruned.packed;
+        let points = pruned.take(gpu, &points, 3);
+        let features = pruned.take(gpu, &features, self.grid.grid.output_dims());
+
+        let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &drawn.images, *dims));
+        let codes: Vec<&Buffer> = [&direction].into_iter().chain(&appearance).collect();
+        let step = field::forward(gpu, &self.net, &self.weights.values, samples, &features, &codes, background);
+        let left_out = gpu.either(&drawn.left_out, &marched.cut);
+        let target = Target { rgba: &drawn.target, background, left_out: &left_out };
+        let d = loss::loss(gpu, s.terms, samples, &step.out, target, &marched.packed.offsets, &self.sums);
+        let per_level = self.grid.grid.config.features;
+        let g = field::backward(gpu, &self.net, &self.weights.values, samples, per_level, background, &step, &d, s.near_scaling);
+
+        self.weights.step(gpu, s.t, s.rate_scale, &g.params);
+        if !self.table.frozen {
+            self.grid.backward(gpu, &samples.rows(), &points, &g.features, &self.d_table);
+            self.table.step(gpu, s.t, s.rate_scale, &self.d_table);
+        }
+        if let Some((group, dims)) = &self.appearance {
+            let d = gpu.zeros(group.values.len());
+            field::look_up_backward(gpu, &g.codes[1], &drawn.images, *dims, &d);
+            group.step(gpu, s.t, s.rate_scale, &d);
+        }
+        if let (Some(group), Some((codes, rgb))) = (&self.learned, &sky) {
+            let none = BiasKind::None;
+            let d = linear::gpu::backward(gpu, &every_ray, (SKY, 3), codes, &group.values, none, Activation::Sigmoid, rgb, &g.background);
+            group.step(gpu, s.t, s.rate_scale, &d.w);
+        }
+    }
+
+    /// Samples the field at random points of the cells that a camera sees, and decides anew which are occupied.
+    pub fn update_occupancy(&self, rng: &Rng, counter: u64, count: usize, block: usize) {
+        let (points, cells) = self.occupancy.probe(&self.gpu, rng, counter, count, block, self.space);
+        let rows = Rows::all(&self.gpu, count);
+        let features = self.features(&rows, &points);
+        let sigma = field::density(&self.gpu, &self.net, &self.density, &self.weights.values, &features, &rows);
+        self.occupancy.update(&self.gpu, &cells, &sigma, block);
+    }
+
+    fn features(&self, rows: &Rows, points: &Buffer) -> Buffer {
+        let levels = self.grid.forward(&self.gpu, rows, points, &self.table.values);
+        field::to_rows(&self.gpu, rows, &levels, self.grid.grid.config.features, self.grid.grid.output_dims())
+    }
+
+    /// Waits for the device; means since the last call.
+    ///
+    /// # Errors
+    /// When the device was lost or is full.
+    pub fn figures(&mut self) -> Result<Figures, GpuError> {
+        let sums = std::mem::replace(&mut self.sums, self.gpu.zeros(SUMS));
+        let sums: Vec<f64> = self.gpu.read(&sums)?.iter().map(|v| *v as f64).collect();
+        let n = sums[4].max(1.0);
+        Ok(Figures { steps: sums[4] as u64, loss: sums[0] / n, mse: sums[1] / n, trained: sums[2], marched: sums[3] })
+    }
+
+    /// Brings parameters, moments and occupancy back.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn download(
+        &self,
+        field: &mut Field,
+        learned: Option<&mut LearnedBackground>,
+        occupancy: &mut Occupancy,
+    ) -> Result<(), GpuError> {
+        let gpu = &self.gpu;
+        if let Some(t) = &mut field.table {
+            self.table.download(gpu, t)?;
+        }
+        self.weights.download(gpu, &mut field.weights)?;
+        if let (Some((own, _)), Some(a)) = (&self.appearance, &mut field.appearance) {
+            own.download(gpu, &mut a.group)?;
+        }
+        if let (Some(own), Some(l)) = (&self.learned, learned) {
+            own.download(gpu, &mut l.group)?;
+        }
+        (occupancy.density, occupancy.fresh) = self.occupancy.read(gpu)?;
+        occupancy.refresh();
+        Ok(())
+    }
+}

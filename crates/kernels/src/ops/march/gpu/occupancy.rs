@@ -1,0 +1,342 @@
+//! The occupancy grid's upkeep on the device (instant-ngp, section E.2): decayed maxima of densities per cell,
+//! and the bits that marching reads.
+
+use super::super::OccupancyBits;
+use super::{GpuOccupancy, Space, put};
+use crate::gpu::random::{Wide, below, halves, key, product, sum, uniform, widened};
+use crate::gpu::{Buffer, CUBE, Gpu, GpuError, Rows, units};
+use cubecl::prelude::*;
+use diorama_geom::rng::Rng;
+
+/// Parts in which densities are summed.
+const PARTS: usize = 1024;
+
+/// Density that stands for "not sampled yet".
+const UNKNOWN: f32 = f32::MAX;
+
+/// A grid that is kept up to date on the device.
+pub struct GpuOccupancyGrid {
+    /// What marching reads.
+    pub bits: GpuOccupancy,
+    /// Decayed maximum density per cell; negative: never occupied; the greatest number: not sampled yet.
+    density: Buffer,
+    /// Bits of the highest density met since the last update; they order as the densities do.
+    fresh: Buffer,
+    /// Cells that are sampled.
+    live: Buffer,
+    decay: f32,
+    /// Density above which a cell is occupied, unless the mean is lower.
+    threshold: f32,
+}
+
+impl GpuOccupancyGrid {
+    pub fn upload(gpu: &Gpu, bits: &OccupancyBits, density: &[f32], fresh: &[f32], live: &[u32], decay: f32, threshold: f32) -> Self {
+        assert!(density.len() == bits.cells() && fresh.len() == bits.cells(), "occupancy: {} cells", bits.cells());
+        GpuOccupancyGrid {
+            bits: GpuOccupancy::upload(gpu, bits),
+            density: gpu.upload(density),
+            fresh: gpu.upload(fresh),
+            live: gpu.upload_u32(live),
+            decay,
+            threshold,
+        }
+    }
+
+    /// Densities and what was met since the last update.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn read(&self, gpu: &Gpu) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
+        Ok((gpu.read(&self.density)?, gpu.read(&self.fresh)?))
+    }
+
+    /// Notes densities met in cells, but for negative ones; they count at the next update.
+    pub fn record(&self, gpu: &Gpu, rows: &Rows, cells: &Buffer, sigma: &Buffer) {
+        self.note(gpu, rows, cells, sigma, 1);
+    }
+
+    /// [`GpuOccupancyGrid::record`] for blocks of `block³` cells that begin at the given ones.
+    fn note(&self, gpu: &Gpu, rows: &Rows, cells: &Buffer, sigma: &Buffer, block: usize) {
+        let n = rows.most * block.pow(3);
+        if n == 0 {
+            return;
+        }
+        let (live, at) = rows.arg();
+        // SAFETY: units past the rows stop; cells and their blocks lie in the grid.
+        unsafe {
+            highest::launch_unchecked(
+                &gpu.client,
+                units(n),
+                CubeDim::new_1d(CUBE),
+                live,
+                cells.arg(),
+                sigma.arg(),
+                self.fresh.arg(),
+                at,
+                block as u32,
+                self.bits.resolution as u32,
+            );
+        }
+    }
+
+    /// Random points `[count, 3]` of live cells in a field's coordinates, and the cells `[count]`; where blocks of
+    /// `block³` cells share a point, the block's first cell.
+    pub fn probe(&self, gpu: &Gpu, rng: &Rng, counter: u64, count: usize, block: usize, space: Space) -> (Buffer, Buffer) {
+        let (points, cells) = (gpu.empty(count * 3), gpu.empty(count));
+        let ((key_high, key_low), (high, low)) = (key(rng), halves(counter.wrapping_mul(count as u64).wrapping_mul(4)));
+        let (kind, width) = space.arg();
+        if count > 0 && !self.live.is_empty() {
+            // SAFETY: units past `count` stop; draws stay below the number of live cells.
+            unsafe {
+                probe::launch_unchecked(
+                    &gpu.client,
+                    units(count),
+                    CubeDim::new_1d(CUBE),
+                    self.live.arg(),
+                    points.arg(),
+                    cells.arg(),
+                    count as u32,
+                    self.live.len() as u32,
+                    self.bits.resolution as u32,
+                    block as u32,
+                    key_high,
+                    key_low,
+                    high,
+                    low,
+                    width,
+                    kind,
+                );
+            }
+        }
+        (points, cells)
+    }
+
+    /// Folds in the densities `[count]` of probed cells and all that was met, and decides anew about every cell.
+    pub fn update(&self, gpu: &Gpu, cells: &Buffer, sigma: &Buffer, block: usize) {
+        if self.live.is_empty() {
+            return;
+        }
+        self.note(gpu, &Rows::all(gpu, cells.len()), cells, sigma, block);
+        let (n, cascades, cells) = (self.bits.resolution, self.bits.cascades, self.density.len());
+        let (sums, counts, limit) = (gpu.empty(PARTS), gpu.empty(PARTS), gpu.empty(1));
+        let cube = CubeDim::new_1d(CUBE);
+        // SAFETY: units past the parts, words and blocks stop.
+        unsafe {
+            fold::launch_unchecked(
+                &gpu.client,
+                units(PARTS),
+                cube,
+                self.density.arg(),
+                self.fresh.arg(),
+                sums.arg(),
+                counts.arg(),
+                PARTS as u32,
+                cells as u32,
+                self.decay,
+            );
+            decide::launch_unchecked(
+                &gpu.client,
+                CubeCount::Static(1, 1, 1),
+                CubeDim::new_1d(1),
+                sums.arg(),
+                counts.arg(),
+                limit.arg(),
+                PARTS as u32,
+                self.threshold,
+            );
+            occupy::launch_unchecked(
+                &gpu.client,
+                units(cells / 32),
+                cube,
+                self.density.arg(),
+                limit.arg(),
+                self.bits.bits.arg(),
+                (cells / 32) as u32,
+            );
+            for c in 1..cascades {
+                pool::launch_unchecked(&gpu.client, units(n.pow(3) / 32), cube, self.bits.bits.arg(), c as u32, n as u32);
+            }
+            let blocks = self.bits.blocks.len();
+            summarise::launch_unchecked(
+                &gpu.client,
+                units(blocks),
+                cube,
+                self.bits.bits.arg(),
+                self.bits.blocks.arg(),
+                blocks as u32,
+                n as u32,
+            );
+        }
+    }
+}
+
+#[cube(launch_unchecked)]
+fn highest(live: &[u32], cells: &[u32], sigma: &[f32], fresh: &[Atomic<u32>], at: u32, block: u32, resolution: u32) {
+    let unit = ABSOLUTE_POS;
+    let b = block as usize;
+    let n = resolution as usize;
+    let row = unit / (b * b * b);
+    if row >= live[at as usize] as usize {
+        terminate!();
+    }
+    let k = unit % (b * b * b);
+    if sigma[row] > 0.0 {
+        let cell = cells[row] as usize + k % b + n * (k / b % b) + n * n * (k / b / b);
+        fresh[cell].fetch_max(u32::reinterpret(sigma[row]));
+    }
+}
+
+#[cube(launch_unchecked)]
+fn probe(
+    live: &[u32],
+    points: &mut [f32],
+    cells: &mut [u32],
+    count: u32,
+    live_count: u32,
+    resolution: u32,
+    block: u32,
+    key_high: u32,
+    key_low: u32,
+    high: u32,
+    low: u32,
+    width: f32,
+    #[comptime] kind: u32,
+) {
+    let i = ABSOLUTE_POS;
+    if i >= count as usize {
+        terminate!();
+    }
+    let key = Wide { high: key_high, low: key_low };
+    let base = sum(&Wide { high, low }, &product(&widened(u32::cast_from(i)), &widened(4u32)));
+    let n = resolution;
+    let at = live[below(&key, &base, live_count) as usize];
+    let cascade = at / (n * n * n);
+    let x = at % n / block * block;
+    let y = at / n % n / block * block;
+    let z = at / (n * n) % n / block * block;
+    let mut size = 1.0f32;
+    for _ in 0..cascade {
+        size *= 2.0;
+    }
+    let edge = f32::cast_from(block);
+    let scale = f32::cast_from(n);
+    let first = 0.5 - 0.5 * size;
+    let px = first + (f32::cast_from(x) + uniform(&key, &sum(&base, &widened(1u32))) * edge) * size / scale;
+    let py = first + (f32::cast_from(y) + uniform(&key, &sum(&base, &widened(2u32))) * edge) * size / scale;
+    let pz = first + (f32::cast_from(z) + uniform(&key, &sum(&base, &widened(3u32))) * edge) * size / scale;
+    put(points, i * 3, px, py, pz, width, kind);
+    cells[i] = ((cascade * n + z) * n + y) * n + x;
+}
+
+#[cube(launch_unchecked)]
+fn fold(density: &mut [f32], fresh: &mut [u32], sums: &mut [f32], counts: &mut [u32], parts: u32, cells: u32, decay: f32) {
+    let unit = ABSOLUTE_POS;
+    if unit >= parts as usize {
+        terminate!();
+    }
+    let mut total = 0.0f32;
+    let mut known = 0u32;
+    // Neighbouring units read neighbouring cells.
+    let mut i = unit;
+    while i < cells as usize {
+        let mut d = density[i];
+        let f = f32::reinterpret(fresh[i]);
+        if f > 0.0 && d >= 0.0 {
+            if d == UNKNOWN {
+                d = f;
+            } else {
+                d = max(d * decay, f);
+            }
+            density[i] = d;
+        }
+        fresh[i] = 0u32;
+        if d >= 0.0 && d != UNKNOWN {
+            total += d;
+            known += 1;
+        }
+        i += parts as usize;
+    }
+    sums[unit] = total;
+    counts[unit] = known;
+}
+
+/// The threshold: the mean of the known densities, but no more than `most`.
+#[cube(launch_unchecked)]
+fn decide(sums: &[f32], counts: &[u32], limit: &mut [f32], parts: u32, most: f32) {
+    let mut total = 0.0f32;
+    let mut known = 0u32;
+    for i in 0..parts as usize {
+        total += sums[i];
+        known += counts[i];
+    }
+    limit[0] = min(most, total / f32::cast_from(max(known, 1u32)));
+}
+
+#[cube(launch_unchecked)]
+fn occupy(density: &[f32], limit: &[f32], bits: &mut [u32], words: u32) {
+    let w = ABSOLUTE_POS;
+    if w >= words as usize {
+        terminate!();
+    }
+    let mut word = 0u32;
+    for i in 0..32usize {
+        if density[w * 32 + i] > limit[0] {
+            word |= 1u32 << u32::cast_from(i);
+        }
+    }
+    bits[w] = word;
+}
+
+/// Cells of a coarser cascade that a finer one covers are occupied where the finer cells are.
+#[cube(launch_unchecked)]
+fn pool(bits: &mut [u32], cascade: u32, resolution: u32) {
+    let unit = ABSOLUTE_POS;
+    let n = resolution as usize;
+    if unit >= n * n * n / 32 {
+        terminate!();
+    }
+    let own = cascade as usize * n * n * n / 32;
+    let finer = (cascade - 1) as usize * n * n * n / 32;
+    let mut word = bits[own + unit];
+    for b in 0..32usize {
+        let cell = unit * 32 + b;
+        let x = cell % n;
+        let y = cell / n % n;
+        let z = cell / n / n;
+        let low = n / 4;
+        let high = n / 4 * 3;
+        if x >= low && x < high && y >= low && y < high && z >= low && z < high {
+            let mut any = 0u32;
+            for k in 0..8usize {
+                let fx = 2 * (x - low) + k % 2;
+                let fy = 2 * (y - low) + k / 2 % 2;
+                let fz = 2 * (z - low) + k / 4;
+                let at = (fz * n + fy) * n + fx;
+                any |= (bits[finer + at / 32] >> u32::cast_from(at % 32)) & 1;
+            }
+            let bit = u32::cast_from(b);
+            word = (word & !(1u32 << bit)) | (any << bit);
+        }
+    }
+    bits[own + unit] = word;
+}
+
+#[cube(launch_unchecked)]
+fn summarise(bits: &[u32], blocks: &mut [u32], count: u32, resolution: u32) {
+    let unit = ABSOLUTE_POS;
+    if unit >= count as usize {
+        terminate!();
+    }
+    let n = resolution as usize;
+    let side = n / 8;
+    let x = unit % side * 8;
+    let y = unit / side % side * 8;
+    // Cascades follow one another along z.
+    let z = unit / side / side * 8;
+    let mut any = 0u32;
+    for k in 0..64usize {
+        let cell = ((z + k / 8) * n + y + k % 8) * n + x;
+        any |= (bits[cell / 32] >> u32::cast_from(cell % 32)) & 255;
+    }
+    blocks[unit] = min(any, 1u32);
+}

@@ -1,0 +1,174 @@
+//! Leaving out samples that cannot matter, before the costly part of a step: those behind opaque matter and
+//! those that hold next to nothing.
+
+use super::bounded;
+use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::ops::composite::gpu::GpuPacked;
+use crate::ops::scan;
+use cubecl::prelude::*;
+
+/// Which samples are left out.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Limits {
+    /// Share of light behind which nothing counts.
+    pub stop: f32,
+    /// Opacity below which a sample is left out, unless it is denser than `thin`.
+    pub min_alpha: f32,
+    pub thin: f32,
+}
+
+/// The samples that stay.
+pub struct Pruned {
+    pub packed: GpuPacked,
+    /// Where each lay before.
+    source: Buffer,
+}
+
+/// Keeps what [`Limits`] leave of samples with densities `[S]`, as many as `capacity` holds; rays that lose others
+/// for want of room are marked in `cut`. Densities that no light reaches become −1.
+pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: Limits, cut: &Buffer, capacity: usize) -> Pruned {
+    let n = p.rays();
+    let counts = gpu.empty(n);
+    let kept = gpu.empty(p.t.len());
+    if n > 0 {
+        // SAFETY: units past the rays stop; offsets bound the samples.
+        unsafe {
+            keep::launch_unchecked(
+                &gpu.client,
+                units(n),
+                CubeDim::new_1d(CUBE),
+                p.offsets.arg(),
+                p.dt.arg(),
+                sigma.arg(),
+                kept.arg(),
+                counts.arg(),
+                n as u32,
+                limits.stop,
+                limits.min_alpha,
+                limits.thin,
+            );
+        }
+    }
+    let whole = scan::gpu::exclusive(gpu, &counts);
+    let offsets = bounded(gpu, &whole, cut, capacity);
+    let (t, dt, source) = (gpu.empty(capacity), gpu.empty(capacity), gpu.empty(capacity));
+    if n > 0 {
+        // SAFETY: units past the rays stop; samples beyond the capacity are not written.
+        unsafe {
+            compact::launch_unchecked(
+                &gpu.client,
+                units(n),
+                CubeDim::new_1d(CUBE),
+                p.offsets.arg(),
+                p.t.arg(),
+                p.dt.arg(),
+                kept.arg(),
+                offsets.arg(),
+                t.arg(),
+                dt.arg(),
+                source.arg(),
+                n as u32,
+            );
+        }
+    }
+    Pruned { packed: GpuPacked { offsets, t, dt }, source }
+}
+
+impl Pruned {
+    /// Rows `[capacity, width]` of the samples that stay, of those of all `[S, width]`.
+    pub fn take(&self, gpu: &Gpu, all: &Buffer, width: usize) -> Buffer {
+        let rows = self.packed.rows();
+        let out = gpu.empty(rows.most * width);
+        if !out.is_empty() {
+            let (live, at) = rows.arg();
+            // SAFETY: units past the rows stop; sources name samples.
+            unsafe {
+                fetch::launch_unchecked(
+                    &gpu.client,
+                    units(out.len()),
+                    CubeDim::new_1d(CUBE),
+                    live,
+                    self.source.arg(),
+                    all.arg(),
+                    out.arg(),
+                    at,
+                    width as u32,
+                );
+            }
+        }
+        out
+    }
+}
+
+#[cube(launch_unchecked)]
+fn keep(
+    offsets: &[u32],
+    dt: &[f32],
+    sigma: &mut [f32],
+    kept: &mut [u32],
+    counts: &mut [u32],
+    rays: u32,
+    stop: f32,
+    min_alpha: f32,
+    thin: f32,
+) {
+    let r = ABSOLUTE_POS;
+    if r >= rays as usize {
+        terminate!();
+    }
+    let mut light = 1.0f32;
+    let mut count = 0u32;
+    for i in offsets[r] as usize..offsets[r + 1] as usize {
+        let mut stays = 0u32;
+        if light < stop {
+            sigma[i] = -1.0f32;
+        } else {
+            let alpha = 1.0 - (-(sigma[i] * dt[i])).exp();
+            light -= light * alpha;
+            if alpha >= min(min_alpha, thin * dt[i]) {
+                stays = 1u32;
+            }
+        }
+        kept[i] = stays;
+        count += stays;
+    }
+    counts[r] = count;
+}
+
+#[cube(launch_unchecked)]
+fn compact(
+    offsets: &[u32],
+    t: &[f32],
+    dt: &[f32],
+    kept: &[u32],
+    to: &[u32],
+    to_t: &mut [f32],
+    to_dt: &mut [f32],
+    source: &mut [u32],
+    rays: u32,
+) {
+    let r = ABSOLUTE_POS;
+    if r >= rays as usize {
+        terminate!();
+    }
+    let mut next = to[r] as usize;
+    let end = to[r + 1] as usize;
+    for i in offsets[r] as usize..offsets[r + 1] as usize {
+        if kept[i] == 1 && next < end {
+            to_t[next] = t[i];
+            to_dt[next] = dt[i];
+            source[next] = u32::cast_from(i);
+            next += 1;
+        }
+    }
+}
+
+#[cube(launch_unchecked)]
+fn fetch(live: &[u32], source: &[u32], all: &[f32], out: &mut [f32], at: u32, width: u32) {
+    let i = ABSOLUTE_POS;
+    let w = width as usize;
+    if i >= live[at as usize] as usize * w {
+        terminate!();
+    }
+    out[i] = all[source[i / w] as usize * w + i % w];
+}

@@ -1,0 +1,202 @@
+//! The photometric loss of a batch of rays: colour, opacity and distortion, each a mean over the rays.
+
+use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::ops::composite::gpu::{GpuComposited, GpuPacked};
+use crate::ops::distortion;
+use cubecl::prelude::*;
+
+/// Sums that [`loss`] adds to: loss, mean squared error, trained samples, marched samples, steps.
+pub const SUMS: usize = 5;
+
+/// Parts in which rays are summed.
+const PARTS: usize = 256;
+
+/// What counts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Terms {
+    /// Width of the Huber loss's quadratic part; 0: squared error.
+    pub huber: f32,
+    /// Weight of the distortion loss.
+    pub distortion: f32,
+    /// Weight of the squared difference between opacity and the photograph's alpha.
+    pub alpha: f32,
+}
+
+/// What rays are to match.
+#[derive(Clone, Copy)]
+pub struct Target<'a> {
+    /// Straight RGBA `[R, 4]`.
+    pub rgba: &'a Buffer,
+    /// What transparent pixels are composited on, `[R, 3]`.
+    pub background: &'a Buffer,
+    /// Rays that do not count: not 0, `[R]`.
+    pub left_out: &'a Buffer,
+}
+
+/// Gradients of what compositing gave; adds the step's figures to `sums` `[SUMS]`.
+pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target: Target, marched: &Buffer, sums: &Buffer) -> GpuComposited {
+    let r = p.rays();
+    let d = GpuComposited { color: gpu.empty(r * 3), depth: gpu.zeros(r), opacity: gpu.empty(r), weights: gpu.empty(0) };
+    let (values, errors, d_spread) = (gpu.empty(r), gpu.empty(r), gpu.empty(r));
+    let cube = CubeDim::new_1d(CUBE);
+    // SAFETY: units past the rays stop.
+    unsafe {
+        compare::launch_unchecked(
+            &gpu.client,
+            units(r),
+            cube,
+            out.color.arg(),
+            out.opacity.arg(),
+            target.rgba.arg(),
+            target.background.arg(),
+            target.left_out.arg(),
+            d.color.arg(),
+            d.opacity.arg(),
+            d_spread.arg(),
+            values.arg(),
+            errors.arg(),
+            r as u32,
+            1.0 / r as f32,
+            terms.huber,
+            terms.alpha,
+            terms.distortion,
+        );
+    }
+    let (spread, weights) = distortion::gpu::both(gpu, p, &out.weights, &d_spread);
+    let parts = gpu.empty(PARTS * 3);
+    // SAFETY: units past the parts stop; offsets hold one number more than there are rays.
+    unsafe {
+        gather::launch_unchecked(
+            &gpu.client,
+            units(PARTS),
+            cube,
+            target.left_out.arg(),
+            values.arg(),
+            errors.arg(),
+            spread.arg(),
+            parts.arg(),
+            r as u32,
+            PARTS as u32,
+            terms.distortion,
+        );
+        finish::launch_unchecked(
+            &gpu.client,
+            CubeCount::Static(1, 1, 1),
+            CubeDim::new_1d(1),
+            parts.arg(),
+            p.offsets.arg(),
+            marched.arg(),
+            sums.arg(),
+            r as u32,
+            PARTS as u32,
+        );
+    }
+    GpuComposited { weights, ..d }
+}
+
+#[cube(launch_unchecked)]
+fn compare(
+    color: &[f32],
+    opacity: &[f32],
+    rgba: &[f32],
+    background: &[f32],
+    left_out: &[u32],
+    d_color: &mut [f32],
+    d_opacity: &mut [f32],
+    d_spread: &mut [f32],
+    values: &mut [f32],
+    errors: &mut [f32],
+    rays: u32,
+    scale: f32,
+    huber: f32,
+    alpha: f32,
+    distortion: f32,
+) {
+    let r = ABSOLUTE_POS;
+    if r >= rays as usize {
+        terminate!();
+    }
+    let mut counts = 1.0f32;
+    if left_out[r] != 0 {
+        counts = 0.0f32;
+    }
+    let a = rgba[r * 4 + 3];
+    let mut value = 0.0f32;
+    let mut error = 0.0f32;
+    #[unroll]
+    for k in 0..3usize {
+        let d = color[r * 3 + k] - (rgba[r * 4 + k] * a + background[r * 3 + k] * (1.0 - a));
+        let mut v = d * d;
+        let mut slope = 2.0 * d;
+        error += v;
+        if huber > 0.0 {
+            if d.abs() <= huber {
+                v /= 2.0 * huber;
+                slope = d / huber;
+            } else {
+                v = d.abs() - 0.5 * huber;
+                slope = 1.0f32;
+                if d < 0.0 {
+                    slope = -1.0f32;
+                }
+            }
+        }
+        value += v / 3.0;
+        d_color[r * 3 + k] = counts * slope * scale / 3.0;
+    }
+    let d = opacity[r] - a;
+    value += alpha * d * d;
+    d_opacity[r] = counts * alpha * 2.0 * d * scale;
+    d_spread[r] = counts * distortion * scale;
+    values[r] = counts * value;
+    errors[r] = counts * error / 3.0;
+}
+
+#[cube(launch_unchecked)]
+fn gather(
+    left_out: &[u32],
+    values: &[f32],
+    errors: &[f32],
+    spread: &[f32],
+    parts: &mut [f32],
+    rays: u32,
+    n: u32,
+    distortion: f32,
+) {
+    let unit = ABSOLUTE_POS;
+    if unit >= n as usize {
+        terminate!();
+    }
+    let mut value = 0.0f32;
+    let mut error = 0.0f32;
+    let mut count = 0.0f32;
+    let mut r = unit;
+    while r < rays as usize {
+        if left_out[r] == 0 {
+            value += values[r] + distortion * spread[r];
+            error += errors[r];
+            count += 1.0;
+        }
+        r += n as usize;
+    }
+    parts[unit * 3] = value;
+    parts[unit * 3 + 1] = error;
+    parts[unit * 3 + 2] = count;
+}
+
+#[cube(launch_unchecked)]
+fn finish(parts: &[f32], offsets: &[u32], marched: &[u32], sums: &mut [f32], rays: u32, n: u32) {
+    let mut value = 0.0f32;
+    let mut error = 0.0f32;
+    let mut count = 0.0f32;
+    for i in 0..n as usize {
+        value += parts[i * 3];
+        error += parts[i * 3 + 1];
+        count += parts[i * 3 + 2];
+    }
+    sums[0] += value / f32::cast_from(rays);
+    sums[1] += error / max(count, 1.0f32);
+    sums[2] += f32::cast_from(offsets[rays as usize]);
+    sums[3] += f32::cast_from(marched[rays as usize]);
+    sums[4] += 1.0;
+}

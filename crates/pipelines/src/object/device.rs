@@ -1,0 +1,363 @@
+//! Where a run trains: on the CPU, or on a GPU that keeps all of its state.
+
+use super::config::{Config, Method};
+use super::model::ObjectModel;
+use super::recipe::Photographs;
+use crate::error::{PipelineError, Result};
+use diorama_geom::rng::Rng;
+use diorama_kernels::device::Api;
+use diorama_kernels::ops::ray_generation::PosedCamera;
+#[cfg(feature = "gpu")]
+use running::Running;
+
+/// What a step on a GPU depends on besides the configuration.
+pub(super) struct Drawing {
+    pub rays: usize,
+    pub pixels: Rng,
+    /// A new background colour for every ray; none: the run's one colour.
+    pub background: Option<Rng>,
+    /// Points at which the occupancy grid is sampled in this step; none: it is not.
+    pub probes: Option<Rng>,
+    /// Edge of the blocks of cells that share a probe.
+    pub block: usize,
+    pub stretch: f32,
+    pub thin: f32,
+    pub rate_scale: f32,
+}
+
+/// What steps came to, on average over those since the last time that the device was asked.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct StepFigures {
+    pub loss: f64,
+    pub mse: f64,
+    pub trained: f64,
+    pub marched: f64,
+}
+
+/// The device of a run.
+pub(super) struct Opened {
+    #[cfg(feature = "gpu")]
+    running: Option<Running>,
+    note: Option<String>,
+}
+
+/// Why a GPU cannot train a configuration.
+fn lacking(config: &Config) -> Option<String> {
+    let what = match config.method {
+        Method::Ngp if config.sampling.error_map => "sampling.error_map".to_string(),
+        Method::Ngp if config.camera.refine => "camera.refine".to_string(),
+        Method::Ngp => return None,
+        m => format!("method {m}"),
+    };
+    Some(format!("{what} trains on the CPU alone"))
+}
+
+/// Finds the device that a configuration asks for; `auto` is the best GPU that is no software, else the CPU.
+///
+/// # Errors
+/// When a named GPU is not part of the build, absent, or cannot train the configuration.
+pub(super) fn open(config: &Config) -> Result<Opened> {
+    match &config.device[..] {
+        "cpu" => Ok(Opened::cpu(None)),
+        "auto" => Ok(Opened::best(config)),
+        name => {
+            let api: Api = name.parse().map_err(PipelineError::Usage)?;
+            if !api.is_built() {
+                return Err(PipelineError::Usage(api.not_built()));
+            }
+            if let Some(what) = lacking(config) {
+                return Err(PipelineError::Usage(format!("device {name}: {what}; use --device cpu")));
+            }
+            Opened::named(api)
+        }
+    }
+}
+
+impl Opened {
+    fn cpu(note: Option<String>) -> Opened {
+        Opened {
+            #[cfg(feature = "gpu")]
+            running: None,
+            note,
+        }
+    }
+
+    /// What the user is told.
+    pub fn note(&self) -> Option<String> {
+        self.note.clone()
+    }
+}
+
+#[cfg(not(feature = "gpu"))]
+impl Opened {
+    fn best(_: &Config) -> Opened {
+        Opened::cpu(None)
+    }
+
+    fn named(api: Api) -> Result<Opened> {
+        Err(PipelineError::Usage(api.not_built()))
+    }
+
+    pub fn is_gpu(&self) -> bool {
+        false
+    }
+
+    pub fn name(&self) -> String {
+        "cpu".into()
+    }
+
+    pub fn batch_samples(&self, config: &Config) -> usize {
+        batch_samples(config, false)
+    }
+
+    pub fn most_rays(&self) -> usize {
+        MOST_RAYS
+    }
+
+    pub fn upload(&mut self, _: &ObjectModel, _: &Photographs, _: &[PosedCamera]) -> Result<()> {
+        Ok(())
+    }
+
+    pub fn step(&mut self, _: &mut ObjectModel, _: u64, _: &Drawing) -> Result<StepFigures> {
+        unreachable!("this build has no GPUs")
+    }
+
+    pub fn figures(&mut self, _: &mut ObjectModel) -> Result<StepFigures> {
+        Ok(StepFigures::default())
+    }
+
+    pub fn download(&mut self, _: &mut ObjectModel) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// Most rays per step on a CPU; GPUs take eight times as many, as they take samples.
+const MOST_RAYS: usize = 1 << 14;
+
+/// Samples per step.
+fn batch_samples(config: &Config, is_gpu: bool) -> usize {
+    match config.sampling.batch_samples {
+        0 if is_gpu => 1 << 18,
+        0 => 1 << 15,
+        n => n,
+    }
+}
+
+#[cfg(feature = "gpu")]
+impl Opened {
+    fn best(config: &Config) -> Opened {
+        use diorama_kernels::gpu::Gpu;
+        let Some(gpu) = Api::ALL.into_iter().filter(|a| a.is_built()).filter_map(|a| Gpu::open(a).ok()).find(|g| !g.software) else {
+            return Opened::cpu(None);
+        };
+        match lacking(config) {
+            Some(what) => Opened::cpu(Some(format!("{}: {what}", gpu.name))),
+            None => Opened::gpu(gpu),
+        }
+    }
+
+    fn named(api: Api) -> Result<Opened> {
+        let gpu = diorama_kernels::gpu::Gpu::open(api).map_err(|e| PipelineError::Usage(e.to_string()))?;
+        Ok(Opened::gpu(gpu))
+    }
+
+    fn gpu(gpu: diorama_kernels::gpu::Gpu) -> Opened {
+        let note = format!("training on {} ({})", gpu.name, gpu.api.name());
+        Opened { running: Some(Running::new(gpu)), note: Some(note) }
+    }
+
+    pub fn is_gpu(&self) -> bool {
+        self.running.is_some()
+    }
+
+    pub fn name(&self) -> String {
+        self.running.as_ref().map_or("cpu".into(), |r| format!("{} ({})", r.gpu().name, r.gpu().api.name()))
+    }
+
+    /// Whether a GPU computes that the CPU does not play.
+    fn is_hardware(&self) -> bool {
+        self.running.as_ref().is_some_and(|r| !r.gpu().software)
+    }
+
+    /// Samples per step.
+    pub fn batch_samples(&self, config: &Config) -> usize {
+        batch_samples(config, self.is_hardware())
+    }
+
+    /// Rays per step.
+    pub fn most_rays(&self) -> usize {
+        if self.is_hardware() { MOST_RAYS * 8 } else { MOST_RAYS }
+    }
+
+    /// Brings the model and the photographs to the device.
+    ///
+    /// # Errors
+    /// When they do not fit there.
+    pub fn upload(&mut self, model: &ObjectModel, photographs: &Photographs, cameras: &[PosedCamera]) -> Result<()> {
+        self.running.as_mut().map_or(Ok(()), |r| r.upload(model, photographs, cameras))
+    }
+
+    /// One step; its figures are those of the last time that the device was asked.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn step(&mut self, model: &mut ObjectModel, step: u64, drawing: &Drawing) -> Result<StepFigures> {
+        let room = self.batch_samples(&model.config);
+        self.running.as_mut().expect("a GPU is open").step(model, step, drawing, room)
+    }
+
+    /// Waits for the device and counts what it has done.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn figures(&mut self, model: &mut ObjectModel) -> Result<StepFigures> {
+        self.running.as_mut().map_or(Ok(StepFigures::default()), |r| r.figures(model))
+    }
+
+    /// Brings the model back.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn download(&mut self, model: &mut ObjectModel) -> Result<()> {
+        self.running.as_mut().map_or(Ok(()), |r| r.download(model))
+    }
+}
+
+#[cfg(feature = "gpu")]
+mod running {
+    use super::{Drawing, StepFigures};
+    use crate::error::{PipelineError, Result};
+    use crate::object::model::ObjectModel;
+    use crate::object::recipe::Photographs;
+    use diorama_engine::on_gpu::{GpuStep, GpuTrainer};
+    use diorama_engine::samplers::pixels::PixelSource;
+    use diorama_kernels::gpu::{Gpu, GpuError};
+    use diorama_kernels::ops::march::gpu::prune::Limits;
+    use diorama_kernels::ops::ngp_field::gpu::loss::Terms;
+    use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, GpuPhotographs};
+    use diorama_kernels::ops::ray_generation::PosedCamera;
+
+    /// Most steps between which the device is not asked how they went.
+    const UNASKED: u64 = 16;
+
+    /// Room for marched and for trained samples, in wanted samples per step. Rays beyond it are left out of the step.
+    const ROOM: (usize, usize) = (6, 2);
+
+    /// A GPU, and what is in training there.
+    pub struct Running {
+        gpu: Gpu,
+        trainer: Option<GpuTrainer>,
+        last: StepFigures,
+        /// Rays of the steps that were not asked about.
+        rays: u64,
+    }
+
+    impl Running {
+        pub fn new(gpu: Gpu) -> Running {
+            Running { gpu, trainer: None, last: StepFigures::default(), rays: 0 }
+        }
+
+        pub fn gpu(&self) -> &Gpu {
+            &self.gpu
+        }
+
+        pub fn upload(&mut self, m: &ObjectModel, photographs: &Photographs, cameras: &[PosedCamera]) -> Result<()> {
+            let bytes = photographs.bytes();
+            let most = self.gpu.largest_buffer();
+            if bytes > most {
+                return Err(PipelineError::Usage(format!(
+                    "the photographs take {} MB, {} holds {} MB in one piece; raise --downscale, or use --device cpu",
+                    bytes >> 20,
+                    self.gpu.name,
+                    most >> 20
+                )));
+            }
+            let occupancy = m.occupancy.as_ref().expect("ngp has an occupancy grid");
+            let images = resident(&self.gpu, photographs);
+            self.trainer =
+                Some(GpuTrainer::new(self.gpu.clone(), &m.field, m.learned.as_ref(), occupancy, images, cameras, m.cube()));
+            Ok(())
+        }
+
+        fn trainer(&mut self) -> &mut GpuTrainer {
+            self.trainer.as_mut().expect("the model was uploaded")
+        }
+
+        pub fn step(&mut self, m: &mut ObjectModel, step: u64, d: &Drawing, room: usize) -> Result<StepFigures> {
+            let (c, s) = (&m.config, &m.config.sampling);
+            let grid = m.occupancy.as_ref().expect("ngp has an occupancy grid");
+            let o = GpuStep {
+                rays: d.rays,
+                first: m.origin.rays,
+                pixels: d.pixels,
+                backdrop: d.background.map_or(Backdrop::Color(m.backdrop_color()), Backdrop::Random),
+                near: s.near,
+                march: grid.march_config(s.max_samples).stretched(d.stretch),
+                limits: Limits { stop: s.stop, min_alpha: s.min_alpha, thin: d.thin },
+                terms: Terms {
+                    huber: if c.loss.color == "huber" { 0.1 } else { 0.0 },
+                    distortion: c.loss.distortion,
+                    alpha: c.loss.alpha,
+                },
+                near_scaling: c.loss.near_scaling,
+                room: (room * ROOM.0, room * ROOM.1),
+                t: step as u32 + 1,
+                rate_scale: d.rate_scale,
+            };
+            let points = s.occupancy_points;
+            let asked = step == 0 || (step + 1).is_multiple_of(UNASKED.min(c.run.log_every));
+            let trainer = self.trainer();
+            if let Some(rng) = &d.probes {
+                trainer.update_occupancy(rng, step, points, d.block);
+            }
+            trainer.step(&o);
+            self.rays += d.rays as u64;
+            m.origin.rays += d.rays as u64;
+            if !asked {
+                return Ok(StepFigures { marched: 0.0, ..self.last });
+            }
+            self.figures(m)
+        }
+
+        pub fn figures(&mut self, m: &mut ObjectModel) -> Result<StepFigures> {
+            let rays = std::mem::take(&mut self.rays);
+            if rays == 0 {
+                return Ok(StepFigures { marched: 0.0, ..self.last });
+            }
+            let f = self.trainer().figures().map_err(told)?;
+            let per_ray = f.trained / rays as f64;
+            let kept = if m.origin.samples == 0 { 0.0 } else { 0.9f64.powi(f.steps as i32) };
+            m.samples_per_ray = kept * m.samples_per_ray + (1.0 - kept) * per_ray;
+            m.origin.samples += f.trained as u64;
+            self.last = StepFigures { loss: f.loss, mse: f.mse, trained: f.trained / f.steps.max(1) as f64, marched: f.marched };
+            Ok(self.last)
+        }
+
+        pub fn download(&mut self, m: &mut ObjectModel) -> Result<()> {
+            let occupancy = m.occupancy.as_mut().expect("ngp has an occupancy grid");
+            self.trainer().download(&mut m.field, m.learned.as_mut(), occupancy).map_err(told)
+        }
+    }
+
+    fn told(e: GpuError) -> PipelineError {
+        PipelineError::Device(format!("{e}; the run can go on from its last checkpoint with --resume --device cpu"))
+    }
+
+    /// All pixels, and which of them count.
+    fn resident(gpu: &Gpu, photographs: &Photographs) -> GpuPhotographs {
+        let sizes: Vec<(u32, u32)> = (0..photographs.images()).map(|i| photographs.size(i)).collect();
+        let every = || {
+            let within = |i: usize, (w, h): (u32, u32)| (0..h).flat_map(move |y| (0..w).map(move |x| (i, x, y)));
+            sizes.iter().enumerate().flat_map(move |(i, s)| within(i, *s))
+        };
+        let pixels: Vec<u32> = every().map(|(i, x, y)| u32::from_le_bytes(photographs.rgba(i, x, y))).collect();
+        let mut mask = vec![0u32; pixels.len().div_ceil(32)];
+        let mut all = true;
+        for (at, (i, x, y)) in every().enumerate() {
+            let counts = photographs.counts(i, x, y);
+            mask[at / 32] |= (counts as u32) << (at % 32);
+            all &= counts;
+        }
+        GpuPhotographs::upload(gpu, &sizes, &pixels, (!all).then_some(&mask[..]))
+    }
+}
