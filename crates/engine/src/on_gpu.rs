@@ -1,6 +1,8 @@
 //! A hash grid field in training on a GPU: parameters, photographs and occupancy stay there, and nothing is read
 //! back but [`GpuTrainer::figures`] and, for a checkpoint, [`GpuTrainer::download`].
 
+pub mod check;
+
 use crate::background::LearnedBackground;
 use crate::fields::{DirectionCode, Encoding, Field};
 use crate::params::ParamGroup;
@@ -172,7 +174,8 @@ impl GpuTrainer {
         let direction = spherical_harmonics::gpu::forward(gpu, self.degree, &rays.dirs);
         let every_ray = Rows::all(gpu, s.rays);
         let sky = self.learned.as_ref().map(|g| {
-            let codes = if self.degree * self.degree == SKY { direction.clone() } else { spherical_harmonics::gpu::forward(gpu, 4, &rays.dirs) };
+            let codes =
+                if self.degree * self.degree == SKY { direction.clone() } else { spherical_harmonics::gpu::forward(gpu, 4, &rays.dirs) };
             let rgb = linear::gpu::forward(gpu, &every_ray, (SKY, 3), &codes, &g.values, None, BiasKind::None, Activation::Sigmoid);
             (codes, rgb)
         });
@@ -245,12 +248,7 @@ impl GpuTrainer {
     ///
     /// # Errors
     /// When the device was lost.
-    pub fn download(
-        &self,
-        field: &mut Field,
-        learned: Option<&mut LearnedBackground>,
-        occupancy: &mut Occupancy,
-    ) -> Result<(), GpuError> {
+    pub fn download(&self, field: &mut Field, learned: Option<&mut LearnedBackground>, occupancy: &mut Occupancy) -> Result<(), GpuError> {
         let gpu = &self.gpu;
         if let Some(t) = &mut field.table {
             self.table.download(gpu, t)?;

@@ -109,6 +109,14 @@ impl Occupancy {
         if self.live.is_empty() {
             return;
         }
+        let (points, cells) = self.probe(rng, counter, count, block);
+        let mut sigma = vec![0.0; count];
+        field.density(&points, &mut sigma);
+        self.fold(&cells, &sigma, block);
+    }
+
+    /// Random points `[count, 3]` of live cells, and the first cells `[count]` of the blocks that they stand for.
+    pub fn probe(&self, rng: &Rng, counter: u64, count: usize, block: usize) -> (Vec<f32>, Vec<u32>) {
         let n = self.bits.resolution;
         let mut points = vec![0.0; count * 3];
         let mut cells = vec![0u32; count];
@@ -127,13 +135,16 @@ impl Occupancy {
                 *cell = (((c * n + corner[2]) * n + corner[1]) * n + corner[0]) as u32;
             }
         });
-        let mut sigma = vec![0.0; count];
-        field.density(&points, &mut sigma);
+        (points, cells)
+    }
+
+    /// Folds in the densities of probed blocks and what was recorded, and refreshes the bits.
+    pub fn fold(&mut self, cells: &[u32], sigma: &[f32], block: usize) {
         for k in 0..block.pow(3) as u32 {
-            let (n, b) = (n as u32, block as u32);
+            let (n, b) = (self.bits.resolution as u32, block as u32);
             let offset = k % b + n * (k / b % b) + n * n * (k / b / b);
             let of_block: Vec<u32> = cells.iter().map(|c| c + offset).collect();
-            scatter_max(&of_block, &sigma, &mut self.fresh);
+            scatter_max(&of_block, sigma, &mut self.fresh);
         }
         let decay = self.decay;
         self.density.par_chunks_mut(TASK).zip(self.fresh.par_chunks_mut(TASK)).for_each(|(density, fresh)| {

@@ -50,9 +50,7 @@ pub enum RunError<E> {
     /// A step, a checkpoint or going back to one failed.
     Failed(E),
     /// The loss was not finite twice; the last good checkpoint is of this step.
-    Diverged {
-        step: u64,
-    },
+    Diverged { step: u64 },
 }
 
 /// Where a run begins: zero, or what a checkpoint says.

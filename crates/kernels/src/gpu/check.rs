@@ -35,13 +35,18 @@ pub struct Row {
 }
 
 /// The table so far.
-struct Table<'a> {
+pub struct Table<'a> {
     gpu: &'a Gpu,
-    rows: Vec<Row>,
+    pub rows: Vec<Row>,
 }
 
-impl Table<'_> {
-    fn row(&mut self, op: &'static str, result: &'static str, shape: String, outcome: Result<f64, String>) {
+impl<'a> Table<'a> {
+    pub fn new(gpu: &'a Gpu) -> Self {
+        Table { gpu, rows: Vec::new() }
+    }
+
+    /// Adds a line of a known outcome: the largest relative error, or what is wrong.
+    pub fn row(&mut self, op: &'static str, result: &'static str, shape: String, outcome: Result<f64, String>) {
         let (error, fault) = match outcome {
             Ok(e) => (e, None),
             Err(e) => (f64::INFINITY, Some(e)),
@@ -49,13 +54,35 @@ impl Table<'_> {
         self.rows.push(Row { op, result, shape, error, fault });
     }
 
-    fn close(&mut self, op: &'static str, result: &'static str, shape: impl ToString, got: &Buffer, want: &[f64]) -> Result<(), GpuError> {
+    /// Compares numbers within [`TOLERANCE`].
+    ///
+    /// # Errors
+    /// When the device is lost.
+    pub fn close(
+        &mut self,
+        op: &'static str,
+        result: &'static str,
+        shape: impl ToString,
+        got: &Buffer,
+        want: &[f64],
+    ) -> Result<(), GpuError> {
         let got = self.gpu.read(got)?;
         self.row(op, result, shape.to_string(), compare(&got, want, TOLERANCE));
         Ok(())
     }
 
-    fn equal(&mut self, op: &'static str, result: &'static str, shape: impl ToString, got: &Buffer, want: &[u32]) -> Result<(), GpuError> {
+    /// Compares exactly.
+    ///
+    /// # Errors
+    /// When the device is lost.
+    pub fn equal(
+        &mut self,
+        op: &'static str,
+        result: &'static str,
+        shape: impl ToString,
+        got: &Buffer,
+        want: &[u32],
+    ) -> Result<(), GpuError> {
         let got = self.gpu.read_u32(got)?;
         let differs = got.iter().zip(want).position(|(a, b)| a != b);
         let outcome = match differs {
@@ -73,7 +100,7 @@ impl Table<'_> {
 /// # Errors
 /// When the device is lost; wrong results are rows with a fault.
 pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
-    let mut table = Table { gpu, rows: Vec::new() };
+    let mut table = Table::new(gpu);
     let cases = [
         hash_grids,
         encodings,

@@ -40,7 +40,8 @@ pub fn run(device: &str) -> Result<Report> {
         _ => PipelineError::Usage(e.to_string()),
     };
     let gpu = Gpu::open(device.parse().map_err(PipelineError::Usage)?).map_err(told)?;
-    let rows = check::run(&gpu).map_err(told)?;
+    let mut rows = check::run(&gpu).map_err(told)?;
+    rows.extend(diorama_engine::on_gpu::check::run(&gpu).map_err(told)?);
     let line =
         |r: check::Row| Line { op: r.op, result: r.result, shape: r.shape, error: r.error.is_finite().then_some(r.error), fault: r.fault };
     Ok(Report {

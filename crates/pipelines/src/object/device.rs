@@ -274,8 +274,7 @@ mod running {
             }
             let occupancy = m.occupancy.as_ref().expect("ngp has an occupancy grid");
             let images = resident(&self.gpu, photographs);
-            self.trainer =
-                Some(GpuTrainer::new(self.gpu.clone(), &m.field, m.learned.as_ref(), occupancy, images, cameras, m.cube()));
+            self.trainer = Some(GpuTrainer::new(self.gpu.clone(), &m.field, m.learned.as_ref(), occupancy, images, cameras, m.cube()));
             Ok(())
         }
 
@@ -294,11 +293,7 @@ mod running {
                 near: s.near,
                 march: grid.march_config(s.max_samples).stretched(d.stretch),
                 limits: Limits { stop: s.stop, min_alpha: s.min_alpha, thin: d.thin },
-                terms: Terms {
-                    huber: if c.loss.color == "huber" { 0.1 } else { 0.0 },
-                    distortion: c.loss.distortion,
-                    alpha: c.loss.alpha,
-                },
+                terms: Terms { huber: if c.loss.color == "huber" { 0.1 } else { 0.0 }, distortion: c.loss.distortion, alpha: c.loss.alpha },
                 near_scaling: c.loss.near_scaling,
                 room: (room * ROOM.0, room * ROOM.1),
                 t: step as u32 + 1,

@@ -186,17 +186,7 @@ fn corner(place: &Place, levels: &[u32], #[comptime] c: u32, #[comptime] feature
 }
 
 #[cube(launch_unchecked)]
-fn encode(
-    live: &[u32],
-    points: &[f32],
-    levels: &[u32],
-    table: &[f32],
-    out: &mut [f32],
-    at: u32,
-    s: u32,
-    n: u32,
-    #[comptime] f: usize,
-) {
+fn encode(live: &[u32], points: &[f32], levels: &[u32], table: &[f32], out: &mut [f32], at: u32, s: u32, n: u32, #[comptime] f: usize) {
     let unit = ABSOLUTE_POS;
     if unit >= n as usize || unit % s as usize >= live[at as usize] as usize {
         terminate!();

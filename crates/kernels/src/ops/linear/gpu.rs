@@ -1,11 +1,11 @@
-//! Products in tiles of 16 × 16 through shared memory. Weight gradients, sums over very many rows, are
+//! Products by cubes of 16 × 16 units, each with up to 4 × 4 results of its own, through shared memory. Weight gradients, sums over very many rows, are
 //! formed by slices of rows and then added up.
 
 use super::{Activation, BiasKind};
 use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
 use cubecl::prelude::*;
 
-/// Edge of a tile.
+/// Edge of a cube.
 const TILE: usize = 16;
 /// Most rows of tiles in one launch.
 const MAX_TILES: usize = 65_535;
@@ -37,6 +37,17 @@ impl<'a> From<&'a Buffer> for Part<'a> {
     }
 }
 
+/// Results of a unit along an axis of length `n`.
+fn per_unit(n: usize) -> usize {
+    if n > 2 * TILE {
+        4
+    } else if n > TILE {
+        2
+    } else {
+        1
+    }
+}
+
 /// `A B`, `[M, K] [K, N]`, or with the second factor turned `A Bᵀ`, `[M, K] [N, K]`.
 fn product(gpu: &Gpu, second_turned: bool, rows: &Rows, (k, n): (usize, usize), a: &Buffer, b: Part, out: Part) {
     let m = rows.most;
@@ -44,7 +55,8 @@ fn product(gpu: &Gpu, second_turned: bool, rows: &Rows, (k, n): (usize, usize), 
         return;
     }
     assert!(a.len() == m * k && b.buffer.len() >= b.at + k * n && out.buffer.len() >= out.at + m * n, "linear: {m} x {k} x {n}");
-    let (tiles_m, tiles_n) = (m.div_ceil(TILE), n.div_ceil(TILE));
+    let (mr, nr) = (per_unit(m), per_unit(n));
+    let (tiles_m, tiles_n) = (m.div_ceil(TILE * mr), n.div_ceil(TILE * nr));
     assert!(tiles_n <= MAX_TILES && tiles_m <= MAX_TILES * MAX_TILES, "linear: {m} x {n}");
     let count = CubeCount::Static(tiles_n as u32, tiles_m.min(MAX_TILES) as u32, tiles_m.div_ceil(MAX_TILES) as u32);
     let (live, at) = rows.arg();
@@ -63,6 +75,8 @@ fn product(gpu: &Gpu, second_turned: bool, rows: &Rows, (k, n): (usize, usize), 
             out.at as u32,
             k as u32,
             n as u32,
+            mr,
+            nr,
             second_turned,
             gpu.shared,
         );
@@ -77,7 +91,8 @@ fn outer(gpu: &Gpu, rows: &Rows, (k, n): (usize, usize), x: &Buffer, g: &Buffer,
     }
     let slices = (rows.most / SLICE).clamp(1, MAX_SLICES);
     let parts = gpu.empty(slices * k * n);
-    let count = CubeCount::Static(n.div_ceil(TILE) as u32, k.div_ceil(TILE) as u32, slices as u32);
+    let (kr, nr) = (per_unit(k), per_unit(n));
+    let count = CubeCount::Static(n.div_ceil(TILE * nr) as u32, k.div_ceil(TILE * kr) as u32, slices as u32);
     let (live, at) = rows.arg();
     // SAFETY: the kernel checks rows and columns against the sizes.
     unsafe {
@@ -93,6 +108,8 @@ fn outer(gpu: &Gpu, rows: &Rows, (k, n): (usize, usize), x: &Buffer, g: &Buffer,
             k as u32,
             n as u32,
             slices as u32,
+            kr,
+            nr,
             gpu.shared,
         );
     }
@@ -307,6 +324,8 @@ fn multiply(
     out_at: u32,
     k: u32,
     n: u32,
+    #[comptime] mr: usize,
+    #[comptime] nr: usize,
     #[comptime] second_turned: bool,
     #[comptime] shared: bool,
 ) {
@@ -316,49 +335,96 @@ fn multiply(
     let b_at = b_at as usize;
     let tx = UNIT_POS_X as usize;
     let ty = UNIT_POS_Y as usize;
-    let first_row = (CUBE_POS_Y as usize + CUBE_POS_Z as usize * 65_535usize) * 16usize;
-    if first_row >= m {
+    let first = (CUBE_POS_Y as usize + CUBE_POS_Z as usize * 65_535usize) * comptime!(16 * mr);
+    if first >= m {
         terminate!();
     }
-    let row = first_row + ty;
-    let col = CUBE_POS_X as usize * 16usize + tx;
-    let mut sum = 0.0f32;
+    let row = first + ty;
+    let col = CUBE_POS_X as usize * comptime!(16 * nr) + tx;
+    let mut sums = Array::<f32>::new(comptime!(mr * nr));
+    let mut left = Array::<f32>::new(mr);
+    let mut right = Array::<f32>::new(nr);
+    #[unroll]
+    for e in 0..comptime!(mr * nr) {
+        sums[e] = 0.0;
+    }
     if comptime!(shared) {
-        let mut left = Shared::<[f32]>::new_slice(256usize);
-        let mut right = Shared::<[f32]>::new_slice(256usize);
+        let mut lefts = Shared::<[f32]>::new_slice(comptime!(256 * mr));
+        let mut rights = Shared::<[f32]>::new_slice(comptime!(256 * nr));
         for step in 0..k.div_ceil(16usize) {
             let ka = step * 16usize + tx;
             let kb = step * 16usize + ty;
-            let mut va = 0.0f32;
-            if row < m && ka < k {
-                va = a[row * k + ka];
-            }
-            let mut vb = 0.0f32;
-            if kb < k && col < n {
-                vb = right_factor(b, b_at, kb, col, k, n, second_turned);
-            }
-            left[ty * 16usize + tx] = va;
-            right[ty * 16usize + tx] = vb;
-            sync_cube();
             #[unroll]
-            for i in 0..16usize {
-                sum += left[ty * 16usize + i] * right[i * 16usize + tx];
+            for i in 0..mr {
+                let r = row + i * 16;
+                let mut v = 0.0f32;
+                if r < m && ka < k {
+                    v = a[r * k + ka];
+                }
+                lefts[(ty + i * 16) * 16usize + tx] = v;
+            }
+            #[unroll]
+            for j in 0..nr {
+                let c = col + j * 16;
+                let mut v = 0.0f32;
+                if kb < k && c < n {
+                    v = right_factor(b, b_at, kb, c, k, n, second_turned);
+                }
+                rights[ty * comptime!(16 * nr) + tx + j * 16] = v;
+            }
+            sync_cube();
+            for p in 0..16usize {
+                #[unroll]
+                for i in 0..mr {
+                    left[i] = lefts[(ty + i * 16) * 16usize + p];
+                }
+                #[unroll]
+                for j in 0..nr {
+                    right[j] = rights[p * comptime!(16 * nr) + tx + j * 16];
+                }
+                add_outer(&mut sums, &left, &right, mr, nr);
             }
             sync_cube();
         }
-    } else if row < m && col < n {
-        for i in 0..k {
-            sum += a[row * k + i] * right_factor(b, b_at, i, col, k, n, second_turned);
+    } else {
+        for p in 0..k {
+            #[unroll]
+            for i in 0..mr {
+                left[i] = a[min(row + i * 16, m - 1) * k + p];
+            }
+            #[unroll]
+            for j in 0..nr {
+                right[j] = right_factor(b, b_at, p, min(col + j * 16, n - 1), k, n, second_turned);
+            }
+            add_outer(&mut sums, &left, &right, mr, nr);
         }
     }
-    if row < m && col < n {
-        out[out_at as usize + row * n + col] = sum;
+    #[unroll]
+    for i in 0..mr {
+        #[unroll]
+        for j in 0..nr {
+            if row + i * 16 < m && col + j * 16 < n {
+                out[out_at as usize + (row + i * 16) * n + col + j * 16] = sums[i * nr + j];
+            }
+        }
     }
 }
 
 #[cube]
 fn right_factor(b: &[f32], at: usize, i: usize, col: usize, k: usize, n: usize, #[comptime] turned: bool) -> f32 {
     if comptime!(turned) { b[at + col * k + i] } else { b[at + i * n + col] }
+}
+
+/// `sums += left rightᵀ`
+#[cube]
+fn add_outer(sums: &mut Array<f32>, left: &Array<f32>, right: &Array<f32>, #[comptime] mr: usize, #[comptime] nr: usize) {
+    #[unroll]
+    for i in 0..mr {
+        #[unroll]
+        for j in 0..nr {
+            sums[i * nr + j] += left[i] * right[j];
+        }
+    }
 }
 
 /// A slice's part of `Xᵀ G`.
@@ -372,6 +438,8 @@ fn gather(
     k: u32,
     n: u32,
     slices: u32,
+    #[comptime] kr: usize,
+    #[comptime] nr: usize,
     #[comptime] shared: bool,
 ) {
     let m = live[at as usize] as usize;
@@ -379,42 +447,77 @@ fn gather(
     let n = n as usize;
     let tx = UNIT_POS_X as usize;
     let ty = UNIT_POS_Y as usize;
-    let row = CUBE_POS_Y as usize * 16usize + ty;
-    let col = CUBE_POS_X as usize * 16usize + tx;
+    let first_row = CUBE_POS_Y as usize * comptime!(16 * kr);
+    let row = first_row + ty;
+    let col = CUBE_POS_X as usize * comptime!(16 * nr) + tx;
     let per = m.div_ceil(slices as usize);
     let first = min(CUBE_POS_Z as usize * per, m);
     let end = min(first + per, m);
-    let mut sum = 0.0f32;
+    let mut sums = Array::<f32>::new(comptime!(kr * nr));
+    let mut left = Array::<f32>::new(kr);
+    let mut right = Array::<f32>::new(nr);
+    #[unroll]
+    for e in 0..comptime!(kr * nr) {
+        sums[e] = 0.0;
+    }
     if comptime!(shared) {
-        let mut left = Shared::<[f32]>::new_slice(256usize);
-        let mut right = Shared::<[f32]>::new_slice(256usize);
-        let left_col = CUBE_POS_Y as usize * 16usize + tx;
+        let mut lefts = Shared::<[f32]>::new_slice(comptime!(256 * kr));
+        let mut rights = Shared::<[f32]>::new_slice(comptime!(256 * nr));
         for step in 0..(end - first).div_ceil(16usize) {
             let i = first + step * 16usize + ty;
-            let mut vx = 0.0f32;
-            let mut vg = 0.0f32;
-            if i < end && left_col < k {
-                vx = x[i * k + left_col];
-            }
-            if i < end && col < n {
-                vg = g[i * n + col];
-            }
-            left[ty * 16usize + tx] = vx;
-            right[ty * 16usize + tx] = vg;
-            sync_cube();
             #[unroll]
-            for j in 0..16usize {
-                sum += left[j * 16usize + ty] * right[j * 16usize + tx];
+            for e in 0..kr {
+                let c = first_row + tx + e * 16;
+                let mut v = 0.0f32;
+                if i < end && c < k {
+                    v = x[i * k + c];
+                }
+                lefts[ty * comptime!(16 * kr) + tx + e * 16] = v;
+            }
+            #[unroll]
+            for e in 0..nr {
+                let c = col + e * 16;
+                let mut v = 0.0f32;
+                if i < end && c < n {
+                    v = g[i * n + c];
+                }
+                rights[ty * comptime!(16 * nr) + tx + e * 16] = v;
+            }
+            sync_cube();
+            for p in 0..16usize {
+                #[unroll]
+                for e in 0..kr {
+                    left[e] = lefts[p * comptime!(16 * kr) + ty + e * 16];
+                }
+                #[unroll]
+                for e in 0..nr {
+                    right[e] = rights[p * comptime!(16 * nr) + tx + e * 16];
+                }
+                add_outer(&mut sums, &left, &right, kr, nr);
             }
             sync_cube();
         }
-    } else if row < k && col < n {
+    } else {
         for i in first..end {
-            sum += x[i * k + row] * g[i * n + col];
+            #[unroll]
+            for e in 0..kr {
+                left[e] = x[i * k + min(row + e * 16, k - 1)];
+            }
+            #[unroll]
+            for e in 0..nr {
+                right[e] = g[i * n + min(col + e * 16, n - 1)];
+            }
+            add_outer(&mut sums, &left, &right, kr, nr);
         }
     }
-    if row < k && col < n {
-        parts[(CUBE_POS_Z as usize * k + row) * n + col] = sum;
+    #[unroll]
+    for i in 0..kr {
+        #[unroll]
+        for j in 0..nr {
+            if row + i * 16 < k && col + j * 16 < n {
+                parts[(CUBE_POS_Z as usize * k + row + i * 16) * n + col + j * 16] = sums[i * nr + j];
+            }
+        }
     }
 }
 

@@ -5,7 +5,7 @@ pub mod occupancy;
 pub mod prune;
 
 use super::{MarchConfig, OccupancyBits};
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, CUBE, Gpu, GpuError, units};
 use crate::ops::composite::gpu::GpuPacked;
 use crate::ops::scan;
 use cubecl::prelude::*;
@@ -25,6 +25,21 @@ impl GpuOccupancy {
         let bits: Vec<u32> = grid.bits.iter().flat_map(|w| [*w as u32, (*w >> 32) as u32]).collect();
         let blocks: Vec<u32> = grid.blocks.iter().map(|b| *b as u32).collect();
         GpuOccupancy { resolution: grid.resolution, cascades: grid.cascades, bits: gpu.upload_u32(&bits), blocks: gpu.upload_u32(&blocks) }
+    }
+}
+
+impl GpuOccupancy {
+    /// Words of bits and blocks in which this differs from another grid.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn differences(&self, gpu: &Gpu, other: &OccupancyBits) -> Result<usize, GpuError> {
+        let other = GpuOccupancy::upload(gpu, other);
+        let mut wrong = 0;
+        for (a, b) in [(&self.bits, &other.bits), (&self.blocks, &other.blocks)] {
+            wrong += gpu.read_u32(a)?.iter().zip(gpu.read_u32(b)?).filter(|(a, b)| **a != *b).count();
+        }
+        Ok(wrong)
     }
 }
 

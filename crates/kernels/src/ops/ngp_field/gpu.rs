@@ -137,21 +137,12 @@ pub fn look_up_backward(gpu: &Gpu, d: &Buffer, index: &Buffer, width: usize, d_t
     let launch = if gpu.native_atomics { add_rows::launch_unchecked::<Native> } else { add_rows::launch_unchecked::<Swap> };
     // SAFETY: as in `look_up`.
     unsafe {
-        launch(
-            &gpu.client,
-            units(d.len()),
-            CubeDim::new_1d(CUBE),
-            d.arg(),
-            index.arg(),
-            d_table.arg(),
-            d.len() as u32,
-            width as u32,
-        );
+        launch(&gpu.client, units(d.len()), CubeDim::new_1d(CUBE), d.arg(), index.arg(), d_table.arg(), d.len() as u32, width as u32);
     }
 }
 
 /// Scales gradients of samples closer than `reach` by the square of their share of it.
-fn soften(gpu: &Gpu, p: &GpuPacked, d_sigma: &Buffer, d_rgb: &Buffer, reach: f32) {
+pub fn soften(gpu: &Gpu, p: &GpuPacked, d_sigma: &Buffer, d_rgb: &Buffer, reach: f32) {
     let (live, at) = p.rows().arg();
     if p.t.is_empty() {
         return;
@@ -221,16 +212,7 @@ fn along(gpu: &Gpu, p: &GpuPacked, code: &Buffer, samples: &Buffer, width: usize
 }
 
 #[cube(launch_unchecked)]
-fn transpose(
-    live: &[u32],
-    from: &[f32],
-    to: &mut [f32],
-    at: u32,
-    samples: u32,
-    per_level: u32,
-    dims: u32,
-    #[comptime] to_rows: bool,
-) {
+fn transpose(live: &[u32], from: &[f32], to: &mut [f32], at: u32, samples: u32, per_level: u32, dims: u32, #[comptime] to_rows: bool) {
     let unit = ABSOLUTE_POS;
     if unit >= live[at as usize] as usize * dims as usize {
         terminate!();

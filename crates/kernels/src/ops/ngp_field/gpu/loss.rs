@@ -153,16 +153,7 @@ fn compare(
 }
 
 #[cube(launch_unchecked)]
-fn gather(
-    left_out: &[u32],
-    values: &[f32],
-    errors: &[f32],
-    spread: &[f32],
-    parts: &mut [f32],
-    rays: u32,
-    n: u32,
-    distortion: f32,
-) {
+fn gather(left_out: &[u32], values: &[f32], errors: &[f32], spread: &[f32], parts: &mut [f32], rays: u32, n: u32, distortion: f32) {
     let unit = ABSOLUTE_POS;
     if unit >= n as usize {
         terminate!();

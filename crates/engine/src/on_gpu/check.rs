@@ -1,0 +1,297 @@
+//! The parts of a training step on a device against what the CPU does.
+
+use crate::losses::{ColorLoss, Photometric};
+use crate::samplers::RayBatch;
+use crate::samplers::occupancy::{OCCUPIED, Occupancy};
+use crate::samplers::pixels::{self, DrawOptions, PixelSource};
+use diorama_geom::contraction::contract;
+use diorama_geom::glam::DVec3;
+use diorama_geom::rng::Rng;
+use diorama_geom::{Camera, Pose};
+use diorama_kernels::gpu::check::{Row, Table};
+use diorama_kernels::gpu::{Gpu, GpuError, Rows};
+use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
+use diorama_kernels::ops::composite::{Packed, cpu as composite};
+use diorama_kernels::ops::march::MarchRays;
+use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
+use diorama_kernels::ops::march::gpu::prune::{self, Limits};
+use diorama_kernels::ops::march::gpu::{self as march, GpuRays, Space};
+use diorama_kernels::ops::ngp_field::gpu as field;
+use diorama_kernels::ops::ngp_field::gpu::loss::{self, SUMS, Target, Terms};
+use diorama_kernels::ops::ngp_field::{RayGradient, RayLoss, RayOutput};
+use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, GpuPhotographs};
+use diorama_kernels::ops::ray_generation::PosedCamera;
+use diorama_testkit::{random, random_unit, wide};
+
+/// Runs all cases.
+///
+/// # Errors
+/// When the device is lost; wrong results are rows with a fault.
+pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
+    let mut table = Table::new(gpu);
+    for case in [draws, spaces, prunings, grids, losses, look_ups] {
+        case(gpu, &mut table)?;
+    }
+    Ok(table.rows)
+}
+
+/// Two photographs of unlike size; the left half of the second may not be trained on.
+struct Two;
+
+impl PixelSource for Two {
+    fn images(&self) -> usize {
+        2
+    }
+    fn size(&self, image: usize) -> (u32, u32) {
+        [(8, 4), (33, 7)][image]
+    }
+    fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4] {
+        [x as u8 * 7, y as u8 * 30, image as u8, 200 + x as u8]
+    }
+    fn counts(&self, image: usize, x: u32, _: u32) -> bool {
+        image == 0 || x > 16
+    }
+}
+
+fn draws(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let sizes = [Two.size(0), Two.size(1)];
+    let every: Vec<(usize, u32, u32)> =
+        (0..2).flat_map(|i| (0..sizes[i].1).flat_map(move |y| (0..sizes[i].0).map(move |x| (i, x, y)))).collect();
+    let words: Vec<u32> = every.iter().map(|(i, x, y)| u32::from_le_bytes(Two.rgba(*i, *x, *y))).collect();
+    let mut mask = vec![0u32; words.len().div_ceil(32)];
+    every.iter().enumerate().for_each(|(at, (i, x, y))| mask[at / 32] |= (Two.counts(*i, *x, *y) as u32) << (at % 32));
+    let photographs = GpuPhotographs::upload(gpu, &sizes, &words, Some(&mask));
+    let camera = PosedCamera { camera: Camera::pinhole(8, 4, 1.0), pose: Pose::look_at(DVec3::X, DVec3::ZERO, DVec3::Z) };
+    let (rng, back) = (Rng::new(3, 1), Rng::new(3, 2));
+    // Counters beyond 32 bits, too.
+    for (n, first) in [(0, 0), (1, 5), (700, (1 << 33) + 12_345)] {
+        let mut batch = RayBatch::default();
+        batch.resize(n);
+        let o = DrawOptions { cameras: &[camera; 2], first, rng, near: 0.1, cube: (0.0, 1.0), error_map: None };
+        pixels::draw(&Two, &o, &mut batch);
+        let drawn = photographs.draw(gpu, n, first, &rng, Backdrop::Random(back));
+        let (shape, exact) = (format!("R={n} from {first}"), |v: &[f32]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>());
+        table.equal("draw", "images", &shape, &drawn.images, &batch.images)?;
+        table.equal("draw", "pixels", &shape, &drawn.pixels, &exact(&batch.pixels))?;
+        table.equal("draw", "jitter", &shape, &drawn.jitter, &exact(&batch.jitter))?;
+        let refused: Vec<u32> = batch.target.chunks_exact(4).map(|t| t[0].is_nan() as u32).collect();
+        table.equal("draw", "left out", &shape, &drawn.left_out, &refused)?;
+        let background: Vec<f32> = (0..n * 3).map(|i| back.uniform(first * 3 + i as u64)).collect();
+        table.equal("draw", "background", &shape, &drawn.background, &exact(&background))?;
+        let mut got = gpu.read(&drawn.target)?;
+        got.chunks_exact_mut(4).zip(&refused).filter(|(_, r)| **r == 1).for_each(|(t, _)| t.fill(0.0));
+        batch.target.chunks_exact_mut(4).zip(&refused).filter(|(_, r)| **r == 1).for_each(|(t, _)| t.fill(0.0));
+        table.close("draw", "target", &shape, &gpu.upload(&got), &wide(&batch.target))?;
+        let color = photographs.draw(gpu, n, first, &rng, Backdrop::Color([0.25, 0.5, 0.75])).background;
+        table.close("draw", "one background", &shape, &color, &wide(&[0.25, 0.5, 0.75].repeat(n)))?;
+    }
+    Ok(())
+}
+
+/// Rays with 0 to 59 samples each.
+struct Ragged {
+    offsets: Vec<u32>,
+    t: Vec<f32>,
+    dt: Vec<f32>,
+    sigma: Vec<f32>,
+}
+
+impl Ragged {
+    fn new(rays: usize) -> Ragged {
+        let mut offsets = vec![0u32];
+        (0..rays).for_each(|r| offsets.push(offsets[r] + (r as u32 * 37) % 60));
+        let s = offsets[rays] as usize;
+        let t = (0..rays).flat_map(|r| (0..offsets[r + 1] - offsets[r]).map(|i| 0.1 + 0.05 * i as f32)).collect();
+        let dt = random_unit(s, 1).iter().map(|u| 0.01 + 0.03 * u).collect();
+        let sigma = random_unit(s, 2).iter().map(|u| if *u < 0.3 { 0.05 * u } else { 40.0 * u * u }).collect();
+        Ragged { offsets, t, dt, sigma }
+    }
+
+    fn packed(&self) -> Packed<'_> {
+        Packed { offsets: &self.offsets, t: &self.t, dt: &self.dt }
+    }
+}
+
+fn spaces(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for rays in [0, 1, 80] {
+        let scene = Ragged::new(rays);
+        let (origins, dirs) = (random(rays * 3, 4), random(rays * 3, 5));
+        let near_far = vec![0.0; rays * 2];
+        let jitter = vec![0.5; rays];
+        let r = MarchRays { origins: &origins, dirs: &dirs, near_far: &near_far, jitter: &jitter, resumed: false };
+        let (on_gpu, p) = (GpuRays::upload(gpu, &r), GpuPacked::upload(gpu, &scene.packed()));
+        let mut model = vec![0.0f32; scene.t.len() * 3];
+        for r in 0..rays {
+            for i in scene.packed().range(r) {
+                (0..3).for_each(|k| model[i * 3 + k] = origins[r * 3 + k] + (scene.t[i] + 0.5 * scene.dt[i]) * dirs[r * 3 + k]);
+            }
+        }
+        let cube = model.iter().map(|v| ((v - 0.5) / 4.0 + 0.5) as f64).collect::<Vec<_>>();
+        let contracted =
+            model.chunks_exact(3).flat_map(|m| contract([m[0], m[1], m[2]].map(|v| 2.0 * (v - 0.5))).map(|v| 0.25 * v as f64 + 0.5));
+        for (space, want) in [(Space::Model, wide(&model)), (Space::Cube(4.0), cube), (Space::Contracted, contracted.collect())] {
+            table.close("positions", "forward", format!("R={rays} {space:?}"), &march::positions(gpu, &on_gpu, &p, space), &want)?;
+        }
+    }
+    Ok(())
+}
+
+fn prunings(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let limits = Limits { stop: 1e-3, min_alpha: 3e-3, thin: 0.7 };
+    for rays in [0, 1, 130] {
+        let scene = Ragged::new(rays);
+        let (mut sigma, mut kept, mut offsets) = (scene.sigma.clone(), Vec::new(), vec![0u32]);
+        for r in 0..rays {
+            let mut light = 1.0f64;
+            for i in scene.packed().range(r) {
+                if light < limits.stop as f64 {
+                    sigma[i] = -1.0;
+                    continue;
+                }
+                let alpha = 1.0 - (-(sigma[i] as f64) * scene.dt[i] as f64).exp();
+                light *= 1.0 - alpha;
+                if alpha >= limits.min_alpha.min(limits.thin * scene.dt[i]) as f64 {
+                    kept.push(i);
+                }
+            }
+            offsets.push(kept.len() as u32);
+        }
+        let (p, rows) = (GpuPacked::upload(gpu, &scene.packed()), random(scene.t.len() * 5, 6));
+        for capacity in [kept.len() + 10, kept.len() / 2] {
+            let shape = format!("R={rays} room {capacity}");
+            let (sigma_gpu, cut) = (gpu.upload(&scene.sigma), gpu.zeros(rays));
+            let pruned = prune::prune(gpu, &p, &sigma_gpu, limits, &cut, capacity);
+            let bounded: Vec<u32> = offsets.iter().map(|o| (*o).min(capacity as u32)).collect();
+            let lost: Vec<u32> = offsets[1..].iter().map(|o| (*o > capacity as u32) as u32).collect();
+            table.close("prune", "densities", &shape, &sigma_gpu, &wide(&sigma))?;
+            table.equal("prune", "offsets", &shape, &pruned.packed.offsets, &bounded)?;
+            table.equal("prune", "rays cut", &shape, &cut, &lost)?;
+            let n = kept.len().min(capacity);
+            let take =
+                |v: &[f32], width: usize| -> Vec<f64> { kept[..n].iter().flat_map(|i| wide(&v[i * width..(i + 1) * width])).collect() };
+            let live = |all: Vec<f32>, width: usize| gpu.upload(&all[..n * width]);
+            let (t, five) = (gpu.read(&pruned.packed.t)?, gpu.read(&pruned.take(gpu, &gpu.upload(&rows), 5))?);
+            table.close("prune", "starts", &shape, &live(t, 1), &take(&scene.t, 1))?;
+            table.close("prune", "rows", &shape, &live(five, 5), &take(&rows, 5))?;
+        }
+    }
+    Ok(())
+}
+
+fn grids(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let rng = Rng::new(5, 6);
+    for cascades in [1, 3] {
+        let mut grid = Occupancy::new(16, cascades);
+        // A corner that no camera sees.
+        grid.density[..40].fill(-1.0);
+        grid.refresh();
+        let g = &grid;
+        let on_gpu = GpuOccupancyGrid::upload(gpu, &g.bits, &g.density, &g.fresh, &g.live, g.decay, OCCUPIED);
+        for (step, block) in [(0u64, 2), (16, 2), (1 << 30, 1)] {
+            let shape = format!("cascades={cascades} step {step} block {block}");
+            let (points, cells) = grid.probe(&rng, step, 3000, block);
+            let (points_gpu, cells_gpu) = on_gpu.probe(gpu, &rng, step, 3000, block, Space::Model);
+            table.close("occupancy", "points", &shape, &points_gpu, &wide(&points))?;
+            table.equal("occupancy", "cells", &shape, &cells_gpu, &cells)?;
+            let sigma: Vec<f32> = random_unit(3000, step + 1).iter().map(|u| u * u * 20.0).collect();
+            let met: Vec<u32> = cells.iter().rev().copied().collect();
+            let met_sigma: Vec<f32> = random(3000, step + 2).iter().map(|s| s * 9.0).collect();
+            grid.record(&met, &met_sigma);
+            on_gpu.record(gpu, &Rows::all(gpu, 3000), &gpu.upload_u32(&met), &gpu.upload(&met_sigma));
+            grid.fold(&cells, &sigma, block);
+            on_gpu.update(gpu, &cells_gpu, &gpu.upload(&sigma), block);
+            let (density, _) = on_gpu.read(gpu)?;
+            // The greatest number stands for "not sampled yet" and would swamp all errors.
+            let known = |v: &[f32]| v.iter().map(|d| if *d == f32::MAX { -2.0 } else { *d }).collect::<Vec<f32>>();
+            table.close("occupancy", "densities", &shape, &gpu.upload(&known(&density)), &wide(&known(&grid.density)))?;
+            let wrong = on_gpu.bits.differences(gpu, &grid.bits)?;
+            let outcome = if wrong == 0 { Ok(0.0) } else { Err(format!("{wrong} words differ")) };
+            table.row("occupancy", "bits", shape, outcome);
+        }
+    }
+    Ok(())
+}
+
+fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let near = 1.0f32;
+    for rays in [1, 130] {
+        let scene = Ragged::new(rays);
+        let (p, s) = (scene.packed(), scene.t.len());
+        let mut batch = RayBatch::default();
+        batch.resize(rays);
+        batch.target = random_unit(rays * 4, 7);
+        batch.target.chunks_exact_mut(4).skip(2).step_by(9).for_each(|t| t[0] = f32::NAN);
+        let (rgb, background) = (random_unit(s * 3, 8), random_unit(rays * 3, 9));
+        let out = composite::forward(&p, &scene.sigma, &rgb, 3, &background);
+        for (color, huber) in [(ColorLoss::Mse, 0.0), (ColorLoss::Huber(0.1), 0.1)] {
+            let (distortion, alpha) = (0.3, 0.2);
+            let photometric = Photometric { batch: &batch, samples: p, background: &background, color, distortion, alpha };
+            let (mut value, mut error, mut counted) = (0.0f64, 0.0f64, 0usize);
+            let (mut d_color, mut d_opacity, mut d_weights) = (vec![0.0; rays * 3], vec![0.0; rays], vec![0.0; s]);
+            for r in 0..rays {
+                let rgb = [0, 1, 2].map(|k: usize| out.color[r * 3 + k]);
+                let o = RayOutput {
+                    rgb,
+                    opacity: out.opacity[r],
+                    depth: out.depth[r],
+                    weights: &out.weights[p.range(r)],
+                    first: p.range(r).start,
+                };
+                let mut g = RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut d_weights[p.range(r)] };
+                value += photometric.ray(r, &o, &mut g);
+                d_color[r * 3..r * 3 + 3].copy_from_slice(&g.rgb);
+                d_opacity[r] = g.opacity;
+                let target = photometric.target(r);
+                if !target[0].is_nan() {
+                    error += (0..3).map(|k| (rgb[k] - target[k]).powi(2) as f64 / 3.0).sum::<f64>();
+                    counted += 1;
+                }
+            }
+            let up = |v: &[f32]| gpu.upload(v);
+            let on_gpu = GpuPacked::upload(gpu, &p);
+            let results =
+                GpuComposited { color: up(&out.color), depth: up(&out.depth), opacity: up(&out.opacity), weights: up(&out.weights) };
+            let left_out: Vec<u32> = batch.target.chunks_exact(4).map(|t| t[0].is_nan() as u32).collect();
+            let rgba: Vec<f32> = batch.target.iter().map(|v| if v.is_nan() { 0.3 } else { *v }).collect();
+            let (rgba, background, left_out, sums) = (up(&rgba), up(&background), gpu.upload_u32(&left_out), gpu.zeros(SUMS));
+            let target = Target { rgba: &rgba, background: &background, left_out: &left_out };
+            let d = loss::loss(gpu, Terms { huber, distortion, alpha }, &on_gpu, &results, target, &on_gpu.offsets, &sums);
+            let shape = format!("R={rays} S={s} {color:?}");
+            table.close("loss", "d color", &shape, &d.color, &wide(&d_color))?;
+            table.close("loss", "d opacity", &shape, &d.opacity, &wide(&d_opacity))?;
+            table.close("loss", "d weights", &shape, &d.weights, &wide(&d_weights))?;
+            let sums = gpu.read(&sums)?;
+            let want = [value, error / counted as f64];
+            table.close("loss", "sums", &shape, &up(&sums[..2]), &want)?;
+            table.close("loss", "counts", &shape, &up(&sums[2..]), &[s as f64, s as f64, 1.0])?;
+        }
+        // Gradients close to the camera.
+        let (d_sigma, d_rgb) = (random(s, 3), random(s * 3, 4));
+        let (got_sigma, got_rgb) = (gpu.upload(&d_sigma), gpu.upload(&d_rgb));
+        field::soften(gpu, &GpuPacked::upload(gpu, &p), &got_sigma, &got_rgb, near);
+        let scale = |i: usize| ((scene.t[i] + 0.5 * scene.dt[i]) / near).min(1.0).powi(2) as f64;
+        let shape = format!("S={s}");
+        let want: Vec<f64> = (0..s).map(|i| d_sigma[i] as f64 * scale(i)).collect();
+        table.close("near scaling", "d sigma", &shape, &got_sigma, &want)?;
+        let want: Vec<f64> = (0..s * 3).map(|i| d_rgb[i] as f64 * scale(i / 3)).collect();
+        table.close("near scaling", "d rgb", &shape, &got_rgb, &want)?;
+    }
+    Ok(())
+}
+
+fn look_ups(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for n in [0, 1, 200] {
+        let (rows, width, codes, d) = (7, 5, random(35, 1), random(n * 5, 2));
+        let index: Vec<u32> = (0..n as u32).map(|i| i * 3 % 7).collect();
+        let index_gpu = gpu.upload_u32(&index);
+        let want: Vec<f64> = index.iter().flat_map(|i| wide(&codes[*i as usize * width..][..width])).collect();
+        let shape = format!("R={n}");
+        table.close("look up", "forward", &shape, &field::look_up(gpu, &gpu.upload(&codes), &index_gpu, width), &want)?;
+        let mut want = vec![0.0f64; rows * width];
+        d.iter().enumerate().for_each(|(e, d)| want[index[e / width] as usize * width + e % width] += *d as f64);
+        let got = gpu.zeros(rows * width);
+        field::look_up_backward(gpu, &gpu.upload(&d), &index_gpu, width, &got);
+        table.close("look up", "d table", &shape, &got, &want)?;
+    }
+    Ok(())
+}
