@@ -97,7 +97,7 @@ pub struct TrainArgs {
     /// auto, white, black, random or learned
     #[arg(long)]
     pub background: Option<String>,
-    /// auto or cpu
+    /// auto, cpu, cuda, vulkan, metal or webgpu; auto is the best GPU that the build reaches, else the CPU
     #[arg(long)]
     pub device: Option<String>,
     #[arg(long)]
@@ -294,6 +294,8 @@ pub struct BenchTrainArgs {
     pub downscale: u32,
     #[arg(long, default_value = "file")]
     pub split: String,
+    #[arg(long, default_value = "auto")]
+    pub device: String,
     /// Steps before the measured ones
     #[arg(long, default_value_t = 300)]
     pub warmup: u64,
@@ -326,6 +328,9 @@ pub struct BenchRenderArgs {
 /// Flags of `bench check`.
 #[derive(Args, Clone, Debug)]
 pub struct BenchCheckArgs {
+    /// Also train on this capture, on the device and on the CPU, and compare the losses
+    #[arg(long, value_name = "FOLDER")]
+    pub data: Option<PathBuf>,
     /// cuda, vulkan, metal or webgpu
     #[arg(long)]
     pub device: String,

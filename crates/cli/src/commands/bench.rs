@@ -66,6 +66,7 @@ pub fn train(a: &BenchTrainArgs) -> Result<Outcome> {
     let mut c = Config::new(method, a.data.clone());
     c.data.downscale = a.downscale;
     c.data.split = a.split.clone();
+    c.set("device", &a.device)?;
     for o in &a.overrides {
         let (key, value) = o.split_once('=').ok_or_else(|| PipelineError::Usage(format!("--set {o}: expected KEY=VALUE")))?;
         c.set(key.trim(), value.trim())?;
@@ -79,7 +80,8 @@ pub fn train(a: &BenchTrainArgs) -> Result<Outcome> {
     for s in &r.stages {
         println!("{:<12} {:>8.2} ms/step {:>6.1} %", s.stage, s.ms, 100.0 * s.share);
     }
-    println!("{} steps in {:.1} s on {} thread(s), {}", r.steps, r.seconds, r.threads, r.simd);
+    let with = if r.device == "cpu" { format!("{} thread(s), {}", r.threads, r.simd) } else { r.device };
+    println!("{} steps in {:.1} s on {with}", r.steps, r.seconds);
     println!(
         "{:.0} rays/s; per ray {:.1} samples marched, {:.1} trained; {:.0} samples/s trained",
         r.rays_per_s, r.marched_per_ray, r.trained_per_ray, r.trained_per_s
@@ -107,7 +109,7 @@ pub fn render(a: &BenchRenderArgs) -> Result<Outcome> {
 }
 
 pub fn check(a: &BenchCheckArgs) -> Result<Outcome> {
-    let r = bench::check::run(&a.device)?;
+    let r = bench::check::run(&a.device, a.data.as_deref())?;
     let wrong = r.lines.iter().filter(|l| l.fault.is_some()).count();
     if a.json {
         println!("{}", serde_json::json!(r));

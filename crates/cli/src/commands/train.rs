@@ -16,13 +16,14 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
         // Read the capture before anything is written.
         recipe::load_capture(&config)?;
     }
+    let device = recipe::device(&config)?;
     let existed = a.out.exists();
     let mut folder = if a.resume { RunFolder::open(&a.out)?.0 } else { RunFolder::create(&a.out, a.force)? };
     watch_interrupts();
     let mut progress = Progress::new();
-    eprintln!("device: cpu ({}, {} threads)", diorama_kernels::simd::level().name(), diorama_kernels::device::cpu().threads);
+    eprintln!("device: {device}");
     let result = recipe::train(&config, &mut folder, a.resume, &INTERRUPT, &mut |e| progress.event(e));
-    let (model, summary) = match result {
+    let recipe::Trained { model, summary, device } = match result {
         Ok(r) => r,
         Err(e) => {
             // A run that never began leaves nothing behind, and what was there before stays.
@@ -37,7 +38,7 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
     let object = serde_json::json!({
         "run": a.out,
         "method": model.config.method,
-        "device": "cpu",
+        "device": device,
         "steps": summary.step,
         "seconds": summary.seconds,
         "rays": summary.rays,

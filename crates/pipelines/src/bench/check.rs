@@ -1,6 +1,7 @@
 //! Every op on a GPU against its reference.
 
 use crate::{PipelineError, Result};
+use std::path::Path;
 
 /// One comparison.
 #[derive(Clone, Debug, serde::Serialize)]
@@ -27,12 +28,12 @@ pub struct Report {
     pub lines: Vec<Line>,
 }
 
-/// Runs the table on the named device.
+/// Runs the table on the named device, then trains there and on the CPU and compares the losses.
 ///
 /// # Errors
 /// When the device is unknown, not part of the build, absent or lost; wrong results are lines with a fault.
 #[cfg(feature = "gpu")]
-pub fn run(device: &str) -> Result<Report> {
+pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
     use diorama_kernels::gpu::{Gpu, GpuError, check};
     let begin = std::time::Instant::now();
     let told = |e: GpuError| match e {
@@ -44,6 +45,8 @@ pub fn run(device: &str) -> Result<Report> {
     rows.extend(diorama_engine::on_gpu::check::run(&gpu).map_err(told)?);
     let line =
         |r: check::Row| Line { op: r.op, result: r.result, shape: r.shape, error: r.error.is_finite().then_some(r.error), fault: r.fault };
+    let mut lines: Vec<Line> = rows.into_iter().map(line).collect();
+    lines.push(training(device, data)?);
     Ok(Report {
         device: gpu.api.name(),
         native_atomics: gpu.has_native_atomics(),
@@ -51,7 +54,53 @@ pub fn run(device: &str) -> Result<Report> {
         software: gpu.software,
         tolerance: check::TOLERANCE,
         seconds: begin.elapsed().as_secs_f64(),
-        lines: rows.into_iter().map(line).collect(),
+        lines,
+    })
+}
+
+/// Steps over which losses are compared, and how far apart they may be.
+#[cfg(feature = "gpu")]
+const CURVE: (u64, f64) = (50, 0.02);
+
+/// Small steps of the standard recipe on the device and on the CPU, with the same rays: by default on the still life.
+#[cfg(feature = "gpu")]
+fn training(device: &str, data: Option<&Path>) -> Result<Line> {
+    use crate::object::config::{Config, Method};
+    use crate::object::{quickstart, recipe};
+    let (steps, most) = CURVE;
+    let scratch = std::env::temp_dir().join(format!("diorama-check-{}", std::process::id()));
+    let folder = data.unwrap_or(&scratch);
+    let mut c = Config::new(Method::Ngp, folder.into());
+    let name = match data {
+        Some(d) => d.display().to_string(),
+        None => {
+            quickstart::write_capture(&scratch, 24, 64)?;
+            "still life".into()
+        }
+    };
+    c.data.split = "every:8".into();
+    c.data.downscale = if data.is_some() { 4 } else { 1 };
+    c.field.precision = "f32".into();
+    c.run.log_every = 1;
+    (c.sampling.rays, c.sampling.batch_samples, c.sampling.occupancy_points) = (64, 4096, 8192);
+    let mut of = |device: &str| {
+        c.device = device.into();
+        recipe::losses(&c, steps)
+    };
+    let curves = of("cpu").and_then(|cpu| Ok((cpu, of(device)?)));
+    if data.is_none() {
+        // What cannot be removed from a scratch folder stays there.
+        let _ = std::fs::remove_dir_all(&scratch);
+    }
+    let (cpu, gpu) = curves?;
+    let error = cpu.iter().zip(&gpu).map(|(a, b)| (b / a - 1.0).abs()).fold(0.0, |a: f64, e| if e.is_nan() { e } else { a.max(e) });
+    let right = error <= most;
+    Ok(Line {
+        op: "training",
+        result: "loss per step",
+        shape: format!("{steps} steps, {name}"),
+        error: (right && error.is_finite()).then_some(error),
+        fault: (!right).then(|| format!("a loss is {:.2} % off, {:.0} % is allowed", 100.0 * error, 100.0 * most)),
     })
 }
 
@@ -60,7 +109,7 @@ pub fn run(device: &str) -> Result<Report> {
 /// # Errors
 /// Always.
 #[cfg(not(feature = "gpu"))]
-pub fn run(device: &str) -> Result<Report> {
+pub fn run(device: &str, _: Option<&Path>) -> Result<Report> {
     Err(not_built(device))
 }
 

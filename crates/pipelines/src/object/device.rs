@@ -11,6 +11,7 @@ use diorama_kernels::ops::ray_generation::PosedCamera;
 use running::Running;
 
 /// What a step on a GPU depends on besides the configuration.
+#[cfg_attr(not(feature = "gpu"), allow(dead_code, reason = "only GPUs read it"))]
 pub(super) struct Drawing {
     pub rays: usize,
     pub pixels: Rng,
@@ -162,8 +163,7 @@ impl Opened {
     }
 
     fn gpu(gpu: diorama_kernels::gpu::Gpu) -> Opened {
-        let note = format!("training on {} ({})", gpu.name, gpu.api.name());
-        Opened { running: Some(Running::new(gpu)), note: Some(note) }
+        Opened { running: Some(Running::new(gpu)), note: None }
     }
 
     pub fn is_gpu(&self) -> bool {

@@ -3,7 +3,7 @@
 use super::config::{Config, Method};
 use super::evaluate::{self, Report};
 use super::export::{self, ExportOptions, Exported, Format};
-use super::recipe;
+use super::recipe::{self, Trained};
 use super::render::{self, Layer, PathKind, RenderOptions};
 use super::report;
 use super::run_folder::RunFolder;
@@ -67,7 +67,7 @@ pub fn quickstart(
     // A small scene: a smaller table is as sharp and trains faster.
     config.field.log2_size = 17;
     config.field.finest = 512;
-    let (model, summary) = recipe::train(&config, &mut run, false, interrupt, events)?;
+    let Trained { model, summary, .. } = recipe::train(&config, &mut run, false, interrupt, events)?;
     note("scoring held-out views");
     let mut pairs: Vec<Vec<ImageU8>> = vec![Vec::new(), Vec::new()];
     let scores = evaluate::evaluate(&model, Split::Test, Quality::Full, &mut |_, v| {

@@ -60,6 +60,24 @@ pub fn load_capture(config: &Config) -> Result<Capture> {
     Ok(import::import(&config.data.path, &options)?)
 }
 
+/// The device that a configuration will train on, in words.
+///
+/// # Errors
+/// When it is not part of the build, absent, or cannot train the configuration.
+pub fn device(config: &Config) -> Result<String> {
+    let opened = device::open(config)?;
+    let cpu = || format!("cpu ({}, {} threads)", diorama_kernels::simd::level().name(), rayon::current_num_threads());
+    Ok(if opened.is_gpu() { opened.name() } else { cpu() })
+}
+
+/// What training gives.
+pub struct Trained {
+    pub model: ObjectModel,
+    pub summary: Summary,
+    /// `cpu`, or what the GPU calls itself.
+    pub device: String,
+}
+
 /// Trains into `folder`, from the start or from its checkpoint.
 ///
 /// Capture → pixels → model → loop of steps → checkpoint; `events` hears of all of it.
@@ -69,7 +87,7 @@ pub fn train(
     resume: bool,
     interrupt: &AtomicBool,
     events: &mut dyn FnMut(&Event),
-) -> Result<(ObjectModel, Summary)> {
+) -> Result<Trained> {
     let opened = device::open(config)?;
     opened.note().into_iter().for_each(|n| events(&Event::Note(n)));
     let capture = if resume { folder.capture()? } else { load_capture(config)? };
@@ -113,17 +131,18 @@ pub fn train(
         RunError::Diverged { step } => PipelineError::Diverged { step, checkpoint: checkpoint::latest(&checkpoints).display().to_string() },
     })?;
     folder.draw_curves()?;
-    Ok((trainer.model, summary))
+    Ok(Trained { device: trainer.device.name(), model: trainer.model, summary })
+}
+
+/// The losses of the first `steps` steps; writes nothing but pixels that do not fit in memory.
+pub fn losses(config: &Config, steps: u64) -> Result<Vec<f64>> {
+    let mut trainer = scratch_trainer(config)?;
+    (0..steps).map(|step| Ok(trainer.step(step, step as f64 / steps as f64)?.loss)).collect()
 }
 
 /// Where a step's time goes: `warmup` steps, then `steps` measured ones; writes nothing but pixels that do not fit in memory.
 pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> {
-    let capture = load_capture(config)?;
-    let scratch = std::env::temp_dir();
-    let store = load_pixels(config, &capture, &scratch)?;
-    let has_alpha = store.has_alpha;
-    let model = ObjectModel::new(config.clone(), capture, has_alpha)?;
-    let mut trainer = Trainer::new(model, Photographs(store), &scratch, device::open(config)?)?;
+    let mut trainer = scratch_trainer(config)?;
     for step in 0..warmup {
         trainer.step(step, 0.0)?;
     }
@@ -154,6 +173,15 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
         occupied: trainer.model.occupancy.as_ref().map(|o| o.bits.fill()),
         stages: stages.iter().map(|s| StageFigure { stage: s.0, share: s.1 / total, ms: s.1 * 1e3 / steps as f64 }).collect(),
     })
+}
+
+/// A trainer whose run is not kept.
+fn scratch_trainer(config: &Config) -> Result<Trainer<'static>> {
+    let capture = load_capture(config)?;
+    let store = load_pixels(config, &capture, &std::env::temp_dir())?;
+    let has_alpha = store.has_alpha;
+    let model = ObjectModel::new(config.clone(), capture, has_alpha)?;
+    Trainer::new(model, Photographs(store), Path::new(""), device::open(config)?)
 }
 
 fn load_pixels(config: &Config, capture: &Capture, scratch: &Path) -> Result<PixelStore> {
