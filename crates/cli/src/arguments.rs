@@ -129,6 +129,9 @@ pub struct TrainArgs {
 pub struct EvalArgs {
     /// Folder of the run
     pub run: PathBuf,
+    /// auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto")]
+    pub device: String,
     /// train, val or test
     #[arg(long, default_value = "test")]
     pub on: String,
@@ -149,6 +152,9 @@ pub struct EvalArgs {
 pub struct RenderArgs {
     /// Folder of the run
     pub run: PathBuf,
+    /// auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto")]
+    pub device: String,
     /// orbit, spiral, interpolate, held-out, or a camera_path.json
     #[arg(long, default_value = "orbit")]
     pub path: String,
@@ -316,6 +322,9 @@ pub struct BenchTrainArgs {
 pub struct BenchRenderArgs {
     /// Folder of the run
     pub run: PathBuf,
+    /// auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto")]
+    pub device: String,
     /// Calls per view; the median counts
     #[arg(long, default_value_t = 5)]
     pub repeats: usize,

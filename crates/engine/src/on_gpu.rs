@@ -1,11 +1,13 @@
-//! A hash grid field in training on a GPU: parameters, photographs and occupancy stay there, and nothing is read
+//! A hash grid field on a GPU. In training, parameters, photographs and occupancy stay there, and nothing is read
 //! back but [`GpuTrainer::figures`] and, for a checkpoint, [`GpuTrainer::download`].
 
 pub mod check;
 
 use crate::background::LearnedBackground;
-use crate::fields::{DirectionCode, Encoding, Field};
+use crate::fields::{Appearance, DirectionCode, Encoding, Field, Pruning};
 use crate::params::ParamGroup;
+use crate::renderers::volume::{Accelerator, Traced};
+use crate::samplers::RayBatch;
 use crate::samplers::occupancy::{OCCUPIED, Occupancy};
 use diorama_geom::rng::Rng;
 use diorama_kernels::gemm::Precision;
@@ -17,7 +19,7 @@ use diorama_kernels::ops::linear::{self, Activation, BiasKind};
 use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
-use diorama_kernels::ops::march::gpu::{self as march, GpuRays, Space};
+use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays, Space};
 use diorama_kernels::ops::ngp_field::FieldNet;
 use diorama_kernels::ops::ngp_field::gpu as field;
 use diorama_kernels::ops::ngp_field::gpu::loss::{self, SUMS, Target, Terms};
@@ -67,6 +69,43 @@ impl GpuGroup {
     }
 }
 
+/// A field's shape on the device.
+struct Shape {
+    grid: GpuHashGrid,
+    net: FieldNet,
+    /// The layers up to the density head.
+    density: Mlp,
+    /// Of the spherical harmonics.
+    degree: usize,
+    space: Space,
+}
+
+impl Shape {
+    /// # Panics
+    /// When the field is not a hash grid with directions in spherical harmonics.
+    fn new(gpu: &Gpu, field: &Field) -> Self {
+        let (Encoding::Hash(grid), DirectionCode::SphericalHarmonics(degree)) = (&field.encoding, field.directions) else {
+            unreachable!("only hash grid fields go to a GPU")
+        };
+        Shape {
+            grid: GpuHashGrid::new(gpu, grid),
+            net: field.net.clone(),
+            density: field.density_net(Precision::F32),
+            degree,
+            space: if field.contraction { Space::Contracted } else { Space::Cube(field.outer) },
+        }
+    }
+
+    fn features(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: &Buffer) -> Buffer {
+        let levels = self.grid.forward(gpu, rows, points, table);
+        field::to_rows(gpu, rows, &levels, self.grid.grid.config.features, self.grid.grid.output_dims())
+    }
+
+    fn sigma(&self, gpu: &Gpu, rows: &Rows, features: &Buffer, weights: &Buffer) -> Buffer {
+        field::density(gpu, &self.net, &self.density, weights, features, rows)
+    }
+}
+
 /// What a step depends on.
 #[derive(Clone, Copy, Debug)]
 pub struct GpuStep {
@@ -102,11 +141,7 @@ pub struct Figures {
 /// See the module.
 pub struct GpuTrainer {
     gpu: Gpu,
-    grid: GpuHashGrid,
-    net: FieldNet,
-    density: Mlp,
-    degree: usize,
-    space: Space,
+    shape: Shape,
     cube: (f32, f32),
     table: GpuGroup,
     d_table: Buffer,
@@ -133,18 +168,10 @@ impl GpuTrainer {
         cameras: &[PosedCamera],
         cube: (f32, f32),
     ) -> Self {
-        let (Encoding::Hash(grid), Some(table), DirectionCode::SphericalHarmonics(degree)) =
-            (&field.encoding, &field.table, field.directions)
-        else {
-            unreachable!("only hash grid fields are trained on a GPU")
-        };
-        let o = occupancy;
+        let (shape, o) = (Shape::new(&gpu, field), occupancy);
+        let table = field.table.as_ref().expect("a hash field has a table");
         GpuTrainer {
-            grid: GpuHashGrid::new(&gpu, grid),
-            net: field.net.clone(),
-            density: field.density_net(Precision::F32),
-            degree,
-            space: if field.contraction { Space::Contracted } else { Space::Cube(field.outer) },
+            shape,
             cube,
             d_table: gpu.zeros(table.values.len()),
             table: GpuGroup::upload(&gpu, table),
@@ -171,11 +198,14 @@ impl GpuTrainer {
         let (low, size) = self.cube;
         let near_far = ray_aabb::gpu::intersect(gpu, &origins, &dirs, [low; 3], [low + size; 3], s.near);
         let rays = GpuRays { origins, dirs, near_far, jitter: drawn.jitter, resumed: false };
-        let direction = spherical_harmonics::gpu::forward(gpu, self.degree, &rays.dirs);
+        let direction = spherical_harmonics::gpu::forward(gpu, self.shape.degree, &rays.dirs);
         let every_ray = Rows::all(gpu, s.rays);
         let sky = self.learned.as_ref().map(|g| {
-            let codes =
-                if self.degree * self.degree == SKY { direction.clone() } else { spherical_harmonics::gpu::forward(gpu, 4, &rays.dirs) };
+            let codes = if self.shape.degree * self.shape.degree == SKY {
+                direction.clone()
+            } else {
+                spherical_harmonics::gpu::forward(gpu, 4, &rays.dirs)
+            };
             let rgb = linear::gpu::forward(gpu, &every_ray, (SKY, 3), &codes, &g.values, None, BiasKind::None, Activation::Sigmoid);
             (codes, rgb)
         });
@@ -184,27 +214,27 @@ impl GpuTrainer {
         // All samples in occupied cells: their densities decide which are trained, and keep the grid up to date.
         let marched = march::march(gpu, &self.occupancy.bits, &rays, &s.march, s.room.0);
         let all = marched.packed.rows();
-        let points = march::positions(gpu, &rays, &marched.packed, self.space);
-        let features = self.features(&all, &points);
-        let sigma = field::density(gpu, &self.net, &self.density, &self.weights.values, &features, &all);
+        let points = march::positions(gpu, &rays, &marched.packed, self.shape.space);
+        let features = self.shape.features(gpu, &all, &points, &self.table.values);
+        let sigma = self.shape.sigma(gpu, &all, &features, &self.weights.values);
         let pruned = prune::prune(gpu, &marched.packed, &sigma, s.limits, &marched.cut, s.room.1);
         self.occupancy.record(gpu, &all, &marched.cells, &sigma);
         let samples = &pruned.packed;
         let points = pruned.take(gpu, &points, 3);
-        let features = pruned.take(gpu, &features, self.grid.grid.output_dims());
+        let features = pruned.take(gpu, &features, self.shape.grid.grid.output_dims());
 
         let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &drawn.images, *dims));
         let codes: Vec<&Buffer> = [&direction].into_iter().chain(&appearance).collect();
-        let step = field::forward(gpu, &self.net, &self.weights.values, samples, &features, &codes, background);
+        let step = field::forward(gpu, &self.shape.net, &self.weights.values, samples, &features, &codes, background);
         let left_out = gpu.either(&drawn.left_out, &marched.cut);
         let target = Target { rgba: &drawn.target, background, left_out: &left_out };
         let d = loss::loss(gpu, s.terms, samples, &step.out, target, &marched.packed.offsets, &self.sums);
-        let per_level = self.grid.grid.config.features;
-        let g = field::backward(gpu, &self.net, &self.weights.values, samples, per_level, background, &step, &d, s.near_scaling);
+        let per_level = self.shape.grid.grid.config.features;
+        let g = field::backward(gpu, &self.shape.net, &self.weights.values, samples, per_level, background, &step, &d, s.near_scaling);
 
         self.weights.step(gpu, s.t, s.rate_scale, &g.params);
         if !self.table.frozen {
-            self.grid.backward(gpu, &samples.rows(), &points, &g.features, &self.d_table);
+            self.shape.grid.backward(gpu, &samples.rows(), &points, &g.features, &self.d_table);
             self.table.step(gpu, s.t, s.rate_scale, &self.d_table);
         }
         if let Some((group, dims)) = &self.appearance {
@@ -221,16 +251,11 @@ impl GpuTrainer {
 
     /// Samples the field at random points of the cells that a camera sees, and decides anew which are occupied.
     pub fn update_occupancy(&self, rng: &Rng, counter: u64, count: usize, block: usize) {
-        let (points, cells) = self.occupancy.probe(&self.gpu, rng, counter, count, block, self.space);
+        let (points, cells) = self.occupancy.probe(&self.gpu, rng, counter, count, block, self.shape.space);
         let rows = Rows::all(&self.gpu, count);
-        let features = self.features(&rows, &points);
-        let sigma = field::density(&self.gpu, &self.net, &self.density, &self.weights.values, &features, &rows);
+        let features = self.shape.features(&self.gpu, &rows, &points, &self.table.values);
+        let sigma = self.shape.sigma(&self.gpu, &rows, &features, &self.weights.values);
         self.occupancy.update(&self.gpu, &cells, &sigma, block);
-    }
-
-    fn features(&self, rows: &Rows, points: &Buffer) -> Buffer {
-        let levels = self.grid.forward(&self.gpu, rows, points, &self.table.values);
-        field::to_rows(&self.gpu, rows, &levels, self.grid.grid.config.features, self.grid.grid.output_dims())
     }
 
     /// Waits for the device; means since the last call.
@@ -263,5 +288,95 @@ impl GpuTrainer {
         (occupancy.density, occupancy.fresh) = self.occupancy.read(gpu)?;
         occupancy.refresh();
         Ok(())
+    }
+}
+
+/// A trained field on the device, ready to be looked at.
+pub struct GpuTracer {
+    gpu: Gpu,
+    shape: Shape,
+    table: Buffer,
+    weights: Buffer,
+    /// Codes of all images and their mean, `[images + 1, dims]`.
+    appearance: Option<(Buffer, usize)>,
+    occupancy: GpuOccupancy,
+    /// Samples that there is room for.
+    room: usize,
+}
+
+impl GpuTracer {
+    /// # Panics
+    /// When the field is not a hash grid with directions in spherical harmonics.
+    pub fn new(gpu: Gpu, field: &Field, occupancy: &Occupancy) -> Self {
+        let table = field.table.as_ref().expect("a hash field has a table");
+        let codes = |a: &Appearance| (gpu.upload(&[&a.group.values[..], &a.mean()].concat()), a.dims);
+        GpuTracer {
+            shape: Shape::new(&gpu, field),
+            table: gpu.upload(&table.values),
+            weights: gpu.upload(&field.weights.values),
+            appearance: field.appearance.as_ref().map(codes),
+            occupancy: GpuOccupancy::upload(&gpu, &occupancy.bits),
+            room: if gpu.software { 1 << 17 } else { 1 << 20 },
+            gpu,
+        }
+    }
+
+    /// Rays `first..first + n` of a batch; halves are traced apart where their samples find no room together.
+    fn part(
+        &self,
+        batch: &RayBatch,
+        (first, n): (usize, usize),
+        march: &MarchConfig,
+        limits: Limits,
+        appearance: Option<u32>,
+        out: &mut (Traced, Vec<f32>),
+    ) -> Result<(), GpuError> {
+        let gpu = &self.gpu;
+        let of = |v: &[f32], width: usize| gpu.upload(&v[first * width..(first + n) * width]);
+        let rays = GpuRays {
+            origins: of(&batch.origins, 3),
+            dirs: of(&batch.dirs, 3),
+            near_far: of(&batch.near_far, 2),
+            jitter: of(&batch.jitter, 1),
+            resumed: false,
+        };
+        let marched = march::march(gpu, &self.occupancy, &rays, march, self.room);
+        if n > 1 && gpu.read_u32(&marched.cut)?.contains(&1) {
+            self.part(batch, (first, n / 2), march, limits, appearance, out)?;
+            return self.part(batch, (first + n / 2, n - n / 2), march, limits, appearance, out);
+        }
+        let all = marched.packed.rows();
+        let points = march::positions(gpu, &rays, &marched.packed, self.shape.space);
+        let features = self.shape.features(gpu, &all, &points, &self.table);
+        let sigma = self.shape.sigma(gpu, &all, &features, &self.weights);
+        let pruned = prune::prune(gpu, &marched.packed, &sigma, limits, &marched.cut, self.room);
+        let features = pruned.take(gpu, &features, self.shape.grid.grid.output_dims());
+        let direction = spherical_harmonics::gpu::forward(gpu, self.shape.degree, &rays.dirs);
+        let code = self.appearance.as_ref().map(|(codes, dims)| {
+            let mean = (codes.len() / dims - 1) as u32;
+            field::look_up(gpu, codes, &gpu.upload_u32(&vec![appearance.unwrap_or(mean); n]), *dims)
+        });
+        let codes: Vec<&Buffer> = [&direction].into_iter().chain(&code).collect();
+        let black = gpu.zeros(n * 3);
+        let view = field::forward(gpu, &self.shape.net, &self.weights, &pruned.packed, &features, &codes, &black).out;
+        out.0.rgb.extend(gpu.read(&view.color)?);
+        out.0.opacity.extend(gpu.read(&view.opacity)?);
+        out.0.depth.extend(gpu.read(&view.depth)?);
+        out.1.extend(gpu.read(&pruned.light)?);
+        Ok(())
+    }
+}
+
+impl Accelerator for GpuTracer {
+    fn trace(&self, batch: &RayBatch, march: &MarchConfig, pruning: Pruning, appearance: Option<u32>) -> Option<(Traced, Vec<f32>)> {
+        let Pruning { stop, min_alpha, thin, min_weight } = pruning;
+        let mut out = (Traced::default(), Vec::new());
+        let limits = Limits { stop, min_alpha, thin, min_weight };
+        self.part(batch, (0, batch.len()), march, limits, appearance, &mut out).ok()?;
+        Some(out)
+    }
+
+    fn rays(&self) -> usize {
+        if self.gpu.software { 1 << 12 } else { 1 << 17 }
     }
 }

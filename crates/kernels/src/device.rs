@@ -58,8 +58,8 @@ impl Api {
     pub fn is_built(self) -> bool {
         match self {
             Api::Cuda => cfg!(feature = "cuda"),
-            Api::Vulkan => cfg!(feature = "vulkan"),
-            Api::Metal => cfg!(feature = "metal"),
+            Api::Vulkan => cfg!(all(feature = "gpu", not(target_os = "macos"))),
+            Api::Metal => cfg!(all(feature = "gpu", target_os = "macos")),
             Api::WebGpu => cfg!(feature = "webgpu"),
         }
     }
@@ -67,6 +67,11 @@ impl Api {
     /// What to say where a build cannot reach it.
     pub fn not_built(self) -> String {
         let name = self.name();
+        match self {
+            Api::Metal if !cfg!(target_os = "macos") => return "device metal: only macOS has it; use --device auto".into(),
+            Api::Vulkan if cfg!(target_os = "macos") => return "device vulkan: macOS has metal instead; use --device metal".into(),
+            _ => {}
+        }
         format!("device {name}: this build cannot reach it; build it with `cargo build --release --features {name}`, or use --device cpu")
     }
 }

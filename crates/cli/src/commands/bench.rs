@@ -4,7 +4,7 @@ use super::{Outcome, use_threads};
 use crate::arguments::{BenchCheckArgs, BenchOpsArgs, BenchRenderArgs, BenchTrainArgs};
 use diorama_pipelines::bench;
 use diorama_pipelines::object::config::{Config, Method};
-use diorama_pipelines::object::run_folder;
+use diorama_pipelines::object::{device, run_folder};
 use diorama_pipelines::{PipelineError, Result};
 
 pub fn ops(a: &BenchOpsArgs) -> Result<Outcome> {
@@ -94,14 +94,15 @@ pub fn train(a: &BenchTrainArgs) -> Result<Outcome> {
 
 pub fn render(a: &BenchRenderArgs) -> Result<Outcome> {
     use_threads(a.threads)?;
-    let (model, notes) = run_folder::load_model(&a.run)?;
+    let (mut model, notes) = run_folder::load_model(&a.run)?;
+    let device = device::accelerate(&mut model, &a.device)?;
     notes.iter().for_each(|n| eprintln!("note: {n}"));
-    let report = bench::render::run(&model, a.repeats)?;
+    let report = bench::render::run(&model, a.repeats, device)?;
     if a.json {
         println!("{}", serde_json::json!(report));
         return Ok(Outcome::Done);
     }
-    println!("{} views of {} x {} on {} thread(s), {}", report.views, report.width, report.height, report.threads, report.simd);
+    println!("{} views of {} x {} on {}", report.views, report.width, report.height, report.device);
     for (name, q) in [("full", report.full), ("fast", report.fast)] {
         println!("{name}: {:.2} frames/s, {:.2} dB", q.frames_per_s, q.psnr);
     }

@@ -39,7 +39,7 @@ pub fn run(a: &DoctorArgs) -> Result<Outcome> {
     println!("memory     {}, {} available", gib(total), gib(available));
     let reach: Vec<_> = Api::ALL.into_iter().filter(|a| a.is_built()).map(Api::name).collect();
     match &reach[..] {
-        [] => println!("devices    cpu (this build has no GPU kernels; build it with --features vulkan or cuda)"),
+        [] => println!("devices    cpu (this build has no GPU kernels; build it without --no-default-features)"),
         _ if gpus.is_empty() => println!("devices    cpu (no GPU found by {})", reach.join(", ")),
         _ => println!("devices    cpu"),
     }

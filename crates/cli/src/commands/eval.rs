@@ -5,7 +5,7 @@ use crate::arguments::EvalArgs;
 use diorama_data::{DataError, photo};
 use diorama_geom::ImageU8;
 use diorama_geom::capture::Split;
-use diorama_pipelines::object::{evaluate, run_folder};
+use diorama_pipelines::object::{device, evaluate, run_folder};
 use diorama_pipelines::{PipelineError, Result};
 
 pub fn run(a: &EvalArgs) -> Result<Outcome> {
@@ -17,7 +17,8 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         other => return Err(PipelineError::Usage(format!("--on {other}: expected train, val or test"))),
     };
     let quality = a.quality.parse().map_err(|e| PipelineError::Usage(format!("--{e}")))?;
-    let (model, notes) = run_folder::load_model(&a.run)?;
+    let (mut model, notes) = run_folder::load_model(&a.run)?;
+    device::accelerate(&mut model, &a.device)?;
     notes.iter().for_each(|n| eprintln!("note: {n}"));
     let folder = a.run.join("eval");
     if a.save_images {

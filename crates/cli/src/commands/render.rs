@@ -3,7 +3,7 @@
 use super::{INTERRUPT, Outcome, parse_clip, use_threads, watch_interrupts};
 use crate::arguments::RenderArgs;
 use diorama_pipelines::object::render::{self, RenderOptions};
-use diorama_pipelines::object::run_folder;
+use diorama_pipelines::object::{device, run_folder};
 use diorama_pipelines::{PipelineError, Result};
 use std::time::Instant;
 
@@ -20,7 +20,8 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
     let layers = a.layers.iter().map(|l| l.parse().map_err(usage)).collect::<Result<Vec<_>>>()?;
     let path = a.path.parse().map_err(usage)?;
     let quality = a.quality.parse().map_err(usage)?;
-    let (model, notes) = run_folder::load_model(&a.run)?;
+    let (mut model, notes) = run_folder::load_model(&a.run)?;
+    device::accelerate(&mut model, &a.device)?;
     notes.iter().for_each(|n| eprintln!("note: {n}"));
     let images = a.images.clone().or_else(|| a.video.is_none().then(|| a.run.join("render")));
     let clip = a.clip.as_deref().map(|c| parse_clip(c, &model.capture.world_from_capture)).transpose()?;

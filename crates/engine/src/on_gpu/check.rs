@@ -137,10 +137,11 @@ fn spaces(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 }
 
 fn prunings(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
-    let limits = Limits { stop: 1e-3, min_alpha: 3e-3, thin: 0.7 };
+    let limits = Limits { stop: 1e-3, min_alpha: 3e-3, thin: 0.7, min_weight: 2e-3 };
     for rays in [0, 1, 130] {
         let scene = Ragged::new(rays);
         let (mut sigma, mut kept, mut offsets) = (scene.sigma.clone(), Vec::new(), vec![0u32]);
+        let mut lights = Vec::new();
         for r in 0..rays {
             let mut light = 1.0f64;
             for i in scene.packed().range(r) {
@@ -149,12 +150,14 @@ fn prunings(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                     continue;
                 }
                 let alpha = 1.0 - (-(sigma[i] as f64) * scene.dt[i] as f64).exp();
-                light *= 1.0 - alpha;
-                if alpha >= limits.min_alpha.min(limits.thin * scene.dt[i]) as f64 {
+                let weight = light * alpha;
+                light -= weight;
+                if weight >= limits.min_weight as f64 && alpha >= limits.min_alpha.min(limits.thin * scene.dt[i]) as f64 {
                     kept.push(i);
                 }
             }
             offsets.push(kept.len() as u32);
+            lights.push(light);
         }
         let (p, rows) = (GpuPacked::upload(gpu, &scene.packed()), random(scene.t.len() * 5, 6));
         for capacity in [kept.len() + 10, kept.len() / 2] {
@@ -164,6 +167,7 @@ fn prunings(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let bounded: Vec<u32> = offsets.iter().map(|o| (*o).min(capacity as u32)).collect();
             let lost: Vec<u32> = offsets[1..].iter().map(|o| (*o > capacity as u32) as u32).collect();
             table.close("prune", "densities", &shape, &sigma_gpu, &wide(&sigma))?;
+            table.close("prune", "light", &shape, &pruned.light, &lights)?;
             table.equal("prune", "offsets", &shape, &pruned.packed.offsets, &bounded)?;
             table.equal("prune", "rays cut", &shape, &cut, &lost)?;
             let n = kept.len().min(capacity);

@@ -6,7 +6,7 @@ use crate::samplers::occupancy::Occupancy;
 use crate::samplers::{RayBatch, pixels, stratified};
 use diorama_geom::Image;
 use diorama_kernels::ops::composite::Packed;
-use diorama_kernels::ops::march::{self, MarchRays, Marched};
+use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 
 /// What stands behind the scene.
@@ -34,6 +34,15 @@ pub enum Sampling<'a> {
     },
 }
 
+/// Traces rays through an occupancy grid elsewhere than on the CPU.
+pub trait Accelerator: Send + Sync {
+    /// What rays come to before black, and the share of light that passes each; `None` where the device failed.
+    fn trace(&self, batch: &RayBatch, march: &MarchConfig, pruning: Pruning, appearance: Option<u32>) -> Option<(Traced, Vec<f32>)>;
+
+    /// Rays that are worth a call.
+    fn rays(&self) -> usize;
+}
+
 /// A field ready to be looked at.
 #[derive(Clone, Copy)]
 pub struct Tracer<'a> {
@@ -51,6 +60,8 @@ pub struct Tracer<'a> {
     pub appearance: Option<u32>,
     /// Pixels are interpolated where traced neighbours differ by no more than this; 0: all are traced.
     pub tolerance: f32,
+    /// Traces instead of the CPU, unless it fails.
+    pub accelerator: Option<&'a dyn Accelerator>,
 }
 
 /// How much care a view gets.
@@ -163,7 +174,7 @@ impl Tracer<'_> {
         progress: &mut dyn FnMut(usize),
     ) {
         let w = out.rgb.width;
-        for part in wanted.chunks(CHUNK) {
+        for part in wanted.chunks(self.accelerator.map_or(CHUNK, |a| a.rays())) {
             batch.resize(part.len());
             for (i, &p) in part.iter().enumerate() {
                 batch.pixels[i * 2] = (p as usize % w) as f32 + 0.5;
@@ -188,7 +199,7 @@ impl Tracer<'_> {
         if let Some((min, max)) = self.clip {
             diorama_kernels::ops::ray_aabb::cpu::intersect(&batch.origins, &batch.dirs, min, max, self.near, &mut batch.near_far);
         }
-        let mut out = match self.sampling {
+        let out = match self.sampling {
             Sampling::Occupancy { grid, max_samples } => {
                 let rays = MarchRays {
                     origins: &batch.origins,
@@ -197,8 +208,16 @@ impl Tracer<'_> {
                     jitter: &batch.jitter,
                     resumed: false,
                 };
+                let march = grid.march_config(max_samples);
+                let elsewhere = self.accelerator.and_then(|a| a.trace(batch, &march, self.pruning, self.appearance));
+                if let Some((mut out, light)) = elsewhere {
+                    if self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0 {
+                        out.make_up(&light, self.pruning.stop);
+                    }
+                    return self.before_backdrop(batch, out);
+                }
                 let (mut marched, mut positions) = (Marched::default(), Vec::new());
-                self.field.visible(&grid.bits, &rays, &grid.march_config(max_samples), self.pruning, &mut marched, &mut positions, buf);
+                self.field.visible(&grid.bits, &rays, &march, self.pruning, &mut marched, &mut positions, buf);
                 self.composite(self.field, batch, &marched, &positions, buf);
                 let mut out = taken(buf);
                 if self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0 {
@@ -221,6 +240,11 @@ impl Tracer<'_> {
                 taken(buf)
             }
         };
+        self.before_backdrop(batch, out)
+    }
+
+    /// Lets the backdrop show through.
+    fn before_backdrop(&self, batch: &RayBatch, mut out: Traced) -> Traced {
         let mut behind = Vec::new();
         match self.backdrop {
             Backdrop::Color(c) => behind.extend((0..batch.len()).flat_map(|_| c)),
@@ -327,6 +351,7 @@ mod tests {
             pruning: Pruning { stop: 0.0, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             appearance: None,
             tolerance: 0.0,
+            accelerator: None,
         };
         let view = tracer.view(&camera, &mut |_| {});
         let mut batch = RayBatch::default();
@@ -369,6 +394,7 @@ mod tests {
             pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             appearance: None,
             tolerance: 0.0,
+            accelerator: None,
         };
         assert!(tracer.view(&camera, &mut |_| {}).opacity.data[40 + 2] > 0.9);
         tracer.clip = Some(([0.45, 0.0, 0.45], [0.55, 1.0, 0.55]));

@@ -106,6 +106,8 @@ impl Gpu {
         if !api.is_built() {
             return Err(GpuError::NotBuilt(api));
         }
+        #[cfg(feature = "cuda")]
+        keep_compiled();
         let (device, software) = find(api).ok_or(GpuError::NoDevice(api.name()))?;
         let client = quietly(|| device.client()).map_err(|e| GpuError::Open(api.name(), e))?;
         let add = Type::atomic(f32::elem_type_native().with_vector_size(1));
@@ -198,6 +200,17 @@ impl Gpu {
     pub fn sync(&self) -> Result<(), GpuError> {
         cubecl::future::block_on(self.client.sync()).map_err(|e| GpuError::Lost(self.name.clone(), format!("{e:?}")))
     }
+}
+
+/// Has compiled kernels kept in the user's cache folder, for the next start. What the program decided before stays.
+#[cfg(feature = "cuda")]
+fn keep_compiled() {
+    use cubecl::config::{CubeClRuntimeConfig, RuntimeConfig};
+    use cubecl_environment::persistence::CacheConfig;
+    let mut c = CubeClRuntimeConfig::default();
+    c.compilation.cache = true;
+    c.environment.path = CacheConfig::Global;
+    CubeClRuntimeConfig::try_set(c);
 }
 
 fn find(api: Api) -> Option<(cubecl::Device, bool)> {

@@ -18,10 +18,12 @@ pub struct QualityFigure {
 }
 
 /// Held-out views at both qualities.
-#[derive(Clone, Copy, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize)]
 pub struct RenderReport {
     pub threads: usize,
     pub simd: &'static str,
+    /// What draws.
+    pub device: String,
     pub views: usize,
     pub width: u32,
     pub height: u32,
@@ -29,8 +31,8 @@ pub struct RenderReport {
     pub fast: QualityFigure,
 }
 
-/// Draws every held-out view `repeats` times at each quality.
-pub fn run(model: &ObjectModel, repeats: usize) -> Result<RenderReport> {
+/// Draws every held-out view `repeats` times at each quality, on what [`super::super::object::device::accelerate`] named.
+pub fn run(model: &ObjectModel, repeats: usize, device: String) -> Result<RenderReport> {
     let frames = held_out(&model.capture, Split::Test);
     let Some(&first) = frames.first() else {
         return Err(PipelineError::Usage("the run holds no views out; train with --split every:8".into()));
@@ -49,6 +51,7 @@ pub fn run(model: &ObjectModel, repeats: usize) -> Result<RenderReport> {
     Ok(RenderReport {
         threads: rayon::current_num_threads(),
         simd: diorama_kernels::simd::level().name(),
+        device,
         views: frames.len(),
         width: camera.width,
         height: camera.height,

@@ -74,6 +74,30 @@ pub(super) fn open(config: &Config) -> Result<Opened> {
     }
 }
 
+/// Lets the named device draw a model's views; what draws them, in words. `auto` is the best GPU that is no software,
+/// else the CPU, which also draws what GPUs cannot.
+///
+/// # Errors
+/// When a named GPU is not part of the build, absent, or cannot draw the model.
+pub fn accelerate(model: &mut ObjectModel, device: &str) -> Result<String> {
+    // What is only trained differently does not matter to views.
+    let mut c = Config::new(model.config.method, model.config.data.path.clone());
+    c.set("device", device)?;
+    #[cfg(feature = "gpu")]
+    if let (Some(r), Some(occupancy)) = (open(&c)?.running, &model.occupancy) {
+        let tracer = diorama_engine::on_gpu::GpuTracer::new(r.gpu().clone(), &model.field, occupancy);
+        model.accelerator = Some(Box::new(tracer));
+        return Ok(r.name());
+    }
+    open(&c)?;
+    Ok(cpu_name())
+}
+
+/// The CPU in words.
+pub(super) fn cpu_name() -> String {
+    format!("cpu ({}, {} threads)", diorama_kernels::simd::level().name(), rayon::current_num_threads())
+}
+
 impl Opened {
     fn cpu(note: Option<String>) -> Opened {
         Opened {
@@ -171,7 +195,7 @@ impl Opened {
     }
 
     pub fn name(&self) -> String {
-        self.running.as_ref().map_or("cpu".into(), |r| format!("{} ({})", r.gpu().name, r.gpu().api.name()))
+        self.running.as_ref().map_or("cpu".into(), Running::name)
     }
 
     /// Whether a GPU computes that the CPU does not play.
@@ -261,6 +285,11 @@ mod running {
             &self.gpu
         }
 
+        /// What the device calls itself, and how it is reached.
+        pub fn name(&self) -> String {
+            format!("{} ({})", self.gpu.name, self.gpu.api.name())
+        }
+
         pub fn upload(&mut self, m: &ObjectModel, photographs: &Photographs, cameras: &[PosedCamera]) -> Result<()> {
             let bytes = photographs.bytes();
             let most = self.gpu.largest_buffer();
@@ -292,7 +321,7 @@ mod running {
                 backdrop: d.background.map_or(Backdrop::Color(m.backdrop_color()), Backdrop::Random),
                 near: s.near,
                 march: grid.march_config(s.max_samples).stretched(d.stretch),
-                limits: Limits { stop: s.stop, min_alpha: s.min_alpha, thin: d.thin },
+                limits: Limits { stop: s.stop, min_alpha: s.min_alpha, thin: d.thin, min_weight: 0.0 },
                 terms: Terms { huber: if c.loss.color == "huber" { 0.1 } else { 0.0 }, distortion: c.loss.distortion, alpha: c.loss.alpha },
                 near_scaling: c.loss.near_scaling,
                 room: (room * ROOM.0, room * ROOM.1),

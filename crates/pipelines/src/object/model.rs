@@ -6,7 +6,7 @@ use diorama_data::checkpoint::{Checkpoint, Entry};
 use diorama_engine::background::LearnedBackground;
 use diorama_engine::fields::{self, Batch, Field, FieldBuffers};
 use diorama_engine::params::ParamGroup;
-use diorama_engine::renderers::volume::{Backdrop, Quality, Sampling, Tracer};
+use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Sampling, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::pixels::ErrorMap;
 use diorama_engine::train::Origin;
@@ -44,6 +44,8 @@ pub struct ObjectModel {
     pub samples_per_ray: f64,
     /// Lowered once after a loss that was not finite.
     pub rate_scale: f32,
+    /// Draws views instead of the CPU.
+    pub accelerator: Option<Box<dyn Accelerator>>,
 }
 
 impl ObjectModel {
@@ -86,6 +88,7 @@ impl ObjectModel {
             origin: Origin::default(),
             samples_per_ray: 256.0,
             rate_scale: 1.0,
+            accelerator: None,
             config,
             capture,
         };
@@ -168,6 +171,7 @@ impl ObjectModel {
             pruning: quality.pruning(),
             appearance: None,
             tolerance: quality.tolerance(),
+            accelerator: self.accelerator.as_deref(),
         }
     }
 

@@ -66,8 +66,7 @@ pub fn load_capture(config: &Config) -> Result<Capture> {
 /// When it is not part of the build, absent, or cannot train the configuration.
 pub fn device(config: &Config) -> Result<String> {
     let opened = device::open(config)?;
-    let cpu = || format!("cpu ({}, {} threads)", diorama_kernels::simd::level().name(), rayon::current_num_threads());
-    Ok(if opened.is_gpu() { opened.name() } else { cpu() })
+    Ok(if opened.is_gpu() { opened.name() } else { device::cpu_name() })
 }
 
 /// What training gives.

@@ -15,11 +15,15 @@ pub struct Limits {
     /// Opacity below which a sample is left out, unless it is denser than `thin`.
     pub min_alpha: f32,
     pub thin: f32,
+    /// Weight in the pixel below which a sample is left out.
+    pub min_weight: f32,
 }
 
 /// The samples that stay.
 pub struct Pruned {
     pub packed: GpuPacked,
+    /// Share of light that passes all samples, left out or not, `[R]`.
+    pub light: Buffer,
     /// Where each lay before.
     source: Buffer,
 }
@@ -29,7 +33,7 @@ pub struct Pruned {
 pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: Limits, cut: &Buffer, capacity: usize) -> Pruned {
     let n = p.rays();
     let counts = gpu.empty(n);
-    let kept = gpu.empty(p.t.len());
+    let (kept, light) = (gpu.empty(p.t.len()), gpu.empty(n));
     if n > 0 {
         // SAFETY: units past the rays stop; offsets bound the samples.
         unsafe {
@@ -42,10 +46,13 @@ pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: Limits, cut: &Buf
                 sigma.arg(),
                 kept.arg(),
                 counts.arg(),
+                light.arg(),
                 n as u32,
                 limits.stop,
                 limits.min_alpha,
-                limits.thin,
+                // Times a length, this stays a number.
+                limits.thin.min(1e30),
+                limits.min_weight,
             );
         }
     }
@@ -71,7 +78,7 @@ pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: Limits, cut: &Buf
             );
         }
     }
-    Pruned { packed: GpuPacked { offsets, t, dt }, source }
+    Pruned { packed: GpuPacked { offsets, t, dt }, light, source }
 }
 
 impl Pruned {
@@ -107,10 +114,12 @@ fn keep(
     sigma: &mut [f32],
     kept: &mut [u32],
     counts: &mut [u32],
+    lights: &mut [f32],
     rays: u32,
     stop: f32,
     min_alpha: f32,
     thin: f32,
+    min_weight: f32,
 ) {
     let r = ABSOLUTE_POS;
     if r >= rays as usize {
@@ -124,8 +133,9 @@ fn keep(
             sigma[i] = -1.0f32;
         } else {
             let alpha = 1.0 - (-(sigma[i] * dt[i])).exp();
-            light -= light * alpha;
-            if alpha >= min(min_alpha, thin * dt[i]) {
+            let weight = light * alpha;
+            light -= weight;
+            if alpha >= min(min_alpha, thin * dt[i]) && weight >= min_weight {
                 stays = 1u32;
             }
         }
@@ -133,6 +143,7 @@ fn keep(
         count += stays;
     }
     counts[r] = count;
+    lights[r] = light;
 }
 
 #[cube(launch_unchecked)]
