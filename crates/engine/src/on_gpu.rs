@@ -321,6 +321,12 @@ impl GpuTracer {
         }
     }
 
+    /// The same with room for other than the usual number of samples.
+    #[must_use]
+    pub fn with_room(self, samples: usize) -> Self {
+        GpuTracer { room: samples, ..self }
+    }
+
     /// Rays `first..first + n` of a batch; halves are traced apart where their samples find no room together.
     fn part(
         &self,

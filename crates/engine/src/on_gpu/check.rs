@@ -1,6 +1,9 @@
 //! The parts of a training step on a device against what the CPU does.
 
+use super::GpuTracer;
+use crate::fields;
 use crate::losses::{ColorLoss, Photometric};
+use crate::renderers::volume::{self, Quality, Sampling, Tracer};
 use crate::samplers::RayBatch;
 use crate::samplers::occupancy::{OCCUPIED, Occupancy};
 use crate::samplers::pixels::{self, DrawOptions, PixelSource};
@@ -12,6 +15,7 @@ use diorama_kernels::gpu::check::{Row, Table};
 use diorama_kernels::gpu::{Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::composite::{Packed, cpu as composite};
+use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::march::MarchRays;
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
@@ -29,7 +33,7 @@ use diorama_testkit::{random, random_unit, wide};
 /// When the device is lost; wrong results are rows with a fault.
 pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
     let mut table = Table::new(gpu);
-    for case in [draws, spaces, prunings, grids, losses, look_ups] {
+    for case in [draws, spaces, prunings, grids, losses, look_ups, views] {
         case(gpu, &mut table)?;
     }
     Ok(table.rows)
@@ -279,6 +283,41 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         table.close("near scaling", "d sigma", &shape, &got_sigma, &want)?;
         let want: Vec<f64> = (0..s * 3).map(|i| d_rgb[i] as f64 * scale(i / 3)).collect();
         table.close("near scaling", "d rgb", &shape, &got_rgb, &want)?;
+    }
+    Ok(())
+}
+
+/// Views by the device and by the CPU, with room for all samples of a batch and with so little that it is split.
+fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let grid = HashGridConfig { levels: 3, features: 2, log2_size: 10, base: 4, finest: 16 };
+    let camera =
+        PosedCamera { camera: Camera::pinhole(12, 10, 0.6), pose: Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z) };
+    for (images, contraction) in [(0, false), (3, true)] {
+        let mut f = fields::ngp(grid, 1.0, contraction, 1e-2, images, if images > 0 { 4 } else { 0 }, 1);
+        f.net.sigma.shift = 1.2;
+        f.table.iter_mut().for_each(|t| t.values.iter_mut().for_each(|v| *v *= 2e4));
+        let occupancy = Occupancy::new(16, 1);
+        for (quality, room) in [(Quality::Full, 1 << 17), (Quality::Full, 4096), (Quality::Fast, 1 << 17)] {
+            let on_cpu = Tracer {
+                field: &f,
+                sampling: Sampling::Occupancy { grid: &occupancy, max_samples: 4096 },
+                backdrop: volume::Backdrop::Color([0.2, 0.5, 0.9]),
+                near: 0.1,
+                cube: (0.0, 1.0),
+                clip: None,
+                pruning: quality.pruning(),
+                appearance: None,
+                tolerance: 0.0,
+                accelerator: None,
+            };
+            let device = GpuTracer::new(gpu.clone(), &f, &occupancy).with_room(room);
+            let want = on_cpu.view(&camera, &mut |_| {});
+            let got = Tracer { accelerator: Some(&device), ..on_cpu }.view(&camera, &mut |_| {});
+            let shape = format!("{quality:?} room {room} images={images}");
+            table.close("view", "color", &shape, &gpu.upload(&got.rgb.data), &wide(&want.rgb.data))?;
+            table.close("view", "opacity", &shape, &gpu.upload(&got.opacity.data), &wide(&want.opacity.data))?;
+            table.close("view", "depth", &shape, &gpu.upload(&got.depth.data), &wide(&want.depth.data))?;
+        }
     }
     Ok(())
 }

@@ -205,8 +205,8 @@ impl Gpu {
 /// Has compiled kernels kept in the user's cache folder, for the next start. What the program decided before stays.
 #[cfg(feature = "cuda")]
 fn keep_compiled() {
+    use cubecl::config::cache::CacheConfig;
     use cubecl::config::{CubeClRuntimeConfig, RuntimeConfig};
-    use cubecl_environment::persistence::CacheConfig;
     let mut c = CubeClRuntimeConfig::default();
     c.compilation.cache = true;
     c.environment.path = CacheConfig::Global;
