@@ -452,6 +452,7 @@ mod tests {
                 pruning: quality.pruning(),
                 appearance: None,
                 tolerance: quality.tolerance(),
+                accelerator: None,
             };
             let mut rays = 0;
             let view = tracer.view(&camera, &mut |rows| rays += rows * 40);

@@ -381,7 +381,7 @@ mod tests {
             ("optim.rate", "fast"),
             ("optim.rate", "inf"),
             ("data.downscale", "0"),
-            ("device", "cuda"),
+            ("device", "gpu"),
         ] {
             assert!(c.clone().set(k, v).is_err(), "{k} = {v}");
         }

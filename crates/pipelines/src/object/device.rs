@@ -385,3 +385,40 @@ mod running {
         GpuPhotographs::upload(gpu, &sizes, &pixels, (!all).then_some(&mask[..]))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_gpus_cannot_train_is_said() {
+        let plain = Config::new(Method::Ngp, "x".into());
+        assert_eq!(lacking(&plain), None);
+        assert!(lacking(&Config::new(Method::Nerf, "x".into())).unwrap().contains("nerf"));
+        for key in ["sampling.error_map", "camera.refine"] {
+            let mut c = plain.clone();
+            c.set(key, "true").unwrap();
+            assert!(lacking(&c).unwrap().contains(key));
+        }
+    }
+
+    #[test]
+    fn a_device_outside_of_the_build_is_named_with_its_cure() {
+        for api in Api::ALL.into_iter().filter(|a| !a.is_built()) {
+            let mut c = Config::new(Method::Ngp, "x".into());
+            c.set("device", api.name()).unwrap();
+            let Err(PipelineError::Usage(text)) = open(&c) else { panic!("{} opened", api.name()) };
+            assert!(text.contains(api.name()) && !text.contains('\n'), "{text}");
+        }
+        let cpu = open(&Config { device: "cpu".into(), ..Config::new(Method::Ngp, "x".into()) }).unwrap_or_else(|e| panic!("{e}"));
+        assert!(!cpu.is_gpu());
+    }
+
+    #[test]
+    fn batches_are_larger_on_gpus_unless_given() {
+        let mut c = Config::new(Method::Ngp, "x".into());
+        assert_eq!((batch_samples(&c, false), batch_samples(&c, true)), (1 << 15, 1 << 18));
+        c.set("sampling.batch_samples", "100").unwrap();
+        assert_eq!((batch_samples(&c, false), batch_samples(&c, true)), (100, 100));
+    }
+}
