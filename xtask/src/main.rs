@@ -41,8 +41,9 @@ fn libraries_at(level: &str) -> bool {
 
 /// Builds for a device and compares every op on it with its reference.
 fn gpu_check(device: &str) -> bool {
-    let lint = ["clippy", "--release", "--package", "diorama", "--features", device, "--", "-D", "warnings"];
-    let mut args = vec!["run", "--release", "--package", "diorama", "--features", device, "--", "bench", "check", "--device", device];
+    let with = ["--release", "--package", "diorama", "--no-default-features", "--features", device, "--"];
+    let lint = [&["clippy"][..], &with, &["-D", "warnings"]].concat();
+    let mut args = [&["run"][..], &with, &["bench", "check", "--device", device]].concat();
     // Training is compared on a real capture where there is one.
     let fox = std::env::var("DIORAMA_TEST_DATA").map(|d| format!("{d}/fox")).unwrap_or_default();
     if std::path::Path::new(&fox).is_dir() {

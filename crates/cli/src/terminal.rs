@@ -60,9 +60,7 @@ impl Progress {
                 }
             }
             Event::Evaluated { step, psnr, .. } => self.line(&format!("step {step}: held-out psnr {psnr:.2} dB")),
-            Event::Recovered { step, to_step } => {
-                self.line(&format!("the loss was not finite at step {step}: back to step {to_step} with a lower rate"));
-            }
+            Event::Recovered { step, to_step, why } => self.line(&format!("step {step}: {why}; back to step {to_step}")),
             Event::Note(n) => self.line(&format!("note: {n}")),
             Event::Finished { step, seconds, interrupted } => {
                 if let Some(b) = &self.bar {

@@ -32,7 +32,7 @@ fn stages_of_a_step_add_up() {
     diorama_pipelines::object::quickstart::write_capture(dir.path(), 8, 24).unwrap();
     let data = dir.path().to_str().unwrap();
     let before = listing(dir.path());
-    let v = json(&diorama(&["bench", "train", data, "--warmup", "20", "--steps", "5", "--json"]));
+    let v = json(&diorama(&["bench", "train", data, "--device", "cpu", "--warmup", "20", "--steps", "5", "--json"]));
     assert_eq!(v["steps"], 5);
     let stages = v["stages"].as_array().unwrap();
     let total: f64 = stages.iter().map(|s| s["share"].as_f64().unwrap()).sum();

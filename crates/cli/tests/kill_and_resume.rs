@@ -14,7 +14,7 @@ fn start(data: &Path, run: &Path, resume: bool) -> Child {
     if resume {
         c.arg("--resume");
     } else {
-        c.arg(data).args(["--seed", "3", "--threads", "2", "--force"]);
+        c.arg(data).args(["--seed", "3", "--threads", "2", "--device", "cpu", "--force"]);
         for s in [
             "field.log2_size=15",
             "sampling.batch_samples=4096",

@@ -14,7 +14,7 @@ fn every_level_trains_alike_and_tells_its_figures() {
     for level in Level::available() {
         let run = dir.path().join(level.name());
         let out = Command::new(env!("CARGO_BIN_EXE_diorama"))
-            .args(["train", data.to_str().unwrap(), "-o", run.to_str().unwrap(), "--steps", "80", "--json"])
+            .args(["train", data.to_str().unwrap(), "-o", run.to_str().unwrap(), "--device", "cpu", "--steps", "80", "--json"])
             .args(["--set", "sampling.batch_samples=4096", "--set", "field.precision=f32"])
             .env("DIORAMA_SIMD", level.name())
             .output()

@@ -58,8 +58,8 @@ impl Api {
     pub fn is_built(self) -> bool {
         match self {
             Api::Cuda => cfg!(feature = "cuda"),
-            Api::Vulkan => cfg!(all(feature = "gpu", not(target_os = "macos"))),
-            Api::Metal => cfg!(all(feature = "gpu", target_os = "macos")),
+            Api::Vulkan => cfg!(any(feature = "vulkan", all(feature = "native", not(target_os = "macos")))),
+            Api::Metal => cfg!(any(feature = "metal", all(feature = "native", target_os = "macos"))),
             Api::WebGpu => cfg!(feature = "webgpu"),
         }
     }

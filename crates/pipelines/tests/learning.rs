@@ -14,9 +14,13 @@ fn score(steps: u64) -> (f64, f64) {
     let data = dir.path().join("data");
     write_capture(&data, 24, 64).unwrap();
     let mut c = Config::new(Method::Ngp, data);
-    for (k, v) in
-        [("field.log2_size", "14"), ("field.finest", "128"), ("sampling.batch_samples", "16384"), ("sampling.occupancy_resolution", "64")]
-    {
+    for (k, v) in [
+        ("device", "cpu"),
+        ("field.log2_size", "14"),
+        ("field.finest", "128"),
+        ("sampling.batch_samples", "16384"),
+        ("sampling.occupancy_resolution", "64"),
+    ] {
         c.set(k, v).unwrap();
     }
     c.run.steps = steps;

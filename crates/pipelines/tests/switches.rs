@@ -77,6 +77,7 @@ fn train(data: &Path, out: &Path, overrides: &[(&str, &str)]) -> Vec<u32> {
         ("sampling.occupancy_every", "2"),
         ("sampling.occupancy_points", "2048"),
         ("sampling.occupancy_resolution", "16"),
+        ("device", "cpu"),
         ("run.steps", "6"),
         ("data.split", "every:8"),
     ] {

@@ -41,10 +41,11 @@ pub enum Event {
     Saved {
         step: u64,
     },
-    /// A loss that is not finite; the last checkpoint is restored and the rate lowered.
+    /// What went wrong at `step`; the run goes on from `to_step`.
     Recovered {
         step: u64,
         to_step: u64,
+        why: String,
     },
     Note(String),
     Finished {

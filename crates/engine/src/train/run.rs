@@ -25,8 +25,9 @@ pub trait Trainee {
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport, Self::Error>;
     /// Writes a checkpoint that `step` steps and `seconds` have gone into.
     fn save(&mut self, step: u64, seconds: f64) -> Result<(), Self::Error>;
-    /// Goes back to the last checkpoint with a lower rate; the step to go on from, or `None` if that was tried before.
-    fn recover(&mut self) -> Result<Option<u64>, Self::Error>;
+    /// After a loss that is not finite: goes back to where it was; the step to go on from and what went wrong, or
+    /// `None` if that was tried before.
+    fn recover(&mut self) -> Result<Option<(u64, String)>, Self::Error>;
     /// PSNR and MSE on some held-out views.
     fn evaluate(&mut self) -> (f64, f64);
 }
@@ -86,8 +87,8 @@ pub fn run<T: Trainee>(
         let report = trainee.step(step, progress).map_err(RunError::Failed)?;
         if !report.loss.is_finite() {
             match trainee.recover().map_err(RunError::Failed)? {
-                Some(to_step) => {
-                    events(&Event::Recovered { step, to_step });
+                Some((to_step, why)) => {
+                    events(&Event::Recovered { step, to_step, why });
                     step = to_step;
                     continue;
                 }
@@ -208,10 +209,10 @@ mod tests {
             self.saved.push(step);
             Ok(())
         }
-        fn recover(&mut self) -> Result<Option<u64>, ()> {
+        fn recover(&mut self) -> Result<Option<(u64, String)>, ()> {
             let first = !self.recovered;
             self.recovered = true;
-            Ok(first.then_some(2))
+            Ok(first.then_some((2, "a NaN".into())))
         }
         fn evaluate(&mut self) -> (f64, f64) {
             (20.0, 0.01)

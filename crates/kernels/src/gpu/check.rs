@@ -12,7 +12,9 @@ use crate::ops::march::{self, MarchConfig, MarchRays, OccupancyBits, gpu::Space}
 use crate::ops::ngp_field::{self, FieldNet, Head};
 use crate::ops::ray_generation::{self, PosedCamera, gpu::GpuCameras};
 use crate::ops::trilinear_corner_grid::{self, Corners, gpu::GpuCorners};
-use crate::ops::{distortion, frequency, pixel_gather, ray_aabb, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave};
+use crate::ops::{
+    distortion, frequency, marching_cubes, pixel_gather, ray_aabb, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
+};
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, Lens, Pose};
@@ -118,6 +120,7 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         cast,
         images,
         fields,
+        surfaces,
     ];
     for case in cases {
         case(gpu, &mut table)?;
@@ -518,6 +521,45 @@ fn steps(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         }
         table.close("adam", "parameters", format!("N={n} sparse={sparse}"), &pg, &pw)?;
         table.close("adam", "moments", format!("N={n} sparse={sparse}"), &vg, &vw)?;
+    }
+    Ok(())
+}
+
+/// A crossing, named by the edge that it lies on: axis and lower point.
+fn edge_of(p: &[f32]) -> (usize, [u32; 3]) {
+    let axis = (0..3).find(|&k| p[k].fract() > 0.0).unwrap_or(3);
+    (axis, [p[0] as u32, p[1] as u32, p[2] as u32])
+}
+
+/// The same vertices on the same edges, and the same triangles whichever vertex they begin with.
+fn surfaces(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for (nx, ny, nz) in [(0, 3, 3), (1, 1, 1), (2, 2, 2), (9, 13, 11)] {
+        let (density, level) = (random_unit(nx * ny * nz, 5), 0.4);
+        let mut mesher = marching_cubes::cpu::Mesher::new(nx, ny, level);
+        density.chunks_exact((nx * ny).max(1)).for_each(|slice| mesher.push(slice));
+        let (vertices, faces) = marching_cubes::gpu::extract(gpu, &gpu.upload(&density), (nx, ny, nz), level)?;
+        let (vertices, faces) = (gpu.read(&vertices)?, gpu.read_u32(&faces)?);
+        let shape = format!("{nx}x{ny}x{nz}");
+        let sorted = |vertices: &[f32]| {
+            let mut all: Vec<_> = vertices.chunks_exact(3).map(|p| (edge_of(p), [p[0], p[1], p[2]])).collect();
+            all.sort_by_key(|v| v.0);
+            all.iter().flat_map(|v| v.1).collect::<Vec<f32>>()
+        };
+        let want = sorted(mesher.positions.as_flattened());
+        table.close("marching cubes", "vertices", &shape, &gpu.upload(&sorted(&vertices)), &wide(&want))?;
+        let triangles = |vertices: &[f32], faces: &[u32]| {
+            let edge = |v: u32| edge_of(&vertices[v as usize * 3..][..3]);
+            let mut all: Vec<_> = faces.chunks_exact(3).map(|f| [edge(f[0]), edge(f[1]), edge(f[2])]).collect();
+            all.iter_mut().for_each(|t| {
+                let least = (0..3).min_by_key(|&k| t[k]).unwrap_or(0);
+                t.rotate_left(least);
+            });
+            all.sort();
+            all
+        };
+        let same = triangles(&vertices, &faces) == triangles(mesher.positions.as_flattened(), mesher.faces.as_flattened());
+        let outcome = if same { Ok(0.0) } else { Err("other triangles than the CPU's".into()) };
+        table.row("marching cubes", "faces", shape, outcome);
     }
     Ok(())
 }

@@ -103,17 +103,31 @@ impl Gpu {
     /// # Errors
     /// When the build lacks the API, the machine has no such device, or it cannot be opened.
     pub fn open(api: Api) -> Result<Gpu, GpuError> {
+        Gpu::open_kind(api, true)
+    }
+
+    /// The best device of an API, unless the CPU plays it.
+    ///
+    /// # Errors
+    /// As [`Gpu::open`].
+    pub fn open_hardware(api: Api) -> Result<Gpu, GpuError> {
+        Gpu::open_kind(api, false)
+    }
+
+    fn open_kind(api: Api, or_software: bool) -> Result<Gpu, GpuError> {
         if !api.is_built() {
             return Err(GpuError::NotBuilt(api));
         }
         #[cfg(feature = "cuda")]
         keep_compiled();
-        let (device, software) = find(api).ok_or(GpuError::NoDevice(api.name()))?;
+        let (device, software) = find(api).filter(|(_, software)| or_software || !software).ok_or(GpuError::NoDevice(api.name()))?;
         let client = quietly(|| device.client()).map_err(|e| GpuError::Open(api.name(), e))?;
         let add = Type::atomic(f32::elem_type_native().with_vector_size(1));
         let native_atomics = client.properties().atomic_type_usage(add).contains(AtomicUsage::Add);
         let name = client.properties().identity.name.clone();
-        Ok(Gpu { shared: !(software && api == Api::Vulkan), api, name, software, client, native_atomics })
+        // A build with Vulkan speaks SPIR-V to it under any name.
+        let spirv = api == Api::Vulkan || (api == Api::WebGpu && Api::Vulkan.is_built());
+        Ok(Gpu { shared: !(software && spirv), api, name, software, client, native_atomics })
     }
 
     /// The same device adding without native f32 atomics.

@@ -99,7 +99,7 @@ pub(super) fn cpu_name() -> String {
 }
 
 impl Opened {
-    fn cpu(note: Option<String>) -> Opened {
+    pub fn cpu(note: Option<String>) -> Opened {
         Opened {
             #[cfg(feature = "gpu")]
             running: None,
@@ -172,7 +172,7 @@ fn batch_samples(config: &Config, is_gpu: bool) -> usize {
 impl Opened {
     fn best(config: &Config) -> Opened {
         use diorama_kernels::gpu::Gpu;
-        let Some(gpu) = Api::ALL.into_iter().filter(|a| a.is_built()).filter_map(|a| Gpu::open(a).ok()).find(|g| !g.software) else {
+        let Some(gpu) = Api::ALL.into_iter().filter(|a| a.is_built()).find_map(|a| Gpu::open_hardware(a).ok()) else {
             return Opened::cpu(None);
         };
         match lacking(config) {
@@ -364,7 +364,7 @@ mod running {
     }
 
     fn told(e: GpuError) -> PipelineError {
-        PipelineError::Device(format!("{e}; the run can go on from its last checkpoint with --resume --device cpu"))
+        PipelineError::Device(e.to_string())
     }
 
     /// All pixels, and which of them count.

@@ -252,6 +252,8 @@ struct Trainer<'a> {
     /// Samples before any were left out.
     marched: u64,
     device: Opened,
+    /// Why the CPU has to go on for a GPU.
+    device_lost: Option<String>,
 }
 
 impl<'a> Trainer<'a> {
@@ -270,6 +272,7 @@ impl<'a> Trainer<'a> {
             recovered: false,
             marched: 0,
             device,
+            device_lost: None,
         })
     }
 
@@ -506,7 +509,17 @@ impl Trainee for Trainer<'_> {
 
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport> {
         if self.device.is_gpu() {
-            return self.step_gpu(step, progress);
+            let e = match self.step_gpu(step, progress) {
+                // The device was the program's own choice: the CPU goes on.
+                Err(PipelineError::Device(e)) if self.model.config.device == "auto" => e,
+                Err(PipelineError::Device(e)) => {
+                    return Err(PipelineError::Device(format!("{e}; go on with --resume, on the CPU with --resume --device cpu")));
+                }
+                result => return result,
+            };
+            self.device = Opened::cpu(None);
+            self.device_lost = Some(format!("{e}; the CPU goes on"));
+            return Ok(StepReport { loss: f64::NAN, ..StepReport::default() });
         }
         let first = self.model.origin.rays;
         self.draw(step, first);
@@ -555,7 +568,11 @@ impl Trainee for Trainer<'_> {
         Ok(checkpoint::save(self.checkpoints, &entries, metadata)?)
     }
 
-    fn recover(&mut self) -> Result<Option<u64>> {
+    fn recover(&mut self) -> Result<Option<(u64, String)>> {
+        // The host holds what the last checkpoint or evaluation brought back.
+        if let Some(why) = self.device_lost.take() {
+            return Ok(Some((self.model.origin.step, why)));
+        }
         if self.recovered || !checkpoint::latest(self.checkpoints).exists() {
             return Ok(None);
         }
@@ -565,7 +582,7 @@ impl Trainee for Trainer<'_> {
         self.model.rate_scale *= 0.3;
         self.cameras = self.model.cameras();
         self.device.upload(&self.model, &self.photographs, &self.cameras)?;
-        Ok(Some(self.model.origin.step))
+        Ok(Some((self.model.origin.step, "the loss was not finite; the rate is lowered".into())))
     }
 
     fn evaluate(&mut self) -> (f64, f64) {

@@ -6,6 +6,8 @@
 //! triangles wind counter-clockwise seen from the side below `level`.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;
