@@ -10,8 +10,8 @@ mkdir -p "$out"
     nproc
     grep MemTotal /proc/meminfo
 } >"$out/machine.txt"
-fox=(bench train "$data/fox" --downscale 4 --split every:8 --warmup 800 --steps 200 --json)
-lego=(bench train "$data/lego" --set background=white --warmup 800 --steps 200 --json)
+fox=(bench train "$data/fox" --downscale 4 --split every:8 --device cpu --warmup 800 --steps 200 --json)
+lego=(bench train "$data/lego" --set background=white --device cpu --warmup 800 --steps 200 --json)
 "$diorama" bench ops --threads 1 --json >"$out/ops-1-thread.json"
 "$diorama" bench ops --threads 2 --json >"$out/ops-2-threads.json"
 for threads in 1 2; do
