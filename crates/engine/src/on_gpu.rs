@@ -199,17 +199,13 @@ impl GpuTrainer {
         let near_far = ray_aabb::gpu::intersect(gpu, &origins, &dirs, [low; 3], [low + size; 3], s.near);
         let rays = GpuRays { origins, dirs, near_far, jitter: drawn.jitter, resumed: false };
         let direction = spherical_harmonics::gpu::forward(gpu, self.shape.degree, &rays.dirs);
-        let every_ray = Rows::all(gpu, s.rays);
         let sky = self.learned.as_ref().map(|g| {
-            let codes = if self.shape.degree * self.shape.degree == SKY {
-                direction.clone()
-            } else {
-                spherical_harmonics::gpu::forward(gpu, 4, &rays.dirs)
-            };
+            let every_ray = Rows::all(gpu, s.rays);
+            let codes = spherical_harmonics::gpu::forward(gpu, 4, &rays.dirs);
             let rgb = linear::gpu::forward(gpu, &every_ray, (SKY, 3), &codes, &g.values, None, BiasKind::None, Activation::Sigmoid);
-            (codes, rgb)
+            (every_ray, codes, rgb)
         });
-        let background = sky.as_ref().map_or(&drawn.background, |(_, rgb)| rgb);
+        let background = sky.as_ref().map_or(&drawn.background, |(_, _, rgb)| rgb);
 
         // All samples in occupied cells: their densities decide which are trained, and keep the grid up to date.
         let marched = march::march(gpu, &self.occupancy.bits, &rays, &s.march, s.room.0);
@@ -242,9 +238,9 @@ impl GpuTrainer {
             field::look_up_backward(gpu, &g.codes[1], &drawn.images, *dims, &d);
             group.step(gpu, s.t, s.rate_scale, &d);
         }
-        if let (Some(group), Some((codes, rgb))) = (&self.learned, &sky) {
+        if let (Some(group), Some((every_ray, codes, rgb))) = (&self.learned, &sky) {
             let none = BiasKind::None;
-            let d = linear::gpu::backward(gpu, &every_ray, (SKY, 3), codes, &group.values, none, Activation::Sigmoid, rgb, &g.background);
+            let d = linear::gpu::backward(gpu, every_ray, (SKY, 3), codes, &group.values, none, Activation::Sigmoid, rgb, &g.background);
             group.step(gpu, s.t, s.rate_scale, &d.w);
         }
     }

@@ -83,13 +83,15 @@ pub fn accelerate(model: &mut ObjectModel, device: &str) -> Result<String> {
     // What is only trained differently does not matter to views.
     let mut c = Config::new(model.config.method, model.config.data.path.clone());
     c.set("device", device)?;
+    let opened = open(&c)?;
+    #[cfg(not(feature = "gpu"))]
+    drop(opened);
     #[cfg(feature = "gpu")]
-    if let (Some(r), Some(occupancy)) = (open(&c)?.running, &model.occupancy) {
+    if let (Some(r), Some(occupancy)) = (opened.running, &model.occupancy) {
         let tracer = diorama_engine::on_gpu::GpuTracer::new(r.gpu().clone(), &model.field, occupancy);
         model.accelerator = Some(Box::new(tracer));
         return Ok(r.name());
     }
-    open(&c)?;
     Ok(cpu_name())
 }
 
@@ -271,14 +273,15 @@ mod running {
     pub struct Running {
         gpu: Gpu,
         trainer: Option<GpuTrainer>,
-        last: StepFigures,
+        /// Figures of the last time that the device was asked.
+        last: Option<StepFigures>,
         /// Rays of the steps that were not asked about.
         rays: u64,
     }
 
     impl Running {
         pub fn new(gpu: Gpu) -> Running {
-            Running { gpu, trainer: None, last: StepFigures::default(), rays: 0 }
+            Running { gpu, trainer: None, last: None, rays: 0 }
         }
 
         pub fn gpu(&self) -> &Gpu {
@@ -301,6 +304,8 @@ mod running {
                     most >> 20
                 )));
             }
+            // What was known of steps before belongs to parameters that are gone.
+            (self.last, self.rays) = (None, 0);
             let occupancy = m.occupancy.as_ref().expect("ngp has an occupancy grid");
             let images = resident(&self.gpu, photographs);
             self.trainer = Some(GpuTrainer::new(self.gpu.clone(), &m.field, m.learned.as_ref(), occupancy, images, cameras, m.cube()));
@@ -329,7 +334,7 @@ mod running {
                 rate_scale: d.rate_scale,
             };
             let points = s.occupancy_points;
-            let asked = step == 0 || (step + 1).is_multiple_of(UNASKED.min(c.run.log_every));
+            let asked = self.last.is_none() || (step + 1).is_multiple_of(UNASKED.min(c.run.log_every));
             let trainer = self.trainer();
             if let Some(rng) = &d.probes {
                 trainer.update_occupancy(rng, step, points, d.block);
@@ -337,24 +342,27 @@ mod running {
             trainer.step(&o);
             self.rays += d.rays as u64;
             m.origin.rays += d.rays as u64;
-            if !asked {
-                return Ok(StepFigures { marched: 0.0, ..self.last });
-            }
-            self.figures(m)
+            if asked { self.figures(m) } else { Ok(self.known()) }
         }
 
         pub fn figures(&mut self, m: &mut ObjectModel) -> Result<StepFigures> {
             let rays = std::mem::take(&mut self.rays);
             if rays == 0 {
-                return Ok(StepFigures { marched: 0.0, ..self.last });
+                return Ok(self.known());
             }
             let f = self.trainer().figures().map_err(told)?;
             let per_ray = f.trained / rays as f64;
             let kept = if m.origin.samples == 0 { 0.0 } else { 0.9f64.powi(f.steps as i32) };
             m.samples_per_ray = kept * m.samples_per_ray + (1.0 - kept) * per_ray;
             m.origin.samples += f.trained as u64;
-            self.last = StepFigures { loss: f.loss, mse: f.mse, trained: f.trained / f.steps.max(1) as f64, marched: f.marched };
-            Ok(self.last)
+            let figures = StepFigures { loss: f.loss, mse: f.mse, trained: f.trained / f.steps.max(1) as f64, marched: f.marched };
+            self.last = Some(figures);
+            Ok(figures)
+        }
+
+        /// The last figures, but for marched samples, which were counted.
+        fn known(&self) -> StepFigures {
+            StepFigures { marched: 0.0, ..self.last.unwrap_or_default() }
         }
 
         pub fn download(&mut self, m: &mut ObjectModel) -> Result<()> {
