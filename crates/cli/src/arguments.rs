@@ -36,7 +36,7 @@ enum Command {
     Render(RenderArgs),
     /// Extract a mesh
     #[command(
-        after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --format stl --resolution 384 --faces 100000 -o chair.stl"
+        after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --scale-to 80cm -o chair.usdz\n  diorama export runs/chair --resolution 384 --faces 100000 --units mm -o chair.stl"
     )]
     Export(ExportArgs),
     /// Runs side by side: curves, held-out images, cost
@@ -194,22 +194,40 @@ pub struct RenderArgs {
 pub struct ExportArgs {
     /// Folder of the run
     pub run: PathBuf,
-    /// glb, obj, ply or stl [default: the extension of --out]
+    /// auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto")]
+    pub device: String,
+    /// glb, obj, ply, stl, usdz or dae [default: the extension of --out]
     #[arg(long)]
     pub format: Option<String>,
     /// The file to write
     #[arg(short, long)]
     pub out: PathBuf,
     /// Cells along the longest side
-    #[arg(long, default_value_t = 256)]
+    #[arg(long, default_value_t = 320)]
     pub resolution: usize,
     /// auto, or the density of the surface in inverse units of the input
     #[arg(long, default_value = "auto")]
     pub level: String,
-    /// Most faces; 0 keeps all
-    #[arg(long, default_value_t = 200_000)]
-    pub faces: usize,
-    /// Extract only x0,y0,z0,x1,y1,z1 (the input's frame) [default: the scene's inner cube]
+    /// Most faces; 0 keeps all [default: 60000 with a texture, 200000 without]
+    #[arg(long)]
+    pub faces: Option<usize>,
+    /// Edge of the texture in texels; 0 colours the vertices instead [default: 2048 where the format has textures]
+    #[arg(long)]
+    pub texture: Option<usize>,
+    /// Metres per unit of the capture
+    #[arg(long, default_value_t = 1.0, conflicts_with_all = ["scale_to", "measured"])]
+    pub scale: f64,
+    /// Make the longest side so long, for example 80cm, 0.8m, 800mm or 31.5in
+    #[arg(long, value_name = "LENGTH", conflicts_with = "measured")]
+    pub scale_to: Option<String>,
+    /// Two points of the capture and their true distance: x0,y0,z0,x1,y1,z1=45cm
+    #[arg(long, value_name = "POINTS=LENGTH", allow_hyphen_values = true)]
+    pub measured: Option<String>,
+    /// Unit of the coordinates in obj, ply and stl: m, cm, mm or in; the others are in metres by their standards
+    #[arg(long, default_value = "m")]
+    pub units: String,
+    /// Extract only x0,y0,z0,x1,y1,z1 (the input's frame) [default: what most cameras look at]
     #[arg(long, allow_hyphen_values = true)]
     pub clip: Option<String>,
     /// Remove parts with fewer faces than this share of the largest part's

@@ -1,8 +1,8 @@
-//! Binary glTF 2.0 with vertex colours and an unlit material. glTF is y up: (x, y, z) is written as
+//! Binary glTF 2.0 with a texture or vertex colours and an unlit material. glTF is y up: (x, y, z) is written as
 //! (x, z, −y). COLOR_0 is linear by the standard.
 
-use crate::atomic;
 use crate::error::{DataError, Result};
+use crate::{atomic, photo};
 use diorama_geom::Mesh;
 use diorama_geom::color::linear_from_srgb;
 use serde_json::json;
@@ -46,29 +46,48 @@ pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
         let data = floats(&mut mesh.normals.iter().map(|v| y_up(*v)));
         attributes["NORMAL"] = add(data, 34962, json!({ "componentType": 5126, "count": n, "type": "VEC3" })).into();
     }
-    if mesh.colors_srgb.len() == n {
+    let texture = mesh.texture.as_ref().filter(|_| mesh.uvs.len() == n);
+    if texture.is_some() {
+        let data = mesh.uvs.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+        attributes["TEXCOORD_0"] = add(data, 34962, json!({ "componentType": 5126, "count": n, "type": "VEC2" })).into();
+    } else if mesh.colors_srgb.len() == n {
         let word = |v: f32| ((linear_from_srgb(v.clamp(0.0, 1.0)) * 65535.0 + 0.5) as u16).to_le_bytes();
         let data = mesh.colors_srgb.iter().flat_map(|c| [word(c[0]), word(c[1]), word(c[2]), [255, 255]]).flatten().collect();
         attributes["COLOR_0"] = add(data, 34962, json!({ "componentType": 5123, "count": n, "type": "VEC4", "normalized": true })).into();
     }
     let indices = mesh.faces.iter().flatten().flat_map(|i| i.to_le_bytes()).collect();
     let indices = add(indices, 34963, json!({ "componentType": 5125, "count": mesh.faces.len() * 3, "type": "SCALAR" }));
-    let root = json!({
+    let mut material = json!({
+        "name": "radiance",
+        "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 1.0 },
+        "extensions": { "KHR_materials_unlit": {} },
+    });
+    if let Some(t) = texture {
+        let png = photo::encode_png(t);
+        views.push(json!({ "buffer": 0, "byteOffset": bin.len(), "byteLength": png.len() }));
+        bin.extend(png);
+        bin.resize(bin.len().next_multiple_of(4), 0);
+        material["pbrMetallicRoughness"]["baseColorTexture"] = json!({ "index": 0 });
+    }
+    let views_len = views.len();
+    let mut root = json!({
         "asset": { "version": "2.0", "generator": concat!("diorama ", env!("CARGO_PKG_VERSION")) },
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{ "nodes": [0] }],
         "nodes": [{ "mesh": 0, "name": "mesh" }],
         "meshes": [{ "primitives": [{ "attributes": attributes, "indices": indices, "material": 0 }] }],
-        "materials": [{
-            "name": "radiance",
-            "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 1.0 },
-            "extensions": { "KHR_materials_unlit": {} },
-        }],
+        "materials": [material],
         "buffers": [{ "byteLength": bin.len() }],
         "bufferViews": views,
         "accessors": accessors,
     });
+    if texture.is_some() {
+        // Linear filters with mipmaps; repeated coordinates would bring the far edge in.
+        root["samplers"] = json!([{ "magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071 }]);
+        root["textures"] = json!([{ "sampler": 0, "source": 0 }]);
+        root["images"] = json!([{ "mimeType": "image/png", "bufferView": views_len - 1 }]);
+    }
     let mut text = serde_json::to_vec(&root).expect("JSON of plain values");
     text.resize(text.len().next_multiple_of(4), b' ');
     let total = 12 + 8 + text.len() + 8 + bin.len();
@@ -100,6 +119,7 @@ mod tests {
             normals: vec![[0.0, 0.0, 1.0]; 3],
             colors_srgb: vec![[1.0, 0.5, 0.0]; 3],
             faces: vec![[0, 1, 2]],
+            ..Mesh::default()
         };
         let b = encode(&mesh, Path::new("x")).unwrap();
         assert_eq!(b.len() % 4, 0);

@@ -4,6 +4,7 @@
 pub mod atomic;
 pub mod camera_path_json;
 pub mod checkpoint;
+pub mod collada;
 pub mod colmap;
 pub mod error;
 pub mod glb;
@@ -18,5 +19,6 @@ pub mod plot;
 pub mod split;
 pub mod tfevents;
 pub mod transforms_json;
+pub mod usdz;
 
 pub use error::{DataError, Result};

@@ -1,19 +1,54 @@
-//! OBJ with vertex colours, binary little-endian PLY, and binary STL, all in the mesh's own axes.
+//! OBJ with a texture or vertex colours, binary little-endian PLY, and binary STL, all in the mesh's own axes.
 
-use crate::atomic;
 use crate::error::{DataError, Result};
+use crate::{atomic, photo};
 use diorama_geom::Mesh;
 use diorama_geom::color::u8_from_unit;
 use diorama_geom::mesh::{cross, sub};
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-/// Writes an OBJ: `v x y z r g b`, normals, 1-based faces.
+/// Writes the texture of `model.obj` as `model.png` beside it and gives its name, in which blanks, at which many readers stop,
+/// are underscores; none without texture.
+pub(crate) fn save_texture(path: &Path, mesh: &Mesh) -> Result<Option<String>> {
+    let Some(t) = mesh.texture.as_ref().filter(|_| mesh.uvs.len() == mesh.positions.len()) else { return Ok(None) };
+    let name = beside(path, "png");
+    photo::save_png(&path.with_file_name(&name), t)?;
+    Ok(Some(name))
+}
+
+/// Files that saving a textured mesh as `path` writes beside it.
+pub fn companions(path: &Path) -> Vec<PathBuf> {
+    let extensions: &[&str] = match path.extension().and_then(|e| e.to_str()).unwrap_or_default() {
+        "obj" => &["mtl", "png"],
+        "dae" => &["png"],
+        _ => &[],
+    };
+    extensions.iter().map(|e| path.with_file_name(beside(path, e))).collect()
+}
+
+/// The name of a file that goes with `path`.
+fn beside(path: &Path, extension: &str) -> String {
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    format!("{}.{extension}", stem.replace(char::is_whitespace, "_"))
+}
+
+/// Writes an OBJ: `v x y z`, with `r g b` where there is no texture, normals, texture coordinates, 1-based faces. A texture
+/// goes into `.mtl` and `.png` files beside it.
 pub fn save_obj(path: &Path, mesh: &Mesh) -> Result<()> {
     check(path, mesh)?;
+    let texture = save_texture(path, mesh)?;
+    let material = beside(path, "mtl");
+    if let Some(t) = &texture {
+        let text = format!("newmtl radiance\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {t}\n");
+        atomic::write(&path.with_file_name(&material), text.as_bytes())?;
+    }
     atomic::write_with(path, |w| {
         writeln!(w, "# diorama {}; z up", env!("CARGO_PKG_VERSION"))?;
-        let colored = mesh.colors_srgb.len() == mesh.positions.len();
+        if texture.is_some() {
+            writeln!(w, "mtllib {material}\nusemtl radiance")?;
+        }
+        let colored = texture.is_none() && mesh.colors_srgb.len() == mesh.positions.len();
         for (i, p) in mesh.positions.iter().enumerate() {
             write!(w, "v {} {} {}", p[0], p[1], p[2])?;
             if colored {
@@ -25,13 +60,17 @@ pub fn save_obj(path: &Path, mesh: &Mesh) -> Result<()> {
         for n in &mesh.normals {
             writeln!(w, "vn {:.5} {:.5} {:.5}", n[0], n[1], n[2])?;
         }
+        if texture.is_some() {
+            mesh.uvs.iter().try_for_each(|[u, v]| writeln!(w, "vt {u} {}", 1.0 - v))?;
+        }
         let normals = mesh.normals.len() == mesh.positions.len();
         for f in &mesh.faces {
             let [a, b, c] = f.map(|i| i + 1);
-            if normals {
-                writeln!(w, "f {a}//{a} {b}//{b} {c}//{c}")?;
-            } else {
-                writeln!(w, "f {a} {b} {c}")?;
+            match (texture.is_some(), normals) {
+                (true, true) => writeln!(w, "f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}")?,
+                (true, false) => writeln!(w, "f {a}/{a} {b}/{b} {c}/{c}")?,
+                (false, true) => writeln!(w, "f {a}//{a} {b}//{b} {c}//{c}")?,
+                (false, false) => writeln!(w, "f {a} {b} {c}")?,
             }
         }
         Ok(())
@@ -95,7 +134,8 @@ pub fn save_stl(path: &Path, mesh: &Mesh) -> Result<()> {
     })
 }
 
-fn check(path: &Path, mesh: &Mesh) -> Result<()> {
+/// An empty mesh is an error.
+pub(crate) fn check(path: &Path, mesh: &Mesh) -> Result<()> {
     if mesh.faces.is_empty() {
         return Err(DataError::input(path, "the mesh is empty: nothing is denser than the level; lower --level or train longer"));
     }
@@ -112,6 +152,7 @@ mod tests {
             normals: vec![[0.0, 0.0, 1.0]; 3],
             colors_srgb: vec![[1.0, 0.0, 0.5]; 3],
             faces: vec![[0, 1, 2]],
+            ..Mesh::default()
         }
     }
 

@@ -1,5 +1,7 @@
 //! Triangle meshes.
 
+use crate::ImageU8;
+
 /// An indexed triangle mesh; faces wind counter-clockwise seen from outside.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mesh {
@@ -8,6 +10,10 @@ pub struct Mesh {
     pub normals: Vec<[f32; 3]>,
     /// sRGB colours in [0, 1], one per vertex, or empty.
     pub colors_srgb: Vec<[f32; 3]>,
+    /// Texture coordinates, one per vertex, or empty: u to the right, v down, the texture is `[0, 1]²`.
+    pub uvs: Vec<[f32; 2]>,
+    /// sRGB, `[H, W, 3]`.
+    pub texture: Option<ImageU8>,
     pub faces: Vec<[u32; 3]>,
 }
 
@@ -68,6 +74,9 @@ impl Mesh {
             }
         }
         let pick = |v: &Vec<[f32; 3]>| if v.is_empty() { Vec::new() } else { kept.iter().map(|&i| v[i]).collect() };
+        if !self.uvs.is_empty() {
+            self.uvs = kept.iter().map(|&i| self.uvs[i]).collect();
+        }
         self.positions = pick(&self.positions);
         self.normals = pick(&self.normals);
         self.colors_srgb = pick(&self.colors_srgb);

@@ -2,8 +2,9 @@
 
 use super::{Outcome, parse_clip, use_threads};
 use crate::arguments::ExportArgs;
-use diorama_data::DataError;
-use diorama_pipelines::object::export::{self, ExportOptions};
+use diorama_data::{DataError, mesh_text};
+use diorama_pipelines::object::device;
+use diorama_pipelines::object::export::{self, ExportOptions, Size};
 use diorama_pipelines::object::run_folder;
 use diorama_pipelines::{PipelineError, Result};
 use std::time::Instant;
@@ -11,15 +12,19 @@ use std::time::Instant;
 pub fn run(a: &ExportArgs) -> Result<Outcome> {
     use_threads(a.threads)?;
     let extension = a.out.extension().map(|e| e.to_string_lossy().into_owned());
-    let named = a.format.clone().or(extension).ok_or_else(|| PipelineError::Usage("--format: expected glb, obj, ply or stl".into()))?;
+    let named =
+        a.format.clone().or(extension).ok_or_else(|| PipelineError::Usage("--format: expected glb, obj, ply, stl, usdz or dae".into()))?;
     let format = named.parse().map_err(|e| PipelineError::Usage(format!("--{e}")))?;
-    if a.out.exists() && !a.force {
-        return Err(DataError::input(&a.out, "exists; give --force to replace it or another --out").into());
+    let written = [a.out.clone()].into_iter().chain(mesh_text::companions(&a.out));
+    if let Some(file) = written.filter(|_| !a.force).find(|f| f.exists()) {
+        return Err(DataError::input(file, "exists; give --force to replace it or another --out").into());
     }
     if let Some(parent) = a.out.parent().filter(|p| !p.as_os_str().is_empty() && !p.is_dir()) {
         return Err(DataError::input(parent, "is not a folder; create it or choose another --out").into());
     }
-    let (model, notes) = run_folder::load_model(&a.run)?;
+    let (size, unit_m) =
+        (size(a)?, unit(&a.units).ok_or_else(|| PipelineError::Usage(format!("--units {}: expected m, cm, mm or in", a.units)))?);
+    let (mut model, notes) = run_folder::load_model(&a.run)?;
     notes.iter().for_each(|n| eprintln!("note: {n}"));
     let scale = model.capture.world_from_capture.scale as f32;
     let level = match &a.level[..] {
@@ -34,27 +39,97 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
         ),
     };
     let clip = a.clip.as_deref().map(|c| parse_clip(c, &model.capture.world_from_capture)).transpose()?;
-    let options = ExportOptions { format, out: a.out.clone(), resolution: a.resolution, level, faces: a.faces, clip, floaters: a.floaters };
+    device::accelerate(&mut model, &a.device)?;
+    let options = ExportOptions {
+        format,
+        out: a.out.clone(),
+        resolution: a.resolution,
+        level,
+        faces: a.faces,
+        texture: a.texture,
+        size,
+        unit_m,
+        clip,
+        floaters: a.floaters,
+    };
     let mut last = Instant::now();
-    let made = export::export(&model, &options, &mut |i, n| {
+    let made = export::export(&model, &options, &mut |stage, i, n| {
         if last.elapsed().as_secs() >= 5 {
             last = Instant::now();
-            eprintln!("density: slice {i} of {n}");
+            eprintln!("{stage}: {} %", i * 100 / n.max(1));
         }
     })?;
     if a.json {
         println!("{}", serde_json::to_string(&made).expect("plain values"));
     } else {
         println!(
-            "{}: {} vertices, {} faces, {} KiB, {:.1} s, level {:.2}{}",
+            "{}: {} vertices, {} faces, {}{} KiB, {:.3} x {:.3} x {:.3} m, {:.1} s, level {:.2}{}",
             made.file.display(),
             made.vertices,
             made.faces,
+            if made.texture > 0 { format!("texture {0} x {0}, ", made.texture) } else { String::new() },
             made.bytes >> 10,
+            made.extent_m[0],
+            made.extent_m[1],
+            made.extent_m[2],
             made.seconds,
             made.level,
             if made.watertight { ", watertight" } else { "" }
         );
     }
     Ok(Outcome::Done)
+}
+
+/// Metres of a unit's name.
+fn unit(name: &str) -> Option<f64> {
+    match name {
+        "m" => Some(1.0),
+        "cm" => Some(1e-2),
+        "mm" => Some(1e-3),
+        "in" => Some(0.0254),
+        _ => None,
+    }
+}
+
+/// Metres of a number with a unit, such as 80cm.
+fn length(text: &str) -> Option<f64> {
+    let text = text.trim();
+    let split = text.find(|c: char| c.is_ascii_alphabetic() && c != 'e' && c != 'E')?;
+    let value: f64 = text[..split].trim().parse().ok()?;
+    Some(value * unit(&text[split..])?).filter(|v| v.is_finite() && *v > 0.0)
+}
+
+fn size(a: &ExportArgs) -> Result<Size> {
+    let usage = |flag: &str, text: &str, expected: &str| PipelineError::Usage(format!("{flag} {text}: expected {expected}"));
+    if let Some(text) = &a.scale_to {
+        return length(text).map(Size::Longest).ok_or_else(|| usage("--scale-to", text, "a length with its unit, such as 80cm"));
+    }
+    if let Some(text) = &a.measured {
+        let read = || {
+            let (points, distance) = text.split_once('=')?;
+            let v: Vec<f64> = points.split(',').map(|v| v.trim().parse().ok().filter(|v: &f64| v.is_finite())).collect::<Option<_>>()?;
+            let points: [[f64; 3]; 2] = [v.get(..3)?.try_into().ok()?, v.get(3..)?.try_into().ok()?];
+            (points[0] != points[1]).then_some(Size::Measured { points, metres: length(distance)? })
+        };
+        return read().ok_or_else(|| usage("--measured", text, "x0,y0,z0,x1,y1,z1=45cm with two points that differ"));
+    }
+    if !(a.scale > 0.0 && a.scale.is_finite()) {
+        return Err(usage("--scale", &a.scale.to_string(), "a number above 0"));
+    }
+    Ok(Size::Scaled(a.scale))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lengths_have_units() {
+        for (text, metres) in [("80cm", 0.8), ("0.8 m", 0.8), ("800mm", 0.8), ("10in", 0.254), ("1e2cm", 1.0)] {
+            assert!((length(text).unwrap() - metres).abs() < 1e-12, "{text}");
+        }
+        for text in ["80", "cm", "-1m", "1ft", "nan m", ""] {
+            assert_eq!(length(text), None, "{text}");
+        }
+    }
 }

@@ -1,13 +1,14 @@
 //! From a trained field to a mesh file in the input's scale and frame.
 
 use super::model::ObjectModel;
+use super::{extent, texture};
 use crate::error::{PipelineError, Result};
-use diorama_data::{glb, mesh_text};
+use diorama_data::{collada, glb, mesh_text, usdz};
 use diorama_geom::Mesh;
 use diorama_geom::field_query::FieldQuery;
 use diorama_geom::glam::DVec3;
 use diorama_mesh::extract::Grid;
-use diorama_mesh::{clean, color, extract, simplify};
+use diorama_mesh::{atlas, clean, color, extract, simplify};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -19,6 +20,20 @@ pub enum Format {
     Obj,
     Ply,
     Stl,
+    Usdz,
+    Dae,
+}
+
+impl Format {
+    /// Whether the format says what a unit is.
+    pub fn has_units(self) -> bool {
+        matches!(self, Format::Glb | Format::Usdz | Format::Dae)
+    }
+
+    /// Whether the format carries a texture.
+    pub fn has_texture(self) -> bool {
+        !matches!(self, Format::Ply | Format::Stl)
+    }
 }
 
 impl std::str::FromStr for Format {
@@ -30,7 +45,9 @@ impl std::str::FromStr for Format {
             "obj" => Ok(Format::Obj),
             "ply" => Ok(Format::Ply),
             "stl" => Ok(Format::Stl),
-            _ => Err(format!("format {s:?}: expected glb, obj, ply or stl")),
+            "usdz" => Ok(Format::Usdz),
+            "dae" => Ok(Format::Dae),
+            _ => Err(format!("format {s:?}: expected glb, obj, ply, stl, usdz or dae")),
         }
     }
 }
@@ -44,12 +61,33 @@ pub struct ExportOptions {
     pub resolution: usize,
     /// Density of the surface in inverse world units; none: from the field.
     pub level: Option<f32>,
-    /// Most faces; 0: as many as there are.
-    pub faces: usize,
-    /// Lowest and highest corner in the world; none: the scene's inner cube.
+    /// Most faces; 0: as many as there are; none: [`FACES`] with a texture, [`COLORED_FACES`] without.
+    pub faces: Option<usize>,
+    /// Edge of the texture in texels; 0: colours at the vertices; none: [`TEXELS`] where the format has textures.
+    pub texture: Option<usize>,
+    pub size: Size,
+    /// Unit of the coordinates, in metres, of formats that do not tell theirs.
+    pub unit_m: f64,
+    /// Lowest and highest corner in the world; none: what most cameras look at.
     pub clip: Option<([f32; 3], [f32; 3])>,
     /// Components with fewer faces than this share of the largest one's are removed.
     pub floaters: f32,
+}
+
+/// Defaults of [`ExportOptions`].
+pub const FACES: usize = 60_000;
+pub const COLORED_FACES: usize = 200_000;
+pub const TEXELS: usize = 2048;
+
+/// How large the mesh is made.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Size {
+    /// A unit of the capture is so many metres.
+    Scaled(f64),
+    /// The longest side becomes so many metres.
+    Longest(f64),
+    /// Two points of the capture are so many metres apart.
+    Measured { points: [[f64; 3]; 2], metres: f64 },
 }
 
 /// What was written.
@@ -62,34 +100,46 @@ pub struct Exported {
     pub seconds: f64,
     pub watertight: bool,
     pub level: f32,
+    /// Edge of the texture in texels, 0 without.
+    pub texture: usize,
+    /// Extent in metres along x, y, z (z up).
+    pub extent_m: [f32; 3],
+    /// Metres per unit of the capture.
+    pub scale: f64,
 }
 
-/// Extracts, cleans, simplifies, colours and writes; `progress` is told (done, of) while densities are sampled.
-pub fn export(model: &ObjectModel, o: &ExportOptions, progress: &mut dyn FnMut(usize, usize)) -> Result<Exported> {
+/// Extracts, cleans, simplifies, colours and writes; `progress` is told the stage and (done, of).
+pub fn export(model: &ObjectModel, o: &ExportOptions, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Exported> {
     let start = Instant::now();
-    if !(16..=2048).contains(&o.resolution) {
-        return Err(PipelineError::Usage(format!("--resolution {}: must be 16 to 2048", o.resolution)));
-    }
-    let s = model.capture.scene;
-    let (min, max) = o.clip.unwrap_or_else(|| {
-        let corner = |sign: f64| (s.center + DVec3::splat(sign * s.half)).as_vec3().to_array();
-        (corner(-1.0), corner(1.0))
-    });
+    check(o)?;
+    let (min, max) = o.clip.unwrap_or_else(|| extent::of(model));
     if (0..3).any(|k| max[k] <= min[k] || max[k].is_nan() || min[k].is_nan()) {
         return Err(PipelineError::Usage("--clip: each highest coordinate must exceed the lowest".into()));
     }
     let grid = Grid { min, max, resolution: o.resolution };
     let level = o.level.unwrap_or_else(|| automatic_level(model, &grid));
-    let mut mesh = extract::extract(model, &grid, level, progress);
+    let mut mesh = extract::extract(model, &grid, level, &mut |i, n| progress("density", i, n));
     clean::remove_degenerate(&mut mesh);
     clean::remove_floaters(&mut mesh, o.floaters);
-    if o.faces > 0 {
-        simplify::simplify(&mut mesh, o.faces);
+    let texels = o.texture.unwrap_or(if o.format.has_texture() { TEXELS } else { 0 });
+    let faces = o.faces.unwrap_or(if texels > 0 { FACES } else { COLORED_FACES });
+    if faces > 0 {
+        simplify::simplify(&mut mesh, faces);
     }
     mesh.compute_normals();
-    color::color_from_field(&mut mesh, model);
     let watertight = mesh.is_watertight();
+    if texels > 0 && !mesh.faces.is_empty() {
+        atlas::unwrap(&mut mesh, texels);
+        texture::bake(model, &mut mesh, texels, grid.cell(), &mut |i, n| progress("texture", i, n));
+    } else {
+        color::color_from_field(&mut mesh, model);
+    }
     to_capture(model, &mut mesh);
+    let scale = metres_per_unit(&mesh, o.size);
+    let extent = |m: &Mesh| m.bounds().map_or([0.0; 3], |(lo, hi)| std::array::from_fn(|k| hi[k] - lo[k]));
+    let extent_m = extent(&mesh).map(|v| (v as f64 * scale) as f32);
+    let unit = if o.format.has_units() { 1.0 } else { o.unit_m };
+    mesh.positions.iter_mut().flatten().for_each(|v| *v = (*v as f64 * scale / unit) as f32);
     write(o.format, &o.out, &mesh)?;
     let bytes = std::fs::metadata(&o.out).map_or(0, |m| m.len());
     Ok(Exported {
@@ -100,11 +150,39 @@ pub fn export(model: &ObjectModel, o: &ExportOptions, progress: &mut dyn FnMut(u
         seconds: start.elapsed().as_secs_f64(),
         watertight,
         level,
+        texture: texels,
+        extent_m,
+        scale,
     })
 }
 
-/// A cell of matter lets half the light pass: `σ = ln 2 / cell` for a grid of 256 cells, but not more
-/// than half of the 99th percentile of sampled densities.
+fn check(o: &ExportOptions) -> Result<()> {
+    if !(16..=2048).contains(&o.resolution) {
+        return Err(PipelineError::Usage(format!("--resolution {}: must be 16 to 2048", o.resolution)));
+    }
+    match o.texture {
+        Some(n) if n != 0 && !(64..=16_384).contains(&n) => Err(PipelineError::Usage(format!("--texture {n}: must be 0 or 64 to 16384"))),
+        Some(n) if n > 0 && !o.format.has_texture() => {
+            Err(PipelineError::Usage("--texture: ply and stl hold no texture; leave it out or choose glb, obj, usdz or dae".into()))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Metres per unit of the capture for a mesh in the capture's coordinates.
+fn metres_per_unit(mesh: &Mesh, size: Size) -> f64 {
+    match size {
+        Size::Scaled(s) => s,
+        Size::Longest(metres) => {
+            let (lo, hi) = mesh.bounds().unwrap_or_default();
+            metres / (0..3).map(|k| (hi[k] - lo[k]) as f64).fold(1e-12, f64::max)
+        }
+        Size::Measured { points: [a, b], metres } => metres / (DVec3::from(a) - DVec3::from(b)).length().max(1e-12),
+    }
+}
+
+/// A slab of 1/128 of the longest side lets half the light pass, `σ = ln 2 / slab`, but not more than half of the 99th
+/// percentile of sampled densities. On lego and fox twice or half of it shows held-out views 0.1 to 1.1 dB worse.
 fn automatic_level(model: &ObjectModel, grid: &Grid) -> f32 {
     let coarse = Grid { resolution: 48, ..*grid };
     let [nx, ny, nz] = coarse.points();
@@ -119,8 +197,8 @@ fn automatic_level(model: &ObjectModel, grid: &Grid) -> f32 {
     model.density(&points, &mut sigma);
     sigma.sort_by(f32::total_cmp);
     let high = sigma[(sigma.len() as f32 * 0.99) as usize];
-    let half_cell = std::f32::consts::LN_2 / (Grid { resolution: 256, ..*grid }).cell();
-    half_cell.min(0.5 * high).max(1e-6)
+    let half_slab = std::f32::consts::LN_2 / (Grid { resolution: 128, ..*grid }).cell();
+    half_slab.min(0.5 * high).max(1e-6)
 }
 
 /// World coordinates to those of the input.
@@ -137,6 +215,8 @@ fn write(format: Format, out: &Path, mesh: &Mesh) -> Result<()> {
         Format::Obj => mesh_text::save_obj(out, mesh),
         Format::Ply => mesh_text::save_ply(out, mesh),
         Format::Stl => mesh_text::save_stl(out, mesh),
+        Format::Usdz => usdz::save(out, mesh),
+        Format::Dae => collada::save(out, mesh),
     }?;
     Ok(())
 }

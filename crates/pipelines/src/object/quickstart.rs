@@ -2,7 +2,7 @@
 
 use super::config::{Config, Method};
 use super::evaluate::{self, Report};
-use super::export::{self, ExportOptions, Exported, Format};
+use super::export::{self, ExportOptions, Exported, Format, Size};
 use super::recipe::{self, Trained};
 use super::render::{self, Layer, PathKind, RenderOptions};
 use super::report;
@@ -99,11 +99,14 @@ pub fn quickstart(
         out: folder.join("still_life.glb"),
         resolution: 192,
         level: None,
-        faces: 60_000,
+        faces: Some(40_000),
+        texture: Some(1024),
+        size: Size::Scaled(1.0),
+        unit_m: 1.0,
         clip: None,
         floaters: 0.05,
     };
-    let mesh = export::export(&model, &options, &mut |_, _| {})?;
+    let mesh = export::export(&model, &options, &mut |_, _, _| {})?;
     let page = folder.join("report.html");
     report::write(&page, &summary, &scores, &mesh)?;
     Ok(made(folder, summary, scores, mesh, video, page))

@@ -1,0 +1,82 @@
+"""Checks exported meshes with readers that this project did not write: Blender (GLB, OBJ, PLY, STL, DAE), usd-core (USDZ),
+pycollada (DAE), trimesh (GLB, OBJ, PLY, STL).
+
+    diorama export RUN -o OUT/m.{glb,obj,ply,stl,usdz,dae} ...
+    python3 benches/formats.py OUT/m          # trimesh, usd-core, pycollada
+    blender -b -P benches/formats.py -- OUT/m
+
+Prints the bounds in metres, z up, that each reader finds, and whether there is a texture or colours; fails where two readers
+differ by more than a millimetre.
+"""
+import sys
+
+try:
+    import bpy
+except ImportError:
+    bpy = None
+import numpy as np
+
+if bpy:
+    # Blender 3.4 asks for an alias that numpy dropped in 1.24.
+    np.bool = bool
+stem = sys.argv[sys.argv.index("--") + 1] if bpy else sys.argv[1]
+found = {}
+
+
+def turned(points):
+    """glTF and USD are y up."""
+    x, y, z = np.asarray(points, float).T
+    return np.stack([x, -z, y], 1)
+
+
+def note(reader, points, looks):
+    points = np.asarray(points, float)
+    found[reader] = np.array([points.min(0), points.max(0)])
+    print(f"{reader:24} {len(points):8} points  {np.round(found[reader][0], 4)} .. {np.round(found[reader][1], 4)}  {looks}")
+
+
+if bpy:
+    load = {
+        "glb": lambda f: bpy.ops.import_scene.gltf(filepath=f),
+        "obj": lambda f: bpy.ops.wm.obj_import(filepath=f, forward_axis="Y", up_axis="Z"),
+        "ply": lambda f: bpy.ops.import_mesh.ply(filepath=f),
+        "stl": lambda f: bpy.ops.import_mesh.stl(filepath=f),
+        "dae": lambda f: bpy.ops.wm.collada_import(filepath=f),
+    }
+    for kind, read in load.items():
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        if kind in ("ply", "stl"):
+            bpy.ops.preferences.addon_enable(module=f"io_mesh_{kind}")
+        read(f"{stem}.{kind}")
+        (thing,) = [o for o in bpy.data.objects if o.type == "MESH"]
+        pictures = [f'{i.name} {i.size[0]} x {i.size[1]}' for i in bpy.data.images]
+        looks = f"images {pictures}, uvs {len(thing.data.uv_layers)}, colours {len(thing.data.color_attributes)}"
+        note(f"blender {kind}", [thing.matrix_world @ v.co for v in thing.data.vertices], looks)
+else:
+    import collada
+    import trimesh
+    from pxr import Usd, UsdGeom, UsdShade, UsdValidation
+
+    for kind in ["glb", "obj", "ply", "stl"]:
+        m = trimesh.load(f"{stem}.{kind}", force="mesh", process=False)
+        note(f"trimesh {kind}", turned(m.vertices) if kind == "glb" else m.vertices, type(m.visual).__name__)
+    stage = Usd.Stage.Open(f"{stem}.usdz")
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Root/Object"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    ok, warnings = UsdGeom.Mesh.ValidateTopology(mesh.GetFaceVertexIndicesAttr().Get(), mesh.GetFaceVertexCountsAttr().Get(), len(mesh.GetPointsAttr().Get()))
+    assert ok, warnings
+    registry = UsdValidation.ValidationRegistry()
+    validators = [registry.GetOrLoadValidatorByName(m.name) for m in registry.GetAllValidatorMetadata()]
+    complaints = UsdValidation.ValidationContext(validators).Validate(stage)
+    assert not complaints, [c.GetMessage() for c in complaints]
+    material = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0]
+    note("usd-core usdz", turned(mesh.GetPointsAttr().Get()), f"material {material.GetPath()}, {len(validators)} validators content")
+    scene = collada.Collada(f"{stem}.dae")
+    assert scene.assetInfo.unitmeter == 1 and str(scene.assetInfo.upaxis) == "Z_UP" and not scene.errors
+    (shape,) = scene.geometries
+    note("pycollada dae", shape.primitives[0].vertex, f"images {[i.path for i in scene.images]}")
+
+first = next(iter(found.values()))
+worst = max(np.abs(f - first).max() for f in found.values())
+print(f"largest difference between readers: {worst * 1000:.3f} mm")
+sys.exit(int(worst > 1e-3))
