@@ -63,6 +63,9 @@ enum Bench {
     /// Frames per second of a run's held-out views, and what the fast quality costs
     #[command(after_help = "Example:\n  diorama bench render runs/chair --json")]
     Render(BenchRenderArgs),
+    /// A surface from a grid of densities, with normals, to a file
+    #[command(after_help = "Example:\n  diorama bench mesh runs/chair --resolution 512 --save-grid grid.npy")]
+    Mesh(BenchMeshArgs),
     /// Every op on a GPU against its f64 reference; exit code 1 if one is wrong
     #[command(after_help = "Example:\n  diorama bench check --device vulkan")]
     Check(BenchCheckArgs),
@@ -352,6 +355,26 @@ pub struct BenchRenderArgs {
     pub json: bool,
 }
 
+/// Flags of `bench mesh`.
+#[derive(Args, Clone, Debug)]
+pub struct BenchMeshArgs {
+    /// Folder of the run
+    pub run: PathBuf,
+    /// Cells along the longest side
+    #[arg(long, default_value_t = 512)]
+    pub resolution: usize,
+    /// Keep the densities as .npy, for other programs
+    #[arg(long)]
+    pub save_grid: Option<PathBuf>,
+    /// Calls; the median counts
+    #[arg(long, default_value_t = 5)]
+    pub repeats: usize,
+    #[arg(long)]
+    pub threads: Option<usize>,
+    #[arg(long)]
+    pub json: bool,
+}
+
 /// Flags of `bench check`.
 #[derive(Args, Clone, Debug)]
 pub struct BenchCheckArgs {
@@ -387,6 +410,7 @@ pub fn main() -> ExitCode {
         Command::Bench(Bench::Ops(a)) => a.json,
         Command::Bench(Bench::Train(a)) => a.json,
         Command::Bench(Bench::Render(a)) => a.json,
+        Command::Bench(Bench::Mesh(a)) => a.json,
         Command::Bench(Bench::Check(a)) => a.json,
     };
     let result = match cli.command {
@@ -401,6 +425,7 @@ pub fn main() -> ExitCode {
         Command::Bench(Bench::Ops(a)) => commands::bench::ops(&a),
         Command::Bench(Bench::Train(a)) => commands::bench::train(&a),
         Command::Bench(Bench::Render(a)) => commands::bench::render(&a),
+        Command::Bench(Bench::Mesh(a)) => commands::bench::mesh(&a),
         Command::Bench(Bench::Check(a)) => commands::bench::check(&a),
     };
     ExitCode::from(match result {

@@ -75,6 +75,36 @@ pub fn extract(field: &dyn FieldQuery, grid: &Grid, level: f32, progress: &mut d
     Mesh { positions, faces: mesher.faces, ..Mesh::default() }
 }
 
+/// Densities `[nz, ny, nx]` at the points of a grid.
+pub fn sample(field: &dyn FieldQuery, grid: &Grid, progress: &mut dyn FnMut(usize, usize)) -> Vec<f32> {
+    let [nx, ny, nz] = grid.points();
+    let cell = grid.cell();
+    let mut sigma = vec![0.0f32; nx * ny * nz];
+    let at_once = (BATCH / (nx * ny)).clamp(1, nz);
+    for (part, values) in sigma.chunks_mut(at_once * nx * ny).enumerate() {
+        let first = part * at_once;
+        let point = |i: usize| {
+            [
+                grid.min[0] + (i % nx) as f32 * cell,
+                grid.min[1] + (i / nx % ny) as f32 * cell,
+                grid.min[2] + (first + i / nx / ny) as f32 * cell,
+            ]
+        };
+        let points: Vec<[f32; 3]> = (0..values.len()).map(point).collect();
+        field.density(&points, values);
+        progress((first + at_once).min(nz), nz);
+    }
+    sigma
+}
+
+/// The surface in densities that are at hand, in world coordinates; open where the box cuts it.
+pub fn from_densities(sigma: &[f32], grid: &Grid, level: f32) -> Mesh {
+    let cell = grid.cell();
+    let (mut positions, faces) = diorama_kernels::ops::marching_cubes::cpu::surface(sigma, grid.points(), level);
+    positions.iter_mut().for_each(|p| *p = std::array::from_fn(|k| grid.min[k] + p[k] * cell));
+    Mesh { positions, faces, ..Mesh::default() }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

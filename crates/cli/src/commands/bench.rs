@@ -1,7 +1,7 @@
 //! `diorama bench`
 
 use super::{Outcome, use_threads};
-use crate::arguments::{BenchCheckArgs, BenchOpsArgs, BenchRenderArgs, BenchTrainArgs};
+use crate::arguments::{BenchCheckArgs, BenchMeshArgs, BenchOpsArgs, BenchRenderArgs, BenchTrainArgs};
 use diorama_pipelines::bench;
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::{device, run_folder};
@@ -132,6 +132,27 @@ pub fn check(a: &BenchCheckArgs) -> Result<Outcome> {
     }
     if wrong > 0 {
         return Err(PipelineError::Device(format!("{wrong} of {} results on {} are wrong", r.lines.len(), r.device)));
+    }
+    Ok(Outcome::Done)
+}
+
+pub fn mesh(a: &BenchMeshArgs) -> Result<Outcome> {
+    use_threads(a.threads)?;
+    if !(16..=2048).contains(&a.resolution) || a.repeats == 0 {
+        return Err(PipelineError::Usage("--resolution: must be 16 to 2048; --repeats: at least 1".into()));
+    }
+    let (model, notes) = run_folder::load_model(&a.run)?;
+    notes.iter().for_each(|n| eprintln!("note: {n}"));
+    let r = bench::mesh::run(&model, a.resolution, a.save_grid.as_deref(), a.repeats)?;
+    if a.json {
+        println!("{}", serde_json::json!(r));
+    } else {
+        let [x, y, z] = r.points;
+        let memory = r.peak_bytes.map_or(String::new(), |b| format!(", {:.0} MB above the densities", b as f64 / 1e6));
+        println!(
+            "{x} x {y} x {z} at {:.2}: {} vertices, {} faces in {:.2} s on {} thread(s){memory}",
+            r.level, r.vertices, r.faces, r.seconds, r.threads
+        );
     }
     Ok(Outcome::Done)
 }

@@ -4,6 +4,7 @@
 pub mod check;
 #[cfg(feature = "gpu")]
 pub mod gpu_ops;
+pub mod mesh;
 pub mod ops;
 pub mod render;
 pub mod train;

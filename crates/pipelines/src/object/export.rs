@@ -183,7 +183,7 @@ fn metres_per_unit(mesh: &Mesh, size: Size) -> f64 {
 
 /// A slab of 1/128 of the longest side lets half the light pass, `σ = ln 2 / slab`, but not more than half of the 99th
 /// percentile of sampled densities. On lego and fox twice or half of it shows held-out views 0.1 to 1.1 dB worse.
-fn automatic_level(model: &ObjectModel, grid: &Grid) -> f32 {
+pub(crate) fn automatic_level(model: &ObjectModel, grid: &Grid) -> f32 {
     let coarse = Grid { resolution: 48, ..*grid };
     let [nx, ny, nz] = coarse.points();
     let cell = coarse.cell();

@@ -5,7 +5,7 @@ pub mod config;
 pub mod device;
 pub mod evaluate;
 pub mod export;
-mod extent;
+pub(crate) mod extent;
 pub mod model;
 pub mod quickstart;
 pub mod recipe;

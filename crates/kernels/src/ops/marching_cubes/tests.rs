@@ -79,3 +79,32 @@ fn every_case_uses_exactly_its_crossing_edges() {
         }
     }
 }
+
+#[test]
+fn a_whole_grid_in_slabs_equals_slice_by_slice() {
+    // Wider than a word, and several slabs.
+    let (nx, ny, nz) = (70, 9, 53);
+    let mut state = 7u32;
+    let values: Vec<f32> = (0..nx * ny * nz)
+        .map(|_| {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / (1 << 24) as f32
+        })
+        .collect();
+    let m = run(nx, ny, nz, &values, 0.4);
+    let (positions, faces) = cpu::surface(&values, [nx, ny, nz], 0.4);
+    assert_eq!((positions.len(), faces.len()), (m.positions.len(), m.faces.len()));
+    let placed = |p: &[[f32; 3]], f: &[[u32; 3]]| -> Vec<[[f32; 3]; 3]> { f.iter().map(|f| f.map(|i| p[i as usize])).collect() };
+    assert!(placed(&positions, &faces) == placed(&m.positions, &m.faces));
+    // Each vertex is there once.
+    let mut bits: Vec<[u32; 3]> = positions.iter().map(|p| p.map(f32::to_bits)).collect();
+    bits.sort_unstable();
+    bits.dedup();
+    assert_eq!(bits.len(), {
+        let mut b: Vec<[u32; 3]> = m.positions.iter().map(|p| p.map(f32::to_bits)).collect();
+        b.sort_unstable();
+        b.dedup();
+        b.len()
+    });
+    assert!(cpu::surface(&[0.0; 8], [2, 2, 2], 0.5) == (vec![], vec![]));
+}
