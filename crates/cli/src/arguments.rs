@@ -21,6 +21,11 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Photographs or a video without poses to a data set, through COLMAP
+    #[command(
+        after_help = "Examples:\n  diorama prepare photos/ -o data/chair\n  diorama prepare chair.mp4 -o data/chair --frames 120\n  diorama prepare photos/ -o data/chair --resume\n\nCOLMAP (and ffmpeg for videos) must be installed; DIORAMA_COLMAP and DIORAMA_FFMPEG name other programs than those in PATH."
+    )]
+    Prepare(PrepareArgs),
     /// Fit a field to photographs with poses
     #[command(
         after_help = "Examples:\n  diorama train capture/ -o runs/chair --seconds 120\n  diorama train lego/ -o runs/lego --method mlp --downscale 8 --background white\n  diorama train capture/ -o runs/chair --resume"
@@ -69,6 +74,52 @@ enum Bench {
     /// Every op on a GPU against its f64 reference; exit code 1 if one is wrong
     #[command(after_help = "Example:\n  diorama bench check --device vulkan")]
     Check(BenchCheckArgs),
+}
+
+/// Flags of `prepare`.
+#[derive(Args, Clone, Debug)]
+pub struct PrepareArgs {
+    /// Folder of photographs, or a video
+    pub input: PathBuf,
+    /// Folder of the data set
+    #[arg(short, long)]
+    pub out: PathBuf,
+    /// Most frames of a video; the sharpest of each stretch is taken
+    #[arg(long, default_value_t = 150, conflicts_with = "fps")]
+    pub frames: usize,
+    /// Frames per second of a video, instead of --frames
+    #[arg(long)]
+    pub fps: Option<f64>,
+    /// Take every N-th photograph
+    #[arg(long, default_value_t = 1)]
+    pub every: usize,
+    /// Reduce photographs whose longest side is larger
+    #[arg(long, value_name = "PIXELS")]
+    pub max_side: Option<u32>,
+    /// Pairs that are compared: auto, exhaustive or sequential
+    #[arg(long, default_value = "auto")]
+    pub matcher: String,
+    /// COLMAP's camera model: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or OPENCV_FISHEYE
+    #[arg(long, default_value = "OPENCV")]
+    pub lens: String,
+    /// every:N, A:B:C (percent) or all
+    #[arg(long, default_value = "every:8")]
+    pub split: String,
+    #[arg(long, default_value_t = 0)]
+    pub seed: u64,
+    /// Fail where fewer photographs than this percentage find a pose
+    #[arg(long, default_value_t = 80.0)]
+    pub min_registered: f64,
+    #[arg(long)]
+    pub threads: Option<usize>,
+    /// Go on from what an interrupted call left
+    #[arg(long)]
+    pub resume: bool,
+    /// Replace an earlier data set
+    #[arg(long, conflicts_with = "resume")]
+    pub force: bool,
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// Flags of `train`.
@@ -399,6 +450,7 @@ pub fn main() -> ExitCode {
         }
     };
     let json = match &cli.command {
+        Command::Prepare(a) => a.json,
         Command::Train(a) => a.json,
         Command::Eval(a) => a.json,
         Command::Render(a) => a.json,
@@ -414,6 +466,7 @@ pub fn main() -> ExitCode {
         Command::Bench(Bench::Check(a)) => a.json,
     };
     let result = match cli.command {
+        Command::Prepare(a) => commands::prepare::run(&a),
         Command::Train(a) => commands::train::run(&a),
         Command::Eval(a) => commands::eval::run(&a),
         Command::Render(a) => commands::render::run(&a),

@@ -55,6 +55,42 @@ pub fn find_model(root: &Path) -> Option<PathBuf> {
     best.map(|b| b.1)
 }
 
+/// A point that structure from motion found.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Point {
+    pub position: DVec3,
+    pub rgb: [u8; 3],
+    /// Images in which it was matched.
+    pub images: usize,
+}
+
+/// Images that a binary model has registered.
+pub fn registered(model: &Path) -> Result<Vec<String>> {
+    Ok(read_images_bin(&model.join("images.bin"))?.into_iter().map(|i| i.name).collect())
+}
+
+/// Points of a binary model.
+///
+/// # Errors
+/// When the file is missing or ends too early.
+pub fn points(model: &Path) -> Result<Vec<Point>> {
+    let file = model.join("points3D.bin");
+    let data = error::read(&file, LIMIT)?;
+    let mut b = Bytes { file: &file, data: &data };
+    let n = b.u64()?;
+    let mut out = Vec::new();
+    for _ in 0..n {
+        b.u64()?;
+        let position = DVec3::new(b.f64()?, b.f64()?, b.f64()?);
+        let rgb = b.take(3)?.try_into().expect("three bytes");
+        b.f64()?;
+        let images = b.u64()?;
+        b.take(usize::try_from(images).ok().and_then(|p| p.checked_mul(8)).unwrap_or(usize::MAX))?;
+        out.push(Point { position, rgb, images: images as usize });
+    }
+    Ok(out)
+}
+
 /// Reads the largest model under `root`, whose photographs lie in `root/images` or `root`.
 pub fn read(root: &Path) -> Result<Imported> {
     let model = find_model(root)

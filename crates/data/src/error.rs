@@ -13,11 +13,18 @@ pub enum DataError {
     /// The system would not do it: disk full, permission, missing folder.
     #[error("{}: cannot {doing}: {source}", path.display())]
     Io { path: PathBuf, doing: &'static str, source: std::io::Error },
+    /// A program that was asked to do the work could not.
+    #[error("{}: {message}", program.display())]
+    Failed { program: PathBuf, message: String },
 }
 
 impl DataError {
     pub fn input(path: impl Into<PathBuf>, message: impl Into<String>) -> Self {
         DataError::Input { path: path.into(), message: message.into() }
+    }
+
+    pub fn failed(program: impl Into<PathBuf>, message: impl Into<String>) -> Self {
+        DataError::Failed { program: program.into(), message: message.into() }
     }
 
     pub fn io(path: &Path, doing: &'static str) -> impl FnOnce(std::io::Error) -> DataError {
@@ -29,6 +36,7 @@ impl DataError {
     pub fn is_input(&self) -> bool {
         match self {
             DataError::Input { .. } => true,
+            DataError::Failed { .. } => false,
             DataError::Io { doing, source, .. } => doing.starts_with("read") && source.kind() == std::io::ErrorKind::NotFound,
         }
     }

@@ -14,11 +14,14 @@ pub mod llff;
 pub mod mesh_text;
 pub mod mp4;
 pub mod photo;
+pub mod photo_import;
 pub mod pixel_store;
 pub mod plot;
+pub mod process;
 pub mod split;
 pub mod tfevents;
 pub mod transforms_json;
 pub mod usdz;
+pub mod video;
 
 pub use error::{DataError, Result};

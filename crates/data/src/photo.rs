@@ -49,6 +49,13 @@ fn too_large(path: &Path, limits: &PhotoLimits) -> DataError {
     )
 }
 
+/// Whether metadata say that the picture is to be turned or mirrored.
+pub fn is_turned(path: &Path) -> Result<bool> {
+    let limits = PhotoLimits::default();
+    let mut d = open(path, &limits)?;
+    Ok(d.orientation().is_ok_and(|o| o != image::metadata::Orientation::NoTransforms))
+}
+
 /// Width and height as shown, that is after EXIF orientation.
 pub fn size(path: &Path) -> Result<(u32, u32)> {
     let limits = PhotoLimits::default();

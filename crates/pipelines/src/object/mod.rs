@@ -7,6 +7,7 @@ pub mod evaluate;
 pub mod export;
 pub(crate) mod extent;
 pub mod model;
+pub mod prepare;
 pub mod quickstart;
 pub mod recipe;
 pub mod render;

@@ -1,0 +1,70 @@
+//! `diorama prepare`
+
+use super::{INTERRUPT, Outcome, use_threads, watch_interrupts};
+use crate::arguments::PrepareArgs;
+use diorama_data::split::SplitRule;
+use diorama_data::video::Choice;
+use diorama_pipelines::object::prepare::{self, PrepareOptions};
+use diorama_pipelines::{PipelineError, Result};
+use std::time::{Duration, Instant};
+
+pub fn run(a: &PrepareArgs) -> Result<Outcome> {
+    use_threads(a.threads)?;
+    let usage = |e: String| PipelineError::Usage(format!("--{e}"));
+    let least = |flag: &str, ok: bool, what: &str| if ok { Ok(()) } else { Err(usage(format!("{flag}: must be {what}"))) };
+    least("frames", a.frames >= 3, "at least 3")?;
+    least("fps", a.fps.is_none_or(|f| f > 0.0 && f.is_finite()), "above 0")?;
+    least("every", a.every >= 1, "at least 1")?;
+    least("max-side", a.max_side.is_none_or(|s| s >= 64), "at least 64")?;
+    least("min-registered", (0.0..=100.0).contains(&a.min_registered), "0 to 100")?;
+    let split: SplitRule = a.split.parse().map_err(usage)?;
+    let options = PrepareOptions {
+        input: a.input.clone(),
+        out: a.out.clone(),
+        choice: a.fps.map_or(Choice::Count(a.frames), Choice::PerSecond),
+        every: a.every,
+        max_side: a.max_side.unwrap_or(u32::MAX),
+        matcher: a.matcher.parse().map_err(usage)?,
+        lens: a.lens.to_uppercase(),
+        split: if split == SplitRule::File { SplitRule::Every(8) } else { split },
+        seed: a.seed,
+        min_registered: a.min_registered,
+        threads: a.threads,
+        resume: a.resume,
+        force: a.force,
+    };
+    watch_interrupts();
+    let (mut last, mut stage) = (Instant::now(), String::new());
+    let mut note = |text: &str| {
+        // Each stage at once, counts within it every two seconds.
+        let begins = text.split(':').next().unwrap_or(text);
+        if begins != stage || last.elapsed() > Duration::from_secs(2) {
+            (last, stage) = (Instant::now(), begins.to_string());
+            eprintln!("{text}");
+        }
+    };
+    let Some(made) = prepare::prepare(&options, &INTERRUPT, &mut note)? else {
+        eprintln!("interrupted; go on with: diorama prepare {} -o {} --resume", a.input.display(), a.out.display());
+        return Ok(Outcome::Interrupted);
+    };
+    if a.json {
+        println!("{}", serde_json::to_string(&made).expect("plain values"));
+        return Ok(Outcome::Done);
+    }
+    println!(
+        "{}: {} of {} photographs have poses, {} points, {} held out, scene {} times the inner cube{}",
+        made.folder.display(),
+        made.registered,
+        made.images,
+        made.points,
+        made.held_out,
+        made.aabb_scale,
+        if made.floor { ", floor level" } else { "" }
+    );
+    if !made.lost.is_empty() {
+        println!("without a pose: {}", made.lost.join(", "));
+    }
+    println!("look at: {}", made.sheet.display());
+    println!("next: diorama train {} -o runs/{}", made.folder.display(), made.folder.file_name().unwrap_or_default().to_string_lossy());
+    Ok(Outcome::Done)
+}

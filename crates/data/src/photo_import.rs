@@ -1,0 +1,189 @@
+//! Photographs into a data set: upright, at most so large, without metadata.
+
+use crate::error::{DataError, Result};
+use crate::{atomic, photo};
+use diorama_geom::ImageU8;
+use std::path::{Path, PathBuf};
+
+/// Extensions of files that are taken for photographs.
+pub const EXTENSIONS: [&str; 8] = ["jpg", "jpeg", "png", "webp", "tif", "tiff", "exr", "hdr"];
+/// Quality of photographs that had to be encoded anew.
+const JPEG_QUALITY: u8 = 96;
+
+/// The photographs of a folder in order of their names; numbers in names count as numbers.
+///
+/// # Errors
+/// When the folder cannot be read or holds none.
+pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
+    let entries = folder.read_dir().map_err(DataError::io(folder, "read"))?;
+    let is_photo = |p: &PathBuf| {
+        let hidden = p.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
+        let extension = p.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+        !hidden && p.is_file() && extension.is_some_and(|e| EXTENSIONS.contains(&&*e))
+    };
+    let mut found: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(is_photo).collect();
+    if found.is_empty() {
+        return Err(DataError::input(folder, format!("holds no photographs ({}); give the folder they lie in", EXTENSIONS.join(", "))));
+    }
+    found.sort_by_cached_key(|p| natural(&p.file_name().unwrap_or_default().to_string_lossy()));
+    Ok(found)
+}
+
+/// A key under which IMG_9 comes before IMG_10.
+fn natural(name: &str) -> Vec<(String, u64)> {
+    let mut key = vec![(String::new(), 0u64)];
+    for c in name.chars() {
+        let last = key.last_mut().expect("begins with one");
+        match c.to_digit(10) {
+            Some(d) => last.1 = last.1.saturating_mul(10).saturating_add(d as u64 + (last.1 == 0) as u64),
+            None if last.1 > 0 => key.push((c.to_string(), 0)),
+            None => last.0.push(c),
+        }
+    }
+    key
+}
+
+/// Writes a photograph as `folder/stem` with its extension. A JPEG that needs no change keeps its pixels bit for bit; its metadata
+/// goes in any case.
+///
+/// # Errors
+/// When it cannot be decoded, or the disk refuses.
+pub fn import(source: &Path, folder: &Path, stem: &str, max_side: u32) -> Result<PathBuf> {
+    let (w, h) = photo::size(source)?;
+    let shrink = w.max(h) > max_side;
+    let bytes = std::fs::read(source).map_err(DataError::io(source, "read"))?;
+    if !shrink && bytes.starts_with(&[0xff, 0xd8]) && !photo::is_turned(source)? {
+        // Decoding it shows whether it is whole.
+        photo::load(source)?;
+        if let Some(clean) = without_metadata(&bytes) {
+            let target = folder.join(format!("{stem}.jpg"));
+            atomic::write(&target, &clean)?;
+            return Ok(target);
+        }
+    }
+    drop(bytes);
+    let mut image = photo::load(source)?;
+    if shrink {
+        let by = max_side as f64 / w.max(h) as f64;
+        image = image.downsampled(((w as f64 * by).round() as usize).max(1), ((h as f64 * by).round() as usize).max(1));
+    }
+    write(&image, folder, stem)
+}
+
+/// Writes pixels as JPEG, or as PNG where there is alpha.
+pub fn write(image: &ImageU8, folder: &Path, stem: &str) -> Result<PathBuf> {
+    if image.channels != 3 {
+        let target = folder.join(format!("{stem}.png"));
+        photo::save_png(&target, image)?;
+        return Ok(target);
+    }
+    let target = folder.join(format!("{stem}.jpg"));
+    let mut out = Vec::new();
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut out, JPEG_QUALITY)
+        .encode(&image.data, image.width as u32, image.height as u32, image::ExtendedColorType::Rgb8)
+        .map_err(|e| DataError::input(&target, format!("cannot be encoded ({e})")))?;
+    atomic::write(&target, &out)?;
+    Ok(target)
+}
+
+/// A JPEG without EXIF, XMP, comments, previews and whatever follows its end; colour profiles stay. None where it is malformed.
+pub fn without_metadata(jpeg: &[u8]) -> Option<Vec<u8>> {
+    let mut out = jpeg.get(..2)?.to_vec();
+    let mut at = 2;
+    loop {
+        if *jpeg.get(at)? != 0xff {
+            return None;
+        }
+        let marker = *jpeg.get(at + 1)?;
+        match marker {
+            0xff => {
+                at += 1;
+                continue;
+            }
+            0xd9 => {
+                out.extend([0xff, 0xd9]);
+                return Some(out);
+            }
+            _ => {}
+        }
+        let length = u16::from_be_bytes(jpeg.get(at + 2..at + 4)?.try_into().ok()?) as usize;
+        let segment = jpeg.get(at..at + 2 + length)?;
+        let body = segment.get(4..)?;
+        let keep = match marker {
+            0xe0 => body.starts_with(b"JFIF\0"),
+            0xe2 => body.starts_with(b"ICC_PROFILE\0"),
+            0xee => body.starts_with(b"Adobe"),
+            0xe1..=0xef | 0xfe => false,
+            _ => true,
+        };
+        if keep {
+            out.extend(segment);
+        }
+        at += 2 + length;
+        if marker == 0xda {
+            // Entropy-coded data runs to the next marker that is neither a stuffed byte nor a restart.
+            let end = (at..jpeg.len() - 1).find(|i| jpeg[*i] == 0xff && !matches!(jpeg[i + 1], 0 | 0xd0..=0xd7))?;
+            out.extend(&jpeg[at..end]);
+            at = end;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture() -> ImageU8 {
+        let data = (0..32 * 24).flat_map(|i| [(i % 32 * 8) as u8, (i / 32 * 10) as u8, 90]).collect();
+        ImageU8 { width: 32, height: 24, channels: 3, data }
+    }
+
+    /// The picture as JPEG with a position in EXIF, a comment, and a second image behind the end.
+    fn with_metadata(dir: &Path) -> PathBuf {
+        let plain = write(&picture(), dir, "plain").unwrap();
+        let bytes = std::fs::read(&plain).unwrap();
+        let mut out = bytes[..2].to_vec();
+        for (marker, body) in [(0xe1u8, &b"Exif\0\0GPS 48.1 11.6"[..]), (0xfe, b"serial 1234")] {
+            out.extend([0xff, marker]);
+            out.extend((body.len() as u16 + 2).to_be_bytes());
+            out.extend(body);
+        }
+        out.extend(&bytes[2..]);
+        out.extend(b"GPS again");
+        let path = dir.join("secret.jpg");
+        std::fs::write(&path, out).unwrap();
+        path
+    }
+
+    #[test]
+    fn metadata_goes_and_pixels_stay() {
+        let dir = tempfile::tempdir().unwrap();
+        let source = with_metadata(dir.path());
+        let out = dir.path().join("out");
+        std::fs::create_dir(&out).unwrap();
+        let made = import(&source, &out, "a", 100).unwrap();
+        let bytes = std::fs::read(&made).unwrap();
+        for secret in [&b"GPS"[..], b"Exif", b"serial"] {
+            assert!(!bytes.windows(secret.len()).any(|w| w == secret), "{}", String::from_utf8_lossy(secret));
+        }
+        assert_eq!(photo::load(&made).unwrap(), photo::load(&source).unwrap());
+        let small = photo::load(&import(&source, &out, "b", 16).unwrap()).unwrap();
+        assert_eq!((small.width, small.height), (16, 12));
+    }
+
+    #[test]
+    fn truncated_jpegs_are_not_copied() {
+        let dir = tempfile::tempdir().unwrap();
+        let bytes = std::fs::read(with_metadata(dir.path())).unwrap();
+        for n in 0..bytes.len() - 20 {
+            assert!(without_metadata(&bytes[..n]).is_none_or(|b| b.len() <= n));
+        }
+    }
+
+    #[test]
+    fn numbers_in_names_count() {
+        let mut names = ["IMG_10.jpg", "IMG_9.jpg", "a2.jpg", "IMG_009b.jpg"];
+        names.sort_by_cached_key(|n| natural(n));
+        assert_eq!(names, ["IMG_9.jpg", "IMG_009b.jpg", "IMG_10.jpg", "a2.jpg"]);
+    }
+}

@@ -1,0 +1,146 @@
+//! Frames of a video through ffmpeg: the sharpest of each stretch of time.
+
+use crate::error::{DataError, Result};
+use crate::process::{self, Ended};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::atomic::AtomicBool;
+
+/// Size of the small grey frames by which sharpness is judged.
+const WIDTH: usize = 320;
+
+/// Which frames of a video are taken.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Choice {
+    /// So many in all, at most.
+    Count(usize),
+    /// So many per second.
+    PerSecond(f64),
+}
+
+/// ffmpeg's path.
+///
+/// # Errors
+/// When it is not installed.
+pub fn ffmpeg() -> Result<PathBuf> {
+    process::find("ffmpeg", "DIORAMA_FFMPEG", "Debian: apt install ffmpeg")
+}
+
+/// Writes the chosen frames as `frame_00001.jpg` … into `folder`, without metadata; returns how many frames the video has and
+/// how many were written.
+///
+/// # Errors
+/// When ffmpeg is missing or the video has no frames that it can decode.
+pub fn extract(video: &Path, folder: &Path, choice: Choice, log: &Path, interrupt: &AtomicBool) -> Result<Option<(usize, usize)>> {
+    let ffmpeg = ffmpeg()?;
+    let sharpness = measure(&ffmpeg, video)?;
+    let count = match choice {
+        Choice::Count(n) => n,
+        Choice::PerSecond(fps) => ((sharpness.len() as f64 / frames_per_second(&ffmpeg, video)? * fps).round() as usize).max(1),
+    };
+    let chosen = sharpest(&sharpness, count);
+    // Runs of neighbouring frames keep the expression short.
+    let terms: Vec<String> =
+        runs(&chosen).iter().map(|(a, b)| if a == b { format!("eq(n,{a})") } else { format!("between(n,{a},{b})") }).collect();
+    let filter = folder.join("select.txt");
+    std::fs::write(&filter, format!("select='{}'", terms.join("+"))).map_err(DataError::io(&filter, "write"))?;
+    let mut c = Command::new(&ffmpeg);
+    c.args(["-hide_banner", "-nostdin", "-y", "-i"]).arg(video);
+    c.arg("-filter_script:v").arg(&filter);
+    c.args(["-vsync", "0", "-map_metadata", "-1", "-fflags", "+bitexact", "-qscale:v", "1", "-qmin", "1"])
+        .arg(folder.join("frame_%05d.jpg"));
+    let ended = process::run(&mut c, log, interrupt, &mut |_| {});
+    let _ = std::fs::remove_file(&filter);
+    Ok((ended? == Ended::Done).then_some((sharpness.len(), chosen.len())))
+}
+
+/// Variance of the Laplacian of each frame, in small and grey.
+fn measure(ffmpeg: &Path, video: &Path) -> Result<Vec<f32>> {
+    let mut c = Command::new(ffmpeg);
+    c.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-i"]).arg(video);
+    // Square frames: the shape does not matter for sharpness, and the size must be known.
+    c.args(["-vsync", "0", "-vf", &format!("scale={WIDTH}:{WIDTH}:flags=area,format=gray"), "-f", "rawvideo", "-"]);
+    let mut out = Vec::new();
+    let mut frame = vec![0u8; WIDTH * WIDTH];
+    let read = process::read_output(&mut c, &mut |pipe| {
+        loop {
+            match pipe.read_exact(&mut frame) {
+                Ok(()) => out.push(laplacian_variance(&frame, WIDTH)),
+                Err(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => return Ok(()),
+                Err(e) => return Err(e),
+            }
+        }
+    });
+    // What could be decoded before a fault is worth having.
+    match read {
+        Err(e) if out.is_empty() => Err(DataError::input(video, format!("holds no frames that can be decoded ({e}); convert it to MP4"))),
+        _ if out.is_empty() => Err(DataError::input(video, "holds no frames that can be decoded; convert it to MP4")),
+        _ => Ok(out),
+    }
+}
+
+fn frames_per_second(ffmpeg: &Path, video: &Path) -> Result<f64> {
+    // Told by ffmpeg itself, so that ffprobe need not be there: "Stream … 29.97 fps".
+    let out = Command::new(ffmpeg).args(["-hide_banner", "-nostdin", "-i"]).arg(video).output().map_err(DataError::io(ffmpeg, "start"))?;
+    let text = String::from_utf8_lossy(&out.stderr).into_owned();
+    let fps =
+        text.lines().filter(|l| l.contains("Video:")).find_map(|l| l.split(" fps").next()?.rsplit([' ', ',']).next()?.parse::<f64>().ok());
+    fps.filter(|f| *f > 0.0).ok_or_else(|| DataError::input(video, "does not tell its frame rate; give --frames instead of --fps"))
+}
+
+/// Variance of the 4-neighbour Laplacian of a grey image `width` wide.
+pub fn laplacian_variance(gray: &[u8], width: usize) -> f32 {
+    let height = gray.len() / width;
+    let (mut sum, mut squares, mut n) = (0.0f64, 0.0f64, 0.0f64);
+    for y in 1..height.saturating_sub(1) {
+        for x in 1..width - 1 {
+            let i = y * width + x;
+            let v = |i: usize| gray[i] as f64;
+            let l = v(i - 1) + v(i + 1) + v(i - width) + v(i + width) - 4.0 * v(i);
+            (sum, squares, n) = (sum + l, squares + l * l, n + 1.0);
+        }
+    }
+    if n > 0.0 { (squares / n - (sum / n).powi(2)) as f32 } else { 0.0 }
+}
+
+/// The sharpest frame of each of `count` equal stretches.
+fn sharpest(sharpness: &[f32], count: usize) -> Vec<usize> {
+    let (n, count) = (sharpness.len(), count.clamp(1, sharpness.len().max(1)));
+    (0..count)
+        .filter_map(|i| (i * n / count..(i + 1) * n / count).max_by(|a, b| sharpness[*a].total_cmp(&sharpness[*b]).then(b.cmp(a))))
+        .collect()
+}
+
+/// First and last of each run of consecutive numbers.
+fn runs(sorted: &[usize]) -> Vec<(usize, usize)> {
+    let mut out: Vec<(usize, usize)> = Vec::new();
+    for &i in sorted {
+        match out.last_mut() {
+            Some(last) if last.1 + 1 == i => last.1 = i,
+            _ => out.push((i, i)),
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_sharpest_of_each_stretch_is_taken() {
+        assert_eq!(sharpest(&[1.0, 5.0, 2.0, 9.0, 9.0, 1.0], 2), [1, 3]);
+        assert_eq!(sharpest(&[1.0; 3], 9), [0, 1, 2]);
+        assert_eq!(runs(&[0, 1, 2, 5, 7, 8]), [(0, 2), (5, 5), (7, 8)]);
+    }
+
+    #[test]
+    fn blur_lowers_the_variance() {
+        let sharp: Vec<u8> = (0..64 * 64).map(|i| if (i / 64 / 4 + i % 64 / 4) % 2 == 0 { 255 } else { 0 }).collect();
+        let at = |x: i32, y: i32| sharp[(y.clamp(0, 63) * 64 + x.clamp(0, 63)) as usize] as u32;
+        let blurred: Vec<u8> =
+            (0..64 * 64i32).map(|i| ((0..25).map(|k| at(i % 64 + k % 5 - 2, i / 64 + k / 5 - 2)).sum::<u32>() / 25) as u8).collect();
+        assert!(laplacian_variance(&sharp, 64) > 10.0 * laplacian_variance(&blurred, 64));
+        assert_eq!(laplacian_variance(&[7; 64], 8), 0.0);
+    }
+}

@@ -1,0 +1,211 @@
+//! Photographs or a video without poses become a data set: sharp frames, poses from COLMAP, the world upright and of useful size,
+//! a division into training and held-out views, and a sheet that shows it all.
+
+mod sfm;
+mod sheet;
+mod world;
+
+use crate::error::{PipelineError, Result};
+use diorama_data::split::{self, SplitRule};
+use diorama_data::video::{self, Choice};
+use diorama_data::{DataError, atomic, colmap, import, photo_import, transforms_json};
+use diorama_geom::Capture;
+use diorama_geom::capture::Split;
+use serde::Serialize;
+use std::collections::HashSet;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+pub use sfm::Matcher;
+
+/// What to make a data set of, and how.
+#[derive(Clone, Debug)]
+pub struct PrepareOptions {
+    /// A folder of photographs, or a video.
+    pub input: PathBuf,
+    pub out: PathBuf,
+    /// Most frames of a video.
+    pub choice: Choice,
+    /// Take every n-th photograph.
+    pub every: usize,
+    /// Longest side; larger photographs are reduced.
+    pub max_side: u32,
+    pub matcher: Matcher,
+    /// COLMAP's name of the lens.
+    pub lens: String,
+    pub split: SplitRule,
+    pub seed: u64,
+    /// Fewest photographs that need a pose, in percent.
+    pub min_registered: f64,
+    pub threads: Option<usize>,
+    /// Go on from what an earlier call left.
+    pub resume: bool,
+    pub force: bool,
+}
+
+/// What was made.
+#[derive(Clone, Debug, Serialize)]
+pub struct Prepared {
+    pub folder: PathBuf,
+    pub images: usize,
+    pub registered: usize,
+    /// Photographs without a pose.
+    pub lost: Vec<String>,
+    pub points: usize,
+    /// Mean angle between the cameras' own up directions and the world's, in degrees.
+    pub tilt: f64,
+    /// Whether a floor was found, which then lies at the height of the lowest dense plane.
+    pub floor: bool,
+    pub aabb_scale: u32,
+    pub held_out: usize,
+    pub sheet: PathBuf,
+}
+
+/// Names within the data set.
+const IMAGES: &str = "images";
+const WORK: &str = "colmap";
+const IMAGES_DONE: &str = "images.done";
+
+/// Prepares a data set; none when interrupted, after which `resume` goes on. `note` is told what happens.
+///
+/// # Errors
+/// When the input is at fault, a program is missing, or too few photographs find a pose.
+pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Prepared>> {
+    // Missing programs are told before any work is done.
+    let colmap_program = sfm::program()?;
+    let work = o.out.join(WORK);
+    begin(o)?;
+    if !work.join(IMAGES_DONE).exists() && !take_images(o, &work, interrupt, note)? {
+        return Ok(None);
+    }
+    let images = photo_import::list(&o.out.join(IMAGES))?;
+    if images.len() < 3 {
+        return Err(DataError::input(
+            &o.input,
+            format!("{} photographs are not enough; at least 3 are needed, 30 to 150 are usual", images.len()),
+        )
+        .into());
+    }
+    let names: Vec<String> = images.iter().map(|p| p.file_name().unwrap_or_default().to_string_lossy().into_owned()).collect();
+    let is_video = !o.input.is_dir();
+    let Some(model) = sfm::reconstruct(&colmap_program, o, &names, is_video, interrupt, note)? else { return Ok(None) };
+    let registered: HashSet<String> = colmap::registered(&model)?.into_iter().collect();
+    let lost: Vec<String> = names.iter().filter(|n| !registered.contains(*n)).cloned().collect();
+    enough(o, &names, &lost)?;
+    note("turning the world upright");
+    let points = colmap::points(&model)?;
+    let mut frames = colmap::read(&o.out)?.frames;
+    let placed = world::place(&mut frames, &points);
+    split::apply(&o.split, &mut frames, false, o.seed);
+    if frames.iter().filter(|f| f.split == Split::Train).count() < 2 {
+        return Err(PipelineError::Usage(format!("--split {}: leaves fewer than 2 training views; choose another", o.split)));
+    }
+    let world_from_capture = diorama_geom::Similarity::IDENTITY;
+    let capture = Capture { frames, world_from_capture, scene: placed.scene, notes: Vec::new() };
+    transforms_json::write(&o.out.join("transforms.json"), &o.out, &capture)?;
+    let sheet = o.out.join("sheet.png");
+    sheet::draw(&sheet, &capture, &placed.points)?;
+    // What was written reads back as a capture.
+    let options = import::ImportOptions { format: Some(import::Format::Transforms), ..Default::default() };
+    import::import(&o.out, &options)?;
+    Ok(Some(Prepared {
+        folder: o.out.clone(),
+        images: names.len(),
+        registered: registered.len(),
+        lost,
+        points: points.len(),
+        tilt: placed.tilt,
+        floor: placed.floor,
+        aabb_scale: placed.scene.aabb_scale,
+        held_out: capture.indices(Split::Test).len(),
+        sheet,
+    }))
+}
+
+/// Makes the folder ready, or refuses.
+fn begin(o: &PrepareOptions) -> Result<()> {
+    if !o.input.exists() {
+        return Err(DataError::input(&o.input, "does not exist; give a folder of photographs or a video").into());
+    }
+    if o.resume {
+        return if o.out.join(WORK).is_dir() {
+            Ok(())
+        } else {
+            Err(DataError::input(&o.out, "holds nothing to go on from; leave out --resume").into())
+        };
+    }
+    if o.out.exists() && std::fs::read_dir(&o.out).map_err(DataError::io(&o.out, "read"))?.next().is_some() {
+        let ours = o.out.join(WORK).is_dir();
+        if !ours {
+            return Err(DataError::input(&o.out, "exists and is not an earlier data set of prepare; choose another --out").into());
+        }
+        if !o.force {
+            return Err(DataError::input(&o.out, "exists; give --resume to go on, --force to begin anew, or another --out").into());
+        }
+        for part in [IMAGES, WORK, "sparse"] {
+            let folder = o.out.join(part);
+            if folder.exists() {
+                std::fs::remove_dir_all(&folder).map_err(DataError::io(&folder, "remove"))?;
+            }
+        }
+        let _ = std::fs::remove_file(o.out.join("transforms.json"));
+    }
+    for folder in [o.out.join(IMAGES), o.out.join(WORK)] {
+        std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
+    }
+    Ok(())
+}
+
+/// Fills the folder of images; false when interrupted.
+fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<bool> {
+    let folder = o.out.join(IMAGES);
+    if o.input.is_dir() {
+        let all: Vec<PathBuf> = photo_import::list(&o.input)?.into_iter().step_by(o.every).collect();
+        let mut stems = HashSet::new();
+        for (i, source) in all.iter().enumerate() {
+            if interrupt.load(Ordering::Relaxed) {
+                return Ok(false);
+            }
+            let own = source.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            let stem = if stems.contains(&own) { format!("{own}_{i}") } else { own };
+            stems.insert(stem.clone());
+            photo_import::import(source, &folder, &stem, o.max_side)?;
+            note(&format!("photographs: {} of {}", i + 1, all.len()));
+        }
+    } else {
+        note("choosing sharp frames of the video");
+        let Some((all, taken)) = video::extract(&o.input, &folder, o.choice, &work.join("ffmpeg.log"), interrupt)? else {
+            return Ok(false);
+        };
+        note(&format!("frames: {taken} of {all} taken"));
+        if o.max_side < u32::MAX {
+            for file in photo_import::list(&folder)? {
+                let stem = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+                photo_import::import(&file, &folder, &stem, o.max_side)?;
+            }
+        }
+    }
+    atomic::write(&work.join(IMAGES_DONE), b"")?;
+    Ok(true)
+}
+
+fn enough(o: &PrepareOptions, names: &[String], lost: &[String]) -> Result<()> {
+    let found = names.len() - lost.len();
+    let share = 100.0 * found as f64 / names.len() as f64;
+    if found >= 3 && share >= o.min_registered {
+        return Ok(());
+    }
+    let shown = lost.iter().take(8).cloned().collect::<Vec<_>>().join(", ");
+    let more = if lost.len() > 8 { format!(" and {} more", lost.len() - 8) } else { String::new() };
+    Err(DataError::failed(
+        &o.out,
+        format!(
+            "COLMAP found poses for {found} of {} photographs ({share:.0} %, at least {:.0} % are wanted); without: {shown}{more}; \
+             take more photographs with more overlap and texture, or accept this with --resume --min-registered {:.0}",
+            names.len(),
+            o.min_registered,
+            share.floor()
+        ),
+    )
+    .into())
+}
