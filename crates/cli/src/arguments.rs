@@ -44,6 +44,9 @@ enum Command {
         after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --scale-to 80cm -o chair.usdz\n  diorama export runs/chair --resolution 384 --faces 100000 --units mm -o chair.stl"
     )]
     Export(ExportArgs),
+    /// Look at a run in the browser: views, cameras, crop box, camera paths, meshes
+    #[command(after_help = "Examples:\n  diorama view runs/chair\n  diorama view runs/chair --host 0.0.0.0 --port 8080")]
+    View(ViewArgs),
     /// Runs side by side: curves, held-out images, cost
     Compare(CompareArgs),
     /// Everything at once on a capture that the program generates itself
@@ -167,6 +170,11 @@ pub struct TrainArgs {
     /// Start from a config.toml
     #[arg(long)]
     pub config: Option<PathBuf>,
+    /// Show the run in the browser while it trains
+    #[arg(long)]
+    pub view: bool,
+    #[command(flatten)]
+    pub listen: ListenArgs,
     /// Go on from the last checkpoint
     #[arg(long)]
     pub resume: bool,
@@ -220,7 +228,7 @@ pub struct RenderArgs {
     /// Horizontal field of view in degrees [default: that of the capture]
     #[arg(long)]
     pub fov: Option<f64>,
-    /// rgb, depth, normal, opacity
+    /// rgb, depth, normal, opacity, occupancy
     #[arg(long, default_value = "rgb", value_delimiter = ',')]
     pub layers: Vec<String>,
     /// Folder for PNG sequences [default: RUN/render unless --video is given]
@@ -231,7 +239,7 @@ pub struct RenderArgs {
     pub video: Option<PathBuf>,
     #[arg(long, default_value_t = 30)]
     pub fps: u32,
-    /// Show only what lies in x0,y0,z0,x1,y1,z1 (the input's frame)
+    /// Show only what lies in x0,y0,z0,x1,y1,z1 (the input's frame), or all [default: the crop box saved in the viewer, else all]
     #[arg(long, allow_hyphen_values = true)]
     pub clip: Option<String>,
     /// full, or fast for previews
@@ -281,7 +289,7 @@ pub struct ExportArgs {
     /// Unit of the coordinates in obj, ply and stl: m, cm, mm or in; the others are in metres by their standards
     #[arg(long, default_value = "m")]
     pub units: String,
-    /// Extract only x0,y0,z0,x1,y1,z1 (the input's frame) [default: what most cameras look at]
+    /// Extract only x0,y0,z0,x1,y1,z1 (the input's frame), or auto [default: the crop box saved in the viewer, else auto: what most cameras look at]
     #[arg(long, allow_hyphen_values = true)]
     pub clip: Option<String>,
     /// Remove parts with fewer faces than this share of the largest part's
@@ -292,6 +300,34 @@ pub struct ExportArgs {
     /// Replace an existing file
     #[arg(long)]
     pub force: bool,
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Flags of `view`, and of `train --view`.
+#[derive(Args, Clone, Debug)]
+pub struct ListenArgs {
+    /// Address to listen on; any but 127.0.0.1 asks for a token, which is part of the printed address
+    #[arg(long, default_value = "127.0.0.1")]
+    pub host: std::net::IpAddr,
+    /// 0: any that is free
+    #[arg(long, default_value_t = 7007)]
+    pub port: u16,
+}
+
+/// Flags of `view`.
+#[derive(Args, Clone, Debug)]
+pub struct ViewArgs {
+    /// Folder of the run
+    pub run: PathBuf,
+    /// auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto")]
+    pub device: String,
+    #[command(flatten)]
+    pub listen: ListenArgs,
+    #[arg(long)]
+    pub threads: Option<usize>,
+    /// Print the address as a JSON object on stdout
     #[arg(long)]
     pub json: bool,
 }
@@ -455,6 +491,7 @@ pub fn main() -> ExitCode {
         Command::Eval(a) => a.json,
         Command::Render(a) => a.json,
         Command::Export(a) => a.json,
+        Command::View(a) => a.json,
         Command::Compare(a) => a.json,
         Command::Quickstart(a) => a.json,
         Command::Info(a) => a.json,
@@ -471,6 +508,7 @@ pub fn main() -> ExitCode {
         Command::Eval(a) => commands::eval::run(&a),
         Command::Render(a) => commands::render::run(&a),
         Command::Export(a) => commands::export::run(&a),
+        Command::View(a) => commands::view::run(&a),
         Command::Compare(a) => commands::compare::run(&a),
         Command::Quickstart(a) => commands::quickstart::run(&a),
         Command::Info(a) => commands::info::run(&a),

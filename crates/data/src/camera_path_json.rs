@@ -83,6 +83,46 @@ pub fn write(path: &Path, p: &CameraPath, world_from_capture: &Similarity) -> Re
     crate::atomic::write(path, format!("{json:#}\n").as_bytes())
 }
 
+/// The same path with its cameras and keyframes in another frame; all else stays. `file` is named in errors.
+///
+/// # Errors
+/// When the text is no JSON object, or a matrix is malformed.
+pub fn moved(text: &str, file: &Path, target_from_source: &Similarity) -> Result<String> {
+    let map = json::parse(text.as_bytes(), file)?;
+    let mut root = serde_json::Value::Object(map);
+    let wrong = |place: &str| DataError::input(file, format!("{place}: expected 16 finite numbers"));
+    for (list, key, by_columns) in [("camera_path", "camera_to_world", false), ("keyframes", "matrix", true)] {
+        let Some(entries) = root.get_mut(list).and_then(|l| l.as_array_mut()) else { continue };
+        for (i, entry) in entries.iter_mut().enumerate() {
+            let place = format!("{list}[{i}].{key}");
+            // nerfstudio keeps the matrices of keyframes as JSON within JSON.
+            let (value, quoted) = match entry.get(key) {
+                Some(serde_json::Value::String(s)) => (serde_json::from_str(s).map_err(|_| wrong(&place))?, true),
+                Some(v) => (v.clone(), false),
+                None => return Err(wrong(&place)),
+            };
+            let m: Vec<f64> = serde_json::from_value(value).map_err(|_| wrong(&place))?;
+            if m.len() != 16 || m.iter().any(|v| !v.is_finite()) {
+                return Err(wrong(&place));
+            }
+            let at = |row: usize, column: usize| if by_columns { m[column * 4 + row] } else { m[row * 4 + column] };
+            let column = |c: usize| DVec3::new(at(0, c), at(1, c), at(2, c));
+            let pose = Pose { rotation: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) };
+            let to = target_from_source.pose(&pose);
+            let (r, t) = (to.rotation, to.translation);
+            let columns = [r.x_axis, r.y_axis, r.z_axis, t];
+            let out: Vec<f64> = (0..16)
+                .map(|k| {
+                    let (row, column) = if by_columns { (k % 4, k / 4) } else { (k / 4, k % 4) };
+                    if row == 3 { (column == 3) as u8 as f64 } else { columns[column][row] }
+                })
+                .collect();
+            entry[key] = if quoted { json!(out).to_string().into() } else { json!(out) };
+        }
+    }
+    Ok(format!("{root:#}\n"))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -103,6 +143,35 @@ mod tests {
         assert!((q.views[0].camera.fx - view.camera.fx).abs() < 1e-9);
         assert!((q.views[0].world_from_camera.translation - view.world_from_camera.translation).length() < 1e-9);
         assert!((q.views[0].world_from_camera.rotation.z_axis - view.world_from_camera.rotation.z_axis).length() < 1e-9);
+    }
+
+    #[test]
+    fn moving_there_and_back_changes_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("p.json");
+        let view = PathView {
+            camera: Camera::pinhole(64, 48, 0.8),
+            world_from_camera: Pose::look_at(DVec3::new(3.0, 2.0, 1.0), DVec3::ZERO, DVec3::Z),
+        };
+        write(&file, &CameraPath { views: vec![view; 2], fps: 30.0 }, &Similarity::IDENTITY).unwrap();
+        let mut json: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+        json["keyframes"] =
+            json!([{ "matrix": json!([1.0, 0, 0, 0, 0, 1.0, 0, 0, 0, 0, 1.0, 0, 7.0, 8.0, 9.0, 1.0]).to_string(), "fov": 50 }]);
+        let s = Similarity {
+            scale: 2.0,
+            translation: DVec3::new(1.0, 0.0, 0.0),
+            rotation: diorama_geom::transform::rotation_between(DVec3::Z, DVec3::X),
+        };
+        let there = moved(&json.to_string(), &file, &s).unwrap();
+        let m: Vec<f64> =
+            serde_json::from_str(serde_json::from_str::<serde_json::Value>(&there).unwrap()["keyframes"][0]["matrix"].as_str().unwrap())
+                .unwrap();
+        assert!((DVec3::new(m[12], m[13], m[14]) - s.point(DVec3::new(7.0, 8.0, 9.0))).length() < 1e-12);
+        std::fs::write(&file, &there).unwrap();
+        let p = read(&file, &s.inverse()).unwrap();
+        assert!((p.views[0].world_from_camera.translation - view.world_from_camera.translation).length() < 1e-9);
+        assert!(moved(r#"{"camera_path":[{"camera_to_world":[1]}]}"#, &file, &s).unwrap_err().to_string().contains("camera_path[0]"));
+        assert!(moved("[", &file, &s).is_err());
     }
 
     #[test]

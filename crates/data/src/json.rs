@@ -17,8 +17,12 @@ pub struct Object<'a> {
 
 /// Parses a file that must hold one JSON object.
 pub fn read(path: &Path) -> Result<serde_json::Map<String, Value>> {
-    let bytes = error::read(path, LIMIT)?;
-    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&bytes);
+    parse(&error::read(path, LIMIT)?, path)
+}
+
+/// Parses text that must hold one JSON object; `path` is named in errors.
+pub fn parse(bytes: &[u8], path: &Path) -> Result<serde_json::Map<String, Value>> {
+    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     match serde_json::from_slice(text) {
         Ok(Value::Object(map)) => Ok(map),
         Ok(_) => Err(DataError::input(path, "not a JSON object: expected { … }")),

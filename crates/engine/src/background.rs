@@ -18,6 +18,11 @@ impl LearnedBackground {
         LearnedBackground { group: ParamGroup::dense("background", vec![0.0; TERMS * 3], adam), codes: Vec::new() }
     }
 
+    /// A copy to look at, which cannot be trained.
+    pub fn to_look_at(&self) -> Self {
+        LearnedBackground { group: self.group.values_only(), codes: Vec::new() }
+    }
+
     /// Colours `[R, 3]` for unit directions `[R, 3]`.
     pub fn forward(&self, dirs: &[f32], rgb: &mut Vec<f32>) {
         let mut codes = vec![0.0; dirs.len() / 3 * TERMS];

@@ -56,6 +56,20 @@ impl ParamGroup {
         }
     }
 
+    /// A copy to look at, which cannot be trained.
+    pub fn values_only(&self) -> ParamGroup {
+        ParamGroup {
+            name: self.name,
+            values: self.values.clone(),
+            grads: Vec::new(),
+            moment1: Vec::new(),
+            moment2: Vec::new(),
+            touched: Vec::new(),
+            adam: self.adam,
+            frozen: true,
+        }
+    }
+
     /// Whether any value is not finite.
     pub fn is_broken(&self) -> bool {
         self.values.iter().any(|v| !v.is_finite())

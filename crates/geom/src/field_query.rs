@@ -9,12 +9,6 @@ pub trait FieldQuery: Sync {
     fn color(&self, points_in_world: &[[f32; 3]], directions: &[[f32; 3]], rgb_srgb: &mut [[f32; 3]]);
 }
 
-/// What a viewer needs of a run: an image for a camera.
-pub trait ViewSource: Sync {
-    /// Renders `camera` at `world_from_camera` as `[H, W, 4]` sRGB with alpha.
-    fn view(&self, camera: &crate::Camera, world_from_camera: &crate::Pose) -> crate::Image;
-}
-
 /// Pixels that are decoded when first asked for.
 pub trait ImageSource: Send + Sync {
     /// The pixels of frame `index`, or a one-line error that names the file.

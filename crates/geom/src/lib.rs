@@ -14,6 +14,7 @@ pub mod mesh;
 pub mod ray;
 pub mod rng;
 pub mod transform;
+pub mod view_source;
 
 pub use camera::{Camera, Lens};
 pub use capture::{Capture, Frame, SceneBox};

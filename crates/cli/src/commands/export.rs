@@ -1,6 +1,6 @@
 //! `diorama export`
 
-use super::{Outcome, parse_clip, use_threads};
+use super::{Outcome, clip_or_crop, use_threads};
 use crate::arguments::ExportArgs;
 use diorama_data::{DataError, mesh_text};
 use diorama_pipelines::object::device;
@@ -38,7 +38,7 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
                 .ok_or_else(|| PipelineError::Usage(format!("--level {n}: expected auto or a number above 0")))?,
         ),
     };
-    let clip = a.clip.as_deref().map(|c| parse_clip(c, &model.capture.world_from_capture)).transpose()?;
+    let clip = clip_or_crop(a.clip.as_deref(), "auto", &a.run, &model)?;
     device::accelerate(&mut model, &a.device)?;
     let options = ExportOptions {
         format,

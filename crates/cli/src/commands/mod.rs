@@ -10,6 +10,7 @@ pub mod prepare;
 pub mod quickstart;
 pub mod render;
 pub mod train;
+pub mod view;
 
 use diorama_pipelines::{PipelineError, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -64,4 +65,27 @@ pub fn parse_clip(text: &str, world_from_capture: &diorama_geom::Similarity) -> 
         }
     }
     Ok((lo, hi))
+}
+
+/// The box of `--clip`; without the flag that of the viewer, with `whole` none.
+pub fn clip_or_crop(
+    clip: Option<&str>,
+    whole: &str,
+    run: &std::path::Path,
+    model: &diorama_pipelines::object::model::ObjectModel,
+) -> Result<Option<([f32; 3], [f32; 3])>> {
+    match clip {
+        Some(c) if c == whole => Ok(None),
+        Some(c) => parse_clip(c, &model.capture.world_from_capture).map(Some),
+        None => {
+            let crop = diorama_pipelines::object::viewing::read_crop(run)?;
+            if crop.is_some() {
+                eprintln!(
+                    "note: within the crop box saved in the viewer ({}); --clip {whole} leaves it out",
+                    run.join("crop.json").display()
+                );
+            }
+            Ok(crop)
+        }
+    }
 }

@@ -1,6 +1,6 @@
 //! `diorama render`
 
-use super::{INTERRUPT, Outcome, parse_clip, use_threads, watch_interrupts};
+use super::{INTERRUPT, Outcome, clip_or_crop, use_threads, watch_interrupts};
 use crate::arguments::RenderArgs;
 use diorama_pipelines::object::render::{self, RenderOptions};
 use diorama_pipelines::object::{device, run_folder};
@@ -24,7 +24,7 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
     device::accelerate(&mut model, &a.device)?;
     notes.iter().for_each(|n| eprintln!("note: {n}"));
     let images = a.images.clone().or_else(|| a.video.is_none().then(|| a.run.join("render")));
-    let clip = a.clip.as_deref().map(|c| parse_clip(c, &model.capture.world_from_capture)).transpose()?;
+    let clip = clip_or_crop(a.clip.as_deref(), "all", &a.run, &model)?;
     let options = RenderOptions {
         path,
         frames: a.frames,

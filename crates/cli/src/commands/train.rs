@@ -5,9 +5,12 @@ use crate::arguments::TrainArgs;
 use crate::terminal::Progress;
 use diorama_data::DataError;
 use diorama_pipelines::object::config::{Config, Method};
+use diorama_pipelines::object::model::ObjectModel;
 use diorama_pipelines::object::recipe;
 use diorama_pipelines::object::run_folder::{RunFolder, read_config};
+use diorama_pipelines::object::viewing::RunView;
 use diorama_pipelines::{PipelineError, Result};
+use std::sync::Arc;
 
 pub fn run(a: &TrainArgs) -> Result<Outcome> {
     use_threads(a.threads)?;
@@ -22,7 +25,9 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
     watch_interrupts();
     let mut progress = Progress::new();
     eprintln!("device: {device}");
-    let result = recipe::train(&config, &mut folder, a.resume, &INTERRUPT, &mut |e| progress.event(e));
+    let viewing = if a.view { Some(watch(a, &config)?) } else { None };
+    let view = viewing.as_ref().map(|v| &*v.0);
+    let result = recipe::train(&config, &mut folder, a.resume, view, &INTERRUPT, &mut |e| progress.event(e));
     let recipe::Trained { model, summary, device } = match result {
         Ok(r) => r,
         Err(e) => {
@@ -61,7 +66,20 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
         );
         println!("next: diorama eval {}", a.out.display());
     }
+    if let Some((_, server)) = viewing {
+        eprintln!("the viewer goes on until Ctrl-C");
+        let _ = server.join();
+    }
     Ok(if summary.interrupted { Outcome::Interrupted } else { Outcome::Done })
+}
+
+/// Serves the run while it trains.
+fn watch(a: &TrainArgs, config: &Config) -> Result<(Arc<RunView>, std::thread::JoinHandle<()>)> {
+    let model = ObjectModel::new(config.clone(), recipe::load_capture(config)?, false)?;
+    let view = RunView::new(&a.out, model, true);
+    let server = super::view::listen(&a.listen, view.clone())?;
+    eprintln!("view: {}", server.address());
+    Ok((view, std::thread::spawn(move || server.run(&INTERRUPT))))
 }
 
 fn finite(v: f64) -> Option<f64> {

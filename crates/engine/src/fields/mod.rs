@@ -296,6 +296,20 @@ impl Field {
     }
 
     /// All parameter groups.
+    /// A copy to look at, which cannot be trained.
+    pub fn to_look_at(&self) -> Field {
+        Field {
+            encoding: self.encoding.clone(),
+            directions: self.directions,
+            net: self.net.clone(),
+            outer: self.outer,
+            contraction: self.contraction,
+            table: self.table.as_ref().map(ParamGroup::values_only),
+            weights: self.weights.values_only(),
+            appearance: self.appearance.as_ref().map(|a| Appearance { dims: a.dims, group: a.group.values_only() }),
+        }
+    }
+
     pub fn groups(&self) -> Vec<&ParamGroup> {
         self.table.iter().chain([&self.weights]).chain(self.appearance.iter().map(|a| &a.group)).collect()
     }

@@ -14,3 +14,4 @@ pub mod render;
 pub mod report;
 pub mod run_folder;
 mod texture;
+pub mod viewing;

@@ -207,6 +207,27 @@ impl ObjectModel {
         self.groups().iter().any(|(_, g)| g.is_broken())
     }
 
+    /// A copy to look at, which cannot be trained.
+    pub fn to_look_at(&self) -> ObjectModel {
+        ObjectModel {
+            config: self.config.clone(),
+            capture: self.capture.clone(),
+            model_from_world: self.model_from_world,
+            field: self.field.to_look_at(),
+            coarse: self.coarse.as_ref().map(Field::to_look_at),
+            occupancy: self.occupancy.clone(),
+            learned: self.learned.as_ref().map(LearnedBackground::to_look_at),
+            corrections: self.corrections.as_ref().map(ParamGroup::values_only),
+            error_map: None,
+            train: self.train.clone(),
+            has_alpha: self.has_alpha,
+            origin: self.origin,
+            samples_per_ray: self.samples_per_ray,
+            rate_scale: self.rate_scale,
+            accelerator: None,
+        }
+    }
+
     /// Everything that a checkpoint holds.
     pub fn entries(&self) -> (Vec<Entry<'_>>, HashMap<String, String>) {
         let mut entries = Vec::new();

@@ -67,7 +67,7 @@ pub fn quickstart(
     // A small scene: a smaller table is as sharp and trains faster.
     config.field.log2_size = 17;
     config.field.finest = 512;
-    let Trained { model, summary, .. } = recipe::train(&config, &mut run, false, interrupt, events)?;
+    let Trained { model, summary, .. } = recipe::train(&config, &mut run, false, None, interrupt, events)?;
     note("scoring held-out views");
     let mut pairs: Vec<Vec<ImageU8>> = vec![Vec::new(), Vec::new()];
     let scores = evaluate::evaluate(&model, Split::Test, Quality::Full, &mut |_, v| {

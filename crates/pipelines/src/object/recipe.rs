@@ -5,6 +5,7 @@ use super::device::{self, Drawing, Opened};
 use super::evaluate;
 use super::model::ObjectModel;
 use super::run_folder::RunFolder;
+use super::viewing::RunView;
 use crate::bench::train::{StageFigure, TrainReport};
 use crate::error::{PipelineError, Result};
 use diorama_data::import::{self, ImportOptions};
@@ -79,11 +80,12 @@ pub struct Trained {
 
 /// Trains into `folder`, from the start or from its checkpoint.
 ///
-/// Capture → pixels → model → loop of steps → checkpoint; `events` hears of all of it.
+/// Capture → pixels → model → loop of steps → checkpoint; `events` hears of all of it, and `view` sees it.
 pub fn train(
     config: &Config,
     folder: &mut RunFolder,
     resume: bool,
+    view: Option<&RunView>,
     interrupt: &AtomicBool,
     events: &mut dyn FnMut(&Event),
 ) -> Result<Trained> {
@@ -114,14 +116,16 @@ pub fn train(
     let options = run_options(config);
     let origin = model.origin;
     let checkpoints = folder.checkpoints();
-    let mut trainer = Trainer::new(model, Photographs(store), &checkpoints, opened)?;
+    let mut trainer = Trainer { view, ..Trainer::new(model, Photographs(store), &checkpoints, opened)? };
     let mut log_error = None;
     let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
         if let Err(e) = folder.log(e) {
             log_error.get_or_insert(e);
         }
+        view.into_iter().for_each(|v| v.hear(e));
         events(e);
     });
+    trainer.show()?;
     if let Some(e) = log_error {
         return Err(e);
     }
@@ -254,6 +258,8 @@ struct Trainer<'a> {
     device: Opened,
     /// Why the CPU has to go on for a GPU.
     device_lost: Option<String>,
+    /// Who looks on.
+    view: Option<&'a RunView>,
 }
 
 impl<'a> Trainer<'a> {
@@ -273,7 +279,17 @@ impl<'a> Trainer<'a> {
             marched: 0,
             device,
             device_lost: None,
+            view: None,
         })
+    }
+
+    /// Shows what has been learned so far.
+    fn show(&mut self) -> Result<()> {
+        if let Some(view) = self.view {
+            self.device.download(&mut self.model)?;
+            view.show(self.model.to_look_at());
+        }
+        Ok(())
     }
 
     /// Waits for a GPU and counts what it has done.
@@ -508,6 +524,9 @@ impl Trainee for Trainer<'_> {
     type Error = PipelineError;
 
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport> {
+        if self.view.is_some_and(RunView::wants) {
+            self.show()?;
+        }
         if self.device.is_gpu() {
             let e = match self.step_gpu(step, progress) {
                 // The device was the program's own choice: the CPU goes on.

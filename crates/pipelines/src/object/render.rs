@@ -6,10 +6,12 @@ use diorama_data::camera_path_json::{self, CameraPath};
 use diorama_data::mp4::Video;
 use diorama_data::{DataError, photo};
 use diorama_engine::renderers::volume::{Quality, View};
+use diorama_engine::samplers::{RayBatch, pixels};
 use diorama_geom::camera_path::{self, PathView};
 use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
-use diorama_geom::{Camera, Image, Pose};
+use diorama_geom::{Camera, Image, ImageU8, Pose};
+use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -48,6 +50,8 @@ pub enum Layer {
     Depth,
     Normal,
     Opacity,
+    /// How many steps of a ray lie in occupied cells.
+    Occupancy,
 }
 
 impl std::str::FromStr for Layer {
@@ -59,7 +63,8 @@ impl std::str::FromStr for Layer {
             "depth" => Ok(Layer::Depth),
             "normal" => Ok(Layer::Normal),
             "opacity" => Ok(Layer::Opacity),
-            _ => Err(format!("layer {s:?}: expected rgb, depth, normal or opacity")),
+            "occupancy" => Ok(Layer::Occupancy),
+            _ => Err(format!("layer {s:?}: expected rgb, depth, normal, opacity or occupancy")),
         }
     }
 }
@@ -141,7 +146,7 @@ pub fn render(
             return Ok((i, true));
         }
         let posed = model.to_model(v.camera, &v.world_from_camera);
-        let view = trace(model, &posed, o);
+        let view = trace(model, &posed, o.clip, o.quality);
         for (k, layer) in o.layers.iter().enumerate() {
             let image = draw_layer(model, &posed, &view, *layer);
             if let Some(folder) = &o.images {
@@ -159,17 +164,49 @@ pub fn render(
     Ok((total, false))
 }
 
-fn trace(model: &ObjectModel, camera: &PosedCamera, o: &RenderOptions) -> View {
-    let mut tracer = model.tracer(o.quality);
-    tracer.clip = o.clip.map(|(lo, hi)| {
+fn trace(model: &ObjectModel, camera: &PosedCamera, clip: Option<([f32; 3], [f32; 3])>, quality: Quality) -> View {
+    let mut tracer = model.tracer(quality);
+    tracer.clip = clip.map(|(lo, hi)| {
         let to = |p: [f32; 3]| model.model_from_world.point(DVec3::new(p[0] as f64, p[1] as f64, p[2] as f64)).as_vec3().to_array();
         (to(lo), to(hi))
     });
     tracer.view(camera, &mut |_| {})
 }
 
+/// One layer of a view, `[H, W, 3]`, of what lies in `clip` (world).
+pub fn picture(model: &ObjectModel, camera: &PosedCamera, layer: Layer, clip: Option<([f32; 3], [f32; 3])>, quality: Quality) -> ImageU8 {
+    if layer == Layer::Occupancy {
+        // The densities are not needed.
+        let (w, h) = (camera.camera.width as usize, camera.camera.height as usize);
+        let none = View { rgb: Image::zeros(w, h, 3), opacity: Image::zeros(w, h, 1), depth: Image::zeros(w, h, 1) };
+        return draw_layer(model, camera, &none, layer);
+    }
+    draw_layer(model, camera, &trace(model, camera, clip, quality), layer)
+}
+
+/// Steps of each pixel's ray that lie in occupied cells, as a share of the most that any ray has.
+fn occupied(model: &ObjectModel, camera: &PosedCamera) -> Vec<f32> {
+    const STEPS: f32 = 256.0;
+    let (w, h) = (camera.camera.width as usize, camera.camera.height as usize);
+    let Some(grid) = &model.occupancy else { return vec![0.0; w * h] };
+    let mut batch = RayBatch::default();
+    batch.resize(w * h);
+    for i in 0..w * h {
+        (batch.pixels[i * 2], batch.pixels[i * 2 + 1]) = ((i % w) as f32 + 0.5, (i / w) as f32 + 0.5);
+        (batch.images[i], batch.jitter[i]) = (0, 0.5);
+    }
+    pixels::rays(std::slice::from_ref(camera), model.config.sampling.near, model.cube(), &mut batch);
+    let rays = MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
+    let config = MarchConfig { cone: 0.0, dt_min: 1.0 / STEPS, dt_max: 1.0 / STEPS, max_samples: 4 * STEPS as usize };
+    let mut marched = Marched::default();
+    march::cpu::march(&grid.bits, &rays, &config, &mut march::cpu::MarchScratch::default(), &mut marched);
+    let counts: Vec<u32> = marched.offsets.windows(2).map(|o| o[1] - o[0]).collect();
+    let most = counts.iter().max().copied().unwrap_or(0).max(1) as f32;
+    counts.iter().map(|n| *n as f32 / most).collect()
+}
+
 /// A layer as it is shown: depth from near (bright) to far, normals as colours.
-fn draw_layer(model: &ObjectModel, camera: &PosedCamera, view: &View, layer: Layer) -> diorama_geom::ImageU8 {
+fn draw_layer(model: &ObjectModel, camera: &PosedCamera, view: &View, layer: Layer) -> ImageU8 {
     let (w, h) = (view.rgb.width, view.rgb.height);
     let mut out = Image::zeros(w, h, 3);
     let fill = |out: &mut Image, f: &dyn Fn(usize) -> [f32; 3]| {
@@ -178,6 +215,10 @@ fn draw_layer(model: &ObjectModel, camera: &PosedCamera, view: &View, layer: Lay
     match layer {
         Layer::Rgb => return view.rgb.to_u8(),
         Layer::Opacity => fill(&mut out, &|i| [view.opacity.data[i]; 3]),
+        Layer::Occupancy => {
+            let occupied = occupied(model, camera);
+            fill(&mut out, &|i| [occupied[i]; 3]);
+        }
         Layer::Depth => {
             let seen: Vec<f32> = view.depth.data.iter().copied().filter(|d| *d > 0.0).collect();
             let (lo, hi) = seen.iter().fold((f32::MAX, f32::MIN), |(a, b), d| (a.min(*d), b.max(*d)));
@@ -220,7 +261,7 @@ fn normals(model: &ObjectModel, camera: &PosedCamera, view: &View) -> Vec<[f32; 
         .collect()
 }
 
-fn save_layer(folder: &Path, i: usize, layer: Layer, image: &diorama_geom::ImageU8, view: &View, model: &ObjectModel) -> Result<()> {
+fn save_layer(folder: &Path, i: usize, layer: Layer, image: &ImageU8, view: &View, model: &ObjectModel) -> Result<()> {
     let name = match layer {
         Layer::Rgb => format!("{i:04}.png"),
         Layer::Depth => {
@@ -233,6 +274,7 @@ fn save_layer(folder: &Path, i: usize, layer: Layer, image: &diorama_geom::Image
         }
         Layer::Normal => format!("normal_{i:04}.png"),
         Layer::Opacity => format!("opacity_{i:04}.png"),
+        Layer::Occupancy => format!("occupancy_{i:04}.png"),
     };
     Ok(photo::save_png(&folder.join(name), image)?)
 }

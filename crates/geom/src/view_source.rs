@@ -1,0 +1,96 @@
+//! What a viewer needs of a run, without knowing what it is.
+
+use crate::{Camera, ImageU8, Pose};
+use std::path::PathBuf;
+
+/// What a pixel shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ViewLayer {
+    Rgb,
+    Depth,
+    Normal,
+    Opacity,
+    /// How much of the occupancy grid a ray passes.
+    Occupancy,
+}
+
+/// A view to be drawn.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ViewRequest {
+    pub camera: Camera,
+    pub world_from_camera: Pose,
+    pub layer: ViewLayer,
+    /// Lowest and highest corner in the world of what is shown.
+    pub clip: Option<([f32; 3], [f32; 3])>,
+}
+
+/// A camera that took a photograph.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewFrame {
+    pub name: String,
+    pub camera: Camera,
+    pub world_from_camera: Pose,
+    pub held_out: bool,
+}
+
+/// What there is to look at.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewScene {
+    pub name: String,
+    pub frames: Vec<ViewFrame>,
+    /// What the cameras look at, and how far they stand from it.
+    pub focus: [f64; 3],
+    pub distance: f64,
+    /// Lowest and highest corner in the world of what may be shown.
+    pub bounds: ([f64; 3], [f64; 3]),
+    /// The crop box as it was last saved.
+    pub crop: Option<([f32; 3], [f32; 3])>,
+    /// The camera path as it was last saved, nerfstudio's JSON with cameras in the world.
+    pub path: Option<String>,
+}
+
+/// How far training is.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ViewStatus {
+    pub step: u64,
+    pub seconds: f64,
+    pub loss: f64,
+    pub psnr: f64,
+    pub rays_per_s: f64,
+    pub running: bool,
+}
+
+/// A mesh to be made.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MeshRequest {
+    /// glb, obj, ply, stl, usdz or dae.
+    pub format: String,
+    pub faces: usize,
+    pub resolution: usize,
+    pub clip: Option<([f32; 3], [f32; 3])>,
+}
+
+/// A run, or a data set, that can be looked at. Errors are one line for the user.
+pub trait ViewSource: Send + Sync {
+    fn scene(&self) -> ViewScene;
+
+    fn status(&self) -> ViewStatus;
+
+    /// Draws a view as `[H, W, 3]` sRGB.
+    fn view(&self, request: &ViewRequest) -> ImageU8;
+
+    /// A small photograph of a frame.
+    fn thumbnail(&self, frame: usize) -> Result<ImageU8, String>;
+
+    /// Keeps the crop box for `render` and `export`.
+    fn save_crop(&self, crop: Option<([f32; 3], [f32; 3])>) -> Result<(), String>;
+
+    /// Keeps a camera path, nerfstudio's JSON with cameras in the world, for `render`; the file's name.
+    fn save_path(&self, json: &str) -> Result<PathBuf, String>;
+
+    /// The same path, given in the capture's frame as other programs write it, with cameras in the world.
+    fn open_path(&self, json: &str) -> Result<String, String>;
+
+    /// Makes a mesh; the file's name.
+    fn export(&self, request: &MeshRequest, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<PathBuf, String>;
+}

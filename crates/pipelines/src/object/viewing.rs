@@ -1,0 +1,219 @@
+//! A run as the viewer sees it: finished, or while it trains.
+
+use super::export::{self, ExportOptions, Size};
+use super::model::ObjectModel;
+use super::render::{self, Layer};
+use crate::error::{PipelineError, Result};
+use diorama_data::camera_path_json;
+use diorama_data::{DataError, atomic, photo};
+use diorama_engine::renderers::volume::Quality;
+use diorama_engine::train::Event;
+use diorama_geom::ImageU8;
+use diorama_geom::capture::{Split, focus_point};
+use diorama_geom::glam::DVec3;
+use diorama_geom::view_source::{MeshRequest, ViewFrame, ViewLayer, ViewRequest, ViewScene, ViewSource, ViewStatus};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, RwLock};
+use std::time::{Duration, Instant};
+
+/// Longest side of a small photograph.
+const THUMBNAIL: usize = 160;
+/// How often a run in training is looked at, at most.
+const REFRESH: Duration = Duration::from_secs(2);
+
+/// Lowest and highest corner in the world.
+pub type Crop = ([f32; 3], [f32; 3]);
+
+/// A box that was drawn in the viewer, as `crop.json` in the run folder keeps it.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct CropFile {
+    /// Corners in the world: z up, as in the viewer.
+    min: [f32; 3],
+    max: [f32; 3],
+}
+
+/// The crop box of a run, if one was saved.
+///
+/// # Errors
+/// When the file is malformed.
+pub fn read_crop(run: &Path) -> Result<Option<Crop>> {
+    let file = run.join("crop.json");
+    if !file.exists() {
+        return Ok(None);
+    }
+    let text = diorama_data::error::read(&file, 1 << 16)?;
+    let wrong =
+        |e: String| PipelineError::from(DataError::input(&file, format!("{e}; save the box in the viewer again or remove the file")));
+    let c: CropFile = serde_json::from_slice(&text).map_err(|e| wrong(e.to_string()))?;
+    if (0..3).any(|k| c.min[k] >= c.max[k] || !c.min[k].is_finite() || !c.max[k].is_finite()) {
+        return Err(wrong("min: must lie below max".into()));
+    }
+    Ok(Some((c.min, c.max)))
+}
+
+/// A run that is looked at. While it trains, [`RunView::wants`] says when to [`RunView::show`] what has been learned.
+pub struct RunView {
+    folder: PathBuf,
+    model: RwLock<Arc<ObjectModel>>,
+    status: Mutex<ViewStatus>,
+    shown: Mutex<Instant>,
+    /// Whether anybody has looked since the model was last shown.
+    looked: AtomicBool,
+}
+
+impl RunView {
+    pub fn new(folder: &Path, model: ObjectModel, running: bool) -> Arc<RunView> {
+        let status = ViewStatus { step: model.origin.step, seconds: model.origin.seconds, running, ..ViewStatus::default() };
+        Arc::new(RunView {
+            folder: folder.to_path_buf(),
+            model: RwLock::new(Arc::new(model)),
+            status: Mutex::new(status),
+            shown: Mutex::new(Instant::now()),
+            looked: AtomicBool::new(true),
+        })
+    }
+
+    fn model(&self) -> Arc<ObjectModel> {
+        self.model.read().expect("no panic while the model is exchanged").clone()
+    }
+
+    /// Whether a newer model would be looked at.
+    pub fn wants(&self) -> bool {
+        self.looked.load(Ordering::Relaxed) && self.shown.lock().is_ok_and(|s| s.elapsed() >= REFRESH)
+    }
+
+    pub fn show(&self, model: ObjectModel) {
+        *self.model.write().expect("no panic while the model is read") = Arc::new(model);
+        if let Ok(mut s) = self.shown.lock() {
+            *s = Instant::now();
+        }
+        self.looked.store(false, Ordering::Relaxed);
+    }
+
+    /// Takes note of what training tells.
+    pub fn hear(&self, event: &Event) {
+        let Ok(mut s) = self.status.lock() else { return };
+        match *event {
+            Event::Progress { step, seconds, loss, psnr, rays_per_s, .. } => {
+                *s = ViewStatus { step, seconds, loss, psnr, rays_per_s, running: true };
+            }
+            Event::Finished { step, .. } => (s.step, s.running) = (step, false),
+            _ => {}
+        }
+    }
+
+    fn tell<T>(r: Result<T>) -> std::result::Result<T, String> {
+        r.map_err(|e| e.to_string())
+    }
+}
+
+impl ViewSource for RunView {
+    fn scene(&self) -> ViewScene {
+        let m = self.model();
+        let frames: Vec<ViewFrame> = m
+            .capture
+            .frames
+            .iter()
+            .map(|f| ViewFrame {
+                name: f.name.clone(),
+                camera: f.camera,
+                world_from_camera: f.world_from_camera,
+                held_out: f.split != Split::Train,
+            })
+            .collect();
+        let poses: Vec<_> = frames.iter().map(|f| f.world_from_camera).collect();
+        let (focus, distance) = focus_point(&poses);
+        let s = m.capture.scene;
+        let corner = |sign: f64| (s.center + DVec3::splat(sign * s.half * s.aabb_scale as f64)).to_array();
+        let saved = std::fs::read_to_string(self.folder.join("camera_path.json")).ok();
+        ViewScene {
+            name: self.folder.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            frames,
+            focus: focus.to_array(),
+            distance,
+            bounds: (corner(-1.0), corner(1.0)),
+            crop: read_crop(&self.folder).ok().flatten(),
+            path: saved.and_then(|text| self.open_path(&text).ok()),
+        }
+    }
+
+    fn status(&self) -> ViewStatus {
+        self.status.lock().map(|s| *s).unwrap_or_default()
+    }
+
+    fn view(&self, r: &ViewRequest) -> ImageU8 {
+        self.looked.store(true, Ordering::Relaxed);
+        let m = self.model();
+        let posed = m.to_model(r.camera, &r.world_from_camera);
+        let layer = match r.layer {
+            ViewLayer::Rgb => Layer::Rgb,
+            ViewLayer::Depth => Layer::Depth,
+            ViewLayer::Normal => Layer::Normal,
+            ViewLayer::Opacity => Layer::Opacity,
+            ViewLayer::Occupancy => Layer::Occupancy,
+        };
+        render::picture(&m, &posed, layer, r.clip, Quality::Fast)
+    }
+
+    fn thumbnail(&self, frame: usize) -> std::result::Result<ImageU8, String> {
+        let m = self.model();
+        let f = m.capture.frames.get(frame).ok_or_else(|| format!("there is no photograph {frame}"))?;
+        let full = photo::load(&f.image).map_err(|e| e.to_string())?;
+        let by = (THUMBNAIL as f64 / full.width.max(full.height) as f64).min(1.0);
+        let side = |v: usize| ((v as f64 * by) as usize).max(1);
+        let small = full.downsampled(side(full.width), side(full.height));
+        if small.channels == 3 {
+            return Ok(small);
+        }
+        let data =
+            small.data.chunks_exact(small.channels).flat_map(|p| if p.len() == 4 { [p[0], p[1], p[2]] } else { [p[0]; 3] }).collect();
+        Ok(ImageU8 { channels: 3, data, ..small })
+    }
+
+    fn save_crop(&self, crop: Option<Crop>) -> std::result::Result<(), String> {
+        let file = self.folder.join("crop.json");
+        match crop {
+            Some((min, max)) => {
+                let json = serde_json::to_vec(&CropFile { min, max }).expect("plain values");
+                Self::tell(atomic::write(&file, &json).map_err(PipelineError::from))
+            }
+            None if file.exists() => std::fs::remove_file(&file).map_err(|e| e.to_string()),
+            None => Ok(()),
+        }
+    }
+
+    fn save_path(&self, json: &str) -> std::result::Result<PathBuf, String> {
+        let file = self.folder.join("camera_path.json");
+        let capture_from_world = self.model().capture.world_from_capture.inverse();
+        let moved = camera_path_json::moved(json, &file, &capture_from_world).map_err(|e| e.to_string())?;
+        atomic::write(&file, moved.as_bytes()).map_err(|e| e.to_string())?;
+        Ok(file)
+    }
+
+    fn open_path(&self, json: &str) -> std::result::Result<String, String> {
+        let file = self.folder.join("camera_path.json");
+        camera_path_json::moved(json, &file, &self.model().capture.world_from_capture).map_err(|e| e.to_string())
+    }
+
+    fn export(&self, r: &MeshRequest, progress: &mut dyn FnMut(&str, usize, usize)) -> std::result::Result<PathBuf, String> {
+        let format = r.format.parse::<export::Format>()?;
+        let out = self.folder.join(format!("mesh.{}", r.format.to_ascii_lowercase()));
+        let options = ExportOptions {
+            format,
+            out: out.clone(),
+            resolution: r.resolution,
+            level: None,
+            faces: Some(r.faces),
+            texture: None,
+            size: Size::Scaled(1.0),
+            unit_m: 1.0,
+            clip: r.clip,
+            floaters: 0.01,
+        };
+        Self::tell(export::export(&self.model(), &options, progress))?;
+        Ok(out)
+    }
+}

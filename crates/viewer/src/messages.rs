@@ -1,0 +1,143 @@
+//! What page and program say to each other, defined here alone: `web/src/messages.ts` is made from this file.
+//!
+//! Poses are `world_from_camera` as three rows of four; cameras look along +z with y down. Boxes are lowest and highest corner
+//! in the world.
+
+use serde::{Deserialize, Serialize};
+
+pub type Box6 = [f32; 6];
+
+/// What a pixel shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+#[serde(rename_all = "snake_case")]
+pub enum Layer {
+    Rgb,
+    Depth,
+    Normal,
+    Opacity,
+    Occupancy,
+}
+
+/// From the page.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(ts_rs::TS), derive(Serialize))]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Ask {
+    /// Draw a view; only the last one asked for counts. It is answered by a binary message: `id`, then a JPEG.
+    View {
+        id: u32,
+        width: u32,
+        height: u32,
+        fov_y: f64,
+        pose: [f64; 12],
+        layer: Layer,
+        clip: Option<Box6>,
+    },
+    /// Answered by a binary message: 2³¹ plus the frame's number, then a JPEG.
+    Thumbnail {
+        frame: u32,
+    },
+    /// Keep the crop box for `render` and `export`.
+    Crop {
+        clip: Option<Box6>,
+    },
+    /// Keep a camera path, nerfstudio's JSON with cameras in the world; it can then be fetched as `camera_path.json`.
+    Path {
+        json: String,
+    },
+    /// Take over a camera path, nerfstudio's JSON as other programs write it; answered by `Path`.
+    OpenPath {
+        json: String,
+    },
+    Export {
+        format: String,
+        faces: u32,
+        resolution: u32,
+        clip: Option<Box6>,
+    },
+}
+
+/// A camera that took a photograph.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+pub struct Photograph {
+    pub name: String,
+    pub pose: [f64; 12],
+    pub fov_y: f64,
+    pub aspect: f64,
+    pub held_out: bool,
+}
+
+/// From the program.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum Tell {
+    Scene {
+        name: String,
+        photographs: Vec<Photograph>,
+        focus: [f64; 3],
+        distance: f64,
+        bounds: [f64; 6],
+        crop: Option<Box6>,
+        path: Option<String>,
+    },
+    Status {
+        #[cfg_attr(test, ts(type = "number"))]
+        step: u64,
+        seconds: f64,
+        loss: f64,
+        psnr: f64,
+        rays_per_s: f64,
+        running: bool,
+    },
+    Working {
+        what: String,
+        percent: u32,
+    },
+    /// A mesh was made; `mesh.glb` can be fetched where it was a GLB.
+    Exported {
+        file: String,
+        glb: bool,
+    },
+    /// A camera path with cameras in the world.
+    Path {
+        json: String,
+    },
+    Saved {
+        what: String,
+        file: String,
+    },
+    Failed {
+        why: String,
+    },
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ts_rs::{Config, TS};
+
+    /// `DIORAMA_BLESS=1` writes the file anew.
+    #[test]
+    fn the_pages_types_are_those_of_this_file() {
+        let c = Config::default();
+        let types = [Layer::decl(&c), Ask::decl(&c), Photograph::decl(&c), Tell::decl(&c)];
+        let text: String = types.iter().map(|t| format!("export {t}\n")).collect();
+        let text = format!("// Made from crates/viewer/src/messages.rs by its test; do not edit.\n\n{text}");
+        let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("web/src/messages.ts");
+        if std::env::var_os("DIORAMA_BLESS").is_some() {
+            std::fs::write(&file, &text).unwrap();
+        }
+        assert_eq!(std::fs::read_to_string(&file).unwrap_or_default(), text, "run DIORAMA_BLESS=1 cargo test -p diorama-viewer");
+    }
+
+    #[test]
+    fn unknown_kinds_and_fields_are_errors() {
+        assert!(serde_json::from_str::<Ask>(r#"{"kind":"thumbnail","frame":3}"#).is_ok());
+        for bad in [r#"{"kind":"shell"}"#, r#"{"kind":"thumbnail","frame":-1}"#, r#"{"kind":"thumbnail","frame":1,"path":"/etc"}"#, "[]"] {
+            assert!(serde_json::from_str::<Ask>(bad).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,211 @@
+//! Accepting connections: the page's few files, and the socket.
+
+use crate::request::{self, Request};
+use crate::session;
+use diorama_geom::view_source::ViewSource;
+use std::io::Write;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+/// Connections that are served at a time.
+const MOST: usize = 32;
+/// How long a client may take to send its request or to take an answer.
+const PATIENCE: Duration = Duration::from_secs(10);
+
+const PAGE: &str = include_str!("../web/dist/index.html");
+const SCRIPT: &str = include_str!("../web/dist/app.js");
+const STYLE: &str = include_str!("../web/dist/app.css");
+
+/// Where to listen.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ViewerOptions {
+    pub host: IpAddr,
+    /// 0: any that is free.
+    pub port: u16,
+}
+
+impl Default for ViewerOptions {
+    fn default() -> Self {
+        ViewerOptions { host: IpAddr::V4(Ipv4Addr::LOCALHOST), port: 7007 }
+    }
+}
+
+/// Why there is no viewer.
+#[derive(Debug, thiserror::Error)]
+pub enum ViewerError {
+    #[error("--port {0}: is in use; choose another, or 0 for any")]
+    InUse(u16),
+    #[error("--host {0}: cannot listen there: {1}")]
+    Listen(SocketAddr, std::io::Error),
+}
+
+/// A bound, not yet serving viewer.
+pub struct Server {
+    listener: TcpListener,
+    shared: Arc<Shared>,
+}
+
+/// What all connections know.
+pub(crate) struct Shared {
+    /// What the Host header may be.
+    hosts: Vec<String>,
+    token: Option<String>,
+    pub source: Arc<dyn ViewSource>,
+    /// The mesh made last, where it is a GLB.
+    pub mesh: Mutex<Option<PathBuf>>,
+    /// The camera path saved last.
+    pub path: Mutex<Option<PathBuf>>,
+    pub stop: AtomicBool,
+    open: AtomicUsize,
+}
+
+impl Server {
+    /// Binds. Anywhere but on the loopback address a token is needed, which is part of [`Server::address`].
+    ///
+    /// # Errors
+    /// When the port is taken or the address is not this machine's.
+    pub fn bind(options: &ViewerOptions, source: Arc<dyn ViewSource>) -> Result<Server, ViewerError> {
+        let wanted = SocketAddr::new(options.host, options.port);
+        let listener = TcpListener::bind(wanted).map_err(|e| match e.kind() {
+            std::io::ErrorKind::AddrInUse => ViewerError::InUse(options.port),
+            _ => ViewerError::Listen(wanted, e),
+        })?;
+        let failed = |e| ViewerError::Listen(wanted, e);
+        let at = listener.local_addr().map_err(failed)?;
+        listener.set_nonblocking(true).map_err(failed)?;
+        let mut hosts = vec![at.to_string()];
+        if options.host.is_loopback() {
+            hosts.push(format!("localhost:{}", at.port()));
+        } else if options.host.is_unspecified() {
+            // Whatever address of this machine was typed; the token keeps others out.
+            hosts.extend(own_addresses().into_iter().map(|ip| SocketAddr::new(ip, at.port()).to_string()));
+        }
+        let token = (!options.host.is_loopback()).then(random_token);
+        let shared = Shared {
+            hosts,
+            token,
+            source,
+            mesh: Mutex::new(None),
+            path: Mutex::new(None),
+            stop: AtomicBool::new(false),
+            open: AtomicUsize::new(0),
+        };
+        Ok(Server { listener, shared: Arc::new(shared) })
+    }
+
+    /// What to open in a browser.
+    pub fn address(&self) -> String {
+        let host = self.shared.hosts.last().filter(|_| self.shared.token.is_some()).unwrap_or(&self.shared.hosts[0]);
+        match &self.shared.token {
+            Some(t) => format!("http://{host}/?token={t}"),
+            None => format!("http://{host}/"),
+        }
+    }
+
+    /// Serves until `interrupt` is set.
+    pub fn run(&self, interrupt: &AtomicBool) {
+        while !interrupt.load(Ordering::Relaxed) {
+            match self.listener.accept() {
+                Ok((stream, _)) => {
+                    let shared = self.shared.clone();
+                    if shared.open.fetch_add(1, Ordering::Relaxed) >= MOST {
+                        shared.open.fetch_sub(1, Ordering::Relaxed);
+                        continue;
+                    }
+                    std::thread::spawn(move || {
+                        let _ = serve(stream, &shared);
+                        shared.open.fetch_sub(1, Ordering::Relaxed);
+                    });
+                }
+                Err(_) => std::thread::sleep(Duration::from_millis(20)),
+            }
+        }
+        self.shared.stop.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Addresses under which this machine is reached: that of the route outward, and the loopback's.
+fn own_addresses() -> Vec<IpAddr> {
+    let outward = std::net::UdpSocket::bind("0.0.0.0:0").and_then(|s| {
+        // Nothing is sent: this asks the routing table.
+        s.connect("192.0.2.1:9")?;
+        s.local_addr()
+    });
+    [Some(IpAddr::V4(Ipv4Addr::LOCALHOST)), outward.ok().map(|a| a.ip())].into_iter().flatten().collect()
+}
+
+/// 128 random bits from the system.
+fn random_token() -> String {
+    let mut bits = [0u8; 16];
+    getrandom::fill(&mut bits).expect("the system has random numbers");
+    bits.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+fn serve(mut stream: TcpStream, shared: &Arc<Shared>) -> std::io::Result<()> {
+    stream.set_nonblocking(false)?;
+    stream.set_read_timeout(Some(PATIENCE))?;
+    stream.set_write_timeout(Some(PATIENCE))?;
+    stream.set_nodelay(true)?;
+    let admitted = request::read(&mut stream).and_then(|r| {
+        request::admit(&r, &shared.hosts, shared.token.as_deref())?;
+        Ok(r)
+    });
+    match admitted {
+        Err((status, why)) => answer(&mut stream, status, "text/plain; charset=utf-8", why.as_bytes()),
+        Ok(Request { path, socket_key: Some(key), .. }) if path == "/socket" => {
+            let accept = tungstenite::handshake::derive_accept_key(key.as_bytes());
+            write!(
+                stream,
+                "HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: {accept}\r\n\r\n"
+            )?;
+            session::run(stream, shared);
+            Ok(())
+        }
+        Ok(r) => file(&mut stream, &r.path, shared),
+    }
+}
+
+fn file(stream: &mut TcpStream, path: &str, shared: &Shared) -> std::io::Result<()> {
+    match path {
+        "/" => answer(stream, 200, "text/html; charset=utf-8", PAGE.as_bytes()),
+        "/app.js" => answer(stream, 200, "text/javascript; charset=utf-8", SCRIPT.as_bytes()),
+        "/app.css" => answer(stream, 200, "text/css; charset=utf-8", STYLE.as_bytes()),
+        "/favicon.ico" => answer(stream, 204, "image/x-icon", b""),
+        "/mesh.glb" => made(stream, &shared.mesh, "model/gltf-binary"),
+        "/camera_path.json" => made(stream, &shared.path, "application/json"),
+        _ => answer(stream, 404, "text/plain; charset=utf-8", b"there is no such page"),
+    }
+}
+
+/// Answers with a file that a session made.
+fn made(stream: &mut TcpStream, file: &Mutex<Option<PathBuf>>, kind: &str) -> std::io::Result<()> {
+    let file = file.lock().ok().and_then(|f| f.clone());
+    match file.map(std::fs::read) {
+        Some(Ok(bytes)) => answer(stream, 200, kind, &bytes),
+        _ => answer(stream, 404, "text/plain; charset=utf-8", b"it has not been made yet"),
+    }
+}
+
+fn answer(stream: &mut TcpStream, status: u16, kind: &str, body: &[u8]) -> std::io::Result<()> {
+    let reason = match status {
+        200 => "OK",
+        204 => "No Content",
+        401 => "Unauthorized",
+        403 => "Forbidden",
+        404 => "Not Found",
+        405 => "Method Not Allowed",
+        _ => "Bad Request",
+    };
+    write!(
+        stream,
+        "HTTP/1.1 {status} {reason}\r\nContent-Type: {kind}\r\nContent-Length: {}\r\nConnection: close\r\nCache-Control: no-store\r\n\
+         X-Content-Type-Options: nosniff\r\nX-Frame-Options: DENY\r\nReferrer-Policy: no-referrer\r\nCross-Origin-Resource-Policy: same-origin\r\n\
+         Content-Security-Policy: default-src 'self'; img-src 'self' blob: data:; connect-src 'self' blob:; frame-ancestors 'none'\r\n\r\n",
+        body.len()
+    )?;
+    stream.write_all(body)?;
+    stream.flush()
+}

@@ -1,0 +1,136 @@
+// What lies over the picture: cameras, crop box, path and mesh, in the picture's own perspective.
+
+import * as THREE from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
+import type { Photograph } from "./messages";
+
+/** World from a three.js camera (looking along -z, y up), from `world_from_camera` rows (looking along z, y down). */
+export function matrixOf(pose: number[]): THREE.Matrix4 {
+  const p = pose as [number, number, number, number, number, number, number, number, number, number, number, number];
+  return new THREE.Matrix4().set(p[0], -p[1], -p[2], p[3], p[4], -p[5], -p[6], p[7], p[8], -p[9], -p[10], p[11], 0, 0, 0, 1);
+}
+
+export function poseOf(m: THREE.Matrix4): number[] {
+  const e = m.elements;
+  return [e[0], -e[4], -e[8], e[12], e[1], -e[5], -e[9], e[13], e[2], -e[6], -e[10], e[14]];
+}
+
+export class Stage {
+  readonly camera = new THREE.PerspectiveCamera(50, 1, 0.01, 1000);
+  readonly controls: OrbitControls;
+  private readonly scene = new THREE.Scene();
+  private readonly renderer: THREE.WebGLRenderer | null;
+  private readonly frusta = new THREE.Group();
+  private readonly path = new THREE.Group();
+  private readonly box: THREE.Box3Helper;
+  private mesh: THREE.Object3D | null = null;
+  private changed = true;
+
+  constructor(canvas: HTMLCanvasElement) {
+    // Without WebGL the picture alone is shown; it comes from the program.
+    try {
+      this.renderer = new THREE.WebGLRenderer({ canvas, alpha: true, antialias: true, preserveDrawingBuffer: true });
+      this.renderer.setClearColor(0, 0);
+    } catch {
+      this.renderer = null;
+    }
+    this.camera.up.set(0, 0, 1);
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.addEventListener("change", () => (this.changed = true));
+    this.box = new THREE.Box3Helper(new THREE.Box3(), 0xffcc44);
+    this.box.visible = false;
+    this.scene.add(this.frusta, this.path, this.box);
+  }
+
+  get hasOverlay(): boolean {
+    return this.renderer !== null;
+  }
+
+  resize(width: number, height: number): void {
+    this.renderer?.setPixelRatio(window.devicePixelRatio);
+    this.renderer?.setSize(width, height, false);
+    this.camera.aspect = width / Math.max(height, 1);
+    this.camera.updateProjectionMatrix();
+  }
+
+  /** Draws where anything has changed. */
+  draw(): void {
+    if (this.changed) this.renderer?.render(this.scene, this.camera);
+    this.changed = false;
+  }
+
+  touch(): void {
+    this.changed = true;
+  }
+
+  /** Stands the camera where a pose says, turning about a point `distance` before it. */
+  lookFrom(matrix: THREE.Matrix4, distance: number): void {
+    const position = new THREE.Vector3().setFromMatrixPosition(matrix);
+    const forward = new THREE.Vector3(0, 0, -1).transformDirection(matrix);
+    this.camera.position.copy(position);
+    this.controls.target.copy(position).addScaledVector(forward, distance);
+    this.controls.update();
+  }
+
+  pose(): number[] {
+    this.camera.updateMatrixWorld();
+    return poseOf(this.camera.matrixWorld);
+  }
+
+  showPhotographs(photographs: Photograph[], size: number): void {
+    this.frusta.clear();
+    for (const held of [false, true]) {
+      const points: number[] = [];
+      for (const p of photographs.filter((p) => p.held_out === held)) {
+        const m = matrixOf(p.pose);
+        const h = Math.tan(p.fov_y / 2) * size;
+        const w = h * p.aspect;
+        const eye = new THREE.Vector3().setFromMatrixPosition(m);
+        const corners = [[-w, -h], [w, -h], [w, h], [-w, h]].map(([x, y]) => new THREE.Vector3(x, y, -size).applyMatrix4(m));
+        corners.forEach((c, k) => points.push(...eye.toArray(), ...c.toArray(), ...c.toArray(), ...corners[(k + 1) % 4]!.toArray()));
+      }
+      this.frusta.add(lines(points, held ? 0xdc3c28 : 0x4a8aff));
+    }
+  }
+
+  showFrusta(on: boolean): void {
+    this.frusta.visible = on;
+  }
+
+  showBox(box: number[] | null): void {
+    this.box.visible = box !== null;
+    if (box) {
+      this.box.box.min.set(box[0]!, box[1]!, box[2]!);
+      this.box.box.max.set(box[3]!, box[4]!, box[5]!);
+    }
+  }
+
+  showPath(points: THREE.Vector3[]): void {
+    this.path.clear();
+    if (points.length > 1) {
+      const material = new THREE.LineBasicMaterial({ color: 0x66ff99, depthTest: false });
+      this.path.add(new THREE.Line(new THREE.BufferGeometry().setFromPoints(points), material));
+    }
+  }
+
+  async loadMesh(url: string): Promise<void> {
+    const made = await new GLTFLoader().loadAsync(url);
+    if (this.mesh) this.scene.remove(this.mesh);
+    this.mesh = made.scene;
+    // glTF is y up; the world here is z up.
+    this.mesh.rotation.x = Math.PI / 2;
+    this.scene.add(this.mesh);
+  }
+
+  showMesh(on: boolean): boolean {
+    if (this.mesh) this.mesh.visible = on;
+    return this.mesh !== null;
+  }
+}
+
+function lines(points: number[], color: number): THREE.LineSegments {
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.Float32BufferAttribute(points, 3));
+  return new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ color }));
+}
