@@ -1,4 +1,4 @@
-//! Chores: `cargo xtask ci`, `cargo xtask gpu-check` and `cargo xtask tidy`.
+//! Chores: `cargo xtask ci`, `cargo xtask gpu-check`, `cargo xtask viewer-check` and `cargo xtask tidy`.
 
 mod tidy;
 
@@ -9,9 +9,10 @@ fn main() -> ExitCode {
     let ok = match &verb[..] {
         "ci" => ci(),
         "gpu-check" => gpu_check(&std::env::args().nth(2).unwrap_or("vulkan".into())),
+        "viewer-check" => viewer_check(),
         "tidy" => step("tidy", tidy::run()),
         _ => {
-            eprintln!("usage: cargo xtask ci | gpu-check [cuda|vulkan|metal|webgpu] | tidy");
+            eprintln!("usage: cargo xtask ci | gpu-check [cuda|vulkan|metal|webgpu] | viewer-check | tidy");
             false
         }
     };
@@ -102,4 +103,32 @@ fn tests() -> (usize, usize, usize) {
         failed = 1;
     }
     (passed.saturating_sub(skipped), failed, skipped)
+}
+
+/// The viewer's page: types, bundle as fresh as its sources, and the whole of it in headless Chromium.
+fn viewer_check() -> bool {
+    let web = std::path::Path::new("crates/viewer/web");
+    let npm = |args: &[&str]| {
+        println!("\n$ npm {}", args.join(" "));
+        Command::new("npm").args(args).current_dir(web).status().is_ok_and(|s| s.success())
+    };
+    let read = || ["app.js", "app.css", "index.html"].map(|f| std::fs::read(web.join("dist").join(f)).unwrap_or_default());
+    // esbuild's program comes with its package; no script of any package runs.
+    let mut ok = step("packages", npm(&["ci", "--ignore-scripts", "--no-audit", "--no-fund"]));
+    ok &= step("types", npm(&["run", "check"]));
+    let before = read();
+    ok &= step("bundle", npm(&["run", "build"]) && read() == before);
+    let run = std::env::temp_dir().join(format!("diorama-viewer-check-{}", std::process::id()));
+    let diorama = "target/release/diorama";
+    let made = cargo(&["build", "--release"])
+        && Command::new(diorama)
+            .args(["quickstart", "--seconds", "6", "--out"])
+            .arg(&run)
+            .stdout(Stdio::null())
+            .status()
+            .is_ok_and(|s| s.success());
+    let absolute = std::path::absolute(diorama).unwrap_or_default();
+    let seen = Command::new("node").arg("test/viewer.mjs").arg(absolute).arg(&run).current_dir(web).status().is_ok_and(|s| s.success());
+    let _ = std::fs::remove_dir_all(&run);
+    ok & step("viewer", made && seen)
 }
