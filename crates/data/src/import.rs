@@ -1,5 +1,6 @@
 //! From a folder of photographs with poses to a [`Capture`].
 
+use crate::archive::{self, ArchiveLimits};
 use crate::error::{DataError, Result};
 use crate::split::{self, SplitRule};
 use crate::{colmap, llff, transforms_json};
@@ -64,7 +65,7 @@ pub struct Imported {
     pub unknown_up: bool,
 }
 
-/// Reads a capture: a folder, or one of the description files in it.
+/// Reads a capture: a folder, one of the description files in it, or a zip of it.
 ///
 /// `transforms.json` wins over the Blender set, COLMAP and LLFF unless `options.format` says otherwise.
 pub fn import(data: &Path, options: &ImportOptions) -> Result<Capture> {
@@ -74,6 +75,13 @@ pub fn import(data: &Path, options: &ImportOptions) -> Result<Capture> {
             "does not exist; give a folder with photographs and transforms.json, a COLMAP model or poses_bounds.npy",
         ));
     }
+    let unpacked;
+    let data = if data.is_file() && data.extension().is_some_and(|e| e.eq_ignore_ascii_case("zip")) {
+        unpacked = archive::unpacked(data, &ArchiveLimits::default())?;
+        &unpacked
+    } else {
+        data
+    };
     let (root, file) = if data.is_dir() { (data, None) } else { (data.parent().unwrap_or(Path::new(".")), Some(data)) };
     let root = if root.as_os_str().is_empty() { Path::new(".") } else { root };
     let named = file.and_then(|f| f.extension()).is_some_and(|e| e == "json");

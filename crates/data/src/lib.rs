@@ -1,6 +1,7 @@
 //! Every byte to or from disk: captures, images, video, meshes, checkpoints, logs. Knows no training.
 #![allow(unsafe_code)] // the memory map in `pixel_store`
 
+pub mod archive;
 pub mod atomic;
 pub mod camera_path_json;
 pub mod checkpoint;

@@ -29,15 +29,15 @@ pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// A key under which IMG_9 comes before IMG_10.
-fn natural(name: &str) -> Vec<(String, u64)> {
-    let mut key = vec![(String::new(), 0u64)];
+/// A key under which IMG_9 comes before IMG_10: texts with the numbers that follow them.
+fn natural(name: &str) -> Vec<(String, Option<u64>)> {
+    let mut key = vec![(String::new(), None)];
     for c in name.chars() {
         let last = key.last_mut().expect("begins with one");
-        match c.to_digit(10) {
-            Some(d) => last.1 = last.1.saturating_mul(10).saturating_add(d as u64 + (last.1 == 0) as u64),
-            None if last.1 > 0 => key.push((c.to_string(), 0)),
-            None => last.0.push(c),
+        match (c.to_digit(10), last.1) {
+            (Some(d), n) => last.1 = Some(n.unwrap_or(0u64).saturating_mul(10).saturating_add(d as u64)),
+            (None, Some(_)) => key.push((c.to_string(), None)),
+            (None, None) => last.0.push(c),
         }
     }
     key
