@@ -42,7 +42,10 @@ pub fn unpacked(archive: &Path, limits: &ArchiveLimits) -> Result<PathBuf> {
         return if known == mark {
             Ok(root_of(&folder))
         } else {
-            Err(DataError::input(&folder, format!("is there and is not what {} holds; move it away, or give the folder instead", archive.display())))
+            Err(DataError::input(
+                &folder,
+                format!("is there and is not what {} holds; move it away, or give the folder instead", archive.display()),
+            ))
         };
     }
     let partial = archive.with_extension("partial");
@@ -76,7 +79,8 @@ fn root_of(folder: &Path) -> PathBuf {
 fn unpack(archive: &Path, folder: &Path, limits: &ArchiveLimits) -> Result<()> {
     let bad = |what: String| DataError::input(archive, what);
     let file = File::open(archive).map_err(DataError::io(archive, "read"))?;
-    let mut zip = zip::ZipArchive::new(BufReader::new(file)).map_err(|e| bad(format!("is not a zip that can be read ({e}); copy it again")))?;
+    let mut zip =
+        zip::ZipArchive::new(BufReader::new(file)).map_err(|e| bad(format!("is not a zip that can be read ({e}); copy it again")))?;
     if zip.len() > limits.entries {
         return Err(bad(format!("holds {} entries, more than the limit of {}", zip.len(), limits.entries)));
     }
@@ -168,7 +172,9 @@ mod tests {
         }
         refused("is a link", usual, &|w| w.add_symlink("l", "/etc/passwd", SimpleFileOptions::default()).unwrap());
         refused("a bomb", usual, &|w| put(w, "b", &vec![0; 8 << 20]));
-        refused("more than the limit of 1 MiB", ArchiveLimits { bytes: 1 << 20, ratio: 1 << 40, ..usual }, &|w| put(w, "b", &vec![0; 2 << 20]));
+        refused("more than the limit of 1 MiB", ArchiveLimits { bytes: 1 << 20, ratio: 1 << 40, ..usual }, &|w| {
+            put(w, "b", &vec![0; 2 << 20])
+        });
         refused("more than the limit of 2", ArchiveLimits { entries: 2, ..usual }, &|w| (0..3).for_each(|i| put(w, &format!("{i}"), b"")));
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("c.zip");

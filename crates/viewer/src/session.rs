@@ -235,6 +235,15 @@ fn view_request(width: u32, height: u32, fov_y: f64, pose: &[f64; 12], layer: La
     Some(ViewRequest { camera, world_from_camera, layer, clip })
 }
 
+/// Reads a message as a session would.
+pub fn fuzz(text: &[u8]) {
+    if let Ok(Ask::View { width, height, fov_y, pose, layer, clip, .. }) = serde_json::from_slice(text)
+        && let Some(r) = view_request(width, height, fov_y, &pose, layer, clip)
+    {
+        assert!(r.camera.width * r.camera.height <= LARGEST && r.camera.fx.is_finite());
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

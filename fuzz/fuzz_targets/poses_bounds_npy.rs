@@ -1,0 +1,3 @@
+#![no_main]
+
+libfuzzer_sys::fuzz_target!(|data: &[u8]| (diorama_fuzz::parser("poses_bounds_npy").run)(data));

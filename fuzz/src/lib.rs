@@ -1,0 +1,254 @@
+//! Every parser of bytes that may come from strangers, as a function that must neither crash nor hang.
+
+use diorama_data::{archive, camera_path_json, checkpoint, colmap, import, llff, photo, photo_import, transforms_json};
+use diorama_geom::{ImageU8, Similarity};
+use std::path::PathBuf;
+use std::sync::OnceLock;
+
+/// A parser with an input that it accepts.
+pub struct Parser {
+    pub name: &'static str,
+    pub run: fn(&[u8]),
+    pub seeds: fn() -> Vec<Vec<u8>>,
+}
+
+/// All of them.
+pub const PARSERS: &[Parser] = &[
+    Parser { name: "transforms_json", run: transforms_json, seeds: transforms_seeds },
+    Parser { name: "camera_path_json", run: camera_path, seeds: path_seeds },
+    Parser { name: "colmap_binary", run: colmap_binary, seeds: colmap_binary_seeds },
+    Parser { name: "colmap_text", run: colmap_text, seeds: colmap_text_seeds },
+    Parser { name: "colmap_points", run: colmap_points, seeds: points_seeds },
+    Parser { name: "poses_bounds_npy", run: npy, seeds: npy_seeds },
+    Parser { name: "checkpoint", run: load_checkpoint, seeds: checkpoint_seeds },
+    Parser { name: "photo", run: decode_photo, seeds: photo_seeds },
+    Parser { name: "jpeg_metadata", run: strip_jpeg, seeds: photo_seeds },
+    Parser { name: "zip", run: unzip, seeds: zip_seeds },
+    Parser { name: "http_request", run: http, seeds: http_seeds },
+    Parser { name: "viewer_message", run: message, seeds: message_seeds },
+];
+
+/// A parser by name.
+///
+/// # Panics
+/// When there is none of that name.
+pub fn parser(name: &str) -> &'static Parser {
+    PARSERS.iter().find(|p| p.name == name).unwrap_or_else(|| panic!("no parser {name}"))
+}
+
+/// A folder of this process with a small photograph, in memory where the system has such.
+fn folder() -> &'static PathBuf {
+    static FOLDER: OnceLock<PathBuf> = OnceLock::new();
+    FOLDER.get_or_init(|| {
+        let base = PathBuf::from("/dev/shm");
+        let base = if base.is_dir() { base } else { std::env::temp_dir() };
+        let folder = base.join(format!("diorama-fuzz-{}", std::process::id()));
+        std::fs::create_dir_all(folder.join("images")).expect("a scratch folder");
+        let image = ImageU8 { width: 4, height: 3, channels: 3, data: vec![90; 36] };
+        photo::save_png(&folder.join("images/a.png"), &image).expect("a scratch file");
+        folder
+    })
+}
+
+/// Removes what [`PARSERS`] have left.
+pub fn clean_up() {
+    let _ = std::fs::remove_dir_all(folder());
+}
+
+/// Writes `data` as a file of the scratch folder.
+fn file(name: &str, data: &[u8]) -> PathBuf {
+    let path = folder().join(name);
+    std::fs::write(&path, data).expect("a scratch file");
+    path
+}
+
+fn transforms_json(data: &[u8]) {
+    let path = file("transforms.json", data);
+    let _ = transforms_json::read(&path, folder());
+    let _ = import::import(&path, &import::ImportOptions::default());
+}
+
+fn camera_path(data: &[u8]) {
+    let path = file("camera_path.json", data);
+    let _ = camera_path_json::read(&path, &Similarity::IDENTITY);
+    if let Ok(text) = std::str::from_utf8(data) {
+        let _ = camera_path_json::moved(text, &path, &Similarity::IDENTITY);
+    }
+}
+
+/// Cameras and images in one input, divided where its first byte says.
+fn halves(data: &[u8]) -> (&[u8], &[u8]) {
+    let Some((&at, rest)) = data.split_first() else { return (data, data) };
+    rest.split_at((at as usize * rest.len() / 255).min(rest.len()))
+}
+
+fn joined(a: &[u8], b: &[u8]) -> Vec<u8> {
+    let at = (a.len() * 255).div_ceil(a.len() + b.len());
+    [&[at as u8][..], a, b].concat()
+}
+
+fn colmap_binary(data: &[u8]) {
+    let (cameras, images) = halves(data);
+    let _ = std::fs::create_dir_all(folder().join("binary/images"));
+    file("binary/cameras.bin", cameras);
+    file("binary/images.bin", images);
+    let _ = colmap::read(&folder().join("binary"));
+    let _ = colmap::registered(&folder().join("binary"));
+}
+
+fn colmap_text(data: &[u8]) {
+    let (cameras, images) = halves(data);
+    let _ = std::fs::create_dir_all(folder().join("text/images"));
+    file("text/cameras.txt", cameras);
+    file("text/images.txt", images);
+    let _ = colmap::read(&folder().join("text"));
+}
+
+fn colmap_points(data: &[u8]) {
+    file("points3D.bin", data);
+    let _ = colmap::points(folder());
+}
+
+fn npy(data: &[u8]) {
+    let _ = std::fs::create_dir_all(folder().join("llff/images"));
+    file("llff/images/a.png", b"");
+    file("llff/poses_bounds.npy", data);
+    let _ = llff::read(&folder().join("llff"));
+}
+
+fn load_checkpoint(data: &[u8]) {
+    let _ = checkpoint::read(&file("c.safetensors", data));
+}
+
+fn decode_photo(data: &[u8]) {
+    // The format is told by the content.
+    let path = file("photo.png", data);
+    // Mutations may claim any size; those beyond the limits must be refused, those below need not be decoded here.
+    if photo::size(&path).is_ok_and(|(w, h)| w as u64 * h as u64 <= 1 << 16) {
+        let _ = photo::load(&path);
+    }
+    let _ = photo::is_turned(&path);
+}
+
+fn strip_jpeg(data: &[u8]) {
+    if let Some(clean) = photo_import::without_metadata(data) {
+        assert!(clean.len() <= data.len());
+        assert_eq!(photo_import::without_metadata(&clean).as_deref(), Some(&clean[..]), "a clean file is clean");
+    }
+}
+
+fn unzip(data: &[u8]) {
+    let path = file("archive.zip", data);
+    let _ = std::fs::remove_dir_all(folder().join("archive"));
+    let limits = archive::ArchiveLimits { entries: 100, bytes: 1 << 20, ratio: 100 };
+    let _ = archive::unpacked(&path, &limits);
+}
+
+fn http(data: &[u8]) {
+    diorama_viewer::fuzz_request(data);
+}
+
+fn message(data: &[u8]) {
+    diorama_viewer::fuzz_message(data);
+}
+
+fn transforms_seeds() -> Vec<Vec<u8>> {
+    let frame = |x: f64| serde_json::json!({ "file_path": "images/a", "transform_matrix": [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]], "mask_path": "images/a.png", "time": 0.5 });
+    let whole = serde_json::json!({ "camera_angle_x": 0.7, "fl_x": 3.0, "w": 4, "h": 3, "k1": 0.1, "k2": 0.0, "p1": 1e-3, "p2": 0, "camera_model": "OPENCV",
+        "aabb_scale": 4, "scale": 0.33, "offset": [0.5, 0.5, 0.5], "train_filenames": ["images/a"], "frames": [frame(0.0), frame(1.0), frame(2.0), frame(3.0)] });
+    vec![whole.to_string().into_bytes()]
+}
+
+fn path_seeds() -> Vec<Vec<u8>> {
+    let m = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4, 0, 0, 0, 1];
+    let path = serde_json::json!({ "render_width": 64, "render_height": 48, "fps": 24, "is_cycle": false,
+        "keyframes": [{ "matrix": "[1,0,0,0,0,1,0,0,0,0,1,0,0,0,4,1]", "fov": 50 }], "camera_path": [{ "camera_to_world": m, "fov": 50, "aspect": 1.3 }] });
+    vec![path.to_string().into_bytes()]
+}
+
+fn colmap_binary_seeds() -> Vec<Vec<u8>> {
+    let (mut cameras, mut images) = (Vec::new(), Vec::new());
+    cameras.extend(1u64.to_le_bytes());
+    cameras.extend([1u32.to_le_bytes(), 4u32.to_le_bytes()].concat());
+    cameras.extend([4u64.to_le_bytes(), 3u64.to_le_bytes()].concat());
+    [3.0f64, 3.0, 2.0, 1.5, 0.1, 0.0, 0.0, 0.0].iter().for_each(|v| cameras.extend(v.to_le_bytes()));
+    images.extend(1u64.to_le_bytes());
+    images.extend(1u32.to_le_bytes());
+    [1.0f64, 0.0, 0.0, 0.0, 0.0, 0.0, 4.0].iter().for_each(|v| images.extend(v.to_le_bytes()));
+    images.extend(1u32.to_le_bytes());
+    images.extend(b"a.png\0");
+    images.extend(1u64.to_le_bytes());
+    images.extend([0; 24]);
+    vec![joined(&cameras, &images)]
+}
+
+fn colmap_text_seeds() -> Vec<Vec<u8>> {
+    vec![joined(b"# cameras\n1 OPENCV 4 3 3 3 2 1.5 0.1 0 0 0\n", b"# images\n1 1 0 0 0 0 0 4 1 a.png\n0.5 0.5 -1\n")]
+}
+
+fn points_seeds() -> Vec<Vec<u8>> {
+    let mut out = 1u64.to_le_bytes().to_vec();
+    out.extend(7u64.to_le_bytes());
+    [1.0f64, 2.0, 3.0].iter().for_each(|v| out.extend(v.to_le_bytes()));
+    out.extend([9, 8, 7]);
+    out.extend(0.5f64.to_le_bytes());
+    out.extend(1u64.to_le_bytes());
+    out.extend([0; 8]);
+    vec![out]
+}
+
+fn npy_seeds() -> Vec<Vec<u8>> {
+    let mut header = "{'descr': '<f8', 'fortran_order': False, 'shape': (1, 17), }".to_string();
+    header.push_str(&" ".repeat(117 - header.len()));
+    header.push('\n');
+    let mut out = b"\x93NUMPY\x01\x00".to_vec();
+    out.extend((header.len() as u16).to_le_bytes());
+    out.extend(header.as_bytes());
+    for v in [1.0f64, 0.0, 0.0, 0.0, 3.0, 0.0, 1.0, 0.0, 0.0, 4.0, 0.0, 0.0, 1.0, 4.0, 3.0, 1.0, 9.0] {
+        out.extend(v.to_le_bytes());
+    }
+    vec![out]
+}
+
+fn checkpoint_seeds() -> Vec<Vec<u8>> {
+    let folder = folder().join("checkpoints");
+    let data = [1.0f32, 2.0, 3.0];
+    let entries = [checkpoint::Entry { name: "a".into(), shape: vec![3], data: &data }];
+    let metadata = std::collections::HashMap::from([("method".to_string(), "ngp".to_string())]);
+    checkpoint::save(&folder, &entries, metadata).expect("a scratch checkpoint");
+    vec![std::fs::read(checkpoint::latest(&folder)).expect("a scratch checkpoint")]
+}
+
+fn photo_seeds() -> Vec<Vec<u8>> {
+    let data: Vec<u8> = (0..16 * 12 * 3).map(|i| (i * 7) as u8).collect();
+    let rgb = ImageU8 { width: 16, height: 12, channels: 3, data };
+    let rgba = ImageU8 { width: 4, height: 4, channels: 4, data: (0..64).collect() };
+    let jpeg = photo_import::write(&rgb, folder(), "seed").expect("a scratch file");
+    vec![std::fs::read(jpeg).expect("a scratch file"), photo::encode_png(&rgb), photo::encode_png(&rgba)]
+}
+
+fn zip_seeds() -> Vec<Vec<u8>> {
+    use std::io::Write;
+    let mut w = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    for name in ["a/transforms.json", "a/images/b.txt"] {
+        let deflated = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Deflated);
+        w.start_file(name, deflated).and_then(|()| Ok(w.write_all(&[b'x'; 100])?)).expect("memory takes all");
+    }
+    vec![w.finish().expect("memory takes all").into_inner()]
+}
+
+fn http_seeds() -> Vec<Vec<u8>> {
+    let head = "GET /socket?token=abc HTTP/1.1\r\nHost: 127.0.0.1:7007\r\nOrigin: http://127.0.0.1:7007\r\nUpgrade: websocket\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n";
+    vec![head.as_bytes().to_vec()]
+}
+
+fn message_seeds() -> Vec<Vec<u8>> {
+    let pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4];
+    [
+        serde_json::json!({ "kind": "view", "id": 1, "width": 64, "height": 48, "fov_y": 0.8, "pose": pose, "layer": "depth", "clip": [0, 0, 0, 1, 1, 1] }),
+        serde_json::json!({ "kind": "export", "format": "glb", "faces": 100, "resolution": 64, "clip": null }),
+        serde_json::json!({ "kind": "path", "json": "{}" }),
+    ]
+    .map(|v| v.to_string().into_bytes())
+    .to_vec()
+}
