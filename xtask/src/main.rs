@@ -64,6 +64,7 @@ fn ci() -> bool {
         // A level that this machine lacks falls back to the best it has.
         ok &= step(level, libraries_at(level));
     }
+    ok &= step("fuzz", cargo(&["run", "--release", "--quiet", "--package", "diorama-fuzz", "--", "20000"]));
     ok &= step("docs", cargo(&["doc", "--release", "--workspace", "--no-deps"]));
     for (tool, args) in [("deny", &["deny", "check", "licenses", "bans", "sources"][..]), ("typos", &["typos"][..])] {
         if installed(tool) {

@@ -204,7 +204,7 @@ fn poses_that_are_zero_broken_stretched_or_mirrored() {
             }
         }
     });
-    json_refused(&["frames[2].transform_matrix", "not a finite number"], set(0, serde_json::Value::Null));
+    json_refused(&["frames[2].transform_matrix", "not a finite 32-bit number"], set(0, serde_json::Value::Null));
     json_refused(&["frames[2].transform_matrix", "not rigid"], set(4, 3.5.into()));
     json_refused(&["frames[2].transform_matrix", "mirrors"], |j| {
         for r in 0..3 {
@@ -315,7 +315,7 @@ fn folders_of_runs() {
     check(&diorama(&["render", r, "--path", "loop"]), &["orbit, spiral"]);
     check(&diorama(&["render", r, "--size", "9"]), &["WIDTHxHEIGHT"]);
     check(&diorama(&["render", r, "--layers", "rgb,heat"]), &["heat"]);
-    check(&diorama(&["export", r, "-o", out.path().join("a.docx").to_str().unwrap()]), &["glb, obj, ply or stl"]);
+    check(&diorama(&["export", r, "-o", out.path().join("a.docx").to_str().unwrap()]), &["glb, obj, ply, stl, usdz or dae"]);
     check(&diorama(&["export", r, "-o", "/nonexistent/a.glb"]), &["/nonexistent", "not a folder"]);
     check(&diorama(&["export", r, "-o", out.path().join("a.glb").to_str().unwrap(), "--clip", "1,2,3"]), &["--clip"]);
     check(&diorama(&["export", r, "-o", out.path().join("a.glb").to_str().unwrap(), "--level", "1e9"]), &["mesh is empty", "--level"]);

@@ -101,8 +101,8 @@ impl<'a> Object<'a> {
         flat.iter()
             .map(|v| {
                 v.as_f64()
-                    .filter(|x| x.is_finite())
-                    .ok_or_else(|| self.wrong(key, &format!("{v:.40} is not a finite number; estimate this pose again")))
+                    .filter(|x| x.abs() <= f32::MAX as f64)
+                    .ok_or_else(|| self.wrong(key, &format!("{v:.40} is not a finite 32-bit number; estimate this pose again")))
             })
             .collect::<Result<Vec<f64>>>()
             .map(Some)
