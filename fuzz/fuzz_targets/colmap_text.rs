@@ -1,3 +1,4 @@
+//! Coverage-guided fuzzing of `colmap_text`.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|data: &[u8]| (diorama_fuzz::parser("colmap_text").run)(data));

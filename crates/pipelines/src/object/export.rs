@@ -182,7 +182,8 @@ fn metres_per_unit(mesh: &Mesh, size: Size) -> f64 {
 }
 
 /// A slab of 1/128 of the longest side lets half the light pass, `σ = ln 2 / slab`, but not more than half of the 99th
-/// percentile of sampled densities. On lego and fox twice or half of it shows held-out views 0.1 to 1.1 dB worse.
+/// percentile of sampled densities. Twice
+/// that shows held-out views of lego 0.1 dB better and of fox 0.4 dB worse, where holes open.
 pub(crate) fn automatic_level(model: &ObjectModel, grid: &Grid) -> f32 {
     let coarse = Grid { resolution: 48, ..*grid };
     let [nx, ny, nz] = coarse.points();
