@@ -12,7 +12,6 @@ const IMPORTS: [(&str, &[&str]); 10] = [
     ("data", &["geom"]),
     ("scenes", &["geom", "mesh"]),
     ("pipelines", &["geom", "kernels", "engine", "mesh", "data", "scenes"]),
-    ("viewer", &["geom"]),
     ("cli", &["geom", "kernels", "engine", "mesh", "data", "scenes", "pipelines", "viewer"]),
     ("testkit", &["geom"]),
     ("viewer", &["geom"]),
