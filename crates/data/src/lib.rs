@@ -1,5 +1,5 @@
 //! Every byte to or from disk: captures, images, video, meshes, checkpoints, logs. Knows no training.
-#![allow(unsafe_code)] // the memory map in `pixel_store`
+#![allow(unsafe_code)] // the bytes of numbers in `checkpoint`
 
 pub mod archive;
 pub mod atomic;

@@ -1,38 +1,36 @@
-//! The pixels of a capture as 8-bit samples: in memory while they fit a budget, else in a scratch file
-//! that is mapped, so that anonymous memory stays bounded however large the capture is.
+//! The pixels of a capture as 8-bit samples in memory: all of them while they fit a budget, else one of each square of some, drawn
+//! at random. Training draws far fewer pixels than such captures have, and memory stays bounded however large they are.
 
 use crate::error::{DataError, Result};
 use crate::photo;
 use diorama_geom::ImageU8;
 use diorama_geom::capture::Frame;
+use diorama_geom::rng::Rng;
 use rayon::prelude::*;
-use std::io::{Seek, SeekFrom, Write};
-use std::path::Path;
 
-/// Bytes that are kept in memory before a scratch file is used.
+/// Bytes that pixels may take.
 pub const DEFAULT_BUDGET: u64 = 4 << 30;
 
-enum Bytes {
-    Memory(Vec<u8>),
-    Mapped(memmap2::Mmap),
-}
+/// Stream of the random numbers by which pixels are kept.
+const KEPT: u64 = 15;
 
 /// Pixels of some frames, four bytes each: RGB and alpha (255 where the photograph has none).
 pub struct PixelStore {
-    bytes: Bytes,
+    bytes: Vec<u8>,
+    /// One of each `stride × stride` pixels is kept.
+    stride: u32,
     /// First byte of each frame, and of the one after the last.
     offsets: Vec<usize>,
     sizes: Vec<(u32, u32)>,
-    masks: Vec<Option<ImageU8>>,
+    /// 0 where a kept pixel is masked away.
+    masks: Vec<Option<Vec<u8>>>,
     pub has_alpha: bool,
 }
 
 /// What to decode.
-pub struct StoreOptions<'a> {
+pub struct StoreOptions {
     pub downscale: u32,
     pub budget: u64,
-    /// Where a scratch file may be put.
-    pub scratch: &'a Path,
 }
 
 impl PixelStore {
@@ -45,48 +43,52 @@ impl PixelStore {
                 (c.width, c.height)
             })
             .collect();
+        let squares = |stride: u32| sizes.iter().map(move |(w, h)| w.div_ceil(stride) as usize * h.div_ceil(stride) as usize);
+        let stride = (1..).find(|s| squares(*s).sum::<usize>() as u64 * 4 <= options.budget || *s >= 64).expect("some stride");
         let mut offsets = vec![0usize];
-        for (w, h) in &sizes {
-            offsets.push(offsets[offsets.len() - 1] + *w as usize * *h as usize * 4);
-        }
-        let total = offsets[frames.len()] as u64;
-        let in_memory = total <= options.budget;
-        let mut memory = vec![0u8; if in_memory { total as usize } else { 0 }];
-        let mut file = if in_memory { None } else { Some(scratch_file(options.scratch, total)?) };
-        let mut masks = Vec::with_capacity(frames.len());
-        let mut has_alpha = false;
+        squares(stride).for_each(|n| offsets.push(offsets[offsets.len() - 1] + n * 4));
+        let mut out = PixelStore { bytes: vec![0; offsets[frames.len()]], stride, offsets, sizes, masks: Vec::new(), has_alpha: false };
         // A few photographs at a time: decoded ones are larger than what is kept.
         let batch = rayon::current_num_threads().max(1) * 2;
         for first in (0..frames.len()).step_by(batch) {
             let last = (first + batch).min(frames.len());
-            let decoded: Vec<Result<(ImageU8, Option<ImageU8>)>> = (first..last)
+            let decoded: Vec<Result<Kept>> = (first..last)
                 .into_par_iter()
                 .map(|i| {
-                    let out = decode(frames[i], sizes[i]);
+                    let (image, mask) = decode(frames[i], out.sizes[i])?;
                     progress();
-                    out
+                    let mask = mask.map(|m| out.keep(i, |x, y| m.pixel(x, y)[0]));
+                    Ok(Kept { rgba: out.keep(i, |x, y| rgba(&image, x, y)), mask, has_alpha: image.channels == 4 })
                 })
                 .collect();
-            for (i, d) in (first..last).zip(decoded) {
-                let (image, mask) = d?;
-                has_alpha |= image.channels == 4;
-                masks.push(mask);
-                let rgba = to_rgba(&image);
-                match &mut file {
-                    None => memory[offsets[i]..offsets[i + 1]].copy_from_slice(&rgba),
-                    Some(f) => f.write_all(&rgba).map_err(DataError::io(options.scratch, "write the pixel cache"))?,
-                }
+            for (i, kept) in (first..last).zip(decoded) {
+                let kept = kept?;
+                out.has_alpha |= kept.has_alpha;
+                out.masks.push(kept.mask);
+                out.bytes[out.offsets[i]..out.offsets[i + 1]].copy_from_slice(kept.rgba.as_flattened());
             }
         }
-        let bytes = match file {
-            None => Bytes::Memory(memory),
-            Some(mut f) => {
-                f.seek(SeekFrom::Start(0)).map_err(DataError::io(options.scratch, "write the pixel cache"))?;
-                // SAFETY: the file has no name any more, so nobody else can shorten it.
-                Bytes::Mapped(unsafe { memmap2::Mmap::map(&f) }.map_err(DataError::io(options.scratch, "map the pixel cache"))?)
-            }
-        };
-        Ok(PixelStore { bytes, offsets, sizes, masks, has_alpha })
+        Ok(out)
+    }
+
+    /// What a frame has at the pixels that are kept of it.
+    fn keep<T>(&self, i: usize, at: impl Fn(usize, usize) -> T) -> Vec<T> {
+        let ((w, h), s) = (self.sizes[i], self.stride);
+        let places = (0..h.div_ceil(s)).flat_map(|by| (0..w.div_ceil(s)).map(move |bx| (bx, by)));
+        places.map(|(bx, by)| self.snap(i, bx * s, by * s)).map(|(x, y)| at(x as usize, y as usize)).collect()
+    }
+
+    /// The pixel that is kept of the square in which a pixel lies.
+    #[inline]
+    pub fn snap(&self, i: usize, x: u32, y: u32) -> (u32, u32) {
+        let s = self.stride;
+        if s == 1 {
+            return (x, y);
+        }
+        let ((w, h), (x0, y0)) = (self.sizes[i], (x / s * s, y / s * s));
+        let random = Rng::new(i as u64, KEPT).bits((y0 as u64) << 32 | x0 as u64);
+        // Squares at the right and lower edge are cut off.
+        (x0 + random as u32 % s.min(w - x0), y0 + (random >> 32) as u32 % s.min(h - y0))
     }
 
     pub fn len(&self) -> usize {
@@ -102,42 +104,36 @@ impl PixelStore {
         self.sizes[i]
     }
 
-    /// Pixels of frame `i`, `[H, W, 4]`.
-    pub fn frame(&self, i: usize) -> &[u8] {
-        let all: &[u8] = match &self.bytes {
-            Bytes::Memory(v) => v,
-            Bytes::Mapped(m) => m,
-        };
-        &all[self.offsets[i]..self.offsets[i + 1]]
+    /// Place of the square in which a pixel lies.
+    #[inline]
+    fn square(&self, i: usize, x: u32, y: u32) -> usize {
+        (y / self.stride) as usize * self.sizes[i].0.div_ceil(self.stride) as usize + (x / self.stride) as usize
     }
 
-    /// RGBA of a pixel.
+    /// RGBA of a pixel that [`PixelStore::snap`] gave.
     #[inline]
     pub fn pixel(&self, i: usize, x: u32, y: u32) -> [u8; 4] {
-        let at = (y as usize * self.sizes[i].0 as usize + x as usize) * 4;
-        self.frame(i)[at..at + 4].try_into().expect("four bytes")
+        let at = self.offsets[i] + self.square(i, x, y) * 4;
+        self.bytes[at..at + 4].try_into().expect("four bytes")
     }
 
-    /// Whether a pixel counts: not masked away.
+    /// Whether such a pixel counts: not masked away.
     #[inline]
     pub fn counts(&self, i: usize, x: u32, y: u32) -> bool {
-        self.masks[i].as_ref().is_none_or(|m| m.pixel(x as usize, y as usize)[0] >= 128)
+        self.masks[i].as_ref().is_none_or(|m| m[self.square(i, x, y)] >= 128)
     }
 
-    /// Whether the pixels lie in a mapped scratch file.
-    pub fn is_mapped(&self) -> bool {
-        matches!(self.bytes, Bytes::Mapped(_))
+    /// One of so many by so many pixels is kept; 1: all are.
+    pub fn stride(&self) -> u32 {
+        self.stride
     }
 }
 
-/// An unnamed file of the right size in `folder`.
-fn scratch_file(folder: &Path, bytes: u64) -> Result<std::fs::File> {
-    let path = folder.join("pixels.partial");
-    let file = std::fs::OpenOptions::new().read(true).write(true).create(true).truncate(true).open(&path);
-    let file = file.map_err(DataError::io(&path, "create the pixel cache"))?;
-    file.set_len(bytes).map_err(DataError::io(&path, "reserve the pixel cache"))?;
-    std::fs::remove_file(&path).map_err(DataError::io(&path, "hide the pixel cache"))?;
-    Ok(file)
+/// What is kept of a frame.
+struct Kept {
+    rgba: Vec<[u8; 4]>,
+    mask: Option<Vec<u8>>,
+    has_alpha: bool,
 }
 
 fn decode(frame: &Frame, size: (u32, u32)) -> Result<(ImageU8, Option<ImageU8>)> {
@@ -165,19 +161,20 @@ fn decode(frame: &Frame, size: (u32, u32)) -> Result<(ImageU8, Option<ImageU8>)>
     Ok((full.downsampled(size.0 as usize, size.1 as usize), mask))
 }
 
-fn to_rgba(im: &ImageU8) -> Vec<u8> {
-    match im.channels {
-        4 => im.data.clone(),
-        3 => im.data.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2], 255]).collect(),
-        _ => im.data.iter().flat_map(|v| [*v, *v, *v, 255]).collect(),
+fn rgba(im: &ImageU8, x: usize, y: usize) -> [u8; 4] {
+    match *im.pixel(x, y) {
+        [r, g, b, a] => [r, g, b, a],
+        [r, g, b] => [r, g, b, 255],
+        [v, ..] => [v, v, v, 255],
+        [] => [0; 4],
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
     use diorama_geom::{Camera, Pose};
+    use std::path::Path;
 
     fn frame(dir: &Path, name: &str, w: usize, h: usize, value: u8) -> Frame {
         let image = dir.join(name);
@@ -185,19 +182,44 @@ mod tests {
         Frame::new(name, image, Camera::pinhole(w as u32, h as u32, 1.0), Pose::IDENTITY)
     }
 
+    /// A photograph whose pixels tell where they are.
+    fn places(dir: &Path, w: usize, h: usize) -> Frame {
+        let data = (0..w * h).flat_map(|i| [(i % w) as u8, (i / w) as u8, 7]).collect();
+        let f = frame(dir, "places.png", w, h, 0);
+        photo::save_png(&f.image, &ImageU8 { width: w, height: h, channels: 3, data }).unwrap();
+        f
+    }
+
     #[test]
-    fn memory_and_mapped_file_hold_the_same_pixels() {
+    fn a_small_budget_keeps_one_pixel_of_each_square() {
         let dir = tempfile::tempdir().unwrap();
-        let frames: Vec<Frame> = (0..5).map(|i| frame(dir.path(), &format!("{i}.png"), 8 + i, 6, 40 * i as u8)).collect();
-        let refs: Vec<&Frame> = frames.iter().collect();
-        let load = |budget| PixelStore::load(&refs, &StoreOptions { downscale: 2, budget, scratch: dir.path() }, &|| {}).unwrap();
-        let (a, b) = (load(u64::MAX), load(0));
-        assert!(!a.is_mapped() && b.is_mapped());
-        for i in 0..5 {
-            assert_eq!(a.frame(i), b.frame(i));
-            assert_eq!(a.pixel(i, 1, 2), [40 * i as u8, 40 * i as u8, 40 * i as u8, 255]);
+        let mut f = places(dir.path(), 101, 67);
+        let mask = dir.path().join("m.png");
+        let half =
+            ImageU8 { width: 101, height: 67, channels: 1, data: (0..101 * 67).map(|i| if i % 101 < 50 { 255 } else { 0 }).collect() };
+        photo::save_png(&mask, &half).unwrap();
+        f.mask = Some(mask);
+        let load = |budget| PixelStore::load(&[&f, &f], &StoreOptions { downscale: 1, budget }, &|| {}).unwrap();
+        assert_eq!(load(u64::MAX).stride(), 1);
+        let budget = 2 * 101 * 67 * 4 / 10;
+        let s = load(budget);
+        assert!(s.stride() == 4 && s.bytes.len() as u64 <= budget);
+        let (mut sum, mut kept) = ([0.0; 2], std::collections::HashSet::new());
+        for i in 0..2 {
+            for (x, y) in (0..67).flat_map(|y| (0..101).map(move |x| (x, y))) {
+                let (a, b) = s.snap(i, x, y);
+                assert!(a / 4 == x / 4 && b / 4 == y / 4 && a < 101 && b < 67);
+                assert_eq!(s.snap(i, a, b), (a, b), "what is kept stays");
+                assert_eq!(s.pixel(i, x, y), [a as u8, b as u8, 7, 255]);
+                assert_eq!(s.counts(i, x, y), a < 50);
+                if x < 100 && y < 64 {
+                    (sum[0], sum[1]) = (sum[0] + (a % 4) as f64, sum[1] + (b % 4) as f64);
+                }
+                kept.insert((i, a, b));
+            }
         }
-        assert!(!dir.path().join("pixels.partial").exists());
+        assert_eq!(kept.len(), 2 * 26 * 17);
+        assert!(sum.iter().all(|v| (v / (2.0 * 6400.0) - 1.5).abs() < 0.15), "{sum:?}");
     }
 
     #[test]
@@ -205,7 +227,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let mut f = frame(dir.path(), "a.png", 8, 6, 0);
         f.camera.width = 9;
-        let options = StoreOptions { downscale: 1, budget: 1 << 20, scratch: dir.path() };
+        let options = StoreOptions { downscale: 1, budget: 1 << 20 };
         let e = PixelStore::load(&[&f], &options, &|| {}).err().unwrap();
         assert!(e.is_input() && e.to_string().contains("8×6"), "{e}");
         f.camera.width = 8;
@@ -222,7 +244,7 @@ mod tests {
         let mask = dir.path().join("m.png");
         photo::save_png(&mask, &ImageU8 { width: 4, height: 1, channels: 1, data: vec![0, 255, 0, 255] }).unwrap();
         f.mask = Some(mask);
-        let s = PixelStore::load(&[&f], &StoreOptions { downscale: 1, budget: 1 << 20, scratch: dir.path() }, &|| {}).unwrap();
+        let s = PixelStore::load(&[&f], &StoreOptions { downscale: 1, budget: 1 << 20 }, &|| {}).unwrap();
         assert_eq!([0, 1, 2, 3].map(|x| s.counts(0, x, 0)), [false, true, false, true]);
     }
 }

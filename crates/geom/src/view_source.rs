@@ -1,6 +1,6 @@
 //! What a viewer needs of a run, without knowing what it is.
 
-use crate::{Camera, ImageU8, Pose};
+use crate::{Camera, ImageU8, Pose, Similarity};
 use std::path::PathBuf;
 
 /// What a pixel shows.
@@ -41,6 +41,8 @@ pub struct ViewScene {
     /// What the cameras look at, and how far they stand from it.
     pub focus: [f64; 3],
     pub distance: f64,
+    /// Meshes are made in the capture's frame.
+    pub world_from_capture: Similarity,
     /// Lowest and highest corner in the world of what may be shown.
     pub bounds: ([f64; 3], [f64; 3]),
     /// The crop box as it was last saved.

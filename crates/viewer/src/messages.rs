@@ -79,6 +79,8 @@ pub enum Tell {
         photographs: Vec<Photograph>,
         focus: [f64; 3],
         distance: f64,
+        /// Rows of the similarity that takes meshes to the world.
+        world_from_capture: [f64; 12],
         bounds: [f64; 6],
         crop: Option<Box6>,
         path: Option<String>,

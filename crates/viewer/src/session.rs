@@ -192,12 +192,16 @@ fn scene(source: &dyn ViewSource) -> Tell {
         Photograph { name: f.name, pose, fov_y, aspect: c.width as f64 / c.height as f64, held_out: f.held_out }
     });
     let six = |(lo, hi): ([f32; 3], [f32; 3])| [lo[0], lo[1], lo[2], hi[0], hi[1], hi[2]];
+    let w = s.world_from_capture;
+    let row = |k: usize| [w.scale * w.rotation.x_axis[k], w.scale * w.rotation.y_axis[k], w.scale * w.rotation.z_axis[k], w.translation[k]];
+    let world_from_capture = [row(0), row(1), row(2)].concat().try_into().expect("twelve");
     let (lo, hi) = s.bounds;
     Tell::Scene {
         name: s.name,
         photographs: photographs.collect(),
         focus: s.focus,
         distance: s.distance,
+        world_from_capture,
         bounds: [lo[0], lo[1], lo[2], hi[0], hi[1], hi[2]],
         crop: s.crop.map(six),
         path: s.path,

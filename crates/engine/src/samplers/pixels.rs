@@ -10,6 +10,10 @@ use rayon::prelude::*;
 pub trait PixelSource: Sync {
     fn images(&self) -> usize;
     fn size(&self, image: usize) -> (u32, u32);
+    /// The pixel to take in place of one that is not at hand: one close by, and always the same.
+    fn snap(&self, _image: usize, x: u32, y: u32) -> (u32, u32) {
+        (x, y)
+    }
     fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4];
     /// Whether the pixel may be trained on.
     fn counts(&self, image: usize, x: u32, y: u32) -> bool;
@@ -102,6 +106,7 @@ pub fn draw(source: &dyn PixelSource, o: &DrawOptions, batch: &mut RayBatch) {
             };
             let (w, h) = source.size(img as usize);
             let (x, y) = (((u * w as f32) as u32).min(w - 1), ((v * h as f32) as u32).min(h - 1));
+            let (x, y) = source.snap(img as usize, x, y);
             *image = img as u32;
             pixel.copy_from_slice(&[x as f32 + 0.5, y as f32 + 0.5]);
             target.copy_from_slice(&pixel_gather::cpu::convert(source.rgba(img as usize, x, y)));

@@ -56,7 +56,7 @@ pub struct DataConfig {
     pub format: String,
     pub downscale: u32,
     pub split: String,
-    /// Bytes of pixels kept in memory; beyond that a mapped scratch file is used.
+    /// Bytes that pixels may take; beyond that one of each small square is kept.
     pub memory_budget: u64,
 }
 

@@ -294,6 +294,12 @@ mod running {
         }
 
         pub fn upload(&mut self, m: &ObjectModel, photographs: &Photographs, cameras: &[PosedCamera]) -> Result<()> {
+            if !photographs.are_whole() {
+                let cure = "raise it (--set data.memory_budget=BYTES), raise --downscale, or use --device cpu";
+                return Err(PipelineError::Usage(format!(
+                    "the photographs exceed data.memory_budget, and a GPU takes all of their pixels; {cure}"
+                )));
+            }
             let bytes = photographs.bytes();
             let most = self.gpu.largest_buffer();
             if bytes > most {

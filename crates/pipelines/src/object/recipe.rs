@@ -95,9 +95,12 @@ pub fn train(
     for note in &capture.notes {
         events(&Event::Note(note.clone()));
     }
-    let store = load_pixels(config, &capture, folder.path())?;
-    if store.is_mapped() {
-        events(&Event::Note("the photographs exceed the memory budget and are read from a mapped scratch file".into()));
+    let store = load_pixels(config, &capture)?;
+    if let n @ 2.. = store.stride() {
+        events(&Event::Note(format!(
+            "the photographs exceed data.memory_budget ({} MiB): one pixel of each {n} x {n} is trained on",
+            config.data.memory_budget >> 20
+        )));
     }
     let has_alpha = store.has_alpha;
     let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
@@ -137,13 +140,13 @@ pub fn train(
     Ok(Trained { device: trainer.device.name(), model: trainer.model, summary })
 }
 
-/// The losses of the first `steps` steps; writes nothing but pixels that do not fit in memory.
+/// The losses of the first `steps` steps; writes nothing.
 pub fn losses(config: &Config, steps: u64) -> Result<Vec<f64>> {
     let mut trainer = scratch_trainer(config)?;
     (0..steps).map(|step| Ok(trainer.step(step, step as f64 / steps as f64)?.loss)).collect()
 }
 
-/// Where a step's time goes: `warmup` steps, then `steps` measured ones; writes nothing but pixels that do not fit in memory.
+/// Where a step's time goes: `warmup` steps, then `steps` measured ones; writes nothing.
 pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> {
     let mut trainer = scratch_trainer(config)?;
     for step in 0..warmup {
@@ -181,16 +184,16 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
 /// A trainer whose run is not kept.
 fn scratch_trainer(config: &Config) -> Result<Trainer<'static>> {
     let capture = load_capture(config)?;
-    let store = load_pixels(config, &capture, &std::env::temp_dir())?;
+    let store = load_pixels(config, &capture)?;
     let has_alpha = store.has_alpha;
     let model = ObjectModel::new(config.clone(), capture, has_alpha)?;
     Trainer::new(model, Photographs(store), Path::new(""), device::open(config)?)
 }
 
-fn load_pixels(config: &Config, capture: &Capture, scratch: &Path) -> Result<PixelStore> {
+fn load_pixels(config: &Config, capture: &Capture) -> Result<PixelStore> {
     let train = capture.indices(Split::Train);
     let frames: Vec<_> = train.iter().map(|&i| &capture.frames[i]).collect();
-    let options = StoreOptions { downscale: config.data.downscale, budget: config.data.memory_budget, scratch };
+    let options = StoreOptions { downscale: config.data.downscale, budget: config.data.memory_budget };
     Ok(PixelStore::load(&frames, &options, &|| {})?)
 }
 
@@ -211,6 +214,12 @@ fn run_options(config: &Config) -> RunOptions {
 pub(super) struct Photographs(PixelStore);
 
 impl Photographs {
+    /// Whether all pixels are at hand.
+    #[cfg(feature = "gpu")]
+    pub fn are_whole(&self) -> bool {
+        self.0.stride() == 1
+    }
+
     /// Bytes of all pixels.
     #[cfg(feature = "gpu")]
     pub fn bytes(&self) -> u64 {
@@ -224,6 +233,9 @@ impl PixelSource for Photographs {
     }
     fn size(&self, image: usize) -> (u32, u32) {
         self.0.size(image)
+    }
+    fn snap(&self, image: usize, x: u32, y: u32) -> (u32, u32) {
+        self.0.snap(image, x, y)
     }
     fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4] {
         self.0.pixel(image, x, y)

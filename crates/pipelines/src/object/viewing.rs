@@ -134,6 +134,7 @@ impl ViewSource for RunView {
             frames,
             focus: focus.to_array(),
             distance,
+            world_from_capture: m.capture.world_from_capture,
             bounds: (corner(-1.0), corner(1.0)),
             crop: read_crop(&self.folder).ok().flatten(),
             path: saved.and_then(|text| self.open_path(&text).ok()),

@@ -27,6 +27,7 @@ let socket: WebSocket;
 let photographs: Photograph[] = [];
 let keys: Key[] = [];
 let distance = 4;
+let worldFromCapture: number[] = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0];
 let crop: Box6 = [-1, -1, -1, 1, 1, 1];
 let training = false;
 let nextId = 0;
@@ -73,6 +74,7 @@ function hear(tell: Tell): void {
       const first = photographs.length === 0;
       photographs = tell.photographs;
       distance = tell.distance;
+      worldFromCapture = tell.world_from_capture;
       element("name").textContent = tell.name;
       document.title = `${tell.name} – diorama`;
       // Cameras right before the eye would hide everything.
@@ -109,7 +111,7 @@ function hear(tell: Tell): void {
       if (tell.glb) {
         element<HTMLAnchorElement>("mesh-link").href = `mesh.glb${query}`;
         element("mesh-link").hidden = false;
-        stage.loadMesh(`mesh.glb${query}`).then(() => {
+        stage.loadMesh(`mesh.glb${query}`, worldFromCapture).then(() => {
           element("mesh-note").textContent = "";
           input("mesh").checked = true;
           stage.showMesh(true);

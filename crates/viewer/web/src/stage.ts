@@ -114,12 +114,15 @@ export class Stage {
     }
   }
 
-  async loadMesh(url: string): Promise<void> {
+  /** Shows a mesh that lies in the capture's frame; `rows` take it to the world. */
+  async loadMesh(url: string, rows: number[]): Promise<void> {
     const made = await new GLTFLoader().loadAsync(url);
     if (this.mesh) this.scene.remove(this.mesh);
     this.mesh = made.scene;
     // glTF is y up; the world here is z up.
-    this.mesh.rotation.x = Math.PI / 2;
+    const r = rows as [number, number, number, number, number, number, number, number, number, number, number, number];
+    this.mesh.matrixAutoUpdate = false;
+    this.mesh.matrix.set(...r, 0, 0, 0, 1).multiply(new THREE.Matrix4().makeRotationX(Math.PI / 2));
     this.scene.add(this.mesh);
   }
 
