@@ -80,7 +80,7 @@ pub enum Tell {
         focus: [f64; 3],
         distance: f64,
         /// Rows of the similarity that takes meshes to the world.
-        world_from_capture: [f64; 12],
+        world_from_capture: Box<[f64; 12]>,
         bounds: [f64; 6],
         crop: Option<Box6>,
         path: Option<String>,

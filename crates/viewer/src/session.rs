@@ -194,7 +194,8 @@ fn scene(source: &dyn ViewSource) -> Tell {
     let six = |(lo, hi): ([f32; 3], [f32; 3])| [lo[0], lo[1], lo[2], hi[0], hi[1], hi[2]];
     let w = s.world_from_capture;
     let row = |k: usize| [w.scale * w.rotation.x_axis[k], w.scale * w.rotation.y_axis[k], w.scale * w.rotation.z_axis[k], w.translation[k]];
-    let world_from_capture = [row(0), row(1), row(2)].concat().try_into().expect("twelve");
+    let rows: [f64; 12] = [row(0), row(1), row(2)].concat().try_into().expect("twelve");
+    let world_from_capture = Box::new(rows);
     let (lo, hi) = s.bounds;
     Tell::Scene {
         name: s.name,
