@@ -1,21 +1,47 @@
-import numpy as np, time, resource, sys, os, threading
-from skimage import measure
+"""Extracts, shades and writes a surface with scikit-image and trimesh, for comparison with `diorama bench mesh`.
+
+    diorama bench mesh RUN --resolution 512 --save-grid GRID.npy
+    python3 benches/peers/mesh_skimage.py GRID.npy LEVEL [REPEATS]
+
+Prints vertices, faces, the median time and the most memory in use above the grid.
+"""
+import os
+import sys
+import tempfile
+import threading
+import time
+
+import numpy as np
 import trimesh
-path=sys.argv[1]; level=float(sys.argv[2])
-g=np.load(path)
-base=int(open('/proc/self/statm').read().split()[1])*4096
-peak=[0]; stop=[False]
+from skimage import measure
+
+grid, level = np.load(sys.argv[1]), float(sys.argv[2])
+repeats = int(sys.argv[3]) if len(sys.argv) > 3 else 5
+
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096
+
+
+base, peak, stop = resident(), 0, False
+
+
 def watch():
-    while not stop[0]:
-        peak[0]=max(peak[0],int(open('/proc/self/statm').read().split()[1])*4096); time.sleep(0.01)
-t=threading.Thread(target=watch); t.start()
-ts=[]
-for i in range(int(sys.argv[3]) if len(sys.argv)>3 else 1):
-    t0=time.time()
-    v,f,n,_=measure.marching_cubes(g,level)
-    m=trimesh.Trimesh(v,f,vertex_normals=n,process=False)
-    m.export('/tmp/sk.ply')
-    ts.append(time.time()-t0)
-    nv=len(v); nf=len(f); del v,f,n,m
-stop[0]=True
-print(nv,nf,'median s',sorted(ts)[len(ts)//2],'peak above grid MB',(peak[0]-base)/1e6)
+    global peak
+    while not stop:
+        peak = max(peak, resident())
+        time.sleep(0.01)
+
+
+watcher = threading.Thread(target=watch)
+watcher.start()
+times = []
+with tempfile.TemporaryDirectory() as folder:
+    for _ in range(repeats):
+        begin = time.time()
+        vertices, faces, normals, _ = measure.marching_cubes(grid, level)
+        trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False).export(os.path.join(folder, "m.ply"))
+        times.append(time.time() - begin)
+stop = True
+watcher.join()
+print(f"{len(vertices)} vertices, {len(faces)} faces, {sorted(times)[len(times) // 2]:.2f} s, {(peak - base) / 1e6:.0f} MB above the grid")

@@ -113,7 +113,7 @@ fn detect(root: &Path) -> Result<Format> {
     } else {
         Err(DataError::input(
             root,
-            "holds no transforms.json, transforms_train.json, COLMAP model (sparse/0) or poses_bounds.npy; estimate poses first, for example with COLMAP",
+            "holds no transforms.json, transforms_train.json, COLMAP model (sparse/0) or poses_bounds.npy; diorama prepare makes a data set of bare photographs",
         ))
     }
 }

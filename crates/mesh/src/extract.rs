@@ -35,17 +35,44 @@ const BATCH: usize = 1 << 18;
 /// The surface where density equals `level`, in world coordinates, faces outward. What lies outside of
 /// the box counts as empty, so the surface is closed where it is cut. `progress` is told slices done of all.
 pub fn extract(field: &dyn FieldQuery, grid: &Grid, level: f32, progress: &mut dyn FnMut(usize, usize)) -> Mesh {
-    let [nx, ny, nz] = grid.points();
+    let [nx, ny, _] = grid.points();
     let cell = grid.cell();
     // One empty layer around the box closes the surface.
     let (px, py) = (nx + 2, ny + 2);
     let mut mesher = Mesher::new(px, py, level);
     let empty = vec![0.0f32; px * py];
     mesher.push(&empty);
-    let at_once = (BATCH / (nx * ny)).clamp(1, nz);
-    let mut points = Vec::new();
-    let mut sigma = Vec::new();
     let mut slice = vec![0.0f32; px * py];
+    each_slab(field, grid, progress, &mut |slab| {
+        for values in slab.chunks_exact(nx * ny) {
+            slice.fill(0.0);
+            for y in 0..ny {
+                slice[(y + 1) * px + 1..][..nx].copy_from_slice(&values[y * nx..(y + 1) * nx]);
+            }
+            mesher.push(&slice);
+        }
+    });
+    mesher.push(&empty);
+    // The empty layer lies one cell outside: pull what it cut back onto the box.
+    let world =
+        |p: &[f32; 3]| std::array::from_fn(|k| (grid.min[k] + (p[k] - 1.0) * cell).clamp(grid.min[k], grid.max[k].max(grid.min[k] + cell)));
+    let positions = mesher.positions.iter().map(world).collect();
+    Mesh { positions, faces: mesher.faces, ..Mesh::default() }
+}
+
+/// Densities `[nz, ny, nx]` at the points of a grid.
+pub fn sample(field: &dyn FieldQuery, grid: &Grid, progress: &mut dyn FnMut(usize, usize)) -> Vec<f32> {
+    let mut sigma = Vec::with_capacity(grid.points().iter().product());
+    each_slab(field, grid, progress, &mut |slab| sigma.extend_from_slice(slab));
+    sigma
+}
+
+/// Hands over the densities of a few slices at a time, from the lowest up.
+fn each_slab(field: &dyn FieldQuery, grid: &Grid, progress: &mut dyn FnMut(usize, usize), take: &mut dyn FnMut(&[f32])) {
+    let [nx, ny, nz] = grid.points();
+    let cell = grid.cell();
+    let at_once = (BATCH / (nx * ny)).clamp(1, nz);
+    let (mut points, mut sigma) = (Vec::new(), Vec::new());
     for z0 in (0..nz).step_by(at_once) {
         let z1 = (z0 + at_once).min(nz);
         points.clear();
@@ -58,43 +85,9 @@ pub fn extract(field: &dyn FieldQuery, grid: &Grid, level: f32, progress: &mut d
         }
         sigma.resize(points.len(), 0.0);
         field.density(&points, &mut sigma);
-        for values in sigma.chunks_exact(nx * ny) {
-            slice.fill(0.0);
-            for y in 0..ny {
-                slice[(y + 1) * px + 1..][..nx].copy_from_slice(&values[y * nx..(y + 1) * nx]);
-            }
-            mesher.push(&slice);
-        }
+        take(&sigma);
         progress(z1, nz);
     }
-    mesher.push(&empty);
-    // The empty layer lies one cell outside: pull what it cut back onto the box.
-    let world =
-        |p: &[f32; 3]| std::array::from_fn(|k| (grid.min[k] + (p[k] - 1.0) * cell).clamp(grid.min[k], grid.max[k].max(grid.min[k] + cell)));
-    let positions = mesher.positions.iter().map(world).collect();
-    Mesh { positions, faces: mesher.faces, ..Mesh::default() }
-}
-
-/// Densities `[nz, ny, nx]` at the points of a grid.
-pub fn sample(field: &dyn FieldQuery, grid: &Grid, progress: &mut dyn FnMut(usize, usize)) -> Vec<f32> {
-    let [nx, ny, nz] = grid.points();
-    let cell = grid.cell();
-    let mut sigma = vec![0.0f32; nx * ny * nz];
-    let at_once = (BATCH / (nx * ny)).clamp(1, nz);
-    for (part, values) in sigma.chunks_mut(at_once * nx * ny).enumerate() {
-        let first = part * at_once;
-        let point = |i: usize| {
-            [
-                grid.min[0] + (i % nx) as f32 * cell,
-                grid.min[1] + (i / nx % ny) as f32 * cell,
-                grid.min[2] + (first + i / nx / ny) as f32 * cell,
-            ]
-        };
-        let points: Vec<[f32; 3]> = (0..values.len()).map(point).collect();
-        field.density(&points, values);
-        progress((first + at_once).min(nz), nz);
-    }
-    sigma
 }
 
 /// The surface in densities that are at hand, in world coordinates; open where the box cuts it.

@@ -62,7 +62,9 @@ impl Session<'_> {
                 let s = self.shared.source.status();
                 if last != Some(s) {
                     last = Some(s);
-                    let (step, seconds, loss, psnr) = (s.step, s.seconds, s.loss, s.psnr);
+                    // JSON has no infinity.
+                    let finite = |v: f64| if v.is_finite() { v } else { 0.0 };
+                    let (step, seconds, loss, psnr) = (s.step, s.seconds, finite(s.loss), finite(s.psnr));
                     self.send(&Tell::Status { step, seconds, loss, psnr, rays_per_s: s.rays_per_s, running: s.running })?;
                 }
             }
