@@ -1,4 +1,4 @@
-//! Binary glTF 2.0 with a texture or vertex colours and an unlit material. glTF is y up: (x, y, z) is written as
+//! Binary glTF 2.0 with a texture or vertex colours; the material is unlit unless there is a normal map. glTF is y up: (x, y, z) is written as
 //! (x, z, −y). COLOR_0 is linear by the standard.
 
 use crate::error::{DataError, Result};
@@ -57,22 +57,36 @@ pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
     }
     let indices = mesh.faces.iter().flatten().flat_map(|i| i.to_le_bytes()).collect();
     let indices = add(indices, 34963, json!({ "componentType": 5125, "count": mesh.faces.len() * 3, "type": "SCALAR" }));
-    let mut material = json!({
-        "name": "radiance",
-        "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 1.0 },
-        "extensions": { "KHR_materials_unlit": {} },
-    });
-    if let Some(t) = texture {
-        let png = photo::encode_png(t);
+    let normal_map = mesh.normal_map.as_ref().filter(|_| texture.is_some() && mesh.tangents.len() == n);
+    if normal_map.is_some() {
+        let turned = mesh.tangents.iter().flat_map(|t| {
+            let [x, y, z] = y_up([t[0], t[1], t[2]]);
+            [x, y, z, t[3]]
+        });
+        let data = turned.flat_map(f32::to_le_bytes).collect();
+        attributes["TANGENT"] = add(data, 34962, json!({ "componentType": 5126, "count": n, "type": "VEC4" })).into();
+    }
+    let mut material = json!({ "name": "radiance", "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 1.0 } });
+    // What light falls on the surface is in its colours already; with a normal map the user's own lights are meant.
+    if normal_map.is_none() {
+        material["extensions"] = json!({ "KHR_materials_unlit": {} });
+    }
+    let mut images = Vec::new();
+    for image in [texture, normal_map].into_iter().flatten() {
+        let png = photo::encode_png(image);
+        images.push(json!({ "mimeType": "image/png", "bufferView": views.len() }));
         views.push(json!({ "buffer": 0, "byteOffset": bin.len(), "byteLength": png.len() }));
         bin.extend(png);
         bin.resize(bin.len().next_multiple_of(4), 0);
+    }
+    if texture.is_some() {
         material["pbrMetallicRoughness"]["baseColorTexture"] = json!({ "index": 0 });
     }
-    let views_len = views.len();
+    if normal_map.is_some() {
+        material["normalTexture"] = json!({ "index": 1 });
+    }
     let mut root = json!({
         "asset": { "version": "2.0", "generator": concat!("diorama ", env!("CARGO_PKG_VERSION")) },
-        "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{ "nodes": [0] }],
         "nodes": [{ "mesh": 0, "name": "mesh" }],
@@ -85,8 +99,11 @@ pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
     if texture.is_some() {
         // Linear filters with mipmaps; repeated coordinates would bring the far edge in.
         root["samplers"] = json!([{ "magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071 }]);
-        root["textures"] = json!([{ "sampler": 0, "source": 0 }]);
-        root["images"] = json!([{ "mimeType": "image/png", "bufferView": views_len - 1 }]);
+        root["textures"] = (0..images.len()).map(|i| json!({ "sampler": 0, "source": i })).collect();
+        root["images"] = images.into();
+    }
+    if normal_map.is_none() {
+        root["extensionsUsed"] = json!(["KHR_materials_unlit"]);
     }
     let mut text = serde_json::to_vec(&root).expect("JSON of plain values");
     text.resize(text.len().next_multiple_of(4), b' ');

@@ -20,12 +20,15 @@ pub(crate) fn save_texture(path: &Path, mesh: &Mesh) -> Result<Option<String>> {
 /// Files that saving a textured mesh as `path` writes beside it.
 pub fn companions(path: &Path) -> Vec<PathBuf> {
     let extensions: &[&str] = match path.extension().and_then(|e| e.to_str()).unwrap_or_default() {
-        "obj" => &["mtl", "png"],
+        "obj" => &["mtl", "png", NORMALS],
         "dae" => &["png"],
         _ => &[],
     };
     extensions.iter().map(|e| path.with_file_name(beside(path, e))).collect()
 }
+
+/// Ending of the file with an OBJ's normal map.
+const NORMALS: &str = "normal.png";
 
 /// The name of a file that goes with `path`.
 fn beside(path: &Path, extension: &str) -> String {
@@ -40,7 +43,13 @@ pub fn save_obj(path: &Path, mesh: &Mesh) -> Result<()> {
     let texture = save_texture(path, mesh)?;
     let material = beside(path, "mtl");
     if let Some(t) = &texture {
-        let text = format!("newmtl radiance\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {t}\n");
+        let mut text = format!("newmtl radiance\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {t}\n");
+        if let Some(map) = &mesh.normal_map {
+            let name = beside(path, NORMALS);
+            photo::save_png(&path.with_file_name(&name), map)?;
+            // `norm` is what readers of physically based materials know, the second what others do.
+            text += &format!("norm {name}\nmap_Bump {name}\n");
+        }
         atomic::write(&path.with_file_name(&material), text.as_bytes())?;
     }
     atomic::write_with(path, |w| {

@@ -14,6 +14,10 @@ pub struct Mesh {
     pub uvs: Vec<[f32; 2]>,
     /// sRGB, `[H, W, 3]`.
     pub texture: Option<ImageU8>,
+    /// Unit vectors along u, and the sign that `normal × tangent` needs to point against v, one per vertex, or empty.
+    pub tangents: Vec<[f32; 4]>,
+    /// Normals in tangent space, `(n + 1) / 2`, `[H, W, 3]`: x along u, y against v, z outward.
+    pub normal_map: Option<ImageU8>,
     pub faces: Vec<[u32; 3]>,
 }
 
@@ -76,6 +80,9 @@ impl Mesh {
         let pick = |v: &Vec<[f32; 3]>| if v.is_empty() { Vec::new() } else { kept.iter().map(|&i| v[i]).collect() };
         if !self.uvs.is_empty() {
             self.uvs = kept.iter().map(|&i| self.uvs[i]).collect();
+        }
+        if !self.tangents.is_empty() {
+            self.tangents = kept.iter().map(|&i| self.tangents[i]).collect();
         }
         self.positions = pick(&self.positions);
         self.normals = pick(&self.normals);

@@ -28,16 +28,6 @@ pub fn remove_floaters(mesh: &mut Mesh, share: f32) {
     mesh.compact();
 }
 
-/// Removes triangles without area and repeated vertices in a face.
-pub fn remove_degenerate(mesh: &mut Mesh) {
-    let positions = &mesh.positions;
-    mesh.faces.retain(|f| {
-        let [a, b, c] = f.map(|i| positions[i as usize]);
-        f[0] != f[1] && f[1] != f[2] && f[0] != f[2] && a != b && b != c && a != c
-    });
-    mesh.compact();
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -57,13 +47,5 @@ mod tests {
         assert_eq!(all.faces.len(), 11);
         remove_floaters(&mut m, 0.2);
         assert_eq!((m.faces.len(), m.positions.len()), (10, 12));
-    }
-
-    #[test]
-    fn degenerate_faces_go() {
-        let mut m = Mesh { positions: vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0; 3]], ..Mesh::default() };
-        m.faces = vec![[0, 1, 2], [0, 0, 1], [0, 3, 1]];
-        remove_degenerate(&mut m);
-        assert_eq!(m.faces.len(), 1);
     }
 }

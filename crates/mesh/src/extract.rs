@@ -1,9 +1,41 @@
-//! Marching cubes over a [`FieldQuery`], a few slices at a time: memory is two slices of density plus
+//! Marching cubes or tetrahedra over a [`FieldQuery`], a few slices at a time: memory is two slices of density plus
 //! the surface, whatever the resolution.
 
 use diorama_geom::Mesh;
 use diorama_geom::field_query::FieldQuery;
-use diorama_kernels::ops::marching_cubes::cpu::Mesher;
+use diorama_kernels::ops::marching_cubes::{self, CaseTable, cpu::Mesher};
+use diorama_kernels::ops::marching_tetrahedra;
+
+/// What a surface is made of.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Method {
+    /// Marching cubes: fewest faces.
+    #[default]
+    Cubes,
+    /// Marching tetrahedra: some twice the faces, none ambiguous.
+    Tetrahedra,
+}
+
+impl Method {
+    fn table(self) -> CaseTable {
+        match self {
+            Method::Cubes => marching_cubes::case_table(),
+            Method::Tetrahedra => marching_tetrahedra::case_table(),
+        }
+    }
+}
+
+impl std::str::FromStr for Method {
+    type Err = String;
+
+    fn from_str(s: &str) -> Result<Self, String> {
+        match s {
+            "mc" => Ok(Method::Cubes),
+            "mt" => Ok(Method::Tetrahedra),
+            _ => Err(format!("extract {s:?}: expected mc (marching cubes) or mt (marching tetrahedra)")),
+        }
+    }
+}
 
 /// Where and how finely to look.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -34,12 +66,13 @@ const BATCH: usize = 1 << 18;
 
 /// The surface where density equals `level`, in world coordinates, faces outward. What lies outside of
 /// the box counts as empty, so the surface is closed where it is cut. `progress` is told slices done of all.
-pub fn extract(field: &dyn FieldQuery, grid: &Grid, level: f32, progress: &mut dyn FnMut(usize, usize)) -> Mesh {
+pub fn extract(field: &dyn FieldQuery, grid: &Grid, level: f32, method: Method, progress: &mut dyn FnMut(usize, usize)) -> Mesh {
     let [nx, ny, _] = grid.points();
     let cell = grid.cell();
     // One empty layer around the box closes the surface.
     let (px, py) = (nx + 2, ny + 2);
-    let mut mesher = Mesher::new(px, py, level);
+    let table = method.table();
+    let mut mesher = Mesher::new(&table, px, py, level);
     let empty = vec![0.0f32; px * py];
     mesher.push(&empty);
     let mut slice = vec![0.0f32; px * py];
@@ -93,7 +126,7 @@ fn each_slab(field: &dyn FieldQuery, grid: &Grid, progress: &mut dyn FnMut(usize
 /// The surface in densities that are at hand, in world coordinates; open where the box cuts it.
 pub fn from_densities(sigma: &[f32], grid: &Grid, level: f32) -> Mesh {
     let cell = grid.cell();
-    let (mut positions, faces) = diorama_kernels::ops::marching_cubes::cpu::surface(sigma, grid.points(), level);
+    let (mut positions, faces) = marching_cubes::cpu::surface(&marching_cubes::case_table(), sigma, grid.points(), level);
     positions.iter_mut().for_each(|p| *p = std::array::from_fn(|k| grid.min[k] + p[k] * cell));
     Mesh { positions, faces, ..Mesh::default() }
 }
@@ -161,18 +194,20 @@ mod tests {
     #[test]
     fn a_sphere_is_met_within_half_a_voxel_both_ways() {
         let shape = Shape::Sphere { radius: 0.7 };
-        let mesh = extract(&shape, &GRID, 10.0, &mut |_, _| {});
-        let cell = GRID.cell();
-        assert!(mesh.is_watertight());
-        for p in &mesh.positions {
-            assert!(shape.distance(*p).abs() <= 0.5 * cell);
-        }
-        // Surface to mesh.
-        for i in 0..500 {
-            let z = 1.0 - (2.0 * i as f32 + 1.0) / 500.0;
-            let (r, a) = ((1.0 - z * z).sqrt(), i as f32 * 2.399_963);
-            let p = [0.7 * r * a.cos(), 0.7 * r * a.sin(), 0.7 * z];
-            assert!(nearest(&mesh, p) <= 0.5 * cell, "a hole near {p:?}");
+        for method in [Method::Cubes, Method::Tetrahedra] {
+            let mesh = extract(&shape, &GRID, 10.0, method, &mut |_, _| {});
+            let cell = GRID.cell();
+            assert!(mesh.is_watertight());
+            for p in &mesh.positions {
+                assert!(shape.distance(*p).abs() <= 0.5 * cell);
+            }
+            // Surface to mesh.
+            for i in 0..500 {
+                let z = 1.0 - (2.0 * i as f32 + 1.0) / 500.0;
+                let (r, a) = ((1.0 - z * z).sqrt(), i as f32 * 2.399_963);
+                let p = [0.7 * r * a.cos(), 0.7 * r * a.sin(), 0.7 * z];
+                assert!(nearest(&mesh, p) <= 0.5 * cell, "a hole near {p:?}");
+            }
         }
     }
 
@@ -180,7 +215,7 @@ mod tests {
     fn a_box_is_met_within_half_a_voxel_and_its_edges_within_one_and_a_fifth() {
         let half = [0.6, 0.45, 0.3];
         let shape = Shape::Box { half };
-        let mesh = extract(&shape, &GRID, 10.0, &mut |_, _| {});
+        let mesh = extract(&shape, &GRID, 10.0, Method::Cubes, &mut |_, _| {});
         let cell = GRID.cell();
         assert!(mesh.is_watertight());
         for p in &mesh.positions {
@@ -213,7 +248,7 @@ mod tests {
     #[test]
     fn what_the_box_cuts_is_closed() {
         let grid = Grid { min: [-0.5, -1.0, -1.0], max: [0.5, 1.0, 1.0], resolution: 40 };
-        let mesh = extract(&Shape::Sphere { radius: 0.7 }, &grid, 10.0, &mut |_, _| {});
+        let mesh = extract(&Shape::Sphere { radius: 0.7 }, &grid, 10.0, Method::Cubes, &mut |_, _| {});
         assert!(mesh.is_watertight());
         let (lo, hi) = mesh.bounds().unwrap();
         assert!(lo[0] >= -0.5 && hi[0] <= 0.5 + 1e-6);

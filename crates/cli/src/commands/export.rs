@@ -43,10 +43,13 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
     let options = ExportOptions {
         format,
         out: a.out.clone(),
+        method: a.extract.parse().map_err(|e| PipelineError::Usage(format!("--{e}")))?,
         resolution: a.resolution,
         level,
         faces: a.faces,
         texture: a.texture,
+        normal_map: a.normal_map,
+        watertight: a.watertight,
         size,
         unit_m,
         clip,

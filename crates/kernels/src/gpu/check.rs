@@ -9,11 +9,13 @@ use crate::ops::fused_mlp::{self, Layer, Mlp, Source};
 use crate::ops::hash_grid::{self, HashGrid, HashGridConfig, gpu::GpuHashGrid};
 use crate::ops::linear::{self, Activation, BiasKind};
 use crate::ops::march::{self, MarchConfig, MarchRays, OccupancyBits, gpu::Space};
+use crate::ops::marching_cubes::CaseTable;
 use crate::ops::ngp_field::{self, FieldNet, Head};
 use crate::ops::ray_generation::{self, PosedCamera, gpu::GpuCameras};
 use crate::ops::trilinear_corner_grid::{self, Corners, gpu::GpuCorners};
 use crate::ops::{
-    distortion, frequency, marching_cubes, pixel_gather, ray_aabb, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
+    distortion, frequency, marching_cubes, marching_tetrahedra, pixel_gather, ray_aabb, sample_pdf, scan, spherical_harmonics, ssim,
+    triangle_wave,
 };
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
@@ -525,19 +527,24 @@ fn steps(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     Ok(())
 }
 
-/// A crossing, named by the edge that it lies on: axis and lower point.
+/// A crossing, named by the edge that it lies on: direction and lower point.
 fn edge_of(p: &[f32]) -> (usize, [u32; 3]) {
-    let axis = (0..3).find(|&k| p[k].fract() > 0.0).unwrap_or(3);
-    (axis, [p[0] as u32, p[1] as u32, p[2] as u32])
+    let direction = (0..3).filter(|&k| p[k].fract() > 0.0).map(|k| 1 << k).sum();
+    (direction, [p[0] as u32, p[1] as u32, p[2] as u32])
 }
 
 /// The same vertices on the same edges, and the same triangles whichever vertex they begin with.
 fn surfaces(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    surface(gpu, table, "marching cubes", &marching_cubes::case_table())?;
+    surface(gpu, table, "marching tetrahedra", &marching_tetrahedra::case_table())
+}
+
+fn surface(gpu: &Gpu, table: &mut Table, op: &'static str, cases: &CaseTable) -> Result<(), GpuError> {
     for (nx, ny, nz) in [(0, 3, 3), (1, 1, 1), (2, 2, 2), (9, 13, 11)] {
         let (density, level) = (random_unit(nx * ny * nz, 5), 0.4);
-        let mut mesher = marching_cubes::cpu::Mesher::new(nx, ny, level);
+        let mut mesher = marching_cubes::cpu::Mesher::new(cases, nx, ny, level);
         density.chunks_exact((nx * ny).max(1)).for_each(|slice| mesher.push(slice));
-        let (vertices, faces) = marching_cubes::gpu::extract(gpu, &gpu.upload(&density), (nx, ny, nz), level)?;
+        let (vertices, faces) = marching_cubes::gpu::extract(gpu, cases, &gpu.upload(&density), (nx, ny, nz), level)?;
         let (vertices, faces) = (gpu.read(&vertices)?, gpu.read_u32(&faces)?);
         let shape = format!("{nx}x{ny}x{nz}");
         let sorted = |vertices: &[f32]| {
@@ -546,7 +553,7 @@ fn surfaces(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             all.iter().flat_map(|v| v.1).collect::<Vec<f32>>()
         };
         let want = sorted(mesher.positions.as_flattened());
-        table.close("marching cubes", "vertices", &shape, &gpu.upload(&sorted(&vertices)), &wide(&want))?;
+        table.close(op, "vertices", &shape, &gpu.upload(&sorted(&vertices)), &wide(&want))?;
         let triangles = |vertices: &[f32], faces: &[u32]| {
             let edge = |v: u32| edge_of(&vertices[v as usize * 3..][..3]);
             let mut all: Vec<_> = faces.chunks_exact(3).map(|f| [edge(f[0]), edge(f[1]), edge(f[2])]).collect();
@@ -559,7 +566,7 @@ fn surfaces(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         };
         let same = triangles(&vertices, &faces) == triangles(mesher.positions.as_flattened(), mesher.faces.as_flattened());
         let outcome = if same { Ok(0.0) } else { Err("other triangles than the CPU's".into()) };
-        table.row("marching cubes", "faces", shape, outcome);
+        table.row(op, "faces", shape, outcome);
     }
     Ok(())
 }

@@ -9,6 +9,7 @@ pub mod hash_grid;
 pub mod linear;
 pub mod march;
 pub mod marching_cubes;
+pub mod marching_tetrahedra;
 pub mod ngp_field;
 pub mod pixel_gather;
 pub mod ray_aabb;

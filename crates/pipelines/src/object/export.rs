@@ -3,12 +3,12 @@
 use super::model::ObjectModel;
 use super::{extent, texture};
 use crate::error::{PipelineError, Result};
-use diorama_data::{collada, glb, mesh_text, usdz};
+use diorama_data::{DataError, collada, glb, mesh_text, usdz};
 use diorama_geom::Mesh;
 use diorama_geom::field_query::FieldQuery;
 use diorama_geom::glam::DVec3;
 use diorama_mesh::extract::Grid;
-use diorama_mesh::{atlas, clean, color, extract, simplify};
+use diorama_mesh::{atlas, clean, color, extract, normal_map, repair, simplify};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -28,6 +28,11 @@ impl Format {
     /// Whether the format says what a unit is.
     pub fn has_units(self) -> bool {
         matches!(self, Format::Glb | Format::Usdz | Format::Dae)
+    }
+
+    /// Whether normal maps are written into the format.
+    pub fn has_normal_map(self) -> bool {
+        matches!(self, Format::Glb | Format::Obj)
     }
 
     /// Whether the format carries a texture.
@@ -57,6 +62,7 @@ impl std::str::FromStr for Format {
 pub struct ExportOptions {
     pub format: Format,
     pub out: PathBuf,
+    pub method: extract::Method,
     /// Cells along the box's longest side.
     pub resolution: usize,
     /// Density of the surface in inverse world units; none: from the field.
@@ -65,6 +71,10 @@ pub struct ExportOptions {
     pub faces: Option<usize>,
     /// Edge of the texture in texels; 0: colours at the vertices; none: [`TEXELS`] where the format has textures.
     pub texture: Option<usize>,
+    /// Bake the field's normals beside the texture.
+    pub normal_map: bool,
+    /// Part and fill what simplification left open, or fail.
+    pub watertight: bool,
     pub size: Size,
     /// Unit of the coordinates, in metres, of formats that do not tell theirs.
     pub unit_m: f64,
@@ -118,19 +128,31 @@ pub fn export(model: &ObjectModel, o: &ExportOptions, progress: &mut dyn FnMut(&
     }
     let grid = Grid { min, max, resolution: o.resolution };
     let level = o.level.unwrap_or_else(|| automatic_level(model, &grid));
-    let mut mesh = extract::extract(model, &grid, level, &mut |i, n| progress("density", i, n));
-    clean::remove_degenerate(&mut mesh);
+    let mut mesh = extract::extract(model, &grid, level, o.method, &mut |i, n| progress("density", i, n));
+    repair::weld(&mut mesh);
     clean::remove_floaters(&mut mesh, o.floaters);
     let texels = o.texture.unwrap_or(if o.format.has_texture() { TEXELS } else { 0 });
     let faces = o.faces.unwrap_or(if texels > 0 { FACES } else { COLORED_FACES });
     if faces > 0 {
         simplify::simplify(&mut mesh, faces);
     }
+    let watertight = if o.watertight { repair::close(&mut mesh) } else { mesh.is_watertight() };
+    if o.watertight && !watertight && !mesh.faces.is_empty() {
+        return Err(DataError::failed(
+            &o.out,
+            "--watertight: the surface crosses itself and could not be closed; try --faces 0, another --level or --resolution",
+        )
+        .into());
+    }
     mesh.compute_normals();
-    let watertight = mesh.is_watertight();
     if texels > 0 && !mesh.faces.is_empty() {
         atlas::unwrap(&mut mesh, texels);
         texture::bake(model, &mut mesh, texels, grid.cell(), &mut |i, n| progress("texture", i, n));
+        if o.normal_map {
+            normal_map::set_tangents(&mut mesh);
+            let map = normal_map::bake(model, &mesh, texels, grid.cell(), level, &mut |i, n| progress("normal map", i, n));
+            mesh.normal_map = Some(map);
+        }
     } else {
         color::color_from_field(&mut mesh, model);
     }
@@ -164,6 +186,9 @@ fn check(o: &ExportOptions) -> Result<()> {
         Some(n) if n != 0 && !(64..=16_384).contains(&n) => Err(PipelineError::Usage(format!("--texture {n}: must be 0 or 64 to 16384"))),
         Some(n) if n > 0 && !o.format.has_texture() => {
             Err(PipelineError::Usage("--texture: ply and stl hold no texture; leave it out or choose glb, obj, usdz or dae".into()))
+        }
+        _ if o.normal_map && (!o.format.has_normal_map() || o.texture == Some(0)) => {
+            Err(PipelineError::Usage("--normal-map: needs a texture, and glb or obj as format".into()))
         }
         _ => Ok(()),
     }
@@ -208,6 +233,10 @@ fn to_capture(model: &ObjectModel, mesh: &mut Mesh) {
     let wide = |p: [f32; 3]| DVec3::new(p[0] as f64, p[1] as f64, p[2] as f64);
     mesh.positions.iter_mut().for_each(|p| *p = t.point(wide(*p)).as_vec3().to_array());
     mesh.normals.iter_mut().for_each(|n| *n = (t.rotation * wide(*n)).as_vec3().to_array());
+    for v in &mut mesh.tangents {
+        let turned = (t.rotation * wide([v[0], v[1], v[2]])).as_vec3();
+        *v = turned.extend(v[3]).to_array();
+    }
 }
 
 fn write(format: Format, out: &Path, mesh: &Mesh) -> Result<()> {

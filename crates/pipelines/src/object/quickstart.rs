@@ -88,7 +88,7 @@ pub fn quickstart(
         layers: vec![Layer::Rgb],
         images: None,
         video: Some(video.clone()),
-        fps: 20,
+        fps: Some(20),
         clip: None,
         quality: Quality::Full,
     };
@@ -97,10 +97,13 @@ pub fn quickstart(
     let options = ExportOptions {
         format: Format::Glb,
         out: folder.join("still_life.glb"),
+        method: Default::default(),
         resolution: 192,
         level: None,
         faces: Some(40_000),
         texture: Some(1024),
+        normal_map: false,
+        watertight: false,
         size: Size::Scaled(1.0),
         unit_m: 1.0,
         clip: None,

@@ -74,20 +74,24 @@ impl std::str::FromStr for Layer {
 pub struct RenderOptions {
     pub path: PathKind,
     pub frames: usize,
-    /// Width and height; none: those of the run.
+    /// Width and height; none: those of the run, or of a path's file.
     pub size: Option<(u32, u32)>,
-    /// Horizontal field of view in radians; none: that of the capture.
+    /// Horizontal field of view in radians; none: that of the capture, or the vertical one of a path's file.
     pub fov: Option<f64>,
     pub layers: Vec<Layer>,
     /// Folder for PNG sequences, if any.
     pub images: Option<PathBuf>,
     /// MP4 of the first layer, if any.
     pub video: Option<PathBuf>,
-    pub fps: u32,
+    /// None: [`FPS`], or that of a path's file.
+    pub fps: Option<u32>,
     /// Only what lies in this box (world) is shown.
     pub clip: Option<([f32; 3], [f32; 3])>,
     pub quality: Quality,
 }
+
+/// Frames per second where nobody says.
+pub const FPS: u32 = 30;
 
 /// The views of a path in the world.
 pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> {
@@ -98,12 +102,19 @@ pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> 
     let camera = view_camera(&base, o.size, o.fov);
     let n = o.frames.max(1);
     let views = |poses: Vec<Pose>| poses.into_iter().map(|p| PathView { camera, world_from_camera: p }).collect();
-    let up = DVec3::Z;
+    let (up, fps) = (DVec3::Z, o.fps.unwrap_or(FPS) as f64);
     Ok(match &o.path {
-        PathKind::Orbit => CameraPath { views: views(camera_path::orbit(&poses, center, up, n)), fps: o.fps as f64 },
-        PathKind::Spiral => CameraPath { views: views(camera_path::spiral(&poses, center, up, n)), fps: o.fps as f64 },
-        PathKind::Interpolate => CameraPath { views: views(camera_path::interpolate(&poses, n)), fps: o.fps as f64 },
-        PathKind::File(f) => camera_path_json::read(f, &model.capture.world_from_capture)?,
+        PathKind::Orbit => CameraPath { views: views(camera_path::orbit(&poses, center, up, n)), fps },
+        PathKind::Spiral => CameraPath { views: views(camera_path::spiral(&poses, center, up, n)), fps },
+        PathKind::Interpolate => CameraPath { views: views(camera_path::interpolate(&poses, n)), fps },
+        PathKind::File(f) => {
+            let mut path = camera_path_json::read(f, &model.capture.world_from_capture)?;
+            path.fps = o.fps.map_or(path.fps, f64::from);
+            if o.size.is_some() || o.fov.is_some() {
+                path.views.iter_mut().for_each(|v| v.camera = other_size(&v.camera, o.size, o.fov));
+            }
+            path
+        }
         PathKind::HeldOut => {
             let held = super::evaluate::held_out(&model.capture, diorama_geom::capture::Split::Test);
             if held.is_empty() {
@@ -111,7 +122,7 @@ pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> 
             }
             let views =
                 held.iter().map(|&i| PathView { camera: model.posed(i).camera, world_from_camera: frames[i].world_from_camera }).collect();
-            CameraPath { views, fps: o.fps as f64 }
+            CameraPath { views, fps }
         }
     })
 }
@@ -121,6 +132,13 @@ fn view_camera(base: &Camera, size: Option<(u32, u32)>, fov: Option<f64>) -> Cam
     let (w, h) = size.unwrap_or((base.width, base.height));
     let fov = fov.unwrap_or(2.0 * (0.5 * base.width as f64 / base.fx).atan());
     Camera::pinhole(w, h, fov)
+}
+
+/// A path's camera at another size, where its vertical field of view stays, or with another horizontal one.
+fn other_size(c: &Camera, size: Option<(u32, u32)>, fov: Option<f64>) -> Camera {
+    let (w, h) = size.unwrap_or((c.width, c.height));
+    let same_height = 2.0 * (0.5 * w as f64 / (c.fy * h as f64 / c.height as f64)).atan();
+    Camera::pinhole(w, h, fov.unwrap_or(same_height))
 }
 
 /// Renders a path; returns the number of frames and whether it was interrupted. `progress` is told (frame, of).

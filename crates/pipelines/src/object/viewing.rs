@@ -205,10 +205,13 @@ impl ViewSource for RunView {
         let options = ExportOptions {
             format,
             out: out.clone(),
+            method: Default::default(),
             resolution: r.resolution,
             level: None,
             faces: Some(r.faces),
             texture: None,
+            normal_map: false,
+            watertight: false,
             size: Size::Scaled(1.0),
             unit_m: 1.0,
             clip: r.clip,

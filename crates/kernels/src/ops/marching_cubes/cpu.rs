@@ -1,25 +1,25 @@
 //! Slice by slice with shared vertices. Which points are inside is kept as bits, so that the many cells without surface cost a few
 //! operations per 64 of them.
 
-use super::{case_table, edge_corners};
+use super::CaseTable;
 use rayon::prelude::*;
 
 /// Slices that are pushed into one mesher where a whole grid is at hand.
 const SLAB: usize = 16;
 
 /// Collects a surface from slices of density pushed in order of z.
-pub struct Mesher {
+pub struct Mesher<'a> {
     nx: usize,
     ny: usize,
     level: f32,
-    table: Vec<Vec<[u8; 3]>>,
+    table: &'a CaseTable,
     z: usize,
     /// Place of the first slice.
     first_z: usize,
     below: Slice,
     above: Slice,
-    /// Vertices on the edges between the last two slices; only those that the surface cuts are set.
-    z_edges: Vec<u32>,
+    /// Vertices on the edges of each direction from the slice below to that above; only those that the surface cuts are set.
+    between: [Vec<u32>; 4],
     /// Vertex positions in grid coordinates (x, y, z).
     pub positions: Vec<[f32; 3]>,
     pub faces: Vec<[u32; 3]>,
@@ -30,22 +30,18 @@ struct Slice {
     values: Vec<f32>,
     /// Which points lie inside, `[ny, words]`.
     inside: Vec<u64>,
-    /// Vertices on the slice's x and y edges; only those that the surface cuts are set.
-    x_edges: Vec<u32>,
-    y_edges: Vec<u32>,
+    /// Vertices on the edges of each direction within the slice; only those that the surface cuts are set.
+    within: [Vec<u32>; 3],
 }
 
-impl Slice {
-    fn new(n: usize) -> Self {
-        Slice { x_edges: vec![0; n], y_edges: vec![0; n], ..Slice::default() }
-    }
-}
-
-impl Mesher {
-    /// For slices of `ny` rows of `nx` values.
-    pub fn new(nx: usize, ny: usize, level: f32) -> Self {
-        let (below, above, z_edges) = (Slice::new(nx * ny), Slice::new(nx * ny), vec![0; nx * ny]);
-        Mesher { nx, ny, level, table: case_table(), z: 0, first_z: 0, below, above, z_edges, positions: Vec::new(), faces: Vec::new() }
+impl<'a> Mesher<'a> {
+    /// For slices of `ny` rows of `nx` values, cut by `table`.
+    pub fn new(table: &'a CaseTable, nx: usize, ny: usize, level: f32) -> Self {
+        let room = |d: usize| vec![0; if table.directions.contains(&d) { nx * ny } else { 0 }];
+        let slice = || Slice { within: std::array::from_fn(|k| room(k + 1)), ..Slice::default() };
+        let between = std::array::from_fn(|k| room(k + 4));
+        let (below, above) = (slice(), slice());
+        Mesher { nx, ny, level, table, z: 0, first_z: 0, below, above, between, positions: Vec::new(), faces: Vec::new() }
     }
 
     /// Adds the next slice, `[ny, nx]`.
@@ -89,38 +85,43 @@ impl Mesher {
         if left >= 64 { u64::MAX } else { (1 << left) - 1 }
     }
 
-    /// Vertices on the newest slice's own edges and on those down to the slice below.
+    /// Vertices on the newest slice's own edges and on those from the slice below.
     fn cut_edges(&mut self) {
-        let (nx, ny, z, level, words) = (self.nx, self.ny, self.z, self.level, self.words());
+        let (nx, ny, level, words) = (self.nx, self.ny, self.level, self.words());
+        let directions: Vec<usize> = self.table.directions.iter().copied().filter(|d| d & 4 == 0 || self.z > 0).collect();
         for y in 0..ny {
             for k in 0..words {
-                let row = y * words;
-                let here = self.above.inside[row + k];
-                let along_x = (here ^ Self::shifted(&self.above.inside, row, words, k)) & self.has_next(k);
-                let along_y = if y + 1 < ny { here ^ self.above.inside[row + words + k] } else { 0 };
-                let along_z = if z > 0 { here ^ self.below.inside[row + k] } else { 0 };
-                let mut cut = along_x | along_y | along_z;
-                while cut != 0 {
-                    let bit = cut.trailing_zeros();
-                    cut &= cut - 1;
+                // Bits of the points from which an edge of each direction is cut.
+                let (mut cut, mut any) = ([0u64; 8], 0);
+                for &d in &directions {
+                    if d & 2 != 0 && y + 1 == ny {
+                        continue;
+                    }
+                    let from = if d & 4 == 0 { &self.above.inside } else { &self.below.inside };
+                    let row = (y + (d >> 1 & 1)) * words;
+                    let to = if d & 1 == 0 { self.above.inside[row + k] } else { Self::shifted(&self.above.inside, row, words, k) };
+                    cut[d] = (from[y * words + k] ^ to) & if d & 1 == 0 { u64::MAX } else { self.has_next(k) };
+                    any |= cut[d];
+                }
+                while any != 0 {
+                    let bit = any.trailing_zeros();
+                    any &= any - 1;
                     let x = k * 64 + bit as usize;
                     let i = y * nx + x;
-                    let s = &mut self.above;
-                    let (base, a) = ([x as f32, y as f32, (self.first_z + z) as f32], s.values[i]);
-                    let positions = &mut self.positions;
-                    let mut vertex = |axis: usize, a: f32, b: f32, mut p: [f32; 3]| {
-                        p[axis] += (level - a) / (b - a);
-                        positions.push(p);
-                        u32::try_from(positions.len() - 1).expect("fewer than 2^32 vertices")
-                    };
-                    if along_x >> bit & 1 == 1 {
-                        s.x_edges[i] = vertex(0, a, s.values[i + 1], base);
-                    }
-                    if along_y >> bit & 1 == 1 {
-                        s.y_edges[i] = vertex(1, a, s.values[i + nx], base);
-                    }
-                    if along_z >> bit & 1 == 1 {
-                        self.z_edges[i] = vertex(2, self.below.values[i], a, [base[0], base[1], base[2] - 1.0]);
+                    for &d in directions.iter().filter(|d| cut[**d] >> bit & 1 == 1) {
+                        let from = if d & 4 == 0 { &self.above } else { &self.below };
+                        let (a, b) = (from.values[i], self.above.values[i + (d & 1) + nx * (d >> 1 & 1)]);
+                        let low = self.first_z + self.z - (d >> 2);
+                        let mut p = [x as f32, y as f32, low as f32];
+                        let along = (level - a) / (b - a);
+                        (0..3).filter(|axis| d >> axis & 1 == 1).for_each(|axis| p[axis] += along);
+                        self.positions.push(p);
+                        let id = u32::try_from(self.positions.len() - 1).expect("fewer than 2^32 vertices");
+                        if d & 4 == 0 {
+                            self.above.within[d - 1][i] = id;
+                        } else {
+                            self.between[d - 4][i] = id;
+                        }
                     }
                 }
             }
@@ -148,14 +149,13 @@ impl Mesher {
                     cells &= cells - 1;
                     let case = corners.iter().enumerate().fold(0, |n, (c, bits)| n | ((bits >> bit & 1) as usize) << c);
                     let i = y * nx + k * 64 + bit as usize;
-                    for t in &self.table[case] {
+                    for t in &self.table.triangles[case] {
                         self.faces.push(t.map(|e| {
-                            let (c, _) = edge_corners(e as usize);
-                            let at = i + (c & 1) + nx * ((c >> 1) & 1);
-                            match e / 4 {
-                                0 => slices[c >> 2].x_edges[at],
-                                1 => slices[c >> 2].y_edges[at],
-                                _ => self.z_edges[at],
+                            let at = i + (e.corner & 1) + nx * (e.corner >> 1 & 1);
+                            if e.direction & 4 == 0 {
+                                slices[e.corner >> 2].within[e.direction - 1][at]
+                            } else {
+                                self.between[e.direction - 4][at]
                             }
                         }));
                     }
@@ -168,13 +168,13 @@ impl Mesher {
     fn top(&self) -> Vec<u32> {
         let (nx, words, s) = (self.nx, self.words(), &self.above);
         let mut out = Vec::new();
+        let inside = |i: usize| s.inside[i / nx * words + i % nx / 64] >> (i % nx % 64) & 1;
         for i in 0..s.values.len() {
-            let inside = |i: usize| s.inside[i / nx * words + i % nx / 64] >> (i % nx % 64) & 1;
-            if i % nx + 1 < nx && inside(i) != inside(i + 1) {
-                out.push(s.x_edges[i]);
-            }
-            if i + nx < s.values.len() && inside(i) != inside(i + nx) {
-                out.push(s.y_edges[i]);
+            for &d in self.table.directions.iter().filter(|d| **d < 4) {
+                let fits = (d & 1 == 0 || i % nx + 1 < nx) && (d & 2 == 0 || i + nx < s.values.len());
+                if fits && inside(i) != inside(i + (d & 1) + nx * (d >> 1)) {
+                    out.push(s.within[d - 1][i]);
+                }
             }
         }
         out
@@ -185,12 +185,12 @@ impl Mesher {
 ///
 /// # Panics
 /// When the grid has another size.
-pub fn surface(grid: &[f32], [nx, ny, nz]: [usize; 3], level: f32) -> (Vec<[f32; 3]>, Vec<[u32; 3]>) {
+pub fn surface(table: &CaseTable, grid: &[f32], [nx, ny, nz]: [usize; 3], level: f32) -> (Vec<[f32; 3]>, Vec<[u32; 3]>) {
     assert_eq!(grid.len(), nx * ny * nz, "marching cubes: grid");
     let slice = |z: usize| &grid[z * nx * ny..(z + 1) * nx * ny];
     // Slabs share a slice: its vertices come from the slab below.
     let slab = |z0: usize| {
-        let mut m = Mesher { first_z: z0, ..Mesher::new(nx, ny, level) };
+        let mut m = Mesher { first_z: z0, ..Mesher::new(table, nx, ny, level) };
         m.push(slice(z0));
         let shared = m.positions.len();
         (z0 + 1..(z0 + SLAB + 1).min(nz)).for_each(|z| m.push(slice(z)));

@@ -1,30 +1,37 @@
-//! One unit per grid point: it owns the crossings on its three edges and the triangles of the cell above it.
+//! One unit per grid point: it owns the crossings on the edges that begin there and the triangles of the cell above it.
 //! Counted first, then, with their places known, written.
 
-use super::{case_table, edge_corners};
+use super::CaseTable;
 use crate::gpu::{Buffer, CUBE, Gpu, GpuError, units};
 use crate::ops::scan;
 use cubecl::prelude::*;
 
-/// Numbers per case: how many triangles, and the edges of at most five.
-const CASE: usize = 16;
+/// Numbers per case: how many triangles, and the edges of at most twelve.
+const CASE: usize = 40;
 
 /// Vertices `[V, 3]` in grid coordinates (x, y, z) and faces `[T, 3]` of densities `[nz, ny, nx]`.
 ///
 /// # Errors
 /// When the device was lost or is full.
-pub fn extract(gpu: &Gpu, density: &Buffer, (nx, ny, nz): (usize, usize, usize), level: f32) -> Result<(Buffer, Buffer), GpuError> {
+pub fn extract(
+    gpu: &Gpu,
+    table: &CaseTable,
+    density: &Buffer,
+    (nx, ny, nz): (usize, usize, usize),
+    level: f32,
+) -> Result<(Buffer, Buffer), GpuError> {
     let n = nx * ny * nz;
     assert_eq!(density.len(), n, "marching cubes: {nx} x {ny} x {nz}");
     let mut cases = vec![0u32; 256 * CASE];
-    for (case, triangles) in case_table().iter().enumerate() {
+    for (case, triangles) in table.triangles.iter().enumerate() {
         cases[case * CASE] = triangles.len() as u32;
         for (i, e) in triangles.iter().flatten().enumerate() {
-            cases[case * CASE + 1 + i] = *e as u32;
+            cases[case * CASE + 1 + i] = (e.corner * 8 + e.direction) as u32;
         }
     }
-    let corners: Vec<u32> = (0..12).map(|e| edge_corners(e).0 as u32).collect();
-    let (cases, corners) = (gpu.upload_u32(&cases), gpu.upload_u32(&corners));
+    let cases = gpu.upload_u32(&cases);
+    // Vertices lie along the axes, or along all seven directions.
+    let diagonals = table.directions.len() > 3;
     let (crossings, triangles) = (gpu.empty(n), gpu.empty(n));
     let (cubes, cube) = (units(n), CubeDim::new_1d(CUBE));
     let size = (nx as u32, ny as u32, nz as u32);
@@ -43,6 +50,7 @@ pub fn extract(gpu: &Gpu, density: &Buffer, (nx, ny, nz): (usize, usize, usize),
                 size.1,
                 size.2,
                 level,
+                diagonals,
             );
         }
     }
@@ -58,7 +66,6 @@ pub fn extract(gpu: &Gpu, density: &Buffer, (nx, ny, nz): (usize, usize, usize),
                 cube,
                 density.arg(),
                 cases.arg(),
-                corners.arg(),
                 first_vertex.arg(),
                 first_face.arg(),
                 vertices.arg(),
@@ -67,6 +74,7 @@ pub fn extract(gpu: &Gpu, density: &Buffer, (nx, ny, nz): (usize, usize, usize),
                 size.1,
                 size.2,
                 level,
+                diagonals,
             );
         }
     }
@@ -77,18 +85,37 @@ fn last(gpu: &Gpu, offsets: &Buffer) -> Result<usize, GpuError> {
     Ok(gpu.read_u32(offsets)?.last().copied().unwrap_or(0) as usize)
 }
 
-/// Whether the density crosses the level along the edge from point `i` to the one `step` on.
+/// Whether the edge from point `i` in a direction lies in the grid and crosses the level.
 #[cube]
-fn crosses(density: &[f32], i: usize, step: usize, level: f32) -> u32 {
-    let mut here = 0u32;
-    let mut there = 0u32;
-    if density[i] > level {
-        here = 1u32;
+fn crosses(density: &[f32], i: usize, #[comptime] direction: usize, nx: usize, ny: usize, nz: usize, level: f32) -> u32 {
+    let mut fits = true;
+    if comptime!(direction & 1 != 0) {
+        fits = fits && i % nx + 1 < nx;
     }
-    if density[i + step] > level {
-        there = 1u32;
+    if comptime!(direction & 2 != 0) {
+        fits = fits && i / nx % ny + 1 < ny;
     }
-    here ^ there
+    if comptime!(direction & 4 != 0) {
+        fits = fits && i / (nx * ny) + 1 < nz;
+    }
+    let mut crossed = 0u32;
+    if fits {
+        let mut there = 0u32;
+        if density[i] > level {
+            crossed = 1u32;
+        }
+        if density[i + step(direction, nx, ny)] > level {
+            there = 1u32;
+        }
+        crossed ^= there;
+    }
+    crossed
+}
+
+/// From a point to the next one in a direction.
+#[cube]
+fn step(#[comptime] direction: usize, nx: usize, ny: usize) -> usize {
+    comptime!(direction & 1) + nx * comptime!(direction >> 1 & 1) + nx * ny * comptime!(direction >> 2)
 }
 
 /// Which corners of the cell above point `i` lie inside.
@@ -106,7 +133,17 @@ fn case_of(density: &[f32], i: usize, nx: usize, slice: usize, level: f32) -> u3
 }
 
 #[cube(launch_unchecked)]
-fn count(density: &[f32], cases: &[u32], crossings: &mut [u32], triangles: &mut [u32], nx: u32, ny: u32, nz: u32, level: f32) {
+fn count(
+    density: &[f32],
+    cases: &[u32],
+    crossings: &mut [u32],
+    triangles: &mut [u32],
+    nx: u32,
+    ny: u32,
+    nz: u32,
+    level: f32,
+    #[comptime] diagonals: bool,
+) {
     let i = ABSOLUTE_POS;
     let nx = nx as usize;
     let ny = ny as usize;
@@ -115,22 +152,16 @@ fn count(density: &[f32], cases: &[u32], crossings: &mut [u32], triangles: &mut 
     if i >= slice * nz {
         terminate!();
     }
-    let x = i % nx;
-    let y = i / nx % ny;
-    let z = i / slice;
     let mut n = 0u32;
-    if x + 1 < nx {
-        n += crosses(density, i, 1usize, level);
-    }
-    if y + 1 < ny {
-        n += crosses(density, i, nx, level);
-    }
-    if z + 1 < nz {
-        n += crosses(density, i, slice, level);
+    #[unroll]
+    for d in 1..8usize {
+        if comptime!(diagonals || d == 1 || d == 2 || d == 4) {
+            n += crosses(density, i, d, nx, ny, nz, level);
+        }
     }
     crossings[i] = n;
     let mut t = 0u32;
-    if x + 1 < nx && y + 1 < ny && z + 1 < nz {
+    if i % nx + 1 < nx && i / nx % ny + 1 < ny && i / slice + 1 < nz {
         t = cases[case_of(density, i, nx, slice, level) as usize * CASE];
     }
     triangles[i] = t;
@@ -140,7 +171,6 @@ fn count(density: &[f32], cases: &[u32], crossings: &mut [u32], triangles: &mut 
 fn write(
     density: &[f32],
     cases: &[u32],
-    corners: &[u32],
     first_vertex: &[u32],
     first_face: &[u32],
     vertices: &mut [f32],
@@ -149,6 +179,7 @@ fn write(
     ny: u32,
     nz: u32,
     level: f32,
+    #[comptime] diagonals: bool,
 ) {
     let i = ABSOLUTE_POS;
     let nx = nx as usize;
@@ -163,27 +194,15 @@ fn write(
     let z = i / slice;
     let mut at = first_vertex[i] as usize * 3;
     #[unroll]
-    for axis in 0..3usize {
-        let mut step = 1usize;
-        let mut within = x + 1 < nx;
-        if comptime!(axis == 1) {
-            step = nx;
-            within = y + 1 < ny;
-        }
-        if comptime!(axis == 2) {
-            step = slice;
-            within = z + 1 < nz;
-        }
-        let mut crossed = 0u32;
-        if within {
-            crossed = crosses(density, i, step, level);
-        }
-        if crossed == 1 {
-            vertices[at] = f32::cast_from(x);
-            vertices[at + 1] = f32::cast_from(y);
-            vertices[at + 2] = f32::cast_from(z);
-            vertices[at + axis] += (level - density[i]) / (density[i + step] - density[i]);
-            at += 3;
+    for d in 1..8usize {
+        if comptime!(diagonals || d == 1 || d == 2 || d == 4) {
+            if crosses(density, i, d, nx, ny, nz, level) == 1 {
+                let along = (level - density[i]) / (density[i + step(d, nx, ny)] - density[i]);
+                vertices[at] = f32::cast_from(x) + along * comptime!((d & 1) as f32);
+                vertices[at + 1] = f32::cast_from(y) + along * comptime!((d >> 1 & 1) as f32);
+                vertices[at + 2] = f32::cast_from(z) + along * comptime!((d >> 2) as f32);
+                at += 3;
+            }
         }
     }
     if x + 1 < nx && y + 1 < ny && z + 1 < nz {
@@ -191,17 +210,17 @@ fn write(
         let to = first_face[i] as usize * 3;
         for k in 0..cases[case] as usize * 3 {
             let e = cases[case + 1 + k] as usize;
-            let c = corners[e] as usize;
-            let px = x + c % 2;
-            let py = y + c / 2 % 2;
+            let c = e / 8;
             let p = i + c % 2 + nx * (c / 2 % 2) + slice * (c / 4);
-            // The point's crossings along x and y come before that along z.
+            // The point's crossings in lower directions come first.
             let mut id = first_vertex[p];
-            if e >= 4 && px + 1 < nx {
-                id += crosses(density, p, 1usize, level);
-            }
-            if e >= 8 && py + 1 < ny {
-                id += crosses(density, p, nx, level);
+            #[unroll]
+            for d in 1..7usize {
+                if comptime!(diagonals || d == 1 || d == 2 || d == 4) {
+                    if d < e % 8 {
+                        id += crosses(density, p, d, nx, ny, nz, level);
+                    }
+                }
             }
             faces[to + k] = id;
         }

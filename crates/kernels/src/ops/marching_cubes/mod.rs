@@ -12,17 +12,34 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
+/// An edge of a cell from one of its corners in a direction; bit `k` of either is a step along axis `k`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Edge {
+    pub corner: usize,
+    pub direction: usize,
+}
+
+/// How cells are cut, here and by marching tetrahedra.
+pub struct CaseTable {
+    /// Directions of the edges on which vertices lie, ascending.
+    pub directions: &'static [usize],
+    /// Triangles for each of the 256 sets of inside corners.
+    pub triangles: Vec<Vec<[Edge; 3]>>,
+}
+
 /// Corners of edge `e`: edge `4 a + i` runs along axis `a`. Corner bit `k` is the step along axis `k`.
-pub fn edge_corners(e: usize) -> (usize, usize) {
+fn edge_corners(e: usize) -> (usize, usize) {
     let (a, i) = (e / 4, e % 4);
     let (u, v) = ((a + 1) % 3, (a + 2) % 3);
     let low = ((i & 1) << u) | ((i >> 1) << v);
     (low, low | 1 << a)
 }
 
-/// Triangles, as edge numbers, for each of the 256 sets of inside corners.
-pub fn case_table() -> Vec<Vec<[u8; 3]>> {
-    (0..256).map(triangles_of_case).collect()
+/// The cases of cubes.
+pub fn case_table() -> CaseTable {
+    let edge = |e: u8| Edge { corner: edge_corners(e as usize).0, direction: 1 << (e / 4) };
+    let triangles = (0..256).map(|inside| triangles_of_case(inside).into_iter().map(|t| t.map(edge)).collect()).collect();
+    CaseTable { directions: &[1, 2, 4], triangles }
 }
 
 fn edge_between(p: usize, q: usize) -> usize {

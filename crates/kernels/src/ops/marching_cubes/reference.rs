@@ -1,6 +1,6 @@
 //! Cell by cell in f64, without sharing vertices.
 
-use super::{case_table, edge_corners};
+use super::case_table;
 
 /// Triangles as three points each, for values `[nz, ny, nx]`.
 pub fn triangles(nx: usize, ny: usize, nz: usize, values: &[f64], level: f64) -> Vec<[[f64; 3]; 3]> {
@@ -15,9 +15,9 @@ pub fn triangles(nx: usize, ny: usize, nz: usize, values: &[f64], level: f64) ->
                     values[(z * ny + y) * nx + x]
                 };
                 let inside = (0..8).filter(|&c| value(c) > level).map(|c| 1 << c).sum::<usize>();
-                for t in &table[inside] {
+                for t in &table.triangles[inside] {
                     out.push(t.map(|e| {
-                        let (a, b) = edge_corners(e as usize);
+                        let (a, b) = (e.corner, e.corner | e.direction);
                         let f = (level - value(a)) / (value(b) - value(a));
                         let (p, q) = (place(a), place(b));
                         std::array::from_fn(|k| p[k] as f64 + f * (q[k] as f64 - p[k] as f64))

@@ -1,12 +1,14 @@
 use super::*;
 use diorama_testkit::{random, wide};
 
-fn run(nx: usize, ny: usize, nz: usize, values: &[f32], level: f32) -> cpu::Mesher {
-    let mut m = cpu::Mesher::new(nx, ny, level);
+/// Positions and faces, slice by slice.
+fn run(nx: usize, ny: usize, nz: usize, values: &[f32], level: f32) -> diorama_geom::Mesh {
+    let table = case_table();
+    let mut m = cpu::Mesher::new(&table, nx, ny, level);
     for z in 0..nz {
         m.push(&values[z * nx * ny..(z + 1) * nx * ny]);
     }
-    m
+    diorama_geom::Mesh { positions: m.positions, faces: m.faces, ..Default::default() }
 }
 
 #[test]
@@ -36,9 +38,7 @@ fn random_fields_closed_by_their_border_are_watertight() {
                 *v = -1.0;
             }
         }
-        let m = run(n, n, n, &v, 0.0);
-        let mesh = diorama_geom::Mesh { positions: m.positions, faces: m.faces, ..Default::default() };
-        assert!(mesh.is_watertight());
+        assert!(run(n, n, n, &v, 0.0).is_watertight());
     }
 }
 
@@ -71,11 +71,12 @@ fn a_sphere_lies_on_its_surface_and_faces_outward() {
 
 #[test]
 fn every_case_uses_exactly_its_crossing_edges() {
-    for (inside, triangles) in case_table().iter().enumerate() {
-        let used: std::collections::HashSet<u8> = triangles.iter().flatten().copied().collect();
+    for (inside, triangles) in case_table().triangles.iter().enumerate() {
+        let used: std::collections::HashSet<Edge> = triangles.iter().flatten().copied().collect();
         for e in 0..12 {
             let (a, b) = edge_corners(e);
-            assert_eq!(used.contains(&(e as u8)), (inside >> a & 1) != (inside >> b & 1), "case {inside} edge {e}");
+            let edge = Edge { corner: a, direction: a ^ b };
+            assert_eq!(used.contains(&edge), (inside >> a & 1) != (inside >> b & 1), "case {inside} edge {e}");
         }
     }
 }
@@ -92,7 +93,7 @@ fn a_whole_grid_in_slabs_equals_slice_by_slice() {
         })
         .collect();
     let m = run(nx, ny, nz, &values, 0.4);
-    let (positions, faces) = cpu::surface(&values, [nx, ny, nz], 0.4);
+    let (positions, faces) = cpu::surface(&case_table(), &values, [nx, ny, nz], 0.4);
     assert_eq!((positions.len(), faces.len()), (m.positions.len(), m.faces.len()));
     let placed = |p: &[[f32; 3]], f: &[[u32; 3]]| -> Vec<[[f32; 3]; 3]> { f.iter().map(|f| f.map(|i| p[i as usize])).collect() };
     assert!(placed(&positions, &faces) == placed(&m.positions, &m.faces));
@@ -106,5 +107,5 @@ fn a_whole_grid_in_slabs_equals_slice_by_slice() {
         b.dedup();
         b.len()
     });
-    assert!(cpu::surface(&[0.0; 8], [2, 2, 2], 0.5) == (vec![], vec![]));
+    assert!(cpu::surface(&case_table(), &[0.0; 8], [2, 2, 2], 0.5) == (vec![], vec![]));
 }

@@ -1,0 +1,241 @@
+//! Closed meshes: vertices at one place become one, edges of four faces are parted, holes are filled.
+
+use diorama_geom::Mesh;
+use diorama_geom::mesh::{cross, sub};
+use std::collections::HashMap;
+
+/// Makes one vertex of those at the same place, and drops the faces that lose their area by it. What was closed stays closed.
+pub fn weld(mesh: &mut Mesh) {
+    let mut first = HashMap::new();
+    let at: Vec<u32> = mesh
+        .positions
+        .iter()
+        .enumerate()
+        // Adding zero makes one of both zeros.
+        .map(|(i, p)| *first.entry(p.map(|v| (v + 0.0).to_bits())).or_insert(i as u32))
+        .collect();
+    mesh.faces.iter_mut().flatten().for_each(|i| *i = at[*i as usize]);
+    mesh.faces.retain(|f| f[0] != f[1] && f[1] != f[2] && f[0] != f[2]);
+    drop_folds(mesh);
+    mesh.compact();
+}
+
+/// Two faces on the same three vertices that look away from each other enclose nothing; of equal ones one stays.
+fn drop_folds(mesh: &mut Mesh) {
+    let mut balance: HashMap<[u32; 3], i32> = HashMap::new();
+    let key = |f: &[u32; 3]| {
+        let mut k = *f;
+        k.sort_unstable();
+        let least = (0..3).min_by_key(|i| f[*i]).unwrap_or(0);
+        // Which way round the face runs.
+        (k, if f[(least + 1) % 3] == k[1] { 1 } else { -1 })
+    };
+    for f in &mesh.faces {
+        let (k, way) = key(f);
+        *balance.entry(k).or_default() += way;
+    }
+    mesh.faces.retain(|f| {
+        let (k, way) = key(f);
+        match balance.get_mut(&k) {
+            Some(b) if *b != 0 && b.signum() == way => {
+                *b = 0;
+                true
+            }
+            _ => false,
+        }
+    });
+}
+
+/// Closes a mesh; whether it is watertight then. Edges that more than two faces share are parted so that the solid on either side
+/// is its own, and rims are filled by fans around their middle.
+pub fn close(mesh: &mut Mesh) -> bool {
+    weld(mesh);
+    for _ in 0..4 {
+        if mesh.is_watertight() {
+            return true;
+        }
+        part(mesh);
+        fill(mesh);
+    }
+    mesh.is_watertight()
+}
+
+/// Gives each fan of faces around a vertex a vertex of its own, where fans are joined by edges between two faces.
+fn part(mesh: &mut Mesh) {
+    let mut along: HashMap<(u32, u32), Vec<u32>> = HashMap::new();
+    for (i, f) in mesh.faces.iter().enumerate() {
+        (0..3).for_each(|k| along.entry((f[k], f[(k + 1) % 3])).or_default().push((i * 3 + k) as u32));
+    }
+    // Corners that are one: those at both ends of an edge between two faces.
+    let mut same: Vec<u32> = (0..mesh.faces.len() as u32 * 3).collect();
+    fn root(same: &mut [u32], mut i: u32) -> u32 {
+        while same[i as usize] != i {
+            same[i as usize] = same[same[i as usize] as usize];
+            i = same[i as usize];
+        }
+        i
+    }
+    let next = |c: u32| c / 3 * 3 + (c + 1) % 3;
+    for (&(a, b), forth) in &along {
+        if a > b && along.contains_key(&(b, a)) {
+            continue;
+        }
+        let Some(back) = along.get(&(b, a)) else { continue };
+        for (x, y) in pairs(mesh, (a, b), forth, back) {
+            for (p, q) in [(x, next(y)), (next(x), y)] {
+                let (p, q) = (root(&mut same, p), root(&mut same, q));
+                same[p as usize] = q;
+            }
+        }
+    }
+    let mut vertex: HashMap<(u32, u32), u32> = HashMap::new();
+    let mut positions = Vec::new();
+    let own = |c: u32| {
+        let at = mesh.faces[c as usize / 3][c as usize % 3];
+        *vertex.entry((at, root(&mut same, c))).or_insert_with(|| {
+            positions.push(mesh.positions[at as usize]);
+            positions.len() as u32 - 1
+        })
+    };
+    let corners: Vec<u32> = (0..mesh.faces.len() as u32 * 3).map(own).collect();
+    let faces = corners.chunks_exact(3).map(|f| [f[0], f[1], f[2]]).collect();
+    *mesh = Mesh { positions, faces, ..Mesh::default() };
+}
+
+/// Which faces (by their corner at the edge's start) belong together across an edge: of more than two, those with the solid between them.
+fn pairs(mesh: &Mesh, (a, b): (u32, u32), forth: &[u32], back: &[u32]) -> Vec<(u32, u32)> {
+    if forth.len() == 1 && back.len() == 1 {
+        return vec![(forth[0], back[0])];
+    }
+    let p = |i: u32| mesh.positions[i as usize];
+    let axis = sub(p(b), p(a));
+    let dot = |a: [f32; 3], b: [f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    let helper = if axis[0].abs() < axis[1].abs().max(axis[2].abs()) { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] };
+    let u = cross(axis, helper);
+    let v = cross(axis, u);
+    let length = dot(axis, axis).sqrt().max(1e-20);
+    let angle = |c: u32| {
+        let f = mesh.faces[c as usize / 3];
+        let d = sub(p(f[(c as usize + 2) % 3]), p(a));
+        (dot(d, v) / length).atan2(dot(d, u))
+    };
+    let turn = |from: f32, to: f32| (to - from).rem_euclid(std::f32::consts::TAU);
+    let mut free: Vec<(u32, f32)> = back.iter().map(|c| (*c, angle(*c))).collect();
+    let mut out = Vec::new();
+    for &c in forth {
+        // The solid lies behind the face that runs along the edge: the next one that way round bounds it.
+        let own = angle(c);
+        let Some(k) = (0..free.len()).min_by(|i, j| turn(free[*i].1, own).total_cmp(&turn(free[*j].1, own))) else { break };
+        out.push((c, free.remove(k).0));
+    }
+    out
+}
+
+/// Fills each rim with a fan around its middle.
+fn fill(mesh: &mut Mesh) {
+    let mut count: HashMap<(u32, u32), i32> = HashMap::new();
+    for f in &mesh.faces {
+        (0..3).for_each(|k| *count.entry((f[k], f[(k + 1) % 3])).or_default() += 1);
+    }
+    let mut rim: HashMap<u32, Vec<u32>> = HashMap::new();
+    let mut starts: Vec<(u32, u32)> = count.keys().copied().filter(|(a, b)| !count.contains_key(&(*b, *a))).collect();
+    starts.sort_unstable();
+    // A rim runs against its faces.
+    starts.iter().for_each(|(a, b)| rim.entry(*b).or_default().push(*a));
+    for (_, start) in starts {
+        let mut ring = vec![start];
+        while let Some(next) = rim.get_mut(&ring[ring.len() - 1]).and_then(Vec::pop) {
+            if next == start {
+                break;
+            }
+            ring.push(next);
+        }
+        if ring.len() < 3 {
+            continue;
+        }
+        if ring.len() == 3 {
+            mesh.faces.push([ring[0], ring[1], ring[2]]);
+            continue;
+        }
+        let sum = ring.iter().fold([0.0f32; 3], |s, i| std::array::from_fn(|k| s[k] + mesh.positions[*i as usize][k]));
+        let middle = mesh.positions.len() as u32;
+        mesh.positions.push(sum.map(|v| v / ring.len() as f32));
+        mesh.faces.extend((0..ring.len()).map(|k| [ring[k], ring[(k + 1) % ring.len()], middle]));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A cube of two triangles a side from `lo`, each face with vertices of its own.
+    fn cube(lo: [f32; 3], mesh: &mut Mesh) {
+        for (axis, side) in (0..3).flat_map(|a| [(a, 0.0), (a, 1.0f32)]) {
+            let first = mesh.positions.len() as u32;
+            for (u, v) in [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)] {
+                let mut p = lo;
+                p[axis] += side;
+                p[(axis + 1) % 3] += u;
+                p[(axis + 2) % 3] += v;
+                mesh.positions.push(p);
+            }
+            let ring = if side > 0.5 { [0, 1, 2, 3] } else { [0, 3, 2, 1] }.map(|i| first + i);
+            mesh.faces.extend([[ring[0], ring[1], ring[2]], [ring[0], ring[2], ring[3]]]);
+        }
+    }
+
+    fn volume(m: &Mesh) -> f32 {
+        let of = |f: &[u32; 3]| {
+            let [a, b, c] = f.map(|i| m.positions[i as usize]);
+            let n = cross(b, c);
+            (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) / 6.0
+        };
+        m.faces.iter().map(of).sum()
+    }
+
+    #[test]
+    fn vertices_at_one_place_become_one() {
+        let mut m = Mesh::default();
+        cube([0.0; 3], &mut m);
+        assert!(!m.is_watertight());
+        weld(&mut m);
+        assert!(m.is_watertight() && m.positions.len() == 8);
+    }
+
+    #[test]
+    fn holes_are_filled() {
+        // A whole side, a triangle, and both, which meet in a corner or along an edge.
+        for (first, last) in [(2, 0), (0, 1), (2, 1)] {
+            let mut m = Mesh::default();
+            cube([0.0; 3], &mut m);
+            weld(&mut m);
+            m.faces.drain(..first);
+            m.faces.truncate(m.faces.len() - last);
+            assert!(close(&mut m));
+            // Flat holes are filled flat.
+            assert!((volume(&m) - 1.0).abs() < if first + last < 3 { 1e-5 } else { 0.2 }, "{}", volume(&m));
+        }
+    }
+
+    #[test]
+    fn cubes_that_touch_along_an_edge_or_in_a_corner_are_parted() {
+        for other in [[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]] {
+            let mut m = Mesh::default();
+            cube([0.0; 3], &mut m);
+            cube(other, &mut m);
+            assert!(close(&mut m), "{other:?}");
+            assert!((volume(&m) - 2.0).abs() < 1e-5 && m.faces.len() == 24);
+        }
+    }
+
+    #[test]
+    fn faces_that_fold_onto_each_other_go() {
+        let mut m = Mesh::default();
+        cube([0.0; 3], &mut m);
+        weld(&mut m);
+        let f = m.faces[0];
+        m.positions.push([0.5, 0.5, 3.0]);
+        m.faces.extend([[f[0], f[1], 8], [f[1], f[0], 8]]);
+        assert!(close(&mut m) && m.faces.len() == 12);
+    }
+}
