@@ -2,6 +2,8 @@
 
 use diorama_data::{archive, camera_path_json, checkpoint, colmap, import, llff, photo, photo_import, transforms_json};
 use diorama_geom::{ImageU8, Similarity};
+use diorama_pipelines::object::config::{Config, Method};
+use diorama_pipelines::object::viewing;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
@@ -26,6 +28,8 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "zip", run: unzip, seeds: zip_seeds },
     Parser { name: "http_request", run: http, seeds: http_seeds },
     Parser { name: "viewer_message", run: message, seeds: message_seeds },
+    Parser { name: "run_config", run: run_config, seeds: config_seeds },
+    Parser { name: "crop_json", run: crop_json, seeds: crop_seeds },
 ];
 
 /// A parser by name.
@@ -251,4 +255,29 @@ fn message_seeds() -> Vec<Vec<u8>> {
     ]
     .map(|v| v.to_string().into_bytes())
     .to_vec()
+}
+
+fn run_config(data: &[u8]) {
+    let Ok(text) = std::str::from_utf8(data) else { return };
+    if let Ok(mut config) = Config::from_toml(text) {
+        let _ = config.check();
+        // What was read is written and set as it is.
+        let _ = Config::from_toml(&config.to_toml());
+        let _ = config.set("data.downscale", text);
+    }
+    // A flag's value may be anything.
+    let _ = Config::new(Method::Ngp, "x".into()).set(text, text);
+}
+
+fn config_seeds() -> Vec<Vec<u8>> {
+    [Method::Ngp, Method::Nerf, Method::Mlp, Method::Baseline].map(|m| Config::new(m, "data".into()).to_toml().into_bytes()).into()
+}
+
+fn crop_json(data: &[u8]) {
+    let path = file("crop.json", data);
+    let _ = viewing::read_crop(path.parent().expect("a folder"));
+}
+
+fn crop_seeds() -> Vec<Vec<u8>> {
+    vec![br#"{"min": [-1.0, -0.5, 0.0], "max": [1.0, 0.5, 2e-3]}"#.to_vec()]
 }

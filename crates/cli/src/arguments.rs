@@ -2,7 +2,7 @@
 
 use crate::commands::{self, Outcome};
 use crate::terminal;
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory, Parser, Subcommand};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -53,8 +53,17 @@ enum Command {
     Quickstart(QuickstartArgs),
     /// What a capture or a run is
     Info(InfoArgs),
-    /// What this machine offers, and what each missing part disables
+    /// What this machine offers, and what each missing part disables; of a capture, what will likely go wrong
+    #[command(after_help = "Examples:\n  diorama doctor\n  diorama doctor data/chair")]
     Doctor(DoctorArgs),
+    /// Completions for a shell, to be put where it looks for them
+    #[command(
+        after_help = "Examples:\n  diorama completions bash > ~/.local/share/bash-completion/completions/diorama\n  diorama completions zsh > ~/.zfunc/_diorama\n  diorama completions fish > ~/.config/fish/completions/diorama.fish"
+    )]
+    Completions(CompletionsArgs),
+    /// Manual pages, one per verb
+    #[command(after_help = "Example:\n  diorama man ~/.local/share/man/man1 && man diorama-train")]
+    Man(ManArgs),
     /// Measure the kernels and the training step on this machine
     #[command(subcommand)]
     Bench(Bench),
@@ -105,6 +114,21 @@ pub struct PrepareArgs {
     /// COLMAP's camera model: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or OPENCV_FISHEYE
     #[arg(long, default_value = "OPENCV")]
     pub lens: String,
+    /// Keep only some photographs: diverse:N, the N that differ most in place, direction and looks
+    #[arg(long, value_name = "diverse:N")]
+    pub select: Option<String>,
+    /// Cut the photographs once their poses are known: square, or x,y,width,height in pixels
+    #[arg(long)]
+    pub crop: Option<String>,
+    /// Remove noise (non-local means, as strong as the noise that is measured)
+    #[arg(long)]
+    pub denoise: bool,
+    /// Make exposure and white balance equal, by the points that several photographs show
+    #[arg(long)]
+    pub normalize_exposure: bool,
+    /// off, auto (by the points of what the cameras look at), or a segmentation network: NETWORK.onnx
+    #[arg(long, default_value = "off")]
+    pub remove_background: String,
     /// every:N, A:B:C (percent) or all
     #[arg(long, default_value = "every:8")]
     pub split: String,
@@ -222,10 +246,10 @@ pub struct RenderArgs {
     pub path: String,
     #[arg(long, default_value_t = 90)]
     pub frames: usize,
-    /// WIDTHxHEIGHT [default: that of the run]
+    /// WIDTHxHEIGHT [default: that of the run, or of the path's file]
     #[arg(long)]
     pub size: Option<String>,
-    /// Horizontal field of view in degrees [default: that of the capture]
+    /// Horizontal field of view in degrees [default: that of the capture, or of the path's file]
     #[arg(long)]
     pub fov: Option<f64>,
     /// rgb, depth, normal, opacity, occupancy
@@ -237,8 +261,9 @@ pub struct RenderArgs {
     /// MP4 file of the first layer
     #[arg(long)]
     pub video: Option<PathBuf>,
-    #[arg(long, default_value_t = 30)]
-    pub fps: u32,
+    /// [default: 30, or that of the path's file]
+    #[arg(long)]
+    pub fps: Option<u32>,
     /// Show only what lies in x0,y0,z0,x1,y1,z1 (the input's frame), or all [default: the crop box saved in the viewer, else all]
     #[arg(long, allow_hyphen_values = true)]
     pub clip: Option<String>,
@@ -265,6 +290,9 @@ pub struct ExportArgs {
     /// The file to write
     #[arg(short, long)]
     pub out: PathBuf,
+    /// mc: marching cubes; mt: marching tetrahedra, some twice the faces before they are reduced
+    #[arg(long, default_value = "mc")]
+    pub extract: String,
     /// Cells along the longest side
     #[arg(long, default_value_t = 320)]
     pub resolution: usize,
@@ -277,6 +305,12 @@ pub struct ExportArgs {
     /// Edge of the texture in texels; 0 colours the vertices instead [default: 2048 where the format has textures]
     #[arg(long)]
     pub texture: Option<usize>,
+    /// Bake the field's normals too, for a material that is lit; glb and obj
+    #[arg(long)]
+    pub normal_map: bool,
+    /// Close the mesh, as printing needs it, or fail
+    #[arg(long)]
+    pub watertight: bool,
     /// Metres per unit of the capture
     #[arg(long, default_value_t = 1.0, conflicts_with_all = ["scale_to", "measured"])]
     pub scale: f64,
@@ -378,8 +412,26 @@ pub struct InfoArgs {
 /// Flags of `doctor`.
 #[derive(Args, Clone, Debug)]
 pub struct DoctorArgs {
+    /// A capture's folder; without it, this machine
+    pub data: Option<PathBuf>,
+    /// Format of a capture, where a folder holds several
+    #[arg(long, requires = "data")]
+    pub format: Option<String>,
     #[arg(long)]
     pub json: bool,
+}
+
+/// Flags of `completions`.
+#[derive(Args, Clone, Debug)]
+pub struct CompletionsArgs {
+    pub shell: clap_complete::Shell,
+}
+
+/// Flags of `man`.
+#[derive(Args, Clone, Debug)]
+pub struct ManArgs {
+    /// Folder for the pages, which are named after their verbs
+    pub folder: PathBuf,
 }
 
 /// Flags of `bench ops`.
@@ -496,6 +548,7 @@ pub fn main() -> ExitCode {
         Command::Quickstart(a) => a.json,
         Command::Info(a) => a.json,
         Command::Doctor(a) => a.json,
+        Command::Completions(_) | Command::Man(_) => false,
         Command::Bench(Bench::Ops(a)) => a.json,
         Command::Bench(Bench::Train(a)) => a.json,
         Command::Bench(Bench::Render(a)) => a.json,
@@ -513,6 +566,8 @@ pub fn main() -> ExitCode {
         Command::Quickstart(a) => commands::quickstart::run(&a),
         Command::Info(a) => commands::info::run(&a),
         Command::Doctor(a) => commands::doctor::run(&a),
+        Command::Completions(a) => commands::manual::completions(&a, Cli::command()),
+        Command::Man(a) => commands::manual::pages(&a, Cli::command()),
         Command::Bench(Bench::Ops(a)) => commands::bench::ops(&a),
         Command::Bench(Bench::Train(a)) => commands::bench::train(&a),
         Command::Bench(Bench::Render(a)) => commands::bench::render(&a),

@@ -58,6 +58,7 @@ pub fn find_model(root: &Path) -> Option<PathBuf> {
 /// A point that structure from motion found.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
+    pub id: u64,
     pub position: DVec3,
     pub rgb: [u8; 3],
     /// Images in which it was matched.
@@ -66,7 +67,28 @@ pub struct Point {
 
 /// Images that a binary model has registered.
 pub fn registered(model: &Path) -> Result<Vec<String>> {
-    Ok(read_images_bin(&model.join("images.bin"))?.into_iter().map(|i| i.name).collect())
+    Ok(read_images_bin(&model.join("images.bin"), &mut |_, _| {})?.into_iter().map(|i| i.name).collect())
+}
+
+/// Where points appear in an image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Observed {
+    pub image: String,
+    /// Pixel and [`Point::id`].
+    pub points: Vec<([f64; 2], u64)>,
+}
+
+/// Where the points of a binary model appear, image by image.
+pub fn observations(model: &Path) -> Result<Vec<Observed>> {
+    /// COLMAP's number of a keypoint that is no point's.
+    const NONE: u64 = u64::MAX;
+    let mut out = Vec::new();
+    read_images_bin(&model.join("images.bin"), &mut |name, keypoints| {
+        let word = |k: &[u8], i: usize| u64::from_le_bytes(k[8 * i..8 * i + 8].try_into().expect("eight bytes"));
+        let all = keypoints.chunks_exact(24).map(|k| ([f64::from_bits(word(k, 0)), f64::from_bits(word(k, 1))], word(k, 2)));
+        out.push(Observed { image: name.to_string(), points: all.filter(|p| p.1 != NONE).collect() });
+    })?;
+    Ok(out)
 }
 
 /// Points of a binary model.
@@ -80,13 +102,13 @@ pub fn points(model: &Path) -> Result<Vec<Point>> {
     let n = b.u64()?;
     let mut out = Vec::new();
     for _ in 0..n {
-        b.u64()?;
+        let id = b.u64()?;
         let position = DVec3::new(b.f64()?, b.f64()?, b.f64()?);
         let rgb = b.take(3)?.try_into().expect("three bytes");
         b.f64()?;
         let images = b.u64()?;
         b.take(usize::try_from(images).ok().and_then(|p| p.checked_mul(8)).unwrap_or(usize::MAX))?;
-        out.push(Point { position, rgb, images: images as usize });
+        out.push(Point { id, position, rgb, images: images as usize });
     }
     Ok(out)
 }
@@ -96,7 +118,11 @@ pub fn read(root: &Path) -> Result<Imported> {
     let model = find_model(root)
         .ok_or_else(|| DataError::input(root, "holds no COLMAP model (images.bin or images.txt, in sparse/0 for example)"))?;
     let (cameras, images, file) = if model.join("images.bin").exists() {
-        (read_cameras_bin(&model.join("cameras.bin"))?, read_images_bin(&model.join("images.bin"))?, model.join("images.bin"))
+        (
+            read_cameras_bin(&model.join("cameras.bin"))?,
+            read_images_bin(&model.join("images.bin"), &mut |_, _| {})?,
+            model.join("images.bin"),
+        )
     } else {
         (read_cameras_txt(&model.join("cameras.txt"))?, read_images_txt(&model.join("images.txt"))?, model.join("images.txt"))
     };
@@ -201,7 +227,8 @@ fn read_cameras_bin(file: &Path) -> Result<HashMap<u32, Camera>> {
     Ok(out)
 }
 
-fn read_images_bin(file: &Path) -> Result<Vec<Registered>> {
+/// `keypoints` is handed each image's name and bytes of 2D points, 24 each: x, y, point.
+fn read_images_bin(file: &Path, keypoints: &mut dyn FnMut(&str, &[u8])) -> Result<Vec<Registered>> {
     let data = error::read(file, LIMIT)?;
     let mut b = Bytes { file, data: &data };
     let n = b.u64()?;
@@ -218,7 +245,7 @@ fn read_images_bin(file: &Path) -> Result<Vec<Registered>> {
         b.take(1)?;
         let points = b.u64()?;
         let bytes = usize::try_from(points).ok().and_then(|p| p.checked_mul(24)).unwrap_or(usize::MAX);
-        b.take(bytes)?;
+        keypoints(&name, b.take(bytes)?);
         out.push(Registered { name, camera, world_from_camera: pose([v[0], v[1], v[2], v[3]], [v[4], v[5], v[6]]) });
     }
     Ok(out)

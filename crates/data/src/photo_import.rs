@@ -43,6 +43,20 @@ fn natural(name: &str) -> Vec<(String, Option<u64>)> {
     key
 }
 
+/// Focal length over the longer side, both in pixels, as the camera wrote it into the photograph (the equivalent for 35 mm film, by
+/// the diagonal).
+pub fn focal_ratio(photo: &Path) -> Option<f64> {
+    /// Diagonal of the film in millimetres.
+    const FILM: f64 = 43.267;
+    let mut file = std::io::BufReader::new(std::fs::File::open(photo).ok()?);
+    let exif = exif::Reader::new().read_from_container(&mut file).ok()?;
+    let field = exif.get_field(exif::Tag::FocalLengthIn35mmFilm, exif::In::PRIMARY)?;
+    let mm = field.value.get_uint(0).filter(|v| (5..2000).contains(v))? as f64;
+    let (w, h) = photo::size(photo).ok()?;
+    let (w, h) = (w as f64, h as f64);
+    Some(mm / FILM * w.hypot(h) / w.max(h))
+}
+
 /// Writes a photograph as `folder/stem` with its extension. A JPEG that needs no change keeps its pixels bit for bit; its metadata
 /// goes in any case.
 ///
@@ -169,6 +183,25 @@ mod tests {
         assert_eq!(photo::load(&made).unwrap(), photo::load(&source).unwrap());
         let small = photo::load(&import(&source, &out, "b", 16).unwrap()).unwrap();
         assert_eq!((small.width, small.height), (16, 12));
+    }
+
+    #[test]
+    fn the_focal_length_is_read_before_it_goes() {
+        let dir = tempfile::tempdir().unwrap();
+        let plain = write(&picture(), dir.path(), "plain").unwrap();
+        assert_eq!(focal_ratio(&plain), None);
+        // A TIFF head, one entry that points to the EXIF directory, and there one entry: 26 mm on 35 mm film.
+        let entry = |tag: u16, kind: u16, value: [u8; 4]| [&tag.to_be_bytes()[..], &kind.to_be_bytes(), &[0, 0, 0, 1], &value].concat();
+        let mut tiff = b"MM\0\x2a\0\0\0\x08".to_vec();
+        tiff.extend([&[0, 1][..], &entry(0x8769, 4, [0, 0, 0, 26]), &[0; 4]].concat());
+        tiff.extend([&[0, 1][..], &entry(0xa405, 3, [0, 26, 0, 0]), &[0; 4]].concat());
+        let bytes = std::fs::read(&plain).unwrap();
+        let length = (tiff.len() as u16 + 8).to_be_bytes();
+        let tagged = [&bytes[..2], &[0xff, 0xe1], &length, b"Exif\0\0", &tiff, &bytes[2..]].concat();
+        let path = dir.path().join("tagged.jpg");
+        std::fs::write(&path, tagged).unwrap();
+        // 32 × 24 pixels have a diagonal of 40.
+        assert!((focal_ratio(&path).unwrap() - 26.0 / 43.267 * 40.0 / 32.0).abs() < 1e-9);
     }
 
     #[test]

@@ -62,18 +62,26 @@ pub fn scene_box() -> SceneBox {
     SceneBox { center: DVec3::ZERO, half: 1.0, aabb_scale: 1 }
 }
 
+/// Pose of view `i` of `views`, in turn on the lower and the upper ring.
+pub fn pose(i: usize, views: usize) -> Pose {
+    let (ring, k) = (i % 2, i / 2);
+    let angle = (k as f64 + 0.5 * ring as f64) / views.div_ceil(2) as f64 * std::f64::consts::TAU;
+    let elevation: f64 = [0.35, 0.85][ring];
+    let direction = DVec3::new(angle.cos() * elevation.cos(), angle.sin() * elevation.cos(), elevation.sin());
+    Pose::look_at(direction * 3.0 + DVec3::new(0.0, 0.0, -0.12), DVec3::new(0.0, 0.0, -0.12), DVec3::Z)
+}
+
+/// Horizontal field of view in radians.
+pub const FOV: f64 = 0.75;
+
 /// Renders `views` photographs of `size` pixels a side, exactly posed.
 pub fn photographs(views: usize, size: u32) -> Vec<Photo> {
     let scene = scene();
-    let camera = Camera::pinhole(size, size, 0.75);
+    let camera = Camera::pinhole(size, size, FOV);
     (0..views)
         .into_par_iter()
         .map(|i| {
-            let (ring, k) = (i % 2, i / 2);
-            let angle = (k as f64 + 0.5 * ring as f64) / views.div_ceil(2) as f64 * std::f64::consts::TAU;
-            let elevation: f64 = [0.35, 0.85][ring];
-            let direction = DVec3::new(angle.cos() * elevation.cos(), angle.sin() * elevation.cos(), elevation.sin());
-            let pose = Pose::look_at(direction * 3.0 + DVec3::new(0.0, 0.0, -0.12), DVec3::new(0.0, 0.0, -0.12), DVec3::Z);
+            let pose = pose(i, views);
             Photo { name: format!("view_{i:02}"), camera, world_from_camera: pose, image: scene.render(&camera, &pose, 4) }
         })
         .collect()

@@ -2,19 +2,54 @@
 
 use super::Outcome;
 use crate::arguments::DoctorArgs;
+use diorama_data::import::{self, ImportOptions};
 use diorama_kernels::device::Api;
-use diorama_pipelines::Result;
+use diorama_pipelines::object::diagnose::{self, Grade};
+use diorama_pipelines::{PipelineError, Result};
+use std::path::Path;
 use std::process::{Command, Stdio};
 
 pub fn run(a: &DoctorArgs) -> Result<Outcome> {
+    match &a.data {
+        Some(data) => capture(data, a),
+        None => machine(a),
+    }
+}
+
+/// What a capture is, and what will likely go wrong.
+fn capture(data: &Path, a: &DoctorArgs) -> Result<Outcome> {
+    let format = a.format.as_deref().map(str::parse).transpose().map_err(PipelineError::Usage)?;
+    let capture = import::import(data, &ImportOptions { format, min_views: 1, ..ImportOptions::default() })?;
+    let found = diagnose::diagnose(&capture)?;
+    if a.json {
+        println!("{}", serde_json::json!({ "capture": data, "findings": found }));
+        return Ok(Outcome::Done);
+    }
+    for f in &found {
+        let mark = match f.grade {
+            Grade::Good => "ok",
+            Grade::Note => "note",
+            Grade::Trouble => "trouble",
+        };
+        println!("{mark:<8} {:<10} {}", f.subject, f.text);
+        if !f.cure.is_empty() {
+            println!("{:<19} -> {}", "", f.cure);
+        }
+    }
+    let count = |g: Grade| found.iter().filter(|f| f.grade == g).count();
+    println!("{} troubles, {} notes", count(Grade::Trouble), count(Grade::Note));
+    Ok(Outcome::Done)
+}
+
+fn machine(a: &DoctorArgs) -> Result<Outcome> {
     let cpu = diorama_kernels::device::cpu();
     let gpus = diorama_kernels::device::gpus();
     let devices: Vec<&str> = std::iter::once("cpu").chain(gpus.iter().map(|g| g.api.name())).collect();
     let about: Vec<_> =
         gpus.iter().map(|g| serde_json::json!({ "device": g.api.name(), "name": g.name, "software": g.software })).collect();
     let (total, available) = memory();
-    let ffmpeg = tool("ffmpeg", "-version");
-    let colmap = tool("colmap", "-h");
+    let ffmpeg = tool("ffmpeg", "DIORAMA_FFMPEG", "-version");
+    let colmap = tool("colmap", "DIORAMA_COLMAP", "-h");
     let data = std::env::var("DIORAMA_TEST_DATA").ok().filter(|d| std::path::Path::new(d).is_dir());
     if a.json {
         let object = serde_json::json!({
@@ -57,8 +92,9 @@ pub fn run(a: &DoctorArgs) -> Result<Outcome> {
 }
 
 /// First line of a program's output, if it can be started.
-fn tool(name: &str, flag: &str) -> Option<String> {
-    let out = Command::new(name).arg(flag).stdin(Stdio::null()).output().ok()?;
+fn tool(name: &str, variable: &str, flag: &str) -> Option<String> {
+    let program = std::env::var_os(variable).unwrap_or_else(|| name.into());
+    let out = Command::new(program).arg(flag).stdin(Stdio::null()).output().ok()?;
     let text = String::from_utf8_lossy(&out.stdout).into_owned();
     Some(text.lines().find(|l| !l.trim().is_empty()).unwrap_or(name).trim().to_string())
 }

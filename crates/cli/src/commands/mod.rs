@@ -6,6 +6,7 @@ pub mod doctor;
 pub mod eval;
 pub mod export;
 pub mod info;
+pub mod manual;
 pub mod prepare;
 pub mod quickstart;
 pub mod render;

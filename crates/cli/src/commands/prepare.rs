@@ -4,7 +4,7 @@ use super::{INTERRUPT, Outcome, use_threads, watch_interrupts};
 use crate::arguments::PrepareArgs;
 use diorama_data::split::SplitRule;
 use diorama_data::video::Choice;
-use diorama_pipelines::object::prepare::{self, PrepareOptions};
+use diorama_pipelines::object::prepare::{self, Finish, PrepareOptions};
 use diorama_pipelines::{PipelineError, Result};
 use std::time::{Duration, Instant};
 
@@ -18,7 +18,19 @@ pub fn run(a: &PrepareArgs) -> Result<Outcome> {
     least("max-side", a.max_side.is_none_or(|s| s >= 64), "at least 64")?;
     least("min-registered", (0.0..=100.0).contains(&a.min_registered), "0 to 100")?;
     let split: SplitRule = a.split.parse().map_err(usage)?;
+    let diverse = |text: &String| {
+        let n = text.strip_prefix("diverse:").and_then(|n| n.parse::<usize>().ok()).filter(|n| *n >= 3);
+        n.ok_or_else(|| usage(format!("select {text}: expected diverse:N with N of at least 3")))
+    };
+    let finish = Finish {
+        crop: a.crop.as_deref().map(str::parse).transpose().map_err(usage)?,
+        diverse: a.select.as_ref().map(diverse).transpose()?,
+        denoise: a.denoise,
+        normalize_exposure: a.normalize_exposure,
+        background: a.remove_background.parse().map_err(usage)?,
+    };
     let options = PrepareOptions {
+        finish,
         input: a.input.clone(),
         out: a.out.clone(),
         choice: a.fps.map_or(Choice::Count(a.frames), Choice::PerSecond),
@@ -63,6 +75,19 @@ pub fn run(a: &PrepareArgs) -> Result<Outcome> {
     );
     if !made.lost.is_empty() {
         println!("without a pose: {}", made.lost.join(", "));
+    }
+    let f = &made.finished;
+    if f.left_out > 0 {
+        println!("left out: {} photographs that differ little from others", f.left_out);
+    }
+    if let Some([dark, bright]) = f.exposure_stops {
+        println!("exposures made equal: they were {dark:+.2} to {bright:+.2} stops apart from the middle");
+    }
+    if let Some(sigma) = f.noise {
+        println!("noise removed: {sigma:.1} of 255 in the middle photograph");
+    }
+    if let Some(share) = f.foreground {
+        println!("background removed: {:.0} % of the pixels are left", 100.0 * share);
     }
     println!("look at: {}", made.sheet.display());
     println!("next: diorama train {} -o runs/{}", made.folder.display(), made.folder.file_name().unwrap_or_default().to_string_lossy());

@@ -3,6 +3,7 @@
 pub mod compare;
 pub mod config;
 pub mod device;
+pub mod diagnose;
 pub mod evaluate;
 pub mod export;
 pub(crate) mod extent;

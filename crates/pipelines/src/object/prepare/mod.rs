@@ -1,6 +1,7 @@
 //! Photographs or a video without poses become a data set: sharp frames, poses from COLMAP, the world upright and of useful size,
-//! a division into training and held-out views, and a sheet that shows it all.
+//! photographs finished as wished, a division into training and held-out views, and a sheet that shows it all.
 
+pub mod finish;
 mod sfm;
 mod sheet;
 mod world;
@@ -8,7 +9,7 @@ mod world;
 use crate::error::{PipelineError, Result};
 use diorama_data::split::{self, SplitRule};
 use diorama_data::video::{self, Choice};
-use diorama_data::{DataError, atomic, colmap, import, photo_import, transforms_json};
+use diorama_data::{DataError, atomic, colmap, import, photo, photo_import, transforms_json};
 use diorama_geom::Capture;
 use diorama_geom::capture::Split;
 use serde::Serialize;
@@ -16,6 +17,7 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
+pub use finish::Finish;
 pub use sfm::Matcher;
 
 /// What to make a data set of, and how.
@@ -33,6 +35,7 @@ pub struct PrepareOptions {
     pub matcher: Matcher,
     /// COLMAP's name of the lens.
     pub lens: String,
+    pub finish: Finish,
     pub split: SplitRule,
     pub seed: u64,
     /// Fewest photographs that need a pose, in percent.
@@ -59,6 +62,8 @@ pub struct Prepared {
     pub aabb_scale: u32,
     pub held_out: usize,
     pub sheet: PathBuf,
+    #[serde(flatten)]
+    pub finished: finish::Finished,
 }
 
 /// Names within the data set.
@@ -88,7 +93,12 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
     }
     let names: Vec<String> = images.iter().map(|p| p.file_name().unwrap_or_default().to_string_lossy().into_owned()).collect();
     let is_video = !o.input.is_dir();
-    let Some(model) = sfm::reconstruct(&colmap_program, o, &names, is_video, interrupt, note)? else { return Ok(None) };
+    let one_size = one_size(&images)?;
+    if !one_size {
+        note("photographs differ in size: a lens is found for each; those of one size and zoom are found more reliably");
+    }
+    let kind = sfm::Photographs { names: &names, is_video, one_size, focal_ratio: read_focal_ratio(&work) };
+    let Some(model) = sfm::reconstruct(&colmap_program, o, &kind, interrupt, note)? else { return Ok(None) };
     let registered: HashSet<String> = colmap::registered(&model)?.into_iter().collect();
     let lost: Vec<String> = names.iter().filter(|n| !registered.contains(*n)).cloned().collect();
     enough(o, &names, &lost)?;
@@ -96,6 +106,9 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
     let points = colmap::points(&model)?;
     let mut frames = colmap::read(&o.out)?.frames;
     let placed = world::place(&mut frames, &points);
+    let in_world = points.iter().copied().zip(placed.points.iter().map(|p| p.0)).collect();
+    let found = finish::Found { model: &model, points: in_world, floor: placed.floor };
+    let Some(finished) = finish::finish(&o.finish, &o.out, &found, &mut frames, interrupt, note)? else { return Ok(None) };
     split::apply(&o.split, &mut frames, false, o.seed);
     if frames.iter().filter(|f| f.split == Split::Train).count() < 2 {
         return Err(PipelineError::Usage(format!("--split {}: leaves fewer than 2 training views; choose another", o.split)));
@@ -119,6 +132,7 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
         aabb_scale: placed.scene.aabb_scale,
         held_out: capture.indices(Split::Test).len(),
         sheet,
+        finished,
     }))
 }
 
@@ -142,7 +156,7 @@ fn begin(o: &PrepareOptions) -> Result<()> {
         if !o.force {
             return Err(DataError::input(&o.out, "exists; give --resume to go on, --force to begin anew, or another --out").into());
         }
-        for part in [IMAGES, WORK, "sparse"] {
+        for part in [IMAGES, WORK, "sparse", finish::FINISHED] {
             let folder = o.out.join(part);
             if folder.exists() {
                 std::fs::remove_dir_all(&folder).map_err(DataError::io(&folder, "remove"))?;
@@ -156,11 +170,38 @@ fn begin(o: &PrepareOptions) -> Result<()> {
     Ok(())
 }
 
+/// Whether all photographs have as many pixels.
+fn one_size(images: &[PathBuf]) -> Result<bool> {
+    let first = photo::size(&images[0])?;
+    for i in images {
+        if photo::size(i)? != first {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
+/// What [`take_images`] has kept of the photographs' metadata.
+fn read_focal_ratio(work: &Path) -> Option<f64> {
+    std::fs::read_to_string(work.join(IMAGES_DONE)).ok()?.trim().parse().ok()
+}
+
+/// The focal length that photographs agree on, over the longer side.
+fn common_focal_ratio(all: &[PathBuf]) -> Option<f64> {
+    let mut found: Vec<f64> = all.iter().filter_map(|p| photo_import::focal_ratio(p)).collect();
+    found.sort_by(f64::total_cmp);
+    let middle = *found.get(found.len() / 2)?;
+    let agree = found.iter().filter(|f| (*f / middle - 1.0).abs() < 0.02).count();
+    (agree * 10 >= all.len() * 9).then_some(middle)
+}
+
 /// Fills the folder of images; false when interrupted.
 fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<bool> {
     let folder = o.out.join(IMAGES);
+    let mut focal_ratio = None;
     if o.input.is_dir() {
         let all: Vec<PathBuf> = photo_import::list(&o.input)?.into_iter().step_by(o.every).collect();
+        focal_ratio = common_focal_ratio(&all);
         let mut stems = HashSet::new();
         for (i, source) in all.iter().enumerate() {
             if interrupt.load(Ordering::Relaxed) {
@@ -185,7 +226,8 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
             }
         }
     }
-    atomic::write(&work.join(IMAGES_DONE), b"")?;
+    let kept = focal_ratio.map(|f| f.to_string()).unwrap_or_default();
+    atomic::write(&work.join(IMAGES_DONE), kept.as_bytes())?;
     Ok(true)
 }
 

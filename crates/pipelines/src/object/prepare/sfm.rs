@@ -42,6 +42,16 @@ pub fn program() -> Result<PathBuf> {
     Ok(process::find("colmap", "DIORAMA_COLMAP", "Debian: apt install colmap; others: colmap.github.io/install.html")?)
 }
 
+/// What is to be posed.
+pub struct Photographs<'a> {
+    pub names: &'a [String],
+    pub is_video: bool,
+    /// All have as many pixels, so one lens serves all.
+    pub one_size: bool,
+    /// Focal length over the longer side, where the photographs tell.
+    pub focal_ratio: Option<f64>,
+}
+
 /// One run of COLMAP over a data set.
 struct Sfm<'a> {
     program: &'a Path,
@@ -55,8 +65,7 @@ struct Sfm<'a> {
 pub fn reconstruct(
     program: &Path,
     o: &PrepareOptions,
-    names: &[String],
-    is_video: bool,
+    photos: &Photographs,
     interrupt: &AtomicBool,
     note: &mut dyn FnMut(&str),
 ) -> Result<Option<PathBuf>> {
@@ -64,7 +73,8 @@ pub fn reconstruct(
         return Err(PipelineError::Usage(format!("--lens {}: expected one of {}", o.lens, LENSES.join(", "))));
     }
     let sfm = Sfm { program, images: o.out.join(IMAGES), work: o.out.join(WORK), threads: o.threads, interrupt };
-    if !sfm.features(&o.lens, names.len(), note)? {
+    let (names, is_video) = (photos.names, photos.is_video);
+    if !sfm.features(&o.lens, photos, note)? {
         return Ok(None);
     }
     let neighbours = o.matcher == Matcher::Sequential || (o.matcher == Matcher::Auto && (is_video || names.len() > EXHAUSTIVE));
@@ -119,7 +129,8 @@ impl Sfm<'_> {
         if text.contains(&format!("--{}", names[0])) { names[0] } else { names[1] }
     }
 
-    fn features(&self, lens: &str, n: usize, note: &mut dyn FnMut(&str)) -> Result<bool> {
+    fn features(&self, lens: &str, photos: &Photographs, note: &mut dyn FnMut(&str)) -> Result<bool> {
+        let n = photos.names.len();
         if self.is_done("features") {
             return Ok(true);
         }
@@ -127,14 +138,17 @@ impl Sfm<'_> {
         let _ = std::fs::remove_file(self.database());
         let gpu = self.option("feature_extractor", ["FeatureExtraction.use_gpu", "SiftExtraction.use_gpu"]);
         let threads = self.option("feature_extractor", ["FeatureExtraction.num_threads", "SiftExtraction.num_threads"]);
-        let arguments = [
+        let mut arguments = vec![
             ("database_path", self.database().display().to_string()),
             ("image_path", self.images.display().to_string()),
             ("ImageReader.camera_model", lens.to_string()),
-            ("ImageReader.single_camera", "1".into()),
+            ("ImageReader.single_camera", (photos.one_size as u8).to_string()),
             (gpu, "0".into()),
             (threads, self.threads.map_or(-1, |t| t as i64).to_string()),
         ];
+        if let Some(f) = photos.focal_ratio {
+            arguments.push(("ImageReader.default_focal_length_factor", f.to_string()));
+        }
         let done = self.run(&arguments, "feature_extractor", &mut |l| {
             if let Some(at) = l.split("Processed file [").nth(1).and_then(|r| r.split('/').next()) {
                 note(&format!("features: {at} of {n}"));

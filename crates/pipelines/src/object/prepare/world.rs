@@ -9,7 +9,7 @@ use diorama_geom::transform::rotation_between;
 use diorama_geom::{Pose, SceneBox, Similarity};
 
 /// Median distance of the cameras from what they look at.
-const DISTANCE: f64 = 4.0;
+pub const DISTANCE: f64 = 4.0;
 /// Half the inner cube: what instant-ngp's scale of 0.33 makes of the unit cube.
 const HALF: f64 = 0.5 / 0.33;
 /// Share of the points that the outer cube has to hold.
@@ -131,7 +131,7 @@ mod tests {
                 } else {
                     DVec3::new(0.5 * u(3 * i), 0.5 * u(3 * i + 1), 0.5 * u(3 * i + 2))
                 };
-                Point { position: s.point(p), rgb: [9; 3], images: 4 }
+                Point { id: 0, position: s.point(p), rgb: [9; 3], images: 4 }
             })
             .collect();
         (frames, points)

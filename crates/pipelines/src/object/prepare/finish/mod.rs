@@ -1,0 +1,271 @@
+//! What is done to photographs once their poses are known: some are left out, exposures made equal, noise and background removed,
+//! edges cut off. COLMAP has seen the originals, which stay; what training sees is written beside them.
+
+pub mod background;
+mod denoise;
+mod exposure;
+mod grab_cut;
+mod graph_cut;
+#[cfg(feature = "onnx")]
+mod network;
+mod select;
+
+use crate::error::{PipelineError, Result};
+use background::{Background, Subject};
+use diorama_data::colmap::{self, Point};
+use diorama_data::{DataError, photo, photo_import};
+use diorama_geom::capture::Frame;
+use diorama_geom::glam::DVec3;
+use rayon::prelude::*;
+use serde::Serialize;
+use std::collections::HashMap;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Which part of a photograph stays.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Crop {
+    /// The largest centred square.
+    Square,
+    /// x, y, width, height in pixels of the photograph.
+    Window([u32; 4]),
+}
+
+impl std::str::FromStr for Crop {
+    type Err = String;
+
+    fn from_str(s: &str) -> std::result::Result<Self, String> {
+        if s == "square" {
+            return Ok(Crop::Square);
+        }
+        let v: Option<Vec<u32>> = s.split(',').map(|v| v.trim().parse().ok()).collect();
+        match v.as_deref() {
+            Some(&[x, y, w, h]) if w >= 16 && h >= 16 => Ok(Crop::Window([x, y, w, h])),
+            _ => Err(format!("crop {s:?}: expected square or x,y,width,height in pixels, at least 16 wide and high")),
+        }
+    }
+}
+
+/// What to do.
+#[derive(Clone, Debug)]
+pub struct Finish {
+    pub crop: Option<Crop>,
+    /// Keep so many photographs, those that differ most.
+    pub diverse: Option<usize>,
+    pub denoise: bool,
+    pub normalize_exposure: bool,
+    pub background: Background,
+}
+
+impl Finish {
+    /// Whether pixels change.
+    fn touches_pixels(&self) -> bool {
+        self.crop.is_some() || self.denoise || self.normalize_exposure || self.background != Background::Keep
+    }
+}
+
+/// What was done.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Finished {
+    /// Photographs with poses that were left out.
+    pub left_out: usize,
+    /// Darkest and brightest photograph before exposures were made equal, in stops from the middle.
+    pub exposure_stops: Option<[f32; 2]>,
+    /// Median standard deviation of the noise that was removed, in steps of 8 bits.
+    pub noise: Option<f32>,
+    /// Mean share of the pixels that are foreground.
+    pub foreground: Option<f32>,
+}
+
+/// Name of the folder of finished photographs within the data set.
+pub const FINISHED: &str = "finished";
+
+/// What structure from motion found.
+pub struct Found<'a> {
+    /// Folder of COLMAP's model.
+    pub model: &'a Path,
+    /// Its points with their places in the upright world.
+    pub points: Vec<(Point, DVec3)>,
+    /// Whether there is a floor.
+    pub floor: bool,
+}
+
+/// Finishes the photographs of `frames`, whose poses are those of the upright world; none when interrupted.
+///
+/// # Errors
+/// When a photograph cannot be read, a crop leaves it, or the thing cannot be told from its surroundings.
+pub fn finish(
+    o: &Finish,
+    root: &Path,
+    found: &Found,
+    frames: &mut Vec<Frame>,
+    interrupt: &AtomicBool,
+    note: &mut dyn FnMut(&str),
+) -> Result<Option<Finished>> {
+    let mut made = Finished::default();
+    if let Some(n) = o.diverse {
+        note("choosing photographs that differ");
+        let looks = frames.par_iter().map(|f| Ok(select::looks(&photo::load(&f.image)?))).collect::<Result<Vec<_>>>()?;
+        let chosen = select::diverse(frames, &looks, n);
+        made.left_out = frames.len() - chosen.len();
+        *frames = chosen.into_iter().map(|i| frames[i].clone()).collect();
+    }
+    let folder = root.join(FINISHED);
+    if folder.exists() {
+        std::fs::remove_dir_all(&folder).map_err(DataError::io(&folder, "remove"))?;
+    }
+    if !o.touches_pixels() {
+        return Ok(Some(made));
+    }
+    std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
+    let observed: HashMap<String, colmap::Observed> =
+        colmap::observations(found.model)?.into_iter().map(|v| (v.image.clone(), v)).collect();
+    let name = |f: &Frame| f.image.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let gains = o.normalize_exposure.then(|| {
+        note("comparing exposures");
+        let of = |f: &Frame| match observed.get(&name(f)) {
+            Some(seen) => Ok(exposure::colors(&photo::load(&f.image)?, seen)),
+            None => Ok(Vec::new()),
+        };
+        Ok::<_, PipelineError>(exposure::gains(&frames.par_iter().map(of).collect::<Result<Vec<_>>>()?))
+    });
+    let gains = gains.transpose()?;
+    made.exposure_stops = gains.as_ref().map(|g| {
+        let stops = g.iter().map(|g| g.iter().sum::<f32>() / 3.0 / std::f32::consts::LN_2);
+        stops.fold([f32::INFINITY, f32::NEG_INFINITY], |[lo, hi], s| [lo.min(s), hi.max(s)])
+    });
+    let remover = Remover::open(&o.background, frames, found)?;
+    let work = |i: usize, f: &Frame| -> Result<(Frame, f32, f32)> {
+        let mut image = photo::load(&f.image)?;
+        if let Some(g) = &gains {
+            exposure::apply(&mut image, g[i]);
+        }
+        // A mask is made of what the camera saw, before its noise is gone.
+        let alpha = remover.alpha(&image, f, observed.get(&name(f)))?;
+        let sigma = if o.denoise { denoise::noise(&image) } else { 0.0 };
+        image = denoise::denoise(&image, sigma);
+        let mut share = 1.0;
+        if let Some(alpha) = alpha {
+            share = alpha.iter().map(|a| *a as f64).sum::<f64>() as f32 / 255.0 / alpha.len().max(1) as f32;
+            image = background::with_alpha(&image, &alpha);
+        }
+        let mut f = f.clone();
+        if let Some(crop) = o.crop {
+            image = crop_to(crop, image, &mut f)?;
+        }
+        let stem = f.image.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        f.image = photo_import::write(&image, &folder, &stem)?;
+        Ok((f, sigma, share))
+    };
+    let mut out = Vec::new();
+    // In groups, so that progress shows and Ctrl-C is heard.
+    for first in (0..frames.len()).step_by(4) {
+        if interrupt.load(Ordering::Relaxed) {
+            return Ok(None);
+        }
+        let last = (first + 4).min(frames.len());
+        let group: Vec<_> = (first..last).into_par_iter().map(|i| work(i, &frames[i])).collect::<Result<_>>()?;
+        out.extend(group);
+        note(&format!("finishing photographs: {last} of {}", frames.len()));
+    }
+    let mut sigmas: Vec<f32> = out.iter().map(|v| v.1).collect();
+    sigmas.sort_by(f32::total_cmp);
+    made.noise = o.denoise.then(|| sigmas[sigmas.len() / 2]);
+    made.foreground = (o.background != Background::Keep).then(|| out.iter().map(|v| v.2).sum::<f32>() / out.len().max(1) as f32);
+    *frames = out.into_iter().map(|v| v.0).collect();
+    Ok(Some(made))
+}
+
+/// What tells foreground from background.
+enum Remover {
+    None,
+    Points(Subject),
+    #[cfg(feature = "onnx")]
+    Network(network::Network),
+}
+
+impl Remover {
+    fn open(how: &Background, frames: &[Frame], found: &Found) -> Result<Remover> {
+        match how {
+            Background::Keep => Ok(Remover::None),
+            Background::Auto => {
+                let places: Vec<(u64, DVec3, usize)> = found.points.iter().map(|(p, at)| (p.id, *at, p.images)).collect();
+                let subject = Subject::find(frames, &places, found.floor);
+                if subject.size() < FEWEST_POINTS {
+                    return Err(PipelineError::Usage(format!(
+                        "--remove-background auto: only {} points belong to what the cameras look at, {FEWEST_POINTS} are needed; \
+                         give a network (NETWORK.onnx) or keep the background",
+                        subject.size()
+                    )));
+                }
+                Ok(Remover::Points(subject))
+            }
+            #[cfg(feature = "onnx")]
+            Background::Network(file) => Ok(Remover::Network(network::Network::open(file)?)),
+            #[cfg(not(feature = "onnx"))]
+            Background::Network(file) => Err(PipelineError::Usage(format!(
+                "--remove-background {}: this build runs no networks; build it with --features onnx, or use auto",
+                file.display()
+            ))),
+        }
+    }
+
+    fn alpha(&self, image: &diorama_geom::ImageU8, frame: &Frame, observed: Option<&colmap::Observed>) -> Result<Option<Vec<u8>>> {
+        match self {
+            Remover::None => Ok(None),
+            Remover::Points(subject) => Ok(Some(subject.alpha(image, frame, observed))),
+            #[cfg(feature = "onnx")]
+            Remover::Network(network) => network.alpha(image).map(Some),
+        }
+    }
+}
+
+/// Fewest points by which a thing is told from its surroundings.
+const FEWEST_POINTS: usize = 50;
+
+/// Cuts a photograph, and its camera with it.
+fn crop_to(crop: Crop, image: diorama_geom::ImageU8, frame: &mut Frame) -> Result<diorama_geom::ImageU8> {
+    let (w, h) = (image.width, image.height);
+    let [x, y, cw, ch] = match crop {
+        Crop::Square => {
+            let side = w.min(h);
+            [(w - side) / 2, (h - side) / 2, side, side]
+        }
+        Crop::Window(v) => v.map(|v| v as usize),
+    };
+    if x + cw > w || y + ch > h {
+        return Err(PipelineError::Usage(format!(
+            "--crop {x},{y},{cw},{ch}: leaves {}, which has {w} by {h} pixels",
+            frame.image.display()
+        )));
+    }
+    let c = image.channels;
+    let data = (y..y + ch).flat_map(|row| &image.data[(row * w + x) * c..(row * w + x + cw) * c]).copied().collect();
+    let camera = &mut frame.camera;
+    (camera.width, camera.height) = (cw as u32, ch as u32);
+    (camera.cx, camera.cy) = (camera.cx - x as f64, camera.cy - y as f64);
+    Ok(diorama_geom::ImageU8 { width: cw, height: ch, channels: c, data })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diorama_geom::{Camera, ImageU8, Pose};
+
+    #[test]
+    fn a_cropped_camera_sees_the_same_directions() {
+        let data = (0..40 * 30).flat_map(|i| [(i % 40) as u8, (i / 40) as u8, 0]).collect();
+        let image = ImageU8 { width: 40, height: 30, channels: 3, data };
+        for (crop, [x, y, w, h]) in [(Crop::Square, [5, 0, 30, 30]), ("3,4,20,16".parse().unwrap(), [3usize, 4, 20, 16])] {
+            let mut f = Frame::new("a", "a.jpg", Camera::pinhole(40, 30, 0.8), Pose::IDENTITY);
+            let before = f.camera;
+            let cut = crop_to(crop, image.clone(), &mut f).unwrap();
+            assert_eq!((cut.width, cut.height, cut.pixel(0, 0)), (w, h, &[x as u8, y as u8, 0][..]));
+            let (a, b) = (before.direction(17.5, 12.5), f.camera.direction(17.5 - x as f64, 12.5 - y as f64));
+            assert!((a - b).length() < 1e-12);
+        }
+        let mut f = Frame::new("a", "a.jpg", Camera::pinhole(40, 30, 0.8), Pose::IDENTITY);
+        assert!(crop_to(Crop::Window([30, 0, 20, 20]), image, &mut f).unwrap_err().to_string().contains("--crop"));
+        assert!("1,2,3".parse::<Crop>().is_err() && "0,0,4,4".parse::<Crop>().is_err());
+    }
+}
