@@ -20,7 +20,7 @@ pub fn weld(mesh: &mut Mesh) {
     mesh.compact();
 }
 
-/// Two faces on the same three vertices that look away from each other enclose nothing; of equal ones one stays.
+/// Two faces on the same three vertices that look away from each other enclose nothing.
 fn drop_folds(mesh: &mut Mesh) {
     let mut balance: HashMap<[u32; 3], i32> = HashMap::new();
     let key = |f: &[u32; 3]| {
@@ -38,7 +38,7 @@ fn drop_folds(mesh: &mut Mesh) {
         let (k, way) = key(f);
         match balance.get_mut(&k) {
             Some(b) if *b != 0 && b.signum() == way => {
-                *b = 0;
+                *b -= way;
                 true
             }
             _ => false,
@@ -46,26 +46,81 @@ fn drop_folds(mesh: &mut Mesh) {
     });
 }
 
+/// Rounds of [`close`].
+const ROUNDS: usize = 8;
+/// Parts that touched are moved into themselves by this share of their edges, so that readers without indices see them apart.
+const NUDGE: f32 = 2e-3;
+
 /// Closes a mesh; whether it is watertight then. Edges that more than two faces share are parted so that the solid on either side
 /// is its own, and rims are filled by fans around their middle.
 pub fn close(mesh: &mut Mesh) -> bool {
     weld(mesh);
-    for _ in 0..4 {
+    for _ in 0..ROUNDS {
         if mesh.is_watertight() {
             return true;
         }
         part(mesh);
         fill(mesh);
+        divide(mesh);
     }
     mesh.is_watertight()
 }
 
-/// Gives each fan of faces around a vertex a vertex of its own, where fans are joined by edges between two faces.
-fn part(mesh: &mut Mesh) {
+/// Half edges by their ends: three times the face plus the corner where each begins.
+fn half_edges(mesh: &Mesh) -> HashMap<(u32, u32), Vec<u32>> {
     let mut along: HashMap<(u32, u32), Vec<u32>> = HashMap::new();
     for (i, f) in mesh.faces.iter().enumerate() {
         (0..3).for_each(|k| along.entry((f[k], f[(k + 1) % 3])).or_default().push((i * 3 + k) as u32));
     }
+    along
+}
+
+/// Normal of a face, as long as twice its area.
+fn normal(mesh: &Mesh, face: usize) -> [f32; 3] {
+    let [a, b, c] = mesh.faces[face].map(|i| mesh.positions[i as usize]);
+    cross(sub(b, a), sub(c, a))
+}
+
+fn length(v: [f32; 3]) -> f32 {
+    (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt()
+}
+
+/// Edges along which several pairs of faces meet although their ends cannot be parted get a vertex of their own for each pair.
+fn divide(mesh: &mut Mesh) {
+    let along = half_edges(mesh);
+    let mut touched = vec![false; mesh.faces.len()];
+    let mut edges: Vec<_> = along.iter().filter(|((a, b), c)| a < b && c.len() > 1).collect();
+    edges.sort_unstable();
+    let mut added = Vec::new();
+    for (&(a, b), forth) in edges {
+        let Some(back) = along.get(&(b, a)) else { continue };
+        for (x, y) in pairs(mesh, (a, b), forth, back) {
+            let (f, g) = (x as usize / 3, y as usize / 3);
+            // What was divided in this round waits for the next.
+            if touched[f] || touched[g] || f == g {
+                continue;
+            }
+            (touched[f], touched[g]) = (true, true);
+            let (p, q) = (mesh.positions[a as usize], mesh.positions[b as usize]);
+            let n: [f32; 3] = std::array::from_fn(|k| normal(mesh, f)[k] + normal(mesh, g)[k]);
+            let by = NUDGE * length(sub(q, p)) / length(n).max(1e-20);
+            let middle = mesh.positions.len() as u32;
+            mesh.positions.push(std::array::from_fn(|k| 0.5 * (p[k] + q[k]) - by * n[k]));
+            for c in [x, y] {
+                let face = &mut mesh.faces[c as usize / 3];
+                let k = c as usize % 3;
+                let (end, apex) = (face[(k + 1) % 3], face[(k + 2) % 3]);
+                face[(k + 1) % 3] = middle;
+                added.push([middle, end, apex]);
+            }
+        }
+    }
+    mesh.faces.extend(added);
+}
+
+/// Gives each fan of faces around a vertex a vertex of its own, where fans are joined by edges between two faces.
+fn part(mesh: &mut Mesh) {
+    let along = half_edges(mesh);
     // Corners that are one: those at both ends of an edge between two faces.
     let mut same: Vec<u32> = (0..mesh.faces.len() as u32 * 3).collect();
     fn root(same: &mut [u32], mut i: u32) -> u32 {
@@ -98,8 +153,31 @@ fn part(mesh: &mut Mesh) {
         })
     };
     let corners: Vec<u32> = (0..mesh.faces.len() as u32 * 3).map(own).collect();
+    let mut copies = vec![0u32; mesh.positions.len()];
+    vertex.keys().for_each(|(at, _)| copies[*at as usize] += 1);
+    let mut parted = vec![false; positions.len()];
+    vertex.iter().for_each(|((at, _), id)| parted[*id as usize] = copies[*at as usize] > 1);
     let faces = corners.chunks_exact(3).map(|f| [f[0], f[1], f[2]]).collect();
     *mesh = Mesh { positions, faces, ..Mesh::default() };
+    withdraw(mesh, &parted);
+}
+
+/// Moves vertices a little against the normals of their faces.
+fn withdraw(mesh: &mut Mesh, which: &[bool]) {
+    let (mut sum, mut shortest) = (vec![[0.0f32; 3]; which.len()], vec![f32::INFINITY; which.len()]);
+    for (i, f) in mesh.faces.iter().enumerate().filter(|(_, f)| f.iter().any(|v| which[*v as usize])) {
+        let n = normal(mesh, i);
+        for k in 0..3 {
+            let (a, b) = (f[k] as usize, f[(k + 1) % 3] as usize);
+            let l = length(sub(mesh.positions[b], mesh.positions[a]));
+            (shortest[a], shortest[b]) = (shortest[a].min(l), shortest[b].min(l));
+            (0..3).for_each(|c| sum[a][c] += n[c]);
+        }
+    }
+    for v in (0..which.len()).filter(|v| which[*v]) {
+        let by = NUDGE * shortest[v] / length(sum[v]).max(1e-20);
+        (0..3).for_each(|k| mesh.positions[v][k] -= by * sum[v][k]);
+    }
 }
 
 /// Which faces (by their corner at the edge's start) belong together across an edge: of more than two, those with the solid between them.
@@ -133,12 +211,13 @@ fn pairs(mesh: &Mesh, (a, b): (u32, u32), forth: &[u32], back: &[u32]) -> Vec<(u
 
 /// Fills each rim with a fan around its middle.
 fn fill(mesh: &mut Mesh) {
-    let mut count: HashMap<(u32, u32), i32> = HashMap::new();
-    for f in &mesh.faces {
-        (0..3).for_each(|k| *count.entry((f[k], f[(k + 1) % 3])).or_default() += 1);
-    }
+    let along = half_edges(mesh);
     let mut rim: HashMap<u32, Vec<u32>> = HashMap::new();
-    let mut starts: Vec<(u32, u32)> = count.keys().copied().filter(|(a, b)| !count.contains_key(&(*b, *a))).collect();
+    let mut starts: Vec<(u32, u32)> = Vec::new();
+    for (&(a, b), forth) in &along {
+        let alone = forth.len().saturating_sub(along.get(&(b, a)).map_or(0, Vec::len));
+        starts.extend(std::iter::repeat_n((a, b), alone));
+    }
     starts.sort_unstable();
     // A rim runs against its faces.
     starts.iter().for_each(|(a, b)| rim.entry(*b).or_default().push(*a));
@@ -224,7 +303,10 @@ mod tests {
             cube([0.0; 3], &mut m);
             cube(other, &mut m);
             assert!(close(&mut m), "{other:?}");
-            assert!((volume(&m) - 2.0).abs() < 1e-5 && m.faces.len() == 24);
+            assert!((volume(&m) - 2.0).abs() < 2e-2 && m.faces.len() == 24);
+            // Apart for those, too, who know vertices by their place.
+            weld(&mut m);
+            assert!(m.is_watertight());
         }
     }
 

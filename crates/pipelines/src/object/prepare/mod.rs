@@ -107,7 +107,7 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
     let mut frames = colmap::read(&o.out)?.frames;
     let placed = world::place(&mut frames, &points);
     let in_world = points.iter().copied().zip(placed.points.iter().map(|p| p.0)).collect();
-    let found = finish::Found { model: &model, points: in_world, floor: placed.floor };
+    let found = finish::Found { model: &model, points: in_world };
     let Some(finished) = finish::finish(&o.finish, &o.out, &found, &mut frames, interrupt, note)? else { return Ok(None) };
     split::apply(&o.split, &mut frames, false, o.seed);
     if frames.iter().filter(|f| f.split == Split::Train).count() < 2 {

@@ -40,7 +40,9 @@ pub fn draw(path: &Path, capture: &Capture, points: &[(DVec3, [u8; 3])]) -> Resu
         for y in 0..thumb.height {
             for x in 0..thumb.width {
                 let p = thumb.pixel(x, y);
-                dot(&mut sheet, (x0 + x) as f64, (y0 + y) as f64, [p[0], p[p.len() / 2], p[p.len().min(3) - 1]]);
+                let alpha = if p.len() == 4 { p[3] as u32 } else { 255 };
+                let on_white = |k: usize| ((p[k.min(p.len() - 1)] as u32 * alpha + 255 * (255 - alpha)) / 255) as u8;
+                dot(&mut sheet, (x0 + x) as f64, (y0 + y) as f64, [on_white(0), on_white(1), on_white(2)]);
             }
         }
         let held = capture.frames[*i].split != Split::Train;

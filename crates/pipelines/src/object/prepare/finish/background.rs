@@ -35,13 +35,19 @@ impl std::str::FromStr for Background {
 /// Longest side at which the cut is made.
 const CUT_PX: usize = 360;
 /// A point in fewer cameras' views than this share of the most is surroundings.
-const SEEN: f64 = 0.7;
+const SEEN: f64 = 0.6;
 /// Points farther from the middle than so many medians of the distance are surroundings.
 const REACH: f64 = 2.5;
-/// Thickness of the ground in units of the cameras' distance.
-const GROUND: f64 = 0.012;
+/// A table, floor or wall: its thickness in units of the cameras' distance, the least share of the points that lie on it, and the largest
+/// share that lies behind it.
+const LAYER: f64 = 0.012;
+const ON_SUPPORT: f64 = 0.1;
+const BEHIND: f64 = 0.06;
+/// Supports that are looked for, and planes that are tried for each.
+const SUPPORTS: usize = 3;
+const TRIALS: u64 = 600;
 /// Width of the zone around the thing's outline that may be either, as a share of its extent in the picture.
-const ZONE: f64 = 0.12;
+const ZONE: f64 = 0.2;
 
 /// Points by number: where they are, and whether they are the thing's.
 pub struct Subject {
@@ -49,9 +55,9 @@ pub struct Subject {
 }
 
 impl Subject {
-    /// Tells the thing from its surroundings: the thing is what nearly all cameras look at, above the ground if there is one.
-    /// `points` are (number, place, images) in the world of `frames`, z up; `ground` says whether there is a floor.
-    pub fn find(frames: &[Frame], points: &[(u64, DVec3, usize)], ground: bool) -> Subject {
+    /// Tells the thing from its surroundings: the thing is what nearly all cameras look at, before the planes that it stands on or hangs
+    /// at. `points` are (number, place, images) in the world of `frames`.
+    pub fn find(frames: &[Frame], points: &[(u64, DVec3, usize)]) -> Subject {
         let views: Vec<_> = frames.iter().map(|f| (f.world_from_camera.inverse(), &f.camera)).collect();
         let firm: Vec<&(u64, DVec3, usize)> = points.iter().filter(|p| p.2 >= 3).collect();
         let in_view = |p: DVec3| {
@@ -71,8 +77,10 @@ impl Subject {
             .filter(|(p, n)| **n as f64 >= SEEN * most && p.1.length() < 0.6 * distance)
             .map(|p| p.0)
             .collect();
-        if ground && let Some(height) = ground_height(&near, distance) {
-            near.retain(|p| p.1.z > height + GROUND * distance);
+        let eyes: Vec<DVec3> = frames.iter().map(|f| f.world_from_camera.translation).collect();
+        for round in 0..SUPPORTS {
+            let Some((n, d)) = support(&near, &eyes, LAYER * distance, round as u64) else { break };
+            near.retain(|p| p.1.dot(n) - d > LAYER * distance);
         }
         let middle_of = |v: &mut Vec<f64>| {
             v.sort_by(f64::total_cmp);
@@ -127,30 +135,35 @@ impl Subject {
             if x < 0 || y < 0 || x >= w as i64 || y >= h as i64 {
                 continue;
             }
-            let at = &mut seeds[y as usize * w + x as usize];
-            match (*own, *at) {
-                (true, _) => *at = Seed::Foreground,
-                // One wrong point among those of the thing is no hole.
-                (false, Seed::MaybeForeground) => *at = Seed::MaybeBackground,
-                (false, Seed::MaybeBackground) => *at = Seed::Background,
-                (false, _) => {}
-            }
+            // A wrong point leaves a hole of one pixel, which is filled later.
+            seeds[y as usize * w + x as usize] = if *own { Seed::Foreground } else { Seed::Background };
         }
         seeds
     }
 }
 
-/// Height of the layer below which hardly any points lie and in which many do.
-fn ground_height(points: &[&(u64, DVec3, usize)], distance: f64) -> Option<f64> {
-    let mut z: Vec<f64> = points.iter().map(|p| p.1.z).collect();
-    z.sort_by(f64::total_cmp);
-    let layer = GROUND * distance;
-    let low = *z.get(z.len() / 50)?;
-    let dense = |a: f64| z.iter().filter(|v| (a..a + layer).contains(*v)).count();
-    // The densest layer in the lowest fifth of the extent.
-    let high = *z.get(z.len() * 49 / 50)?;
-    let steps = ((0.2 * (high - low) / layer) * 2.0).ceil() as usize;
-    (0..=steps).map(|i| low + i as f64 * 0.5 * layer).max_by_key(|a| dense(*a)).filter(|a| dense(*a) * 20 > z.len())
+/// The plane (normal, offset) on which most points lie, of those that have all cameras on one side and hardly a point on the other.
+fn support(points: &[&(u64, DVec3, usize)], eyes: &[DVec3], layer: f64, round: u64) -> Option<(DVec3, f64)> {
+    let total = points.len() as f64;
+    let rng = diorama_geom::rng::Rng::new(round, 41);
+    let of = |trial: u64| {
+        let pick = |k: u64| points[rng.below(trial * 3 + k, points.len().max(1) as u64) as usize].1;
+        let (a, b, c) = (pick(0), pick(1), pick(2));
+        let n = (b - a).cross(c - a).try_normalize()?;
+        let n = if (eyes[0] - a).dot(n) < 0.0 { -n } else { n };
+        let d = a.dot(n);
+        if eyes.iter().any(|e| e.dot(n) - d < 3.0 * layer) {
+            return None;
+        }
+        let on = points.iter().filter(|p| (p.1.dot(n) - d).abs() < layer).count();
+        let behind = points.iter().filter(|p| p.1.dot(n) - d < -2.0 * layer).count();
+        (on as f64 > ON_SUPPORT * total && (behind as f64) < BEHIND * total).then_some((on, n, d))
+    };
+    if points.len() < 3 {
+        return None;
+    }
+    let found: Vec<Option<(usize, DVec3, f64)>> = (0..TRIALS).into_par_iter().map(of).collect();
+    found.into_iter().flatten().max_by_key(|f| f.0).map(|f| (f.1, f.2))
 }
 
 /// Convex hull, counter-clockwise; Andrew's monotone chain.
@@ -198,14 +211,14 @@ fn keep_large(mask: &[bool], w: usize, h: usize) -> Vec<bool> {
     let drop_small = |mask: &[bool], value: bool, smallest: &dyn Fn(usize) -> usize| {
         let mut part = vec![usize::MAX; w * h];
         let mut sizes = Vec::new();
-        let mut stack = Vec::new();
         for first in 0..w * h {
             if mask[first] != value || part[first] != usize::MAX {
                 continue;
             }
             let id = sizes.len();
             let mut size = 0;
-            (part[first], stack) = (id, vec![first]);
+            part[first] = id;
+            let mut stack = vec![first];
             while let Some(i) = stack.pop() {
                 size += 1;
                 let (x, y) = (i % w, i / w);
@@ -340,7 +353,7 @@ mod tests {
             }
             points.push((n, p, 5));
         }
-        let subject = Subject::find(&frames, &points, true);
+        let subject = Subject::find(&frames, &points);
         assert!(subject.size() > 50, "{}", subject.size());
         for i in [0, 5, 11] {
             let f = &frames[i];

@@ -86,8 +86,6 @@ pub struct Found<'a> {
     pub model: &'a Path,
     /// Its points with their places in the upright world.
     pub points: Vec<(Point, DVec3)>,
-    /// Whether there is a floor.
-    pub floor: bool,
 }
 
 /// Finishes the photographs of `frames`, whose poses are those of the upright world; none when interrupted.
@@ -190,7 +188,7 @@ impl Remover {
             Background::Keep => Ok(Remover::None),
             Background::Auto => {
                 let places: Vec<(u64, DVec3, usize)> = found.points.iter().map(|(p, at)| (p.id, *at, p.images)).collect();
-                let subject = Subject::find(frames, &places, found.floor);
+                let subject = Subject::find(frames, &places);
                 if subject.size() < FEWEST_POINTS {
                     return Err(PipelineError::Usage(format!(
                         "--remove-background auto: only {} points belong to what the cameras look at, {FEWEST_POINTS} are needed; \
