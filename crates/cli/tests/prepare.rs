@@ -1,0 +1,171 @@
+//! `prepare` from photographs to a data set, with a stand-in for COLMAP that knows the answer.
+#![cfg(unix)]
+
+use diorama_data::{colmap, import, photo, photo_import};
+use diorama_geom::glam::{DQuat, DVec2, DVec3};
+use diorama_geom::rng::Rng;
+use diorama_geom::{Camera, ImageU8, Pose, Ray};
+use diorama_scenes::still_life;
+use std::path::Path;
+use std::process::Command;
+
+const VIEWS: usize = 16;
+const SIZE: u32 = 200;
+
+/// Every second photograph is so much darker, as a factor of linear light.
+const DARKER: f32 = 0.5;
+
+/// Photographs of the still life, of which every second is darker, and COLMAP's model of them.
+fn capture(photos: &Path, model: &Path) {
+    std::fs::create_dir_all(photos).unwrap();
+    std::fs::create_dir_all(model).unwrap();
+    let scene = still_life::scene();
+    let camera = Camera::pinhole(SIZE, SIZE, still_life::FOV);
+    let poses: Vec<Pose> = (0..VIEWS).map(|i| still_life::pose(i, VIEWS)).collect();
+    for (i, p) in poses.iter().enumerate() {
+        let im = scene.render(&camera, p, 2);
+        let shade = |v: u8| {
+            let linear = diorama_geom::color::linear_from_srgb(v as f32 / 255.0) * if i % 2 == 0 { 1.0 } else { DARKER };
+            diorama_geom::color::u8_from_unit(diorama_geom::color::srgb_from_linear(linear))
+        };
+        let over =
+            |p: &[u8]| -> [u8; 3] { std::array::from_fn(|k| shade(((p[k] as u32 * p[3] as u32 + 90 * (255 - p[3] as u32)) / 255) as u8)) };
+        let data = im.data.chunks_exact(4).flat_map(over).collect();
+        photo_import::write(&ImageU8 { channels: 3, data, ..im }, photos, &format!("view_{i:02}")).unwrap();
+    }
+    // Points are what random rays hit; each appears in all views that see it.
+    let rng = Rng::new(8, 0);
+    let mut points: Vec<DVec3> = Vec::new();
+    for n in 0..2500u64 {
+        let p = &poses[rng.below(3 * n, VIEWS as u64) as usize];
+        let px = DVec2::new(rng.uniform(3 * n + 1) as f64, rng.uniform(3 * n + 2) as f64) * SIZE as f64;
+        let ray = Ray { origin: p.translation, direction: p.rotation * camera.direction(px.x, px.y) };
+        points.extend(scene.trace(&ray).map(|(_, t)| ray.origin + ray.direction * t));
+    }
+    let (mut tracks, mut images) = (vec![Vec::new(); points.len()], (VIEWS as u64).to_le_bytes().to_vec());
+    for (i, p) in poses.iter().enumerate() {
+        let inverse = p.inverse();
+        let seen: Vec<(DVec2, usize)> = points
+            .iter()
+            .enumerate()
+            .filter_map(|(n, x)| {
+                let to = *x - p.translation;
+                let ray = Ray { origin: p.translation, direction: to.normalize() };
+                let visible = scene.trace(&ray).is_some_and(|(_, t)| (t - to.length()).abs() < 1e-3);
+                camera.project(inverse.point(*x)).filter(|_| visible).map(|px| (px, n))
+            })
+            .collect();
+        images.extend((i as u32 + 1).to_le_bytes());
+        let q = DQuat::from_mat3(&inverse.rotation);
+        [q.w, q.x, q.y, q.z].into_iter().chain(inverse.translation.to_array()).for_each(|v| images.extend(v.to_le_bytes()));
+        images.extend(1u32.to_le_bytes());
+        images.extend(format!("view_{i:02}.jpg\0").bytes());
+        images.extend((seen.len() as u64).to_le_bytes());
+        for (k, (px, n)) in seen.iter().enumerate() {
+            [px.x, px.y].iter().for_each(|v| images.extend(v.to_le_bytes()));
+            images.extend((*n as u64).to_le_bytes());
+            tracks[*n].push((i as u32 + 1, k as u32));
+        }
+    }
+    std::fs::write(model.join("images.bin"), images).unwrap();
+    let mut cameras = [&1u64.to_le_bytes()[..], &1u32.to_le_bytes(), &1u32.to_le_bytes()].concat();
+    [SIZE as u64; 2].iter().for_each(|v| cameras.extend(v.to_le_bytes()));
+    [camera.fx, camera.fy, camera.cx, camera.cy].iter().for_each(|v| cameras.extend(v.to_le_bytes()));
+    std::fs::write(model.join("cameras.bin"), cameras).unwrap();
+    let mut all = (points.len() as u64).to_le_bytes().to_vec();
+    for (n, (x, track)) in points.iter().zip(&tracks).enumerate() {
+        all.extend((n as u64).to_le_bytes());
+        x.to_array().iter().for_each(|v| all.extend(v.to_le_bytes()));
+        all.extend([120, 130, 140]);
+        all.extend(0.5f64.to_le_bytes());
+        all.extend((track.len() as u64).to_le_bytes());
+        track.iter().for_each(|(i, k)| all.extend([i.to_le_bytes(), k.to_le_bytes()].concat()));
+    }
+    std::fs::write(model.join("points3D.bin"), all).unwrap();
+    assert_eq!(colmap::points(model).unwrap().len(), points.len());
+}
+
+/// A program that answers as COLMAP does, and gives out the model.
+fn stand_in(path: &Path, model: &Path) {
+    use std::os::unix::fs::PermissionsExt;
+    let script = format!(
+        "#!/bin/sh\ncommand=$1\nwhile [ $# -gt 1 ]; do [ \"$1\" = --output_path ] && out=$2; shift; done\n\
+         [ $command = mapper ] && mkdir -p $out/0 && cp {}/*.bin $out/0\nexit 0\n",
+        model.display()
+    );
+    std::fs::write(path, script).unwrap();
+    std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+fn mean_linear(im: &ImageU8) -> f32 {
+    let bright = |p: &[u8]| (p[3] > 200).then(|| diorama_geom::color::linear_from_srgb(p[1] as f32 / 255.0));
+    let all: Vec<f32> = im.data.chunks_exact(4).filter_map(bright).collect();
+    all.iter().sum::<f32>() / all.len() as f32
+}
+
+#[test]
+fn photographs_become_a_finished_data_set() {
+    let dir = tempfile::tempdir().unwrap();
+    let (photos, model, out, colmap) =
+        (dir.path().join("photos"), dir.path().join("model"), dir.path().join("data"), dir.path().join("colmap"));
+    capture(&photos, &model);
+    stand_in(&colmap, &model);
+    let prepare = |more: &[&str]| {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
+        c.env("DIORAMA_COLMAP", &colmap).arg("prepare").arg(&photos).arg("-o").arg(&out).args(more).arg("--json");
+        let o = c.output().unwrap();
+        let text = String::from_utf8_lossy(&o.stderr).into_owned();
+        (o.status.code(), text, serde_json::from_slice::<serde_json::Value>(&o.stdout).unwrap_or_default())
+    };
+    let (code, text, made) = prepare(&[]);
+    assert_eq!(code, Some(0), "{text}");
+    assert_eq!((&made["registered"], &made["left_out"]), (&(VIEWS as u64).into(), &0.into()));
+    let plain = import::import(&out, &Default::default()).unwrap();
+    assert!(plain.frames.len() == VIEWS && plain.frames[0].image.ends_with("images/view_00.jpg"));
+
+    let (code, text, made) = prepare(&[
+        "--resume",
+        "--select",
+        "diverse:12",
+        "--crop",
+        "20,10,160,170",
+        "--normalize-exposure",
+        "--denoise",
+        "--remove-background",
+        "auto",
+    ]);
+    assert_eq!(code, Some(0), "{text}");
+    assert_eq!(made["left_out"], 4);
+    let stops = made["exposure_stops"].as_array().unwrap();
+    let apart = stops[1].as_f64().unwrap() - stops[0].as_f64().unwrap();
+    assert!((apart - 1.0).abs() < 0.15, "half the light is one stop: {stops:?}");
+    let finished = import::import(&out, &Default::default()).unwrap();
+    assert_eq!(finished.frames.len(), 12);
+    let images: Vec<(usize, ImageU8)> =
+        finished.frames.iter().map(|f| (f.name[f.name.len() - 2..].parse().unwrap(), photo::load(&f.image).unwrap())).collect();
+    for (f, (_, im)) in finished.frames.iter().zip(&images) {
+        assert!(f.image.ends_with(format!("finished/{}.png", f.image.file_stem().unwrap().to_string_lossy())));
+        assert_eq!((im.width, im.height, im.channels), (160, 170, 4));
+        assert_eq!((f.camera.cx, f.camera.cy), (80.0, 90.0));
+        // The middle of the picture is the still life, its rim is not.
+        let clear = im.data.chunks_exact(4).filter(|p| p[3] < 50).count();
+        assert!(im.pixel(0, 0)[3] < 50 && clear * 4 > 160 * 170, "{clear}");
+    }
+    let mean = |odd: usize| {
+        let of: Vec<f32> = images.iter().filter(|(i, _)| i % 2 == odd).map(|(_, im)| mean_linear(im)).collect();
+        of.iter().sum::<f32>() / of.len() as f32
+    };
+    assert!((mean(0) / mean(1) - 1.0).abs() < 0.2, "{} {}", mean(0), mean(1));
+
+    for (flags, named) in [
+        (["--crop", "150,0,100,100"], "--crop"),
+        (["--crop", "1,2"], "--crop"),
+        (["--select", "diverse:2"], "--select"),
+        (["--select", "all"], "--select"),
+        (["--remove-background", "yes"], "--remove-background"),
+        (["--remove-background", "net.onnx"], "net.onnx"),
+    ] {
+        let (code, text, _) = prepare(&[&["--resume"], &flags[..]].concat());
+        assert!(code == Some(2) && text.contains(named), "{flags:?}: {text}");
+    }
+}
