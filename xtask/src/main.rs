@@ -40,6 +40,12 @@ fn libraries_at(level: &str) -> bool {
     Command::new("cargo").args(args).env("DIORAMA_SIMD", level).status().is_ok_and(|s| s.success())
 }
 
+/// Every parser with so many mutated inputs. Built with the workspace, so that what the tests were built with serves here too.
+fn fuzz(runs: &str) -> bool {
+    let built = cargo(&["build", "--release", "--quiet", "--workspace", "--bin", "diorama-fuzz"]);
+    built && Command::new("target/release/diorama-fuzz").arg(runs).status().is_ok_and(|s| s.success())
+}
+
 /// Builds for a device and compares every op on it with its reference.
 fn gpu_check(device: &str) -> bool {
     let with = ["--release", "--package", "diorama", "--no-default-features", "--features", device, "--"];
@@ -64,7 +70,7 @@ fn ci() -> bool {
         // A level that this machine lacks falls back to the best it has.
         ok &= step(level, libraries_at(level));
     }
-    ok &= step("fuzz", cargo(&["run", "--release", "--quiet", "--package", "diorama-fuzz", "--", "20000"]));
+    ok &= step("fuzz", fuzz("20000"));
     ok &= step("docs", cargo(&["doc", "--release", "--workspace", "--no-deps"]));
     for (tool, args) in [("deny", &["deny", "check", "licenses", "bans", "sources"][..]), ("typos", &["typos"][..])] {
         if installed(tool) {

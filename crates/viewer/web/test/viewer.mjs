@@ -32,6 +32,17 @@ async function viewer(...flags) {
   return { address: JSON.parse(line).address, end: () => new Promise((r) => (child.on("exit", r), child.kill("SIGINT"))) };
 }
 
+/** Starts training with a viewer on the capture of a run; its address, what it says, and how it ends. */
+async function training(out) {
+  const flags = ["--seconds", "60", "--view", "--port", "0", "--device", "cpu", "--set", "field.log2_size=15"];
+  const child = spawn(diorama, ["train", path.join(run, "capture"), "-o", out, ...flags], { stdio: ["ignore", "ignore", "pipe"] });
+  let said = "";
+  child.stderr.on("data", (d) => (said += d));
+  const ended = new Promise((r) => child.on("exit", r));
+  const address = await until("the address", () => said.match(/view: (http\S+)/)?.[1]);
+  return { address, stop: () => (child.kill("SIGINT"), ended), said: () => said };
+}
+
 /** Sends a request as it stands; the answer's status. */
 function raw(port, lines, host = "127.0.0.1") {
   return new Promise((resolve, reject) => {
@@ -201,6 +212,27 @@ try {
   await download.saveAs(path.join(folder, "s.png"));
   check("a screenshot is saved", readFileSync(path.join(folder, "s.png")).subarray(1, 4).toString() === "PNG");
   rmSync(folder, { recursive: true });
+
+  // Training shows itself.
+  const runs = mkdtempSync(path.join(os.tmpdir(), "viewer-"));
+  const live = await training(path.join(runs, "live"));
+  ends.push(live.stop);
+  const other = await browser.newPage({ viewport: { width: 700, height: 500 } });
+  other.on("console", (m) => m.type() === "error" && complaints.push(m.text()));
+  other.on("pageerror", (e) => complaints.push(String(e)));
+  await other.goto(live.address);
+  const step = () => other.evaluate(() => Number(document.getElementById("status").textContent.match(/step (\d+)/)?.[1] ?? 0));
+  const early = await until("a step", step);
+  const shown = () => other.evaluate(() => Number(document.body.dataset.views ?? 0));
+  const seenViews = await until("a view in training", shown);
+  const later = await until("later steps", async () => (await step()) > early + 50 && (await step()));
+  await until("views without a touch", async () => (await shown()) > seenViews + 2);
+  check("training shows its steps and views by itself", true, `(steps ${early} to ${later})`);
+  if (pictures) await other.screenshot({ path: path.join(pictures, "training.png") });
+  const code = await live.stop();
+  check("Ctrl-C ends training and viewer with a checkpoint", code === 130 && existsSync(path.join(runs, "live", "checkpoints")), `(exit code ${code})`);
+  await other.close();
+  rmSync(runs, { recursive: true });
 
   check("nothing is fetched from elsewhere", requests.every((r) => r.startsWith(address) || r.startsWith("blob:") || r.startsWith("data:")), `(${requests.length} requests)`);
   check("the console has no errors", complaints.length === 0, complaints.join("; "));
