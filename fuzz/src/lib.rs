@@ -276,8 +276,13 @@ fn config_seeds() -> Vec<Vec<u8>> {
 fn crop_json(data: &[u8]) {
     let path = file("crop.json", data);
     let _ = viewing::read_crop(path.parent().expect("a folder"));
+    let path = file("scale.json", data);
+    let _ = viewing::read_scale(path.parent().expect("a folder"));
 }
 
 fn crop_seeds() -> Vec<Vec<u8>> {
-    vec![br#"{"min": [-1.0, -0.5, 0.0], "max": [1.0, 0.5, 2e-3]}"#.to_vec()]
+    vec![
+        br#"{"min": [-1.0, -0.5, 0.0], "max": [1.0, 0.5, 2e-3]}"#.to_vec(),
+        br#"{"points": [[0, 1, 2], [1, 1, 2.5]], "metres": 0.45}"#.to_vec(),
+    ]
 }

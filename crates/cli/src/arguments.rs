@@ -311,9 +311,9 @@ pub struct ExportArgs {
     /// Close the mesh, as printing needs it, or fail
     #[arg(long)]
     pub watertight: bool,
-    /// Metres per unit of the capture
-    #[arg(long, default_value_t = 1.0, conflicts_with_all = ["scale_to", "measured"])]
-    pub scale: f64,
+    /// Metres per unit of the capture [default: by the length measured in the viewer, else 1]
+    #[arg(long, conflicts_with_all = ["scale_to", "measured"])]
+    pub scale: Option<f64>,
     /// Make the longest side so long, for example 80cm, 0.8m, 800mm or 31.5in
     #[arg(long, value_name = "LENGTH", conflicts_with = "measured")]
     pub scale_to: Option<String>,

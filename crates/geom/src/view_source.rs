@@ -47,8 +47,17 @@ pub struct ViewScene {
     pub bounds: ([f64; 3], [f64; 3]),
     /// The crop box as it was last saved.
     pub crop: Option<([f32; 3], [f32; 3])>,
+    /// A length that was measured, in the world.
+    pub measured: Option<MeasuredLength>,
     /// The camera path as it was last saved, nerfstudio's JSON with cameras in the world.
     pub path: Option<String>,
+}
+
+/// Two points and how far they are apart in truth.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MeasuredLength {
+    pub points: [[f64; 3]; 2],
+    pub metres: f64,
 }
 
 /// How far training is.
@@ -81,11 +90,17 @@ pub trait ViewSource: Send + Sync {
     /// Draws a view as `[H, W, 3]` sRGB.
     fn view(&self, request: &ViewRequest) -> ImageU8;
 
+    /// The place in the world that a pixel shows; none where nothing is.
+    fn point(&self, request: &ViewRequest, x_px: f64, y_px: f64) -> Option<[f64; 3]>;
+
     /// A small photograph of a frame.
     fn thumbnail(&self, frame: usize) -> Result<ImageU8, String>;
 
     /// Keeps the crop box for `render` and `export`.
     fn save_crop(&self, crop: Option<([f32; 3], [f32; 3])>) -> Result<(), String>;
+
+    /// Keeps a measured length (in the world) as the scale of exported meshes, or forgets it.
+    fn save_measured(&self, measured: Option<MeasuredLength>) -> Result<(), String>;
 
     /// Keeps a camera path, nerfstudio's JSON with cameras in the world, for `render`; the file's name.
     fn save_path(&self, json: &str) -> Result<PathBuf, String>;
@@ -93,6 +108,6 @@ pub trait ViewSource: Send + Sync {
     /// The same path, given in the capture's frame as other programs write it, with cameras in the world.
     fn open_path(&self, json: &str) -> Result<String, String>;
 
-    /// Makes a mesh; the file's name.
-    fn export(&self, request: &MeshRequest, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<PathBuf, String>;
+    /// Makes a mesh; the file's name, and the metres of the mesh per unit of the capture.
+    fn export(&self, request: &MeshRequest, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<(PathBuf, f64), String>;
 }

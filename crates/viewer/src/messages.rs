@@ -34,6 +34,21 @@ pub enum Ask {
         layer: Layer,
         clip: Option<Box6>,
     },
+    /// Which point of the world a pixel shows; answered by `Picked`.
+    Pick {
+        x: f64,
+        y: f64,
+        width: u32,
+        height: u32,
+        fov_y: f64,
+        pose: [f64; 12],
+        clip: Option<Box6>,
+    },
+    /// Keep the true length in metres between two points of the world as the scale of meshes.
+    Measured {
+        points: Option<[f64; 6]>,
+        metres: f64,
+    },
     /// Answered by a binary message: 2³¹ plus the frame's number, then a JPEG.
     Thumbnail {
         frame: u32,
@@ -83,7 +98,13 @@ pub enum Tell {
         world_from_capture: Box<[f64; 12]>,
         bounds: [f64; 6],
         crop: Option<Box6>,
+        /// Two points of the world, and the metres between them.
+        measured: Option<[f64; 7]>,
         path: Option<String>,
+    },
+    /// None where nothing is.
+    Picked {
+        point: Option<[f64; 3]>,
     },
     Status {
         #[cfg_attr(test, ts(type = "number"))]
@@ -102,6 +123,8 @@ pub enum Tell {
     Exported {
         file: String,
         glb: bool,
+        /// Metres of the mesh per unit of the capture.
+        scale: f64,
     },
     /// A camera path with cameras in the world.
     Path {

@@ -2,7 +2,7 @@
 
 use crate::messages::{Ask, Box6, Layer, Photograph, Tell};
 use crate::server::Shared;
-use diorama_geom::view_source::{MeshRequest, ViewLayer, ViewRequest, ViewSource};
+use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewLayer, ViewRequest, ViewSource};
 use diorama_geom::{Camera, ImageU8, Pose};
 use glam::{DMat3, DVec3};
 use std::net::TcpStream;
@@ -107,6 +107,20 @@ impl Session<'_> {
                 Some(r) => self.view = Some((id, r)),
                 None => self.fail("the view asked for makes no sense")?,
             },
+            Ask::Pick { x, y, width, height, fov_y, pose, clip } => {
+                let inside = (0.0..width as f64).contains(&x) && (0.0..height as f64).contains(&y);
+                match view_request(width, height, fov_y, &pose, Layer::Rgb, clip).filter(|_| inside) {
+                    Some(r) => self.send(&Tell::Picked { point: source.point(&r, x, y) })?,
+                    None => self.fail("the point asked for makes no sense")?,
+                }
+            }
+            Ask::Measured { points, metres } => match measured(points, metres) {
+                Err(()) => self.fail("a measured length needs two points that differ, and a length above 0")?,
+                Ok(m) => match source.save_measured(m) {
+                    Ok(()) => self.send(&Tell::Saved { what: "scale".into(), file: "scale.json".into() })?,
+                    Err(e) => self.fail(e)?,
+                },
+            },
             Ask::Thumbnail { frame } => match source.thumbnail(frame as usize) {
                 Ok(image) => self.picture(THUMBNAIL | frame, &image, 75)?,
                 Err(e) => self.fail(e)?,
@@ -155,12 +169,12 @@ impl Session<'_> {
             });
             busy.store(false, Ordering::Relaxed);
             let _ = tell.send(match made {
-                Ok(file) => {
+                Ok((file, scale)) => {
                     let glb = file.extension().is_some_and(|e| e == "glb");
                     if glb && let Ok(mut m) = shared.mesh.lock() {
                         *m = Some(file.clone());
                     }
-                    Tell::Exported { file: file.display().to_string(), glb }
+                    Tell::Exported { file: file.display().to_string(), glb, scale }
                 }
                 Err(why) => Tell::Failed { why },
             });
@@ -207,8 +221,17 @@ fn scene(source: &dyn ViewSource) -> Tell {
         world_from_capture,
         bounds: [lo[0], lo[1], lo[2], hi[0], hi[1], hi[2]],
         crop: s.crop.map(six),
+        measured: s.measured.map(|m| [m.points[0].as_slice(), &m.points[1], &[m.metres]].concat().try_into().expect("seven")),
         path: s.path,
     }
+}
+
+/// A length that can be one, or none to forget.
+fn measured(points: Option<[f64; 6]>, metres: f64) -> Result<Option<MeasuredLength>, ()> {
+    let Some([a, b, c, d, e, f]) = points else { return Ok(None) };
+    let points = [[a, b, c], [d, e, f]];
+    let sound = points[0] != points[1] && points.iter().flatten().all(|v| v.is_finite()) && metres > 0.0 && metres.is_finite();
+    if sound { Ok(Some(MeasuredLength { points, metres })) } else { Err(()) }
 }
 
 /// Corners of a box that holds something.

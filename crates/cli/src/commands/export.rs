@@ -5,7 +5,7 @@ use crate::arguments::ExportArgs;
 use diorama_data::{DataError, mesh_text};
 use diorama_pipelines::object::device;
 use diorama_pipelines::object::export::{self, ExportOptions, Size};
-use diorama_pipelines::object::run_folder;
+use diorama_pipelines::object::{run_folder, viewing};
 use diorama_pipelines::{PipelineError, Result};
 use std::time::Instant;
 
@@ -116,10 +116,21 @@ fn size(a: &ExportArgs) -> Result<Size> {
         };
         return read().ok_or_else(|| usage("--measured", text, "x0,y0,z0,x1,y1,z1=45cm with two points that differ"));
     }
-    if !(a.scale > 0.0 && a.scale.is_finite()) {
-        return Err(usage("--scale", &a.scale.to_string(), "a number above 0"));
+    let Some(scale) = a.scale else {
+        let measured = viewing::read_scale(&a.run)?;
+        if let Some(Size::Measured { metres, .. }) = measured {
+            let file = a.run.join("scale.json");
+            eprintln!(
+                "note: scaled by the length of {metres} m that was measured in the viewer ({}); --scale 1 leaves it out",
+                file.display()
+            );
+        }
+        return Ok(measured.unwrap_or(Size::Scaled(1.0)));
+    };
+    if !(scale > 0.0 && scale.is_finite()) {
+        return Err(usage("--scale", &scale.to_string(), "a number above 0"));
     }
-    Ok(Size::Scaled(a.scale))
+    Ok(Size::Scaled(scale))
 }
 
 #[cfg(test)]

@@ -191,6 +191,12 @@ fn trace(model: &ObjectModel, camera: &PosedCamera, clip: Option<([f32; 3], [f32
     tracer.view(camera, &mut |_| {})
 }
 
+/// Distance along the ray of a view's first pixel (in the model's space) at which it meets matter; none where it meets hardly any.
+pub fn depth_of_pixel(model: &ObjectModel, camera: &PosedCamera, clip: Option<([f32; 3], [f32; 3])>) -> Option<f32> {
+    let view = trace(model, camera, clip, Quality::Full);
+    (view.opacity.data[0] > 0.3).then_some(view.depth.data[0])
+}
+
 /// One layer of a view, `[H, W, 3]`, of what lies in `clip` (world).
 pub fn picture(model: &ObjectModel, camera: &PosedCamera, layer: Layer, clip: Option<([f32; 3], [f32; 3])>, quality: Quality) -> ImageU8 {
     if layer == Layer::Occupancy {

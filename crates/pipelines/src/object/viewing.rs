@@ -8,10 +8,10 @@ use diorama_data::camera_path_json;
 use diorama_data::{DataError, atomic, photo};
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::train::Event;
-use diorama_geom::ImageU8;
 use diorama_geom::capture::{Split, focus_point};
 use diorama_geom::glam::DVec3;
-use diorama_geom::view_source::{MeshRequest, ViewFrame, ViewLayer, ViewRequest, ViewScene, ViewSource, ViewStatus};
+use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewLayer, ViewRequest, ViewScene, ViewSource, ViewStatus};
+use diorama_geom::{Camera, ImageU8};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -52,6 +52,33 @@ pub fn read_crop(run: &Path) -> Result<Option<Crop>> {
         return Err(wrong("min: must lie below max".into()));
     }
     Ok(Some((c.min, c.max)))
+}
+
+/// A length that was measured in the viewer, as `scale.json` in the run folder keeps it.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ScaleFile {
+    /// Two points in the capture's frame.
+    points: [[f64; 3]; 2],
+    metres: f64,
+}
+
+/// The size that was measured in the viewer, if one was saved.
+///
+/// # Errors
+/// When the file is malformed.
+pub fn read_scale(run: &Path) -> Result<Option<Size>> {
+    let file = run.join("scale.json");
+    if !file.exists() {
+        return Ok(None);
+    }
+    let text = diorama_data::error::read(&file, 1 << 16)?;
+    let wrong = |e: String| PipelineError::from(DataError::input(&file, format!("{e}; measure in the viewer again or remove the file")));
+    let ScaleFile { points, metres } = serde_json::from_slice(&text).map_err(|e| wrong(e.to_string()))?;
+    if points[0] == points[1] || points.iter().flatten().any(|v| !v.is_finite()) || !(metres > 0.0 && metres.is_finite()) {
+        return Err(wrong("needs two points that differ and metres above 0".into()));
+    }
+    Ok(Some(Size::Measured { points, metres }))
 }
 
 /// A run that is looked at. While it trains, [`RunView::wants`] says when to [`RunView::show`] what has been learned.
@@ -137,6 +164,13 @@ impl ViewSource for RunView {
             world_from_capture: m.capture.world_from_capture,
             bounds: (corner(-1.0), corner(1.0)),
             crop: read_crop(&self.folder).ok().flatten(),
+            measured: match read_scale(&self.folder) {
+                Ok(Some(Size::Measured { points, metres })) => {
+                    let to_world = |p| m.capture.world_from_capture.point(DVec3::from_array(p)).to_array();
+                    Some(MeasuredLength { points: points.map(to_world), metres })
+                }
+                _ => None,
+            },
             path: saved.and_then(|text| self.open_path(&text).ok()),
         }
     }
@@ -157,6 +191,30 @@ impl ViewSource for RunView {
             ViewLayer::Occupancy => Layer::Occupancy,
         };
         render::picture(&m, &posed, layer, r.clip, Quality::Fast)
+    }
+
+    fn point(&self, r: &ViewRequest, x_px: f64, y_px: f64) -> Option<[f64; 3]> {
+        let m = self.model();
+        // A picture of that one pixel.
+        let one = Camera { width: 1, height: 1, cx: r.camera.cx - x_px + 0.5, cy: r.camera.cy - y_px + 0.5, ..r.camera };
+        let posed = m.to_model(one, &r.world_from_camera);
+        let distance = render::depth_of_pixel(&m, &posed, r.clip)?;
+        let along = posed.camera.direction(0.5, 0.5);
+        Some(m.model_from_world.inverse().point(posed.pose.point(along * distance as f64)).to_array())
+    }
+
+    fn save_measured(&self, measured: Option<MeasuredLength>) -> std::result::Result<(), String> {
+        let file = self.folder.join("scale.json");
+        match measured {
+            Some(MeasuredLength { points, metres }) => {
+                let capture_from_world = self.model().capture.world_from_capture.inverse();
+                let points = points.map(|p| capture_from_world.point(DVec3::from_array(p)).to_array());
+                let json = serde_json::to_vec(&ScaleFile { points, metres }).expect("plain values");
+                Self::tell(atomic::write(&file, &json).map_err(PipelineError::from))
+            }
+            None if file.exists() => std::fs::remove_file(&file).map_err(|e| e.to_string()),
+            None => Ok(()),
+        }
     }
 
     fn thumbnail(&self, frame: usize) -> std::result::Result<ImageU8, String> {
@@ -199,7 +257,7 @@ impl ViewSource for RunView {
         camera_path_json::moved(json, &file, &self.model().capture.world_from_capture).map_err(|e| e.to_string())
     }
 
-    fn export(&self, r: &MeshRequest, progress: &mut dyn FnMut(&str, usize, usize)) -> std::result::Result<PathBuf, String> {
+    fn export(&self, r: &MeshRequest, progress: &mut dyn FnMut(&str, usize, usize)) -> std::result::Result<(PathBuf, f64), String> {
         let format = r.format.parse::<export::Format>()?;
         let out = self.folder.join(format!("mesh.{}", r.format.to_ascii_lowercase()));
         let options = ExportOptions {
@@ -212,12 +270,12 @@ impl ViewSource for RunView {
             texture: None,
             normal_map: false,
             watertight: false,
-            size: Size::Scaled(1.0),
+            size: Self::tell(read_scale(&self.folder))?.unwrap_or(Size::Scaled(1.0)),
             unit_m: 1.0,
             clip: r.clip,
             floaters: 0.01,
         };
-        Self::tell(export::export(&self.model(), &options, progress))?;
-        Ok(out)
+        let made = Self::tell(export::export(&self.model(), &options, progress))?;
+        Ok((out, made.scale))
     }
 }

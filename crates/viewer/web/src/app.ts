@@ -29,6 +29,8 @@ let keys: Key[] = [];
 let distance = 4;
 let worldFromCapture: number[] = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0];
 let crop: Box6 = [-1, -1, -1, 1, 1, 1];
+let rule: number[][] = [];
+let picking = false;
 let training = false;
 let nextId = 0;
 let asked: { id: number; when: number; scale: number } | null = null;
@@ -90,6 +92,11 @@ function hear(tell: Tell): void {
         const p = photographs[0];
         if (p) lookFrom(p);
         if (tell.path) openPath(tell.path);
+        if (tell.measured) {
+          rule = [tell.measured.slice(0, 3), tell.measured.slice(3, 6)];
+          input("measure-length").value = String(tell.measured[6] * 100);
+        }
+        ruleChanged();
       }
       touch();
       break;
@@ -103,6 +110,11 @@ function hear(tell: Tell): void {
     case "path":
       openPath(tell.json);
       break;
+    case "picked":
+      if (!tell.point) say("nothing is there; click on the thing");
+      else if (rule.push(tell.point) === 2) picking = false;
+      ruleChanged();
+      break;
     case "working":
       say(`${tell.what}: ${tell.percent} %`);
       break;
@@ -111,7 +123,7 @@ function hear(tell: Tell): void {
       if (tell.glb) {
         element<HTMLAnchorElement>("mesh-link").href = `mesh.glb${query}`;
         element("mesh-link").hidden = false;
-        stage.loadMesh(`mesh.glb${query}`, worldFromCapture).then(() => {
+        stage.loadMesh(`mesh.glb${query}`, worldFromCapture, tell.scale).then(() => {
           element("mesh-note").textContent = "";
           input("mesh").checked = true;
           stage.showMesh(true);
@@ -231,6 +243,30 @@ function sides(bounds: number[]): void {
 function cropChanged(): void {
   stage.showBox(clip());
   touch();
+}
+
+/** Length of a unit of the capture in the world. */
+function unit(): number {
+  return Math.hypot(worldFromCapture[0]!, worldFromCapture[4]!, worldFromCapture[8]!);
+}
+
+function ruleChanged(): void {
+  stage.showRule(rule, distance * 0.006);
+  const [a, b] = rule;
+  const apart = a && b ? Math.hypot(...a.map((v, k) => v - b[k]!)) / unit() : 0;
+  element("measure-note").textContent = a && b
+    ? `${apart.toPrecision(4)} units of the capture apart`
+    : picking ? `click the ${a ? "second" : "first"} point` : "of a length that you know";
+  element("measure").classList.toggle("on", picking);
+}
+
+/** Asks which point a click means. */
+function pick(e: PointerEvent): void {
+  const box = picture.getBoundingClientRect();
+  const pose = stage.pose() as Extract<Ask, { kind: "view" }>["pose"];
+  const [width, height] = [Math.round(box.width), Math.round(box.height)];
+  const fov_y = (stage.camera.fov * Math.PI) / 180;
+  send({ kind: "pick", x: e.clientX - box.left, y: e.clientY - box.top, width, height, fov_y, pose, clip: clip() });
 }
 
 function strip(): void {
@@ -380,6 +416,22 @@ button("export", () => {
   say("making the mesh…");
   send({ kind: "export", format, faces: Number(input("faces").value) | 0, resolution: Number(input("resolution").value) | 0, clip: clip() });
 });
+button("measure", () => {
+  rule = [];
+  picking = true;
+  ruleChanged();
+});
+button("measure-clear", () => {
+  rule = [];
+  picking = false;
+  ruleChanged();
+  send({ kind: "measured", points: null, metres: 1 });
+});
+button("measure-save", () => {
+  const metres = Number(input("measure-length").value) * Number(select("measure-unit").value);
+  if (rule.length < 2) say("pick two points first");
+  else send({ kind: "measured", points: rule.flat() as [number, number, number, number, number, number], metres });
+});
 button("screenshot", () => {
   const both = document.createElement("canvas");
   both.width = picture.width;
@@ -392,7 +444,15 @@ button("screenshot", () => {
   download("diorama.png", both.toDataURL("image/png"));
 });
 stage.controls.addEventListener("change", touch);
-element("overlay").addEventListener("pointerdown", () => (playing = null));
+let pressed = [0, 0];
+element("overlay").addEventListener("pointerdown", (e) => {
+  playing = null;
+  pressed = [e.clientX, e.clientY];
+});
+element("overlay").addEventListener("pointerup", (e) => {
+  // A drag turns, a click picks.
+  if (picking && Math.hypot(e.clientX - pressed[0]!, e.clientY - pressed[1]!) < 4) pick(e);
+});
 element("overlay").addEventListener("dblclick", () => {
   stage.controls.target.set(...(photographs.length ? focusOf() : [0, 0, 0]) as [number, number, number]);
   touch();

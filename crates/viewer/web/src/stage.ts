@@ -23,6 +23,7 @@ export class Stage {
   private readonly renderer: THREE.WebGLRenderer | null;
   private readonly frusta = new THREE.Group();
   private readonly path = new THREE.Group();
+  private readonly rule = new THREE.Group();
   private readonly box: THREE.Box3Helper;
   private mesh: THREE.Object3D | null = null;
   private changed = true;
@@ -40,7 +41,7 @@ export class Stage {
     this.controls.addEventListener("change", () => (this.changed = true));
     this.box = new THREE.Box3Helper(new THREE.Box3(), 0xffcc44);
     this.box.visible = false;
-    this.scene.add(this.frusta, this.path, this.box);
+    this.scene.add(this.frusta, this.path, this.rule, this.box);
   }
 
   get hasOverlay(): boolean {
@@ -114,8 +115,24 @@ export class Stage {
     }
   }
 
-  /** Shows a mesh that lies in the capture's frame; `rows` take it to the world. */
-  async loadMesh(url: string, rows: number[]): Promise<void> {
+  /** Shows one or two picked points, and the line between them. */
+  showRule(points: number[][], size: number): void {
+    this.rule.clear();
+    const material = new THREE.MeshBasicMaterial({ color: 0xff4fd8, depthTest: false });
+    for (const p of points) {
+      const ball = new THREE.Mesh(new THREE.SphereGeometry(size, 12, 8), material);
+      ball.position.set(p[0]!, p[1]!, p[2]!);
+      this.rule.add(ball);
+    }
+    if (points.length === 2) {
+      const line = new THREE.BufferGeometry().setFromPoints(points.map((p) => new THREE.Vector3(p[0], p[1], p[2])));
+      this.rule.add(new THREE.Line(line, new THREE.LineBasicMaterial({ color: 0xff4fd8, depthTest: false })));
+    }
+    this.changed = true;
+  }
+
+  /** Shows a mesh of `scale` metres per unit of the capture; `rows` take the capture to the world. */
+  async loadMesh(url: string, rows: number[], scale: number): Promise<void> {
     const made = await new GLTFLoader().loadAsync(url);
     if (this.mesh) this.scene.remove(this.mesh);
     this.mesh = made.scene;
@@ -123,6 +140,7 @@ export class Stage {
     const r = rows as [number, number, number, number, number, number, number, number, number, number, number, number];
     this.mesh.matrixAutoUpdate = false;
     this.mesh.matrix.set(...r, 0, 0, 0, 1).multiply(new THREE.Matrix4().makeRotationX(Math.PI / 2));
+    this.mesh.matrix.multiply(new THREE.Matrix4().makeScale(1 / scale, 1 / scale, 1 / scale));
     this.scene.add(this.mesh);
   }
 

@@ -198,6 +198,20 @@ try {
   await until("the keys of an opened path", () => page.evaluate(() => document.querySelectorAll("#keys li").length === 2));
   check("a saved path is opened again", true);
 
+  // Scale: two points a known length apart.
+  await page.click("#measure");
+  await page.mouse.click(x, y);
+  await until("the first point", () => page.evaluate(() => document.getElementById("measure-note").textContent.includes("second")));
+  await page.mouse.click(x - 60, y + 20);
+  await until("the second point", () => page.evaluate(() => document.getElementById("measure-note").textContent.includes("units of the capture apart")));
+  await page.fill("#measure-length", "25");
+  await page.click("#measure-save");
+  await until("scale.json", () => existsSync(path.join(run, "scale.json")));
+  const scaled = JSON.parse(readFileSync(path.join(run, "scale.json")));
+  const apart = Math.hypot(...scaled.points[0].map((v, k) => v - scaled.points[1][k]));
+  check("a measured length is kept for export", scaled.metres === 0.25 && apart > 0.05 && apart < 2, `(${apart.toFixed(3)} units are 25 cm)`);
+  await shot("measured");
+
   // Mesh.
   await page.fill("#faces", "5000");
   await page.fill("#resolution", "64");
@@ -207,6 +221,10 @@ try {
   await shot("mesh");
   const glb = readFileSync(path.join(run, "mesh.glb"));
   check("a GLB is made and shown", glb.subarray(0, 4).toString() === "glTF", `(${glb.length >> 10} KiB)`);
+  const root = JSON.parse(glb.subarray(20, 20 + glb.readUInt32LE(12)));
+  const at = root.accessors[root.meshes[0].primitives[0].attributes.POSITION];
+  const height = (at.max[1] - at.min[1]) / (0.25 / apart);
+  check("the mesh has the measured scale", height > 0.2 && height < 3, `(${(at.max[1] - at.min[1]).toFixed(3)} m high)`);
   const [download] = await Promise.all([page.waitForEvent("download"), page.click("#screenshot")]);
   const folder = mkdtempSync(path.join(os.tmpdir(), "viewer-"));
   await download.saveAs(path.join(folder, "s.png"));
