@@ -1,6 +1,6 @@
 //! Every parser of bytes that may come from strangers, as a function that must neither crash nor hang.
 
-use diorama_data::{archive, camera_path_json, checkpoint, colmap, import, llff, photo, photo_import, transforms_json};
+use diorama_data::{archive, camera_path_json, checkpoint, colmap, import, llff, photo, photo_import, splat_ply, transforms_json};
 use diorama_geom::{ImageU8, Similarity};
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::viewing;
@@ -30,6 +30,7 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "viewer_message", run: message, seeds: message_seeds },
     Parser { name: "run_config", run: run_config, seeds: config_seeds },
     Parser { name: "crop_json", run: crop_json, seeds: crop_seeds },
+    Parser { name: "splat_ply", run: splats, seeds: splat_seeds },
 ];
 
 /// A parser by name.
@@ -285,4 +286,24 @@ fn crop_seeds() -> Vec<Vec<u8>> {
         br#"{"min": [-1.0, -0.5, 0.0], "max": [1.0, 0.5, 2e-3]}"#.to_vec(),
         br#"{"points": [[0, 1, 2], [1, 1, 2.5]], "metres": 0.45}"#.to_vec(),
     ]
+}
+
+fn splats(data: &[u8]) {
+    let path = file("points.ply", data);
+    let _ = splat_ply::read(&path);
+}
+
+fn splat_seeds() -> Vec<Vec<u8>> {
+    let head = |format: &str, n: usize, more: &str| {
+        format!("ply\nformat {format} 1.0\nelement vertex {n}\nproperty float x\nproperty float y\nproperty double z\n{more}end_header\n")
+    };
+    let colors = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
+    let floats: String = ["f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+        .iter()
+        .map(|n| format!("property float {n}\n"))
+        .collect();
+    let text = format!("{}1 2 3 10 20 30\n-4 5e-1 6 0 255 7\n", head("ascii", 2, colors));
+    let mut binary = head("binary_little_endian", 2, &floats).into_bytes();
+    binary.extend([7u8; 2 * (4 + 4 + 8 + 11 * 4)]);
+    vec![text.into_bytes(), binary]
 }

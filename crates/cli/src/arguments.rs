@@ -44,8 +44,10 @@ enum Command {
         after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --scale-to 80cm -o chair.usdz\n  diorama export runs/chair --resolution 384 --faces 100000 --units mm -o chair.stl"
     )]
     Export(ExportArgs),
-    /// Look at a run in the browser: views, cameras, crop box, camera paths, meshes
-    #[command(after_help = "Examples:\n  diorama view runs/chair\n  diorama view runs/chair --host 0.0.0.0 --port 8080")]
+    /// Look at a run in the browser: views, cameras, crop box, scale, camera paths, meshes; or at a data set's cameras and points
+    #[command(
+        after_help = "Examples:\n  diorama view runs/chair\n  diorama view data/chair\n  diorama view splats.ply\n  diorama view runs/chair --host 0.0.0.0 --port 8080"
+    )]
     View(ViewArgs),
     /// Runs side by side: curves, held-out images, cost
     Compare(CompareArgs),
@@ -111,6 +113,9 @@ pub struct PrepareArgs {
     /// Pairs that are compared: auto, exhaustive or sequential
     #[arg(long, default_value = "auto")]
     pub matcher: String,
+    /// Most features per photograph; matching takes time with the square of it
+    #[arg(long, default_value_t = 8192)]
+    pub features: usize,
     /// COLMAP's camera model: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or OPENCV_FISHEYE
     #[arg(long, default_value = "OPENCV")]
     pub lens: String,
@@ -352,8 +357,8 @@ pub struct ListenArgs {
 /// Flags of `view`.
 #[derive(Args, Clone, Debug)]
 pub struct ViewArgs {
-    /// Folder of the run
-    pub run: PathBuf,
+    /// Folder of a run or of a data set, or a PLY file of points or Gaussian splats
+    pub path: PathBuf,
     /// auto, cpu, cuda, vulkan, metal or webgpu
     #[arg(long, default_value = "auto")]
     pub device: String,

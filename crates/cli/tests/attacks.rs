@@ -378,8 +378,13 @@ fn fault_14_an_npy_header_that_claims_a_trillion_numbers() {
 }
 
 #[test]
-fn fault_15_a_ply_that_claims_too_many_vertices_is_not_read() {
-    not_read("x.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000000\nproperty float x\nend_header\n");
+fn fault_15_a_ply_that_claims_too_many_vertices() {
+    let claim = b"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000000\nproperty float x\nend_header\n";
+    not_read("x.ply", claim);
+    let file = good().capture.join("claim.ply");
+    std::fs::write(&file, claim).unwrap();
+    fails(&diorama(&["view", file.to_str().unwrap(), "--port", "0"]), 2, &["claim.ply", "room"]);
+    std::fs::remove_file(&file).unwrap();
     // Named by a capture it is left alone, too.
     let (dir, capture) = copy(&good().capture);
     std::fs::write(capture.join("x.ply"), b"ply\nformat ascii 1.0\nelement vertex 4000000000000\nend_header\n").unwrap();

@@ -19,6 +19,7 @@ pub mod photo_import;
 pub mod pixel_store;
 pub mod plot;
 pub mod process;
+pub mod splat_ply;
 pub mod split;
 pub mod tfevents;
 pub mod transforms_json;

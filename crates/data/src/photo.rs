@@ -101,6 +101,21 @@ pub fn load(path: &Path) -> Result<ImageU8> {
     Ok(ImageU8 { width, height, channels, data })
 }
 
+/// Decodes a photograph to RGB, its longer side at most `side`; what is clear is white.
+pub fn load_small(path: &Path, side: usize) -> Result<ImageU8> {
+    let full = load(path)?;
+    let by = (side as f64 / full.width.max(full.height) as f64).min(1.0);
+    let to = |v: usize| ((v as f64 * by) as usize).max(1);
+    let small = full.downsampled(to(full.width), to(full.height));
+    let rgb = |p: &[u8]| match *p {
+        [r, g, b, a] => [r, g, b].map(|v| ((v as u32 * a as u32 + 255 * (255 - a as u32)) / 255) as u8),
+        [r, g, b] => [r, g, b],
+        [v, ..] => [v; 3],
+        [] => [255; 3],
+    };
+    Ok(ImageU8 { channels: 3, data: small.data.chunks_exact(small.channels).flat_map(rgb).collect(), ..small })
+}
+
 /// How names of instant-ngp's masks begin; in them, what is not black is to be ignored.
 pub const DYNAMIC_MASK: &str = "dynamic_mask_";
 

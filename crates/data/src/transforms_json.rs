@@ -199,8 +199,9 @@ fn apply_file_lists(head: &Object, frames: &mut [Frame]) -> Result<bool> {
     Ok(any)
 }
 
-/// Writes a capture as `transforms.json`, in the world's frame, image paths relative to `root`.
-pub fn write(path: &Path, root: &Path, capture: &diorama_geom::Capture) -> Result<()> {
+/// Writes a capture as `transforms.json`, in the capture's frame, image paths relative to `root`; `points` is the name of a PLY file
+/// there, if any.
+pub fn write(path: &Path, root: &Path, capture: &diorama_geom::Capture, points: Option<&str>) -> Result<()> {
     let to_capture: Similarity = capture.world_from_capture.inverse();
     let frames: Vec<serde_json::Value> = capture
         .frames
@@ -240,7 +241,7 @@ pub fn write(path: &Path, root: &Path, capture: &diorama_geom::Capture) -> Resul
     let s = capture.scene;
     let scale = 0.5 / s.half;
     let center = to_capture.point(s.center);
-    let json = serde_json::json!({
+    let mut json = serde_json::json!({
         "aabb_scale": s.aabb_scale,
         "scale": scale,
         "offset": (DVec3::splat(0.5) - center * scale).to_array(),
@@ -249,5 +250,8 @@ pub fn write(path: &Path, root: &Path, capture: &diorama_geom::Capture) -> Resul
         "test_filenames": names(Split::Test),
         "frames": frames,
     });
+    if let Some(points) = points {
+        json["ply_file_path"] = points.into();
+    }
     crate::atomic::write(path, format!("{json:#}\n").as_bytes())
 }

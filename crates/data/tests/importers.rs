@@ -36,7 +36,7 @@ fn same_pose(a: &Pose, b: &Pose) {
 fn transforms_json_round_trips() {
     let dir = tempfile::tempdir().unwrap();
     let want = capture(dir.path());
-    transforms_json::write(&dir.path().join("transforms.json"), dir.path(), &want).unwrap();
+    transforms_json::write(&dir.path().join("transforms.json"), dir.path(), &want, None).unwrap();
     let got = import::import(dir.path(), &ImportOptions::default()).unwrap();
     assert_eq!(got.frames.len(), 6);
     for (a, b) in got.frames.iter().zip(&want.frames) {
@@ -69,7 +69,7 @@ fn transforms_json_wins_and_the_format_flag_overrides() {
     let dir = tempfile::tempdir().unwrap();
     let c = capture(dir.path());
     colmap::write_text(&dir.path().join("sparse"), &c).unwrap();
-    transforms_json::write(&dir.path().join("transforms.json"), dir.path(), &c).unwrap();
+    transforms_json::write(&dir.path().join("transforms.json"), dir.path(), &c, None).unwrap();
     let read = |format| import::import(dir.path(), &ImportOptions { format, ..ImportOptions::default() }).unwrap();
     assert_eq!(read(None).scene.aabb_scale, 2);
     assert_eq!(read(Some(Format::Colmap)).scene.aabb_scale, 8, "COLMAP states no box");
@@ -103,7 +103,7 @@ fn blender_sets_keep_their_split_and_complete_extensions() {
 fn a_mask_of_instant_ngp_hides_what_is_not_black() {
     let dir = tempfile::tempdir().unwrap();
     let c = capture(dir.path());
-    transforms_json::write(&dir.path().join("transforms.json"), dir.path(), &c).unwrap();
+    transforms_json::write(&dir.path().join("transforms.json"), dir.path(), &c, None).unwrap();
     let photo_file = &c.frames[1].image;
     let mask = photo_file.with_file_name(format!("dynamic_mask_{}.png", photo_file.file_stem().unwrap().to_str().unwrap()));
     let data = (0..20 * 16).flat_map(|i| if i % 20 < 5 { [0, 90, 0] } else { [0; 3] }).collect();

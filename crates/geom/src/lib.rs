@@ -13,6 +13,7 @@ pub mod image;
 pub mod mesh;
 pub mod ray;
 pub mod rng;
+pub mod splats;
 pub mod transform;
 pub mod view_source;
 

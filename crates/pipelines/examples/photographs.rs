@@ -27,7 +27,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         frames.push(Frame { split, ..Frame::new(name, image, camera, pose) });
     }
     let capture = Capture { frames, world_from_capture: Similarity::IDENTITY, scene: still_life::scene_box(), notes: Vec::new() };
-    transforms_json::write(&root.join("transforms.json"), root, &capture)?;
+    transforms_json::write(&root.join("transforms.json"), root, &capture, None)?;
     Ok(())
 }
 

@@ -15,6 +15,7 @@ pub fn run(a: &PrepareArgs) -> Result<Outcome> {
     least("frames", a.frames >= 3, "at least 3")?;
     least("fps", a.fps.is_none_or(|f| f > 0.0 && f.is_finite()), "above 0")?;
     least("every", a.every >= 1, "at least 1")?;
+    least("features", a.features >= 256, "at least 256")?;
     least("max-side", a.max_side.is_none_or(|s| s >= 64), "at least 64")?;
     least("min-registered", (0.0..=100.0).contains(&a.min_registered), "0 to 100")?;
     let split: SplitRule = a.split.parse().map_err(usage)?;
@@ -37,6 +38,7 @@ pub fn run(a: &PrepareArgs) -> Result<Outcome> {
         every: a.every,
         max_side: a.max_side.unwrap_or(u32::MAX),
         matcher: a.matcher.parse().map_err(usage)?,
+        features: a.features,
         lens: a.lens.to_uppercase(),
         split: if split == SplitRule::File { SplitRule::Every(8) } else { split },
         seed: a.seed,

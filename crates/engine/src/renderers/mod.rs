@@ -1,3 +1,4 @@
 //! From fields to images.
 
+pub mod splat;
 pub mod volume;

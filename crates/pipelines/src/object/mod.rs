@@ -16,3 +16,4 @@ pub mod report;
 pub mod run_folder;
 mod texture;
 pub mod viewing;
+pub mod viewing_points;

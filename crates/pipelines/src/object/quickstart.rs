@@ -44,7 +44,7 @@ pub fn write_capture(folder: &Path, views: usize, size: u32) -> Result<()> {
         frames.push(Frame { split, ..Frame::new(p.name, image, p.camera, p.world_from_camera) });
     }
     let capture = Capture { frames, world_from_capture: Similarity::IDENTITY, scene: still_life::scene_box(), notes: Vec::new() };
-    Ok(transforms_json::write(&folder.join("transforms.json"), folder, &capture)?)
+    Ok(transforms_json::write(&folder.join("transforms.json"), folder, &capture, None)?)
 }
 
 /// Generates, trains, scores, films, exports and reports, all into `folder`.

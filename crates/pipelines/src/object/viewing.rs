@@ -220,16 +220,7 @@ impl ViewSource for RunView {
     fn thumbnail(&self, frame: usize) -> std::result::Result<ImageU8, String> {
         let m = self.model();
         let f = m.capture.frames.get(frame).ok_or_else(|| format!("there is no photograph {frame}"))?;
-        let full = photo::load(&f.image).map_err(|e| e.to_string())?;
-        let by = (THUMBNAIL as f64 / full.width.max(full.height) as f64).min(1.0);
-        let side = |v: usize| ((v as f64 * by) as usize).max(1);
-        let small = full.downsampled(side(full.width), side(full.height));
-        if small.channels == 3 {
-            return Ok(small);
-        }
-        let data =
-            small.data.chunks_exact(small.channels).flat_map(|p| if p.len() == 4 { [p[0], p[1], p[2]] } else { [p[0]; 3] }).collect();
-        Ok(ImageU8 { channels: 3, data, ..small })
+        photo::load_small(&f.image, THUMBNAIL).map_err(|e| e.to_string())
     }
 
     fn save_crop(&self, crop: Option<Crop>) -> std::result::Result<(), String> {

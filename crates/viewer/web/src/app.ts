@@ -184,6 +184,7 @@ function ask(at: number): void {
 function tick(now: number): void {
   requestAnimationFrame(tick);
   if (playing !== null) play(now);
+  fly(now);
   stage.controls.update();
   stage.draw();
   if (asked || socket.readyState !== WebSocket.OPEN || photographs.length === 0) return;
@@ -191,6 +192,18 @@ function tick(now: number): void {
   if (dirty) ask(Math.min(scale, 0.999));
   else if (rest > REST && shown < 1) ask(shown < 0.5 ? 0.5 : 1);
   else if (training && rest > 2000 && Math.floor(now / 2000) !== Math.floor((now - 20) / 2000)) ask(0.5);
+}
+
+let flown = 0;
+
+/** Moves the camera by the keys that are held, a third of its distance a second. */
+function fly(now: number): void {
+  const seconds = Math.min((now - flown) / 1000, 0.1);
+  flown = now;
+  if (held.size === 0) return;
+  const along = (plus: string, minus: string) => Number(held.has(plus)) - Number(held.has(minus));
+  stage.fly(along("d", "a"), along("e", "q"), along("w", "s"), (distance / 3) * seconds);
+  touch();
 }
 
 function lookFrom(p: Photograph): void {
@@ -444,6 +457,14 @@ button("screenshot", () => {
   download("diorama.png", both.toDataURL("image/png"));
 });
 stage.controls.addEventListener("change", touch);
+/** Keys that are held: w a s d fly, q and e sink and rise. */
+const held = new Set<string>();
+window.addEventListener("keydown", (e) => {
+  if (e.target instanceof HTMLInputElement || e.target instanceof HTMLSelectElement || e.ctrlKey || e.metaKey || e.altKey) return;
+  if ("wasdqe".includes(e.key.toLowerCase())) held.add(e.key.toLowerCase());
+});
+window.addEventListener("keyup", (e) => held.delete(e.key.toLowerCase()));
+window.addEventListener("blur", () => held.clear());
 let pressed = [0, 0];
 element("overlay").addEventListener("pointerdown", (e) => {
   playing = null;

@@ -74,6 +74,15 @@ export class Stage {
     this.controls.update();
   }
 
+  /** Moves the camera to its right, up and forward. */
+  fly(right: number, up: number, forward: number, step: number): void {
+    const by = new THREE.Vector3(right, 0, -forward).applyQuaternion(this.camera.quaternion);
+    by.z += up;
+    by.setLength(step);
+    this.camera.position.add(by);
+    this.controls.target.add(by);
+  }
+
   pose(): number[] {
     this.camera.updateMatrixWorld();
     return poseOf(this.camera.matrixWorld);

@@ -2,7 +2,7 @@
 // Prints a line per check and fails with the first that does not hold.
 
 import { spawn } from "node:child_process";
-import { existsSync, mkdtempSync, readFileSync, rmSync } from "node:fs";
+import { existsSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import net from "node:net";
 import os from "node:os";
 import path from "node:path";
@@ -24,8 +24,8 @@ const check = (what, ok, detail = "") => {
 };
 
 /** Starts a viewer; its address and how to end it. */
-async function viewer(...flags) {
-  const child = spawn(diorama, ["view", run, "--port", "0", "--json", "--device", "cpu", ...flags], { stdio: ["ignore", "pipe", "inherit"] });
+async function viewer(what, ...flags) {
+  const child = spawn(diorama, ["view", what, "--port", "0", "--json", "--device", "cpu", ...flags], { stdio: ["ignore", "pipe", "inherit"] });
   let out = "";
   child.stdout.on("data", (d) => (out += d));
   const line = await until("the viewer's address", () => out.includes("\n") && out);
@@ -64,7 +64,7 @@ const browser = await chromium.launch({
 });
 let ends = [];
 try {
-  const { address, end } = await viewer();
+  const { address, end } = await viewer(run);
   ends.push(end);
   const { port, host } = new URL(address);
 
@@ -77,7 +77,7 @@ try {
   check("a wrong Host is refused", (await raw(port, ["GET / HTTP/1.1", `Host: evil.example:${port}`])) === 403);
   check("a path out of the page is not served", (await raw(port, ["GET /../config.toml HTTP/1.1", `Host: ${host}`])) === 404);
   check("another method is refused", (await raw(port, ["POST / HTTP/1.1", `Host: ${host}`])) === 405);
-  const open = await viewer("--host", "0.0.0.0");
+  const open = await viewer(run, "--host", "0.0.0.0");
   ends.push(open.end);
   const far = new URL(open.address);
   check("a missing token is refused", (await raw(far.port, ["GET / HTTP/1.1", `Host: ${far.host}`])) === 401);
@@ -144,6 +144,17 @@ try {
   const turned = await picture();
   check("orbit changes the image", difference(first, turned) > 5, `(mean difference ${difference(first, turned).toFixed(1)}, ${rate.toFixed(1)} views per second while turning)`);
   await shot("turned");
+
+  // Flying.
+  await page.keyboard.down("w");
+  await page.waitForTimeout(400);
+  await page.keyboard.up("w");
+  await settled();
+  check("keys fly", difference(turned, await picture()) > 1);
+  await page.keyboard.down("s");
+  await page.waitForTimeout(400);
+  await page.keyboard.up("s");
+  await settled();
 
   // Layers.
   const seen = { rgb: turned };
@@ -251,6 +262,38 @@ try {
   check("Ctrl-C ends training and viewer with a checkpoint", code === 130 && existsSync(path.join(runs, "live", "checkpoints")), `(exit code ${code})`);
   await other.close();
   rmSync(runs, { recursive: true });
+
+  // A data set and a file of splats, before there is any run.
+  const cloud = path.join(mkdtempSync(path.join(os.tmpdir(), "viewer-")), "ball.ply");
+  const names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
+  const rows = Array.from({ length: 600 }, (_, i) => {
+    const [z, a] = [1 - (2 * i + 1) / 600, i * 2.4];
+    const r = Math.sqrt(1 - z * z);
+    return [r * Math.cos(a), r * Math.sin(a), z, 1.5 * z, -1.5 * z, 0, 5, -2.5, -2.5, -2.5, 1, 0, 0, 0].join(" ");
+  });
+  const head = `ply\nformat ascii 1.0\nelement vertex 600\n${names.map((n) => `property float ${n}\n`).join("")}end_header\n`;
+  writeFileSync(cloud, head + rows.join("\n") + "\n");
+  for (const [name, what] of [["a file of splats", cloud], ["a data set", path.join(run, "capture")]]) {
+    const there = await viewer(what);
+    ends.push(there.end);
+    const look = await browser.newPage({ viewport: { width: 800, height: 500 } });
+    look.on("console", (m) => m.type() === "error" && complaints.push(m.text()));
+    look.on("pageerror", (e) => complaints.push(String(e)));
+    await look.goto(there.address);
+    await until("a view", () => look.evaluate(() => Number(document.body.dataset.views ?? 0) > 0));
+    await until("a whole view", () => look.evaluate(() => Number(document.body.dataset.scale ?? 0) === 1));
+    await look.locator("#photographs button").first().scrollIntoViewIfNeeded();
+    const pictures8 = await until("thumbnails", () => look.evaluate(() => [...document.querySelectorAll("#photographs img")].filter((i) => i.naturalWidth > 0).length));
+    const colors = await look.evaluate(() => {
+      const c = document.getElementById("picture");
+      const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+      return new Set(Array.from({ length: d.length / 4 }, (_, i) => `${d[4 * i] >> 5} ${d[4 * i + 1] >> 5}`)).size;
+    });
+    check(`${name} is shown`, pictures8 > 0 && colors >= (what === cloud ? 8 : 1), `(${colors} colours, ${pictures8} pictures)`);
+    if (pictures) await look.screenshot({ path: path.join(pictures, `${name}.png`) });
+    await look.close();
+  }
+  rmSync(path.dirname(cloud), { recursive: true });
 
   check("nothing is fetched from elsewhere", requests.every((r) => r.startsWith(address) || r.startsWith("blob:") || r.startsWith("data:")), `(${requests.length} requests)`);
   check("the console has no errors", complaints.length === 0, complaints.join("; "));

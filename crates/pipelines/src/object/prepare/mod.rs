@@ -9,9 +9,9 @@ mod world;
 use crate::error::{PipelineError, Result};
 use diorama_data::split::{self, SplitRule};
 use diorama_data::video::{self, Choice};
-use diorama_data::{DataError, atomic, colmap, import, photo, photo_import, transforms_json};
-use diorama_geom::Capture;
+use diorama_data::{DataError, atomic, colmap, import, mesh_text, photo, photo_import, transforms_json};
 use diorama_geom::capture::Split;
+use diorama_geom::{Capture, Mesh};
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
@@ -33,6 +33,8 @@ pub struct PrepareOptions {
     /// Longest side; larger photographs are reduced.
     pub max_side: u32,
     pub matcher: Matcher,
+    /// Most features per photograph.
+    pub features: usize,
     /// COLMAP's name of the lens.
     pub lens: String,
     pub finish: Finish,
@@ -69,6 +71,7 @@ pub struct Prepared {
 /// Names within the data set.
 const IMAGES: &str = "images";
 const WORK: &str = "colmap";
+const POINTS: &str = "points.ply";
 const IMAGES_DONE: &str = "images.done";
 
 /// Prepares a data set; none when interrupted, after which `resume` goes on. `note` is told what happens.
@@ -115,7 +118,13 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
     }
     let world_from_capture = diorama_geom::Similarity::IDENTITY;
     let capture = Capture { frames, world_from_capture, scene: placed.scene, notes: Vec::new() };
-    transforms_json::write(&o.out.join("transforms.json"), &o.out, &capture)?;
+    let cloud = Mesh {
+        positions: placed.points.iter().map(|p| p.0.as_vec3().to_array()).collect(),
+        colors_srgb: placed.points.iter().map(|p| p.1.map(|v| v as f32 / 255.0)).collect(),
+        ..Mesh::default()
+    };
+    mesh_text::save_ply(&o.out.join(POINTS), &cloud)?;
+    transforms_json::write(&o.out.join("transforms.json"), &o.out, &capture, Some(POINTS))?;
     let sheet = o.out.join("sheet.png");
     sheet::draw(&sheet, &capture, &placed.points)?;
     // What was written reads back as a capture.

@@ -74,7 +74,7 @@ pub fn reconstruct(
     }
     let sfm = Sfm { program, images: o.out.join(IMAGES), work: o.out.join(WORK), threads: o.threads, interrupt };
     let (names, is_video) = (photos.names, photos.is_video);
-    if !sfm.features(&o.lens, photos, note)? {
+    if !sfm.features(o, photos, note)? {
         return Ok(None);
     }
     let neighbours = o.matcher == Matcher::Sequential || (o.matcher == Matcher::Auto && (is_video || names.len() > EXHAUSTIVE));
@@ -129,7 +129,7 @@ impl Sfm<'_> {
         if text.contains(&format!("--{}", names[0])) { names[0] } else { names[1] }
     }
 
-    fn features(&self, lens: &str, photos: &Photographs, note: &mut dyn FnMut(&str)) -> Result<bool> {
+    fn features(&self, o: &PrepareOptions, photos: &Photographs, note: &mut dyn FnMut(&str)) -> Result<bool> {
         let n = photos.names.len();
         if self.is_done("features") {
             return Ok(true);
@@ -141,8 +141,9 @@ impl Sfm<'_> {
         let mut arguments = vec![
             ("database_path", self.database().display().to_string()),
             ("image_path", self.images.display().to_string()),
-            ("ImageReader.camera_model", lens.to_string()),
+            ("ImageReader.camera_model", o.lens.clone()),
             ("ImageReader.single_camera", (photos.one_size as u8).to_string()),
+            ("SiftExtraction.max_num_features", o.features.to_string()),
             (gpu, "0".into()),
             (threads, self.threads.map_or(-1, |t| t as i64).to_string()),
         ];

@@ -21,15 +21,7 @@ const HELD_OUT: [u8; 3] = [220, 60, 40];
 pub fn draw(path: &Path, capture: &Capture, points: &[(DVec3, [u8; 3])]) -> Result<()> {
     let n = capture.frames.len();
     let shown: Vec<usize> = (0..n.min(SHOWN)).map(|i| i * n / n.min(SHOWN)).collect();
-    let thumbs: Vec<ImageU8> = shown
-        .par_iter()
-        .map(|i| {
-            let full = photo::load(&capture.frames[*i].image)?;
-            let by = THUMB as f64 / full.width.max(full.height) as f64;
-            let side = |v: usize| ((v as f64 * by) as usize).clamp(1, THUMB);
-            Ok(full.downsampled(side(full.width), side(full.height)))
-        })
-        .collect::<Result<_>>()?;
+    let thumbs: Vec<ImageU8> = shown.par_iter().map(|i| Ok(photo::load_small(&capture.frames[*i].image, THUMB)?)).collect::<Result<_>>()?;
     let rows = thumbs.len().div_ceil(COLUMNS);
     let (width, height) = (COLUMNS * THUMB, PLAN + rows * THUMB);
     let mut sheet = ImageU8 { width, height, channels: 3, data: vec![255; width * height * 3] };
@@ -40,9 +32,7 @@ pub fn draw(path: &Path, capture: &Capture, points: &[(DVec3, [u8; 3])]) -> Resu
         for y in 0..thumb.height {
             for x in 0..thumb.width {
                 let p = thumb.pixel(x, y);
-                let alpha = if p.len() == 4 { p[3] as u32 } else { 255 };
-                let on_white = |k: usize| ((p[k.min(p.len() - 1)] as u32 * alpha + 255 * (255 - alpha)) / 255) as u8;
-                dot(&mut sheet, (x0 + x) as f64, (y0 + y) as f64, [on_white(0), on_white(1), on_white(2)]);
+                dot(&mut sheet, (x0 + x) as f64, (y0 + y) as f64, [p[0], p[1], p[2]]);
             }
         }
         let held = capture.frames[*i].split != Split::Train;
