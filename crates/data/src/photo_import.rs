@@ -102,7 +102,7 @@ pub fn write(image: &ImageU8, folder: &Path, stem: &str) -> Result<PathBuf> {
 
 /// A JPEG without EXIF, XMP, comments, previews and whatever follows its end; colour profiles stay. None where it is malformed.
 pub fn without_metadata(jpeg: &[u8]) -> Option<Vec<u8>> {
-    let mut out = jpeg.get(..2)?.to_vec();
+    let mut out = jpeg.strip_prefix(&[0xff, 0xd8]).map(|_| vec![0xff, 0xd8])?;
     let mut at = 2;
     loop {
         if *jpeg.get(at)? != 0xff {
@@ -118,6 +118,8 @@ pub fn without_metadata(jpeg: &[u8]) -> Option<Vec<u8>> {
                 out.extend([0xff, 0xd9]);
                 return Some(out);
             }
+            // Stuffed bytes and markers without length have no place between segments.
+            0x00 | 0x01 | 0xd0..=0xd8 => return None,
             _ => {}
         }
         let length = u16::from_be_bytes(jpeg.get(at + 2..at + 4)?.try_into().ok()?) as usize;
@@ -135,8 +137,8 @@ pub fn without_metadata(jpeg: &[u8]) -> Option<Vec<u8>> {
         }
         at += 2 + length;
         if marker == 0xda {
-            // Entropy-coded data runs to the next marker that is neither a stuffed byte nor a restart.
-            let end = (at..jpeg.len() - 1).find(|i| jpeg[*i] == 0xff && !matches!(jpeg[i + 1], 0 | 0xd0..=0xd7))?;
+            // Entropy-coded data runs to the next marker that is neither a stuffed byte, nor a restart, nor a fill byte.
+            let end = (at..jpeg.len() - 1).find(|i| jpeg[*i] == 0xff && !matches!(jpeg[i + 1], 0 | 0xff | 0xd0..=0xd7))?;
             out.extend(&jpeg[at..end]);
             at = end;
         }
@@ -211,6 +213,16 @@ mod tests {
         for n in 0..bytes.len() - 20 {
             assert!(without_metadata(&bytes[..n]).is_none_or(|b| b.len() <= n));
         }
+    }
+
+    #[test]
+    fn a_stuffed_byte_after_a_fill_byte_is_no_segment() {
+        let head = [0xff, 0xd8, 0xff, 0xda, 0, 2, 7];
+        let fill = [&head[..], &[0xff, 0xff, 0, 8, 0xff, 0xd9]].concat();
+        let clean = without_metadata(&fill).unwrap();
+        assert_eq!(without_metadata(&clean).as_ref(), Some(&clean));
+        assert_eq!(without_metadata(&[&head[..2], &[0xff, 0, 0, 2, 0xff, 0xd9]].concat()), None);
+        assert_eq!(without_metadata(&[0xdc, 0xff, 0xff, 0xd9]), None);
     }
 
     #[test]

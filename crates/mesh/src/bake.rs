@@ -125,10 +125,11 @@ impl DepthMap {
     pub fn sees(&self, p_in_world: [f32; 3], slack: f32) -> bool {
         let Some((px, d)) = self.project(p_in_world) else { return false };
         let (w, h) = (self.camera.width as i32, self.camera.height as i32);
-        let (x, y) = (px.x.floor() as i32, px.y.floor() as i32);
-        if x < 1 || y < 1 || x + 1 >= w || y + 1 >= h {
+        // Before they are numbers of pixels: a lens may throw a point far beside the picture anywhere.
+        if !((1.0..w as f32 - 1.0).contains(&px.x) && (1.0..h as f32 - 1.0).contains(&px.y)) {
             return false;
         }
+        let (x, y) = (px.x as i32, px.y as i32);
         // The nearest of the pixels around, so that an edge before the point hides it.
         let first = (0..9).map(|k| self.depth[((y + k / 3 - 1) * w + x + k % 3 - 1) as usize]).fold(f32::INFINITY, f32::min);
         // On a surface at 60 degrees to the view the pixels around lie that much nearer.
@@ -166,6 +167,8 @@ mod tests {
         let side = Pose::look_at(DVec3::new(5.0, 0.5, 3.0), DVec3::new(0.5, 0.5, -2.0), DVec3::Y);
         assert!(DepthMap::new(&m, Camera::pinhole(100, 100, 0.8), &side).sees([0.9, 0.5, -2.0], 2e-2));
         assert!(!map.sees([0.5, 0.5, 9.0], 1e-3), "behind the camera");
+        // Beside the camera, where pixels are beyond all numbers of pixels.
+        assert!(!map.sees([1e30, 0.5, 2.9], 1e-3) && !map.sees([0.5, -1e30, 2.9], 1e-3));
     }
 
     #[test]

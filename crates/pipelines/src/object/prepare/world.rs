@@ -14,9 +14,14 @@ pub const DISTANCE: f64 = 4.0;
 const HALF: f64 = 0.5 / 0.33;
 /// Share of the points that the outer cube has to hold.
 const HELD: f64 = 0.95;
-/// A floor lies within this angle (cosine) of the first guess of up and holds at least this share of the points.
-const LEVEL: f64 = 0.94;
-const FLOOR_SHARE: f64 = 0.12;
+/// A floor lies within this angle (cosine) of the first guess of up and holds at least this share of the points, with at most that share
+/// below it: many with some below, or few with hardly any.
+const LEVEL: f64 = 0.9;
+const FLOORS: [(f64, f64); 2] = [(0.12, 0.1), (0.02, 0.01)];
+/// Planes that are tried.
+const TRIALS: u64 = 20_000;
+/// Least extent of a floor in units of the cameras' distance.
+const WIDE: f64 = 0.5;
 
 /// What [`place`] found.
 pub struct Placed {
@@ -35,7 +40,8 @@ pub fn place(frames: &mut [Frame], points: &[Point]) -> Placed {
     // Points in few images are often wrong.
     let firm: Vec<DVec3> = points.iter().filter(|p| p.images >= 3).map(|p| p.position).collect();
     let guess = cameras_up(&poses);
-    let floor = floor_normal(&firm, guess, center, distance);
+    let eyes: Vec<DVec3> = poses.iter().map(|p| p.translation).collect();
+    let floor = floor_normal(&firm, &eyes, guess, center, distance);
     let up = floor.unwrap_or(guess);
     let scale = DISTANCE / distance;
     let rotation = rotation_between(up, DVec3::Z);
@@ -76,7 +82,7 @@ fn cameras_up(poses: &[Pose]) -> DVec3 {
 }
 
 /// Normal of the plane that most points lie on, among those that are nearly level and below the cameras.
-fn floor_normal(points: &[DVec3], up: DVec3, center: DVec3, distance: f64) -> Option<DVec3> {
+fn floor_normal(points: &[DVec3], eyes: &[DVec3], up: DVec3, center: DVec3, distance: f64) -> Option<DVec3> {
     let near: Vec<DVec3> = points.iter().copied().filter(|p| (*p - center).length() < 1.5 * distance).collect();
     if near.len() < 200 {
         return None;
@@ -84,8 +90,8 @@ fn floor_normal(points: &[DVec3], up: DVec3, center: DVec3, distance: f64) -> Op
     let slack = 0.01 * distance;
     let rng = Rng::new(1, 0);
     let pick = |i: u64| near[rng.below(i, near.len() as u64) as usize];
-    let mut best: Option<(usize, DVec3)> = None;
-    for trial in 0..500 {
+    let mut best: Option<(usize, DVec3, DVec3)> = None;
+    for trial in 0..TRIALS {
         let [a, b, c] = [0, 1, 2].map(|k| pick(trial * 3 + k));
         let n = (b - a).cross(c - a).normalize_or_zero();
         let n = if n.dot(up) < 0.0 { -n } else { n };
@@ -98,12 +104,48 @@ fn floor_normal(points: &[DVec3], up: DVec3, center: DVec3, distance: f64) -> Op
             on += (h.abs() < slack) as usize;
             below += (h < -3.0 * slack) as usize;
         }
-        // Little lies under a floor.
-        if below * 10 < near.len() && best.is_none_or(|b| on > b.0) {
-            best = Some((on, n));
+        let share = |v: usize| v as f64 / near.len() as f64;
+        let is_floor = FLOORS.iter().any(|(least, most)| share(on) > *least && share(below) < *most);
+        let all_above = eyes.iter().filter(|e| (**e - a).dot(n) > 0.0).count() * 20 >= eyes.len() * 19;
+        if is_floor && all_above && best.is_none_or(|b| on > b.0) && extent(&near, a, n, slack) > WIDE * distance {
+            best = Some((on, a, n));
         }
     }
-    best.filter(|b| b.0 as f64 > FLOOR_SHARE * near.len() as f64).map(|b| b.1)
+    best.map(|(_, a, n)| fitted(&near, a, n, slack))
+}
+
+/// Normal of the plane through the points near one, by least squares of their heights.
+fn fitted(points: &[DVec3], mut a: DVec3, mut n: DVec3, slack: f64) -> DVec3 {
+    for within in [slack, 0.5 * slack, 0.5 * slack] {
+        let u = n.any_orthonormal_vector();
+        let v = n.cross(u);
+        let (mut m, mut rhs) = (DMat3::ZERO, DVec3::ZERO);
+        for p in points.iter().map(|p| *p - a).filter(|p| p.dot(n).abs() < within) {
+            let x = DVec3::new(p.dot(u), p.dot(v), 1.0);
+            m += DMat3::from_cols(x * x.x, x * x.y, x * x.z);
+            rhs += x * p.dot(n);
+        }
+        if m.determinant().abs() < 1e-12 {
+            break;
+        }
+        let h = m.inverse() * rhs;
+        a += n * h.z;
+        n = (n - u * h.x - v * h.y).normalize();
+    }
+    n
+}
+
+/// How far the points on a plane reach across, in their narrower direction of two.
+fn extent(points: &[DVec3], a: DVec3, n: DVec3, slack: f64) -> f64 {
+    let u = n.any_orthonormal_vector();
+    let v = n.cross(u);
+    let across = |d: DVec3| {
+        let mut at: Vec<f64> = points.iter().filter(|p| (**p - a).dot(n).abs() < slack).map(|p| p.dot(d)).collect();
+        at.sort_by(f64::total_cmp);
+        let edge = at.len() / 20;
+        at.get(at.len() - 1 - edge).zip(at.get(edge)).map_or(0.0, |(hi, lo)| hi - lo)
+    };
+    across(u).min(across(v))
 }
 
 #[cfg(test)]
