@@ -43,6 +43,15 @@ impl Mesh {
         !self.faces.is_empty() && edges.iter().all(|(&(a, b), &n)| n == 1 && edges.get(&(b, a)) == Some(&1))
     }
 
+    /// What a closed mesh encloses; below 0 where its faces look inward.
+    pub fn volume(&self) -> f64 {
+        let of = |f: &[u32; 3]| {
+            let [a, b, c] = f.map(|i| glam::DVec3::from(self.positions[i as usize].map(f64::from)));
+            a.dot(b.cross(c)) / 6.0
+        };
+        self.faces.iter().map(of).sum()
+    }
+
     /// Area-weighted vertex normals; vertices without area get +z.
     pub fn compute_normals(&mut self) {
         let mut sum = vec![[0.0f32; 3]; self.positions.len()];
@@ -113,7 +122,7 @@ mod tests {
     #[test]
     fn watertight_needs_every_face() {
         let mut m = tetrahedron();
-        assert!(m.is_watertight());
+        assert!(m.is_watertight() && (m.volume() - 1.0 / 6.0).abs() < 1e-12);
         m.faces.pop();
         assert!(!m.is_watertight());
     }

@@ -232,17 +232,8 @@ mod tests {
             assert!(nearest(&mesh, p) <= 0.5 * cell);
         }
         // Faces outward: positive volume close to the box's.
-        let volume: f32 = mesh
-            .faces
-            .iter()
-            .map(|f| {
-                let [a, b, c] = f.map(|i| mesh.positions[i as usize]);
-                let n = diorama_geom::mesh::cross(b, c);
-                (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) / 6.0
-            })
-            .sum();
-        let exact = 8.0 * half[0] * half[1] * half[2];
-        assert!((volume / exact - 1.0).abs() < 0.05, "{volume} {exact}");
+        let exact = half.iter().map(|h| 2.0 * *h as f64).product::<f64>();
+        assert!((mesh.volume() / exact - 1.0).abs() < 0.05, "{} {exact}", mesh.volume());
     }
 
     #[test]

@@ -263,15 +263,6 @@ mod tests {
         }
     }
 
-    fn volume(m: &Mesh) -> f32 {
-        let of = |f: &[u32; 3]| {
-            let [a, b, c] = f.map(|i| m.positions[i as usize]);
-            let n = cross(b, c);
-            (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) / 6.0
-        };
-        m.faces.iter().map(of).sum()
-    }
-
     #[test]
     fn vertices_at_one_place_become_one() {
         let mut m = Mesh::default();
@@ -292,7 +283,7 @@ mod tests {
             m.faces.truncate(m.faces.len() - last);
             assert!(close(&mut m));
             // Flat holes are filled flat.
-            assert!((volume(&m) - 1.0).abs() < if first + last < 3 { 1e-5 } else { 0.2 }, "{}", volume(&m));
+            assert!((m.volume() - 1.0).abs() < if first + last < 3 { 1e-5 } else { 0.2 }, "{}", m.volume());
         }
     }
 
@@ -303,7 +294,7 @@ mod tests {
             cube([0.0; 3], &mut m);
             cube(other, &mut m);
             assert!(close(&mut m), "{other:?}");
-            assert!((volume(&m) - 2.0).abs() < 2e-2 && m.faces.len() == 24);
+            assert!((m.volume() - 2.0).abs() < 2e-2 && m.faces.len() == 24);
             // Apart for those, too, who know vertices by their place.
             weld(&mut m);
             assert!(m.is_watertight());
