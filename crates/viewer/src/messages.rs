@@ -99,7 +99,7 @@ pub enum Tell {
         bounds: [f64; 6],
         crop: Option<Box6>,
         /// Two points of the world, and the metres between them.
-        measured: Option<[f64; 7]>,
+        measured: Option<Box<[f64; 7]>>,
         path: Option<String>,
     },
     /// None where nothing is.

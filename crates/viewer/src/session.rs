@@ -221,7 +221,10 @@ fn scene(source: &dyn ViewSource) -> Tell {
         world_from_capture,
         bounds: [lo[0], lo[1], lo[2], hi[0], hi[1], hi[2]],
         crop: s.crop.map(six),
-        measured: s.measured.map(|m| [m.points[0].as_slice(), &m.points[1], &[m.metres]].concat().try_into().expect("seven")),
+        measured: s.measured.map(|m| {
+            let [[a, b, c], [d, e, f]] = m.points;
+            Box::new([a, b, c, d, e, f, m.metres])
+        }),
         path: s.path,
     }
 }

@@ -1,5 +1,6 @@
 //! One unit per grid point: it owns the crossings on the edges that begin there and the triangles of the cell above it.
 //! Counted first, then, with their places known, written.
+#![allow(clippy::collapsible_if)] // the outer one is decided when a kernel is made, the inner one when it runs
 
 use super::CaseTable;
 use crate::gpu::{Buffer, CUBE, Gpu, GpuError, units};

@@ -158,12 +158,13 @@ impl GridCut {
                 let Some(j) = self.neighbour(i, d) else { continue };
                 // Flow comes from the source's tree to the orphan, and leaves it into the sink's.
                 let open = if sink_tree { self.edges[i][d] > 0 } else { self.edges[j][7 - d] > 0 };
-                if open && self.parents[j] < ORPHAN && self.in_sink_tree[j] == sink_tree {
-                    if let Some(distance) = self.distance_to_root(j)
-                        && best.is_none_or(|b| distance < b.0)
-                    {
-                        best = Some((distance, d));
-                    }
+                if open
+                    && self.parents[j] < ORPHAN
+                    && self.in_sink_tree[j] == sink_tree
+                    && let Some(distance) = self.distance_to_root(j)
+                    && best.is_none_or(|b| distance < b.0)
+                {
+                    best = Some((distance, d));
                 }
             }
             if let Some((distance, d)) = best {
