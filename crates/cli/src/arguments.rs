@@ -23,7 +23,7 @@ struct Cli {
 enum Command {
     /// Photographs or a video without poses to a data set, through COLMAP
     #[command(
-        after_help = "Examples:\n  diorama prepare photos/ -o data/chair\n  diorama prepare chair.mp4 -o data/chair --frames 120\n  diorama prepare photos/ -o data/chair --resume\n\nCOLMAP (and ffmpeg for videos) must be installed; DIORAMA_COLMAP and DIORAMA_FFMPEG name other programs than those in PATH."
+        after_help = "Examples:\n  diorama prepare photos/ -o data/chair\n  diorama prepare chair.mp4 -o data/chair --frames 120\n  diorama prepare photos/ -o data/chair --resume --remove-background auto\n\nCOLMAP (and ffmpeg for videos) must be installed; DIORAMA_COLMAP and DIORAMA_FFMPEG name other programs than those in PATH."
     )]
     Prepare(PrepareArgs),
     /// Fit a field to photographs with poses
@@ -41,7 +41,7 @@ enum Command {
     Render(RenderArgs),
     /// Extract a mesh
     #[command(
-        after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --scale-to 80cm -o chair.usdz\n  diorama export runs/chair --resolution 384 --faces 100000 --units mm -o chair.stl"
+        after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --scale-to 80cm -o chair.usdz\n  diorama export runs/chair --resolution 384 --faces 100000 --watertight --units mm -o chair.stl"
     )]
     Export(ExportArgs),
     /// Look at a run in the browser: views, cameras, crop box, scale, camera paths, meshes; or at a data set's cameras and points
@@ -50,10 +50,13 @@ enum Command {
     )]
     View(ViewArgs),
     /// Runs side by side: curves, held-out images, cost
+    #[command(after_help = "Example:\n  diorama compare runs/a runs/b -o runs/compare")]
     Compare(CompareArgs),
     /// Everything at once on a capture that the program generates itself
+    #[command(after_help = "Example:\n  diorama quickstart --seconds 30 -o runs/first")]
     Quickstart(QuickstartArgs),
     /// What a capture or a run is
+    #[command(after_help = "Examples:\n  diorama info data/chair\n  diorama info runs/chair --json")]
     Info(InfoArgs),
     /// What this machine offers, and what each missing part disables; of a capture, what will likely go wrong
     #[command(after_help = "Examples:\n  diorama doctor\n  diorama doctor data/chair")]

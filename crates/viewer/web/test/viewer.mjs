@@ -210,10 +210,21 @@ try {
   check("a saved path is opened again", true);
 
   // Scale: two points a known length apart.
+  // Where something dark stands before the white: the page's places of two such pixels far apart.
+  await settled();
+  const [one, two] = await page.evaluate(() => {
+    const c = document.getElementById("picture");
+    const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+    const dark = Array.from({ length: d.length / 4 }, (_, i) => i).filter((i) => d[4 * i] + d[4 * i + 1] + d[4 * i + 2] < 240);
+    dark.sort((a, b) => (a % c.width) - (b % c.width));
+    const box = c.getBoundingClientRect();
+    const place = (i) => [box.left + ((i % c.width + 0.5) * box.width) / c.width, box.top + ((Math.floor(i / c.width) + 0.5) * box.height) / c.height];
+    return [dark[Math.floor(dark.length * 0.3)], dark[Math.floor(dark.length * 0.7)]].map(place);
+  });
   await page.click("#measure");
-  await page.mouse.click(x, y);
+  await page.mouse.click(...one);
   await until("the first point", () => page.evaluate(() => document.getElementById("measure-note").textContent.includes("second")));
-  await page.mouse.click(x - 60, y + 20);
+  await page.mouse.click(...two);
   await until("the second point", () => page.evaluate(() => document.getElementById("measure-note").textContent.includes("units of the capture apart")));
   await page.fill("#measure-length", "25");
   await page.click("#measure-save");
