@@ -33,6 +33,13 @@ pub struct ViewFrame {
     pub held_out: bool,
 }
 
+impl From<&crate::Frame> for ViewFrame {
+    fn from(f: &crate::Frame) -> ViewFrame {
+        let held_out = f.split != crate::capture::Split::Train;
+        ViewFrame { name: f.name.clone(), camera: f.camera, world_from_camera: f.world_from_camera, held_out }
+    }
+}
+
 /// What there is to look at.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewScene {

@@ -8,7 +8,7 @@ use diorama_data::camera_path_json;
 use diorama_data::{DataError, atomic, photo};
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::train::Event;
-use diorama_geom::capture::{Split, focus_point};
+use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
 use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewLayer, ViewRequest, ViewScene, ViewSource, ViewStatus};
 use diorama_geom::{Camera, ImageU8};
@@ -140,17 +140,7 @@ impl RunView {
 impl ViewSource for RunView {
     fn scene(&self) -> ViewScene {
         let m = self.model();
-        let frames: Vec<ViewFrame> = m
-            .capture
-            .frames
-            .iter()
-            .map(|f| ViewFrame {
-                name: f.name.clone(),
-                camera: f.camera,
-                world_from_camera: f.world_from_camera,
-                held_out: f.split != Split::Train,
-            })
-            .collect();
+        let frames: Vec<ViewFrame> = m.capture.frames.iter().map(ViewFrame::from).collect();
         let poses: Vec<_> = frames.iter().map(|f| f.world_from_camera).collect();
         let (focus, distance) = focus_point(&poses);
         let s = m.capture.scene;

@@ -4,7 +4,7 @@ use crate::error::Result;
 use diorama_data::{colmap, json, photo, splat_ply};
 use diorama_engine::renderers::splat;
 use diorama_engine::renderers::volume::View;
-use diorama_geom::capture::{Split, focus_point};
+use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
 use diorama_geom::splats::Splats;
 use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewLayer, ViewRequest, ViewScene, ViewSource, ViewStatus};
@@ -35,17 +35,11 @@ impl PointsView {
     pub fn of_capture(data: &Path, capture: &Capture) -> Result<PointsView> {
         let mut splats = points(data)?.unwrap_or_default();
         splats.transform(&capture.world_from_capture);
-        let frame = |f: &diorama_geom::Frame| ViewFrame {
-            name: f.name.clone(),
-            camera: f.camera,
-            world_from_camera: f.world_from_camera,
-            held_out: f.split != Split::Train,
-        };
         let photos = capture.frames.iter().map(|f| f.image.clone()).collect();
         let s = capture.scene;
         let corner = |sign: f64| (s.center + DVec3::splat(sign * s.half * s.aabb_scale as f64)).to_array();
         let bounds = (corner(-1.0), corner(1.0));
-        Ok(Self::new(data, capture.frames.iter().map(frame).collect(), photos, splats, bounds, capture.world_from_capture))
+        Ok(Self::new(data, capture.frames.iter().map(ViewFrame::from).collect(), photos, splats, bounds, capture.world_from_capture))
     }
 
     /// A PLY of points or Gaussian splats, z up, seen from around.

@@ -118,6 +118,7 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
     }
     let world_from_capture = diorama_geom::Similarity::IDENTITY;
     let capture = Capture { frames, world_from_capture, scene: placed.scene, notes: Vec::new() };
+    finish::put_in_place(&o.out)?;
     let cloud = Mesh {
         positions: placed.points.iter().map(|p| p.0.as_vec3().to_array()).collect(),
         colors_srgb: placed.points.iter().map(|p| p.1.map(|v| v as f32 / 255.0)).collect(),

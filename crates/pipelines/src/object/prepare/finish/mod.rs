@@ -79,6 +79,8 @@ pub struct Finished {
 
 /// Name of the folder of finished photographs within the data set.
 pub const FINISHED: &str = "finished";
+/// Where they are made.
+const PARTIAL: &str = "finished.partial";
 
 /// What structure from motion found.
 pub struct Found<'a> {
@@ -88,7 +90,23 @@ pub struct Found<'a> {
     pub points: Vec<(Point, DVec3)>,
 }
 
-/// Finishes the photographs of `frames`, whose poses are those of the upright world; none when interrupted.
+/// Takes what [`finish`] has made in place of what an earlier call made, or removes that.
+///
+/// # Errors
+/// When the disk refuses.
+pub fn put_in_place(root: &Path) -> Result<()> {
+    let (folder, partial) = (root.join(FINISHED), root.join(PARTIAL));
+    if folder.exists() {
+        std::fs::remove_dir_all(&folder).map_err(DataError::io(&folder, "remove"))?;
+    }
+    if partial.exists() {
+        std::fs::rename(&partial, &folder).map_err(DataError::io(&partial, "rename"))?;
+    }
+    Ok(())
+}
+
+/// Finishes the photographs of `frames`, whose poses are those of the upright world; none when interrupted. What an earlier call made
+/// stays until [`put_in_place`].
 ///
 /// # Errors
 /// When a photograph cannot be read, a crop leaves it, or the thing cannot be told from its surroundings.
@@ -108,7 +126,7 @@ pub fn finish(
         made.left_out = frames.len() - chosen.len();
         *frames = chosen.into_iter().map(|i| frames[i].clone()).collect();
     }
-    let folder = root.join(FINISHED);
+    let folder = root.join(PARTIAL);
     if folder.exists() {
         std::fs::remove_dir_all(&folder).map_err(DataError::io(&folder, "remove"))?;
     }
@@ -152,7 +170,8 @@ pub fn finish(
             image = crop_to(crop, image, &mut f)?;
         }
         let stem = f.image.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        f.image = photo_import::write(&image, &folder, &stem)?;
+        let written = photo_import::write(&image, &folder, &stem)?;
+        f.image = root.join(FINISHED).join(written.file_name().unwrap_or_default());
         Ok((f, sigma, share))
     };
     let mut out = Vec::new();
