@@ -168,7 +168,8 @@ fn photographs_become_a_finished_data_set() {
         let (code, text, _) = prepare(&[&["--resume"], &flags[..]].concat());
         assert!(code == Some(2) && text.contains(named), "{flags:?}: {text}");
     }
-    // None of these calls has taken away what was there.
+    // None of these calls has taken away what was there, or left anything.
+    assert!(!out.join("finished.partial").exists());
     let kept = import::import(&out, &Default::default()).unwrap();
     assert_eq!(kept.frames.len(), 12);
     assert!(kept.frames.iter().all(|f| photo::load(&f.image).is_ok()));

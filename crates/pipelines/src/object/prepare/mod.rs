@@ -111,7 +111,11 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
     let placed = world::place(&mut frames, &points);
     let in_world = points.iter().copied().zip(placed.points.iter().map(|p| p.0)).collect();
     let found = finish::Found { model: &model, points: in_world };
-    let Some(finished) = finish::finish(&o.finish, &o.out, &found, &mut frames, interrupt, note)? else { return Ok(None) };
+    let made = finish::finish(&o.finish, &o.out, &found, &mut frames, interrupt, note).inspect_err(|_| finish::discard(&o.out))?;
+    let Some(finished) = made else {
+        finish::discard(&o.out);
+        return Ok(None);
+    };
     split::apply(&o.split, &mut frames, false, o.seed);
     if frames.iter().filter(|f| f.split == Split::Train).count() < 2 {
         return Err(PipelineError::Usage(format!("--split {}: leaves fewer than 2 training views; choose another", o.split)));

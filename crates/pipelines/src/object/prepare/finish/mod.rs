@@ -105,6 +105,11 @@ pub fn put_in_place(root: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Removes what a call of [`finish`] that did not end well has made.
+pub fn discard(root: &Path) {
+    let _ = std::fs::remove_dir_all(root.join(PARTIAL));
+}
+
 /// Finishes the photographs of `frames`, whose poses are those of the upright world; none when interrupted. What an earlier call made
 /// stays until [`put_in_place`].
 ///
