@@ -13,16 +13,14 @@ use diorama_geom::rng::Rng;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
-use diorama_kernels::ops::fused_mlp::Mlp;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::linear::{self, Activation, BiasKind};
 use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays, Space};
-use diorama_kernels::ops::ngp_field::FieldNet;
-use diorama_kernels::ops::ngp_field::gpu as field;
 use diorama_kernels::ops::ngp_field::gpu::loss::{self, SUMS, Target, Terms};
+use diorama_kernels::ops::ngp_field::gpu::{self as field, Arithmetic, GpuNet};
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, GpuPhotographs};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
@@ -72,9 +70,7 @@ impl GpuGroup {
 /// A field's shape on the device.
 struct Shape {
     grid: GpuHashGrid,
-    net: FieldNet,
-    /// The layers up to the density head.
-    density: Mlp,
+    net: GpuNet,
     /// Of the spherical harmonics.
     degree: usize,
     space: Space,
@@ -87,22 +83,20 @@ impl Shape {
         let (Encoding::Hash(grid), DirectionCode::SphericalHarmonics(degree)) = (&field.encoding, field.directions) else {
             unreachable!("only hash grid fields go to a GPU")
         };
+        let arithmetic = if field.net.mlp.precision == Precision::F32 { Arithmetic::Exact } else { Arithmetic::Best };
+        // The features', and the appearance codes'; directions have none.
+        let wanted = [true, false, true];
+        let (density, per_level) = (field.density_net(Precision::F32), grid.config.features);
         Shape {
             grid: GpuHashGrid::new(gpu, grid),
-            net: field.net.clone(),
-            density: field.density_net(Precision::F32),
+            net: GpuNet::new(gpu, &field.net, &density, per_level, &wanted[..field.net.mlp.input_widths.len()], arithmetic),
             degree,
             space: if field.contraction { Space::Contracted } else { Space::Cube(field.outer) },
         }
     }
 
     fn features(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: &Buffer) -> Buffer {
-        let levels = self.grid.forward(gpu, rows, points, table);
-        field::to_rows(gpu, rows, &levels, self.grid.grid.config.features, self.grid.grid.output_dims())
-    }
-
-    fn sigma(&self, gpu: &Gpu, rows: &Rows, features: &Buffer, weights: &Buffer) -> Buffer {
-        field::density(gpu, &self.net, &self.density, weights, features, rows)
+        self.net.features(gpu, rows, self.grid.forward(gpu, rows, points, table))
     }
 }
 
@@ -212,30 +206,29 @@ impl GpuTrainer {
         let all = marched.packed.rows();
         let points = march::positions(gpu, &rays, &marched.packed, self.shape.space);
         let features = self.shape.features(gpu, &all, &points, &self.table.values);
-        let sigma = self.shape.sigma(gpu, &all, &features, &self.weights.values);
+        let sigma = self.shape.net.density(gpu, &self.weights.values, &features, &all);
         let pruned = prune::prune(gpu, &marched.packed, &sigma, s.limits, &marched.cut, s.room.1);
         self.occupancy.record(gpu, &all, &marched.cells, &sigma);
         let samples = &pruned.packed;
         let points = pruned.take(gpu, &points, 3);
-        let features = pruned.take(gpu, &features, self.shape.grid.grid.output_dims());
+        let features = self.shape.net.take(gpu, &pruned, &features);
 
         let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &drawn.images, *dims));
         let codes: Vec<&Buffer> = [&direction].into_iter().chain(&appearance).collect();
-        let step = field::forward(gpu, &self.shape.net, &self.weights.values, samples, &features, &codes, background);
+        let step = self.shape.net.forward(gpu, &self.weights.values, samples, &features, &codes, background, true);
         let left_out = gpu.either(&drawn.left_out, &marched.cut);
         let target = Target { rgba: &drawn.target, background, left_out: &left_out };
         let d = loss::loss(gpu, s.terms, samples, &step.out, target, &marched.packed.offsets, &self.sums);
-        let per_level = self.shape.grid.grid.config.features;
-        let g = field::backward(gpu, &self.shape.net, &self.weights.values, samples, per_level, background, &step, &d, s.near_scaling);
+        let g = self.shape.net.backward(gpu, &self.weights.values, samples, background, &step, &d, s.near_scaling);
 
         self.weights.step(gpu, s.t, s.rate_scale, &g.params);
-        if !self.table.frozen {
-            self.shape.grid.backward(gpu, &samples.rows(), &points, &g.features, &self.d_table);
+        if let (false, Some(d_features)) = (self.table.frozen, &g.features) {
+            self.shape.grid.backward(gpu, &samples.rows(), &points, d_features, &self.d_table);
             self.table.step(gpu, s.t, s.rate_scale, &self.d_table);
         }
-        if let Some((group, dims)) = &self.appearance {
+        if let (Some((group, dims)), Some(Some(d_codes))) = (&self.appearance, g.codes.get(1)) {
             let d = gpu.zeros(group.values.len());
-            field::look_up_backward(gpu, &g.codes[1], &drawn.images, *dims, &d);
+            field::look_up_backward(gpu, d_codes, &drawn.images, *dims, &d);
             group.step(gpu, s.t, s.rate_scale, &d);
         }
         if let (Some(group), Some((every_ray, codes, rgb))) = (&self.learned, &sky) {
@@ -250,7 +243,7 @@ impl GpuTrainer {
         let (points, cells) = self.occupancy.probe(&self.gpu, rng, counter, count, block, self.shape.space);
         let rows = Rows::all(&self.gpu, count);
         let features = self.shape.features(&self.gpu, &rows, &points, &self.table.values);
-        let sigma = self.shape.sigma(&self.gpu, &rows, &features, &self.weights.values);
+        let sigma = self.shape.net.density(&self.gpu, &self.weights.values, &features, &rows);
         self.occupancy.update(&self.gpu, &cells, &sigma, block);
     }
 
@@ -350,9 +343,9 @@ impl GpuTracer {
         let all = marched.packed.rows();
         let points = march::positions(gpu, &rays, &marched.packed, self.shape.space);
         let features = self.shape.features(gpu, &all, &points, &self.table);
-        let sigma = self.shape.sigma(gpu, &all, &features, &self.weights);
+        let sigma = self.shape.net.density(gpu, &self.weights, &features, &all);
         let pruned = prune::prune(gpu, &marched.packed, &sigma, limits, &marched.cut, self.room);
-        let features = pruned.take(gpu, &features, self.shape.grid.grid.output_dims());
+        let features = self.shape.net.take(gpu, &pruned, &features);
         let direction = spherical_harmonics::gpu::forward(gpu, self.shape.degree, &rays.dirs);
         let code = self.appearance.as_ref().map(|(codes, dims)| {
             let mean = (codes.len() / dims - 1) as u32;
@@ -360,7 +353,7 @@ impl GpuTracer {
         });
         let codes: Vec<&Buffer> = [&direction].into_iter().chain(&code).collect();
         let black = gpu.zeros(n * 3);
-        let view = field::forward(gpu, &self.shape.net, &self.weights, &pruned.packed, &features, &codes, &black).out;
+        let view = self.shape.net.forward(gpu, &self.weights, &pruned.packed, &features, &codes, &black, false).out;
         out.0.rgb.extend(gpu.read(&view.color)?);
         out.0.opacity.extend(gpu.read(&view.opacity)?);
         out.0.depth.extend(gpu.read(&view.depth)?);

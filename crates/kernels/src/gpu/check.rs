@@ -5,11 +5,13 @@ use super::{Buffer, Gpu, GpuError, Rows};
 use crate::device::Api;
 use crate::ops::adam::{self, Adam};
 use crate::ops::composite::{self, Composited, Packed, gpu::GpuComposited, gpu::GpuPacked};
+use crate::ops::fused_mlp::gpu::fused::{self, Element, Fused};
 use crate::ops::fused_mlp::{self, Layer, Mlp, Source};
 use crate::ops::hash_grid::{self, HashGrid, HashGridConfig, gpu::GpuHashGrid};
 use crate::ops::linear::{self, Activation, BiasKind};
 use crate::ops::march::{self, MarchConfig, MarchRays, OccupancyBits, gpu::Space};
 use crate::ops::marching_cubes::CaseTable;
+use crate::ops::ngp_field::gpu::{Arithmetic, GpuNet};
 use crate::ops::ngp_field::{self, FieldNet, Head};
 use crate::ops::ray_generation::{self, PosedCamera, gpu::GpuCameras};
 use crate::ops::trilinear_corner_grid::{self, Corners, gpu::GpuCorners};
@@ -24,6 +26,29 @@ use diorama_testkit::{compare, random, random_unit, wide};
 
 /// Largest error allowed, relative to the value plus the root mean square of all.
 pub const TOLERANCE: f64 = 1e-3;
+
+/// Largest error allowed of numbers in half precision (11 bits), and of their gradients: root mean square, relative
+/// to that of all. Gradients stray further, because sums close to 0 fall on the other side of a ReLU's kink.
+const HALF_TOLERANCE: [f64; 2] = [5e-3, 5e-2];
+/// The same for bfloat16 (8 bits).
+const BRAIN_TOLERANCE: [f64; 2] = [3e-2, 2e-1];
+
+/// Compares a result that was computed with an element.
+fn compare_as(element: Option<Element>, result: &str, got: &[f32], want: &[f64]) -> Result<f64, String> {
+    let allowed = match element {
+        None | Some(Element::F32) => return compare(got, want, TOLERANCE),
+        Some(Element::F16) => HALF_TOLERANCE,
+        Some(Element::Bf16) => BRAIN_TOLERANCE,
+    }[result.starts_with("d ") as usize];
+    if got.len() != want.len() {
+        return Err(format!("lengths differ: {} and {}", got.len(), want.len()));
+    }
+    let energy = |v: &mut dyn Iterator<Item = f64>| v.map(|x| x * x).sum::<f64>().sqrt();
+    let scale = energy(&mut want.iter().copied());
+    let error = energy(&mut got.iter().zip(want).map(|(g, w)| *g as f64 - w));
+    let relative = if scale > 0.0 { error / scale } else { error };
+    if relative <= allowed { Ok(relative) } else { Err(format!("root mean square error {relative:.3e}, allowed {allowed:.0e}")) }
+}
 
 /// One line of the table.
 #[derive(Clone, Debug)]
@@ -288,6 +313,40 @@ fn networks(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             for (got, want) in di.iter().zip(&wi) {
                 table.close("fused MLP", "d input", &shape, got, want)?;
             }
+            in_one_launch(gpu, table, &mlp, &p, &refs, n)?;
+        }
+    }
+    Ok(())
+}
+
+/// The whole network in one launch, in f32 and on tensor cores, with its last layer as a head.
+fn in_one_launch(gpu: &Gpu, table: &mut Table, mlp: &Mlp, params: &Buffer, inputs: &[&Buffer], n: usize) -> Result<(), GpuError> {
+    let last = mlp.layers.len() - 1;
+    let width = mlp.layers[last].width;
+    let head = Head { layer: last, channel: 0, activation: Activation::None, shift: 0.0 };
+    let wide_params = wide(&gpu.read(params)?);
+    let wide_inputs: Vec<Vec<f64>> = inputs.iter().map(|i| Ok(wide(&gpu.read(i)?))).collect::<Result<_, GpuError>>()?;
+    let wide_inputs: Vec<&[f64]> = wide_inputs.iter().map(|i| &i[..]).collect();
+    let d = random(n * width, 8);
+    let mut wide_d: Vec<Vec<f64>> = mlp.layers.iter().map(|l| vec![0.0; n * l.width]).collect();
+    wide_d[last] = wide(&d);
+    let want = fused_mlp::reference::forward(mlp, &wide_params, &wide_inputs, n);
+    let (want_params, want_inputs) = fused_mlp::reference::backward(mlp, &wide_params, &wide_inputs, n, &wide_d);
+    for element in [Some(Element::F32), fused::tensor_element(gpu)].into_iter().flatten() {
+        let wanted = vec![true; inputs.len()];
+        let Some(net) = Fused::new(gpu, mlp, &[(head, width)], 0, &wanted, element) else { continue };
+        let shape = format!("N={n} {} layers {element:?}", mlp.layers.len());
+        let rows = Rows::all(gpu, n);
+        let kept = net.forward(gpu, params, inputs, &rows, true);
+        let mut close = |result, got: &Buffer, want: &[f64]| {
+            table.row("one launch", result, shape.clone(), compare_as(Some(element), result, &gpu.read(got)?, want));
+            Ok::<_, GpuError>(())
+        };
+        close("forward", &kept.heads[0], want.last().expect("layers"))?;
+        let (dp, di) = net.backward(gpu, params, inputs, &kept, &rows, &[&gpu.upload(&d)], 64.0);
+        close("d parameters", &dp, &want_params)?;
+        for (got, want) in di.iter().zip(&want_inputs) {
+            close("d input", got.as_ref().expect("wanted"), want)?;
         }
     }
     Ok(())
@@ -664,24 +723,40 @@ fn fields(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let up = |v: &[f32]| gpu.upload(v);
         let (on_gpu, pg, fg, bg) = (GpuPacked::upload(gpu, &p), up(&params), up(&features), up(&background));
         let (ca, cb) = (up(&codes[0]), up(&codes[1]));
-        let rows = ngp_field::gpu::to_rows(gpu, &on_gpu.rows(), &fg, per_level, levels * per_level);
-        let step = ngp_field::gpu::forward(gpu, &net, &pg, &on_gpu, &rows, &[&ca, &cb], &bg);
-        let shape = format!("R={rays} S={s}");
-        table.close("field", "color", &shape, &step.out.color, &want.out.color)?;
-        table.close("field", "weights", &shape, &step.out.weights, &want.out.weights)?;
-        let [color, depth, opacity, weights] = d.each_ref().map(|v| up(v));
-        let d = GpuComposited { color, depth, opacity, weights };
-        let g = ngp_field::gpu::backward(gpu, &net, &pg, &on_gpu, per_level, &bg, &step, &d, 0.0);
-        table.close("field", "d parameters", &shape, &g.params, &want.d_params)?;
-        table.close("field", "d background", &shape, &g.background, &want.d_background)?;
-        let level_major: Vec<f64> = (0..levels * s * per_level)
-            .map(|i| want.d_inputs[0][i / per_level % s * levels * per_level + i / (s * per_level) * per_level + i % per_level])
-            .collect();
-        table.close("field", "d features", &shape, &g.features, &level_major)?;
-        for (i, w) in [16, 5].into_iter().enumerate() {
-            let d = &want.d_inputs[i + 1];
-            let summed: Vec<f64> = (0..rays * w).map(|e| p.range(e / w).map(|k| d[k * w + e % w]).sum()).collect();
-            table.close("field", "d code", &shape, &g.codes[i], &summed)?;
+        let density = Mlp::new(net.mlp.input_widths[..1].to_vec(), net.mlp.layers[..=net.sigma.layer].to_vec());
+        for (arithmetic, precise) in [(Arithmetic::Layers, "layers"), (Arithmetic::Exact, "one launch"), (Arithmetic::Best, "tensor cores")]
+        {
+            let on_gpu_net = GpuNet::new(gpu, &net, &density, per_level, &[true; 3], arithmetic);
+            let element = on_gpu_net.element();
+            if matches!((arithmetic, element), (Arithmetic::Exact, None) | (Arithmetic::Best, None | Some(Element::F32))) {
+                // The device has no way but those before.
+                continue;
+            }
+            let shape = format!("R={rays} S={s} {precise}");
+            let features = on_gpu_net.features(gpu, &on_gpu.rows(), fg.clone());
+            let mut close = |result, got: &Buffer, want: &[f64]| {
+                let got = gpu.read(got)?;
+                table.row("field", result, shape.clone(), compare_as(element, result, &got, want));
+                Ok::<_, GpuError>(())
+            };
+            close("density", &on_gpu_net.density(gpu, &pg, &features, &on_gpu.rows()), &want.sigma)?;
+            let step = on_gpu_net.forward(gpu, &pg, &on_gpu, &features, &[&ca, &cb], &bg, true);
+            close("color", &step.out.color, &want.out.color)?;
+            close("weights", &step.out.weights, &want.out.weights)?;
+            let [color, depth, opacity, weights] = d.each_ref().map(|v| up(v));
+            let d = GpuComposited { color, depth, opacity, weights };
+            let g = on_gpu_net.backward(gpu, &pg, &on_gpu, &bg, &step, &d, 0.0);
+            close("d parameters", &g.params, &want.d_params)?;
+            close("d background", &g.background, &want.d_background)?;
+            let level_major: Vec<f64> = (0..levels * s * per_level)
+                .map(|i| want.d_inputs[0][i / per_level % s * levels * per_level + i / (s * per_level) * per_level + i % per_level])
+                .collect();
+            close("d features", g.features.as_ref().expect("wanted"), &level_major)?;
+            for (i, w) in [16, 5].into_iter().enumerate() {
+                let d = &want.d_inputs[i + 1];
+                let summed: Vec<f64> = (0..rays * w).map(|e| p.range(e / w).map(|k| d[k * w + e % w]).sum()).collect();
+                close("d code", g.codes[i].as_ref().expect("wanted"), &summed)?;
+            }
         }
     }
     Ok(())

@@ -15,6 +15,8 @@ use cubecl::server::Handle;
 
 /// Units per cube of the kernels that treat one element per unit.
 pub const CUBE: u32 = 256;
+/// What `stubs/cuda-on-cpu` calls itself.
+const CUDA_ON_CPU: &str = "CPU playing CUDA";
 /// Most cubes along one axis that every API allows.
 const MAX_CUBES: u32 = 65_535;
 
@@ -67,6 +69,13 @@ impl Buffer {
     pub(crate) fn arg(&self) -> BufferArg {
         // SAFETY: `len` is the length that the handle was made with.
         unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len.max(1)) }
+    }
+
+    /// For a launch that takes the memory for `n` elements of two or four bytes.
+    pub(crate) fn arg_of(&self, n: usize) -> BufferArg {
+        assert!(n <= self.len * 2, "{n} elements in {} numbers", self.len);
+        // SAFETY: the kernel's element is at most as large as the handle has room for.
+        unsafe { BufferArg::from_raw_parts(self.handle.clone(), n.max(1)) }
     }
 }
 
@@ -125,6 +134,7 @@ impl Gpu {
         let add = Type::atomic(f32::elem_type_native().with_vector_size(1));
         let native_atomics = client.properties().atomic_type_usage(add).contains(AtomicUsage::Add);
         let name = client.properties().identity.name.clone();
+        let software = software || name == CUDA_ON_CPU;
         // A build with Vulkan speaks SPIR-V to it under any name.
         let spirv = api == Api::Vulkan || (api == Api::WebGpu && Api::Vulkan.is_built());
         Ok(Gpu { shared: !(software && spirv), api, name, software, client, native_atomics })

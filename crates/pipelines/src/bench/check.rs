@@ -35,6 +35,7 @@ pub struct Report {
 #[cfg(feature = "gpu")]
 pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
     use diorama_kernels::gpu::{Gpu, GpuError, check};
+    use diorama_kernels::ops::fused_mlp::gpu::fused::tensor_element;
     let begin = std::time::Instant::now();
     let told = |e: GpuError| match e {
         GpuError::Lost(..) => PipelineError::Device(e.to_string()),
@@ -46,7 +47,10 @@ pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
     let line =
         |r: check::Row| Line { op: r.op, result: r.result, shape: r.shape, error: r.error.is_finite().then_some(r.error), fault: r.fault };
     let mut lines: Vec<Line> = rows.into_iter().map(line).collect();
-    lines.push(training(device, data)?);
+    lines.push(training(device, data, "f32")?);
+    if tensor_element(&gpu).is_some() {
+        lines.push(training(device, data, "auto")?);
+    }
     Ok(Report {
         device: gpu.api.name(),
         native_atomics: gpu.has_native_atomics(),
@@ -58,16 +62,20 @@ pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
     })
 }
 
-/// Steps over which losses are compared, and how far apart they may be.
+/// Steps over which losses are compared.
 #[cfg(feature = "gpu")]
-const CURVE: (u64, f64) = (50, 0.02);
+const STEPS: u64 = 50;
+/// How far losses may be apart in f32, and on tensor cores.
+#[cfg(feature = "gpu")]
+const APART: [f64; 2] = [0.02, 0.05];
 
-/// Small steps of the standard recipe on the device and on the CPU, with the same rays: by default on the still life.
+/// Small steps of the standard recipe on the device in the given precision, and on the CPU in f32, with the same
+/// rays: by default on the still life.
 #[cfg(feature = "gpu")]
-fn training(device: &str, data: Option<&Path>) -> Result<Line> {
+fn training(device: &str, data: Option<&Path>, precision: &str) -> Result<Line> {
     use crate::object::config::{Config, Method};
     use crate::object::{quickstart, recipe};
-    let (steps, most) = CURVE;
+    let most = APART[(precision != "f32") as usize];
     let scratch = std::env::temp_dir().join(format!("diorama-check-{}", std::process::id()));
     let folder = data.unwrap_or(&scratch);
     let mut c = Config::new(Method::Ngp, folder.into());
@@ -80,12 +88,12 @@ fn training(device: &str, data: Option<&Path>) -> Result<Line> {
     };
     c.data.split = "every:8".into();
     c.data.downscale = if data.is_some() { 4 } else { 1 };
-    c.field.precision = "f32".into();
     c.run.log_every = 1;
     (c.sampling.rays, c.sampling.batch_samples, c.sampling.occupancy_points) = (64, 4096, 8192);
     let mut of = |device: &str| {
         c.device = device.into();
-        recipe::losses(&c, steps)
+        c.field.precision = if device == "cpu" { "f32" } else { precision }.into();
+        recipe::losses(&c, STEPS)
     };
     let curves = of("cpu").and_then(|cpu| Ok((cpu, of(device)?)));
     if data.is_none() {
@@ -97,8 +105,8 @@ fn training(device: &str, data: Option<&Path>) -> Result<Line> {
     let right = error <= most;
     Ok(Line {
         op: "training",
-        result: "loss per step",
-        shape: format!("{steps} steps, {name}"),
+        result: if precision == "f32" { "loss per step" } else { "loss, tensor cores" },
+        shape: format!("{STEPS} steps, {name}"),
         error: (right && error.is_finite()).then_some(error),
         fault: (!right).then(|| format!("a loss is {:.2} % off, {:.0} % is allowed", 100.0 * error, 100.0 * most)),
     })

@@ -1,5 +1,7 @@
 //! Layer after layer through `linear`, parameters in one buffer as on the CPU.
 
+pub mod fused;
+
 use super::{Mlp, Source};
 use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
 use crate::ops::linear::gpu::{self as linear, Part};

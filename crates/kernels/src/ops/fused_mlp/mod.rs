@@ -15,7 +15,7 @@ use burn::tensor::Tensor;
 use diorama_geom::rng::Rng;
 
 /// What a layer reads.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Source {
     Input(usize),
     Layer(usize),

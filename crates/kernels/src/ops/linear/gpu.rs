@@ -14,7 +14,7 @@ const MAX_TILES: usize = 65_535;
 const SLICE: usize = 1024;
 const MAX_SLICES: usize = 256;
 
-fn code(a: Activation) -> u32 {
+pub(crate) fn code(a: Activation) -> u32 {
     match a {
         Activation::None => 0,
         Activation::Relu => 1,
@@ -417,7 +417,7 @@ fn right_factor(b: &[f32], at: usize, i: usize, col: usize, k: usize, n: usize, 
 
 /// `sums += left rightᵀ`
 #[cube]
-fn add_outer(sums: &mut Array<f32>, left: &Array<f32>, right: &Array<f32>, #[comptime] mr: usize, #[comptime] nr: usize) {
+pub(crate) fn add_outer(sums: &mut Array<f32>, left: &Array<f32>, right: &Array<f32>, #[comptime] mr: usize, #[comptime] nr: usize) {
     #[unroll]
     for i in 0..mr {
         #[unroll]
@@ -535,7 +535,7 @@ fn total(parts: &[f32], out: &mut [f32], out_at: u32, slices: u32, n: u32) {
 }
 
 #[cube]
-fn apply(x: f32, #[comptime] activation: u32) -> f32 {
+pub(crate) fn apply(x: f32, #[comptime] activation: u32) -> f32 {
     let mut y = x;
     if comptime!(activation == 1) {
         y = max(x, 0.0);
@@ -597,15 +597,10 @@ fn pick(
     out[i] = apply(values[i / c * width as usize + first as usize + i % c] + shift, activation);
 }
 
-/// `d_out · act'` from the activated output.
+/// The activation's slope, from the activated output.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
-#[cube(launch_unchecked)]
-fn chain(live: &[u32], out: &[f32], d_out: &[f32], g: &mut [f32], at: u32, n: u32, #[comptime] activation: u32) {
-    let i = ABSOLUTE_POS;
-    if i >= live[at as usize] as usize * n as usize {
-        terminate!();
-    }
-    let y = out[i];
+#[cube]
+pub(crate) fn slope(y: f32, #[comptime] activation: u32) -> f32 {
     let mut slope = 1.0f32;
     if comptime!(activation == 1) {
         if y <= 0.0 {
@@ -621,7 +616,17 @@ fn chain(live: &[u32], out: &[f32], d_out: &[f32], g: &mut [f32], at: u32, n: u3
     if comptime!(activation == 4) {
         slope = min(y, 3_269_017.5);
     }
-    g[i] = d_out[i] * slope;
+    slope
+}
+
+/// `d_out · act'` from the activated output.
+#[cube(launch_unchecked)]
+fn chain(live: &[u32], out: &[f32], d_out: &[f32], g: &mut [f32], at: u32, n: u32, #[comptime] activation: u32) {
+    let i = ABSOLUTE_POS;
+    if i >= live[at as usize] as usize * n as usize {
+        terminate!();
+    }
+    g[i] = d_out[i] * slope(out[i], activation);
 }
 
 #[cube(launch_unchecked)]

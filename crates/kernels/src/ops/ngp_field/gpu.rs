@@ -1,4 +1,4 @@
-//! The standard field as a composition of its parts on the device.
+//! The standard field on the device: encoded positions, network, compositing, and back.
 
 pub mod loss;
 
@@ -6,15 +6,189 @@ use super::{FieldNet, Head};
 use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Rows, Swap, units};
 use crate::ops::composite::gpu::{self as composite, GpuComposited, GpuPacked};
 use crate::ops::fused_mlp::Mlp;
+use crate::ops::fused_mlp::gpu::fused::{Element, Fused, Kept, tensor_element};
 use crate::ops::fused_mlp::gpu::{self as mlp, columns};
 use crate::ops::linear::gpu as linear;
+use crate::ops::march::gpu::prune::Pruned;
 use cubecl::prelude::*;
+
+/// How a network is computed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Arithmetic {
+    /// In one launch, on tensor cores if the device has them.
+    Best,
+    /// In one launch, in f32.
+    Exact,
+    /// Layer by layer, in f32.
+    Layers,
+}
+
+/// A field's network on a device: in one launch where the device can and the network is small enough, else layer by layer.
+pub struct GpuNet {
+    pub net: FieldNet,
+    /// The layers up to the density head.
+    density: Mlp,
+    /// Numbers per row and level of a hash grid; 0: positions are encoded in rows.
+    per_level: usize,
+    /// The whole network, and what its density needs.
+    fused: Option<[Fused; 2]>,
+}
+
+impl GpuNet {
+    /// `density` is the network up to its density head, which reads input 0 alone; `wanted` says of which inputs
+    /// gradients are asked.
+    pub fn new(gpu: &Gpu, net: &FieldNet, density: &Mlp, per_level: usize, wanted: &[bool], arithmetic: Arithmetic) -> Self {
+        let element = match arithmetic {
+            Arithmetic::Best => tensor_element(gpu).unwrap_or(Element::F32),
+            _ => Element::F32,
+        };
+        let both = || {
+            let whole = Fused::new(gpu, &net.mlp, &[(net.sigma, 1), (net.rgb, 3)], per_level, wanted, element)?;
+            let part = Fused::new(gpu, density, &[(net.sigma, 1)], per_level, &wanted[..1], element)?;
+            Some([whole, part])
+        };
+        let fused = if arithmetic == Arithmetic::Layers { None } else { both() };
+        GpuNet { net: net.clone(), density: density.clone(), per_level, fused }
+    }
+
+    /// What the network multiplies in one launch; none: it goes layer by layer.
+    pub fn element(&self) -> Option<Element> {
+        self.fused.as_ref().map(|[whole, _]| whole.element)
+    }
+
+    /// Whether features are wanted level by level, `[L, S, F]`, rather than in rows.
+    fn in_levels(&self) -> bool {
+        self.fused.is_some() && self.per_level > 0
+    }
+
+    /// Features of a hash grid `[L, S, F]` as the network reads them.
+    pub fn features(&self, gpu: &Gpu, rows: &Rows, levels: Buffer) -> Buffer {
+        if self.in_levels() { levels } else { turn(gpu, rows, &levels, self.per_level, self.net.mlp.input_widths[0], true) }
+    }
+
+    /// Features of the samples that stay.
+    pub fn take(&self, gpu: &Gpu, pruned: &Pruned, features: &Buffer) -> Buffer {
+        let width = self.net.mlp.input_widths[0];
+        if self.in_levels() { pruned.take_levels(gpu, features, width, self.per_level) } else { pruned.take(gpu, features, width) }
+    }
+
+    /// Densities `[S]` of features as the network reads them.
+    pub fn density(&self, gpu: &Gpu, params: &Buffer, features: &Buffer, rows: &Rows) -> Buffer {
+        match &self.fused {
+            Some([_, part]) => part.forward(gpu, params, &[features], rows, false).heads.remove(0),
+            None => {
+                let values = mlp::forward(gpu, &self.density, params, &[features], rows);
+                head(gpu, &self.net, self.net.sigma, &values, rows, 1)
+            }
+        }
+    }
+
+    /// Evaluates and composites packed samples; with `keep` ready for [`GpuNet::backward`].
+    ///
+    /// # Shapes
+    /// features: as the network reads them; codes: `[R, K_i]`; background: `[R, 3]`.
+    #[allow(clippy::too_many_arguments)]
+    pub fn forward(
+        &self,
+        gpu: &Gpu,
+        params: &Buffer,
+        p: &GpuPacked,
+        features: &Buffer,
+        codes: &[&Buffer],
+        background: &Buffer,
+        keep: bool,
+    ) -> GpuStep {
+        let rows = p.rows();
+        let mut inputs = vec![features.clone()];
+        for (code, width) in codes.iter().zip(&self.net.mlp.input_widths[1..]) {
+            let per_sample = gpu.empty(rows.most * width);
+            along(gpu, p, code, &per_sample, *width, true);
+            inputs.push(per_sample);
+        }
+        let refs: Vec<&Buffer> = inputs.iter().collect();
+        let (values, sigma, rgb) = match &self.fused {
+            Some([whole, _]) => {
+                let kept = whole.forward(gpu, params, &refs, &rows, keep);
+                let (sigma, rgb) = (kept.heads[0].clone(), kept.heads[1].clone());
+                (Values::Kept(kept), sigma, rgb)
+            }
+            None => {
+                let values = mlp::forward(gpu, &self.net.mlp, params, &refs, &rows);
+                let sigma = head(gpu, &self.net, self.net.sigma, &values, &rows, 1);
+                let rgb = head(gpu, &self.net, self.net.rgb, &values, &rows, 3);
+                (Values::Layers(values), sigma, rgb)
+            }
+        };
+        let out = composite::forward(gpu, p, &sigma, &rgb, 3, background);
+        GpuStep { out, inputs, values, sigma, rgb }
+    }
+
+    /// Gradients, given those of what compositing gave; see [`super::StepInput::near_scaling`].
+    #[allow(clippy::too_many_arguments)]
+    pub fn backward(
+        &self,
+        gpu: &Gpu,
+        params: &Buffer,
+        p: &GpuPacked,
+        background: &Buffer,
+        step: &GpuStep,
+        d: &GpuComposited,
+        near_scaling: f32,
+    ) -> GpuStepGradients {
+        let (rows, net) = (p.rows(), &self.net);
+        let g = composite::backward(gpu, p, &step.rgb, 3, background, &step.out, d);
+        if near_scaling > 0.0 {
+            soften(gpu, p, &g.sigma, &g.features, near_scaling);
+        }
+        let inputs: Vec<&Buffer> = step.inputs.iter().collect();
+        let (d_params, d_inputs) = match (&self.fused, &step.values) {
+            (Some([whole, _]), Values::Kept(kept)) => {
+                // The loss is a mean over rays.
+                let scale = (p.rays().max(1) as f32 * HALF_SCALE).log2().floor().exp2();
+                whole.backward(gpu, params, &inputs, kept, &rows, &[&g.sigma, &g.features], scale)
+            }
+            (_, Values::Layers(values)) => {
+                let mut seeds: Vec<Option<Buffer>> = net.mlp.layers.iter().map(|_| None).collect();
+                for (h, channels, out, d) in [(net.sigma, 1, &step.sigma, &g.sigma), (net.rgb, 3, &step.rgb, &g.features)] {
+                    let slope = linear::before_activation(gpu, &rows, channels, h.activation, out, d);
+                    let width = net.mlp.layers[h.layer].width;
+                    let seed = seeds[h.layer].get_or_insert_with(|| gpu.zeros(rows.most * width));
+                    columns(gpu, &rows, channels, (&slope, channels, 0), (seed, width, h.channel), true);
+                }
+                let (d_params, d_inputs) = mlp::backward(gpu, &net.mlp, params, &inputs, values, &rows, seeds);
+                (d_params, d_inputs.into_iter().map(Some).collect())
+            }
+            (None, Values::Kept(_)) => unreachable!("the step is another network's"),
+        };
+        let mut d_inputs = d_inputs.into_iter();
+        let features = d_inputs.next().flatten().map(|d| {
+            if self.per_level > 0 && !self.in_levels() { turn(gpu, &rows, &d, self.per_level, net.mlp.input_widths[0], false) } else { d }
+        });
+        let codes = d_inputs.zip(&net.mlp.input_widths[1..]).map(|(d, width)| {
+            d.map(|d| {
+                let sum = gpu.empty(p.rays() * width);
+                along(gpu, p, &sum, &d, *width, false);
+                sum
+            })
+        });
+        GpuStepGradients { codes: codes.collect(), params: d_params, features, background: g.background }
+    }
+}
+
+/// Times the rays: what gradients of a mean over rays are multiplied by in half precision.
+const HALF_SCALE: f32 = 64.0;
+
+/// Activations on the way forward.
+enum Values {
+    Kept(Kept),
+    Layers(Vec<Buffer>),
+}
 
 /// What a backward pass needs of the forward one.
 pub struct GpuStep {
     pub out: GpuComposited,
     inputs: Vec<Buffer>,
-    values: Vec<Buffer>,
+    values: Values,
     sigma: Buffer,
     rgb: Buffer,
 }
@@ -22,90 +196,16 @@ pub struct GpuStep {
 /// Gradients of a step.
 pub struct GpuStepGradients {
     pub params: Buffer,
-    /// Level-major, `[L, S, F]`.
-    pub features: Buffer,
-    /// Per code, `[R, K]`.
-    pub codes: Vec<Buffer>,
+    /// Of a hash grid level by level, `[L, S, F]`, else in rows `[S, K]`; none: not wanted.
+    pub features: Option<Buffer>,
+    /// Per code, `[R, K]`, where wanted.
+    pub codes: Vec<Option<Buffer>>,
     pub background: Buffer,
-}
-
-/// Evaluates and composites packed samples.
-///
-/// # Shapes
-/// features: `[S, K_0]`; codes: `[R, K_i]`; background: `[R, 3]`.
-pub fn forward(
-    gpu: &Gpu,
-    net: &FieldNet,
-    params: &Buffer,
-    p: &GpuPacked,
-    features: &Buffer,
-    codes: &[&Buffer],
-    background: &Buffer,
-) -> GpuStep {
-    let rows = p.rows();
-    let mut inputs = vec![features.clone()];
-    for (code, width) in codes.iter().zip(&net.mlp.input_widths[1..]) {
-        let per_sample = gpu.empty(rows.most * width);
-        along(gpu, p, code, &per_sample, *width, true);
-        inputs.push(per_sample);
-    }
-    let values = mlp::forward(gpu, &net.mlp, params, &inputs.iter().collect::<Vec<_>>(), &rows);
-    let sigma = head(gpu, net, net.sigma, &values, &rows, 1);
-    let rgb = head(gpu, net, net.rgb, &values, &rows, 3);
-    let out = composite::forward(gpu, p, &sigma, &rgb, 3, background);
-    GpuStep { out, inputs, values, sigma, rgb }
-}
-
-/// Densities `[S]` of encoded positions `[S, K_0]`; `layers` are the network's up to the density head.
-pub fn density(gpu: &Gpu, net: &FieldNet, layers: &Mlp, params: &Buffer, features: &Buffer, rows: &Rows) -> Buffer {
-    let values = mlp::forward(gpu, layers, params, &[features], rows);
-    head(gpu, net, net.sigma, &values, rows, 1)
-}
-
-/// Gradients, given those of what compositing gave; see [`super::StepInput::near_scaling`].
-#[allow(clippy::too_many_arguments)]
-pub fn backward(
-    gpu: &Gpu,
-    net: &FieldNet,
-    params: &Buffer,
-    p: &GpuPacked,
-    per_level: usize,
-    background: &Buffer,
-    step: &GpuStep,
-    d: &GpuComposited,
-    near_scaling: f32,
-) -> GpuStepGradients {
-    let rows = p.rows();
-    let g = composite::backward(gpu, p, &step.rgb, 3, background, &step.out, d);
-    if near_scaling > 0.0 {
-        soften(gpu, p, &g.sigma, &g.features, near_scaling);
-    }
-    let mut seeds: Vec<Option<Buffer>> = net.mlp.layers.iter().map(|_| None).collect();
-    for (h, channels, out, d) in [(net.sigma, 1, &step.sigma, &g.sigma), (net.rgb, 3, &step.rgb, &g.features)] {
-        let slope = linear::before_activation(gpu, &rows, channels, h.activation, out, d);
-        let width = net.mlp.layers[h.layer].width;
-        let seed = seeds[h.layer].get_or_insert_with(|| gpu.zeros(rows.most * width));
-        columns(gpu, &rows, channels, (&slope, channels, 0), (seed, width, h.channel), true);
-    }
-    let inputs: Vec<&Buffer> = step.inputs.iter().collect();
-    let (d_params, d_inputs) = mlp::backward(gpu, &net.mlp, params, &inputs, &step.values, &rows, seeds);
-    let features = turn(gpu, &rows, &d_inputs[0], per_level, net.mlp.input_widths[0], false);
-    let codes = d_inputs[1..].iter().zip(&net.mlp.input_widths[1..]).map(|(d, width)| {
-        let sum = gpu.empty(p.rays() * width);
-        along(gpu, p, &sum, d, *width, false);
-        sum
-    });
-    GpuStepGradients { codes: codes.collect(), params: d_params, features, background: g.background }
 }
 
 /// Activated channels of a layer, `[S, channels]`.
 fn head(gpu: &Gpu, net: &FieldNet, h: Head, values: &[Buffer], rows: &Rows, channels: usize) -> Buffer {
     linear::head(gpu, rows, (&values[h.layer], net.mlp.layers[h.layer].width, h.channel), channels, h.shift, h.activation)
-}
-
-/// Level-major `[L, S, F]` to row-major features `[S, L F]`.
-pub fn to_rows(gpu: &Gpu, rows: &Rows, features: &Buffer, per_level: usize, dims: usize) -> Buffer {
-    turn(gpu, rows, features, per_level, dims, true)
 }
 
 /// Rows `[R, width]` of `table` `[N, width]` named by `index` `[R]`.

@@ -8,6 +8,8 @@ use crate::ops::linear::reference::{activate, slope};
 /// Per-ray results and the gradients of a linear loss.
 pub struct Step {
     pub out: Composited<f64>,
+    /// `[S]`
+    pub sigma: Vec<f64>,
     pub d_params: Vec<f64>,
     /// Per network input, `[S, K]`.
     pub d_inputs: Vec<Vec<f64>>,
@@ -36,5 +38,5 @@ pub fn step(net: &FieldNet, params: &[f64], p: &Packed, inputs: &[&[f64]], backg
         }
     }
     let (d_params, d_inputs) = mlp::backward(&net.mlp, params, inputs, s, &seeds);
-    Step { out, d_params, d_inputs, d_background }
+    Step { out, sigma, d_params, d_inputs, d_background }
 }

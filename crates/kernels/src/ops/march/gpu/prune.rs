@@ -84,6 +84,15 @@ pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: Limits, cut: &Buf
 impl Pruned {
     /// Rows `[capacity, width]` of the samples that stay, of those of all `[S, width]`.
     pub fn take(&self, gpu: &Gpu, all: &Buffer, width: usize) -> Buffer {
+        self.taken(gpu, all, width, width)
+    }
+
+    /// Features `[L, capacity, F]` of the samples that stay, of those of all `[L, S, F]`, for `width` = `L F`.
+    pub fn take_levels(&self, gpu: &Gpu, all: &Buffer, width: usize, per_level: usize) -> Buffer {
+        self.taken(gpu, all, width, per_level)
+    }
+
+    fn taken(&self, gpu: &Gpu, all: &Buffer, width: usize, per_level: usize) -> Buffer {
         let rows = self.packed.rows();
         let out = gpu.empty(rows.most * width);
         if !out.is_empty() {
@@ -99,7 +108,10 @@ impl Pruned {
                     all.arg(),
                     out.arg(),
                     at,
+                    (all.len() / width) as u32,
+                    rows.most as u32,
                     width as u32,
+                    per_level as u32,
                 );
             }
         }
@@ -175,11 +187,14 @@ fn compact(
 }
 
 #[cube(launch_unchecked)]
-fn fetch(live: &[u32], source: &[u32], all: &[f32], out: &mut [f32], at: u32, width: u32) {
+fn fetch(live: &[u32], source: &[u32], all: &[f32], out: &mut [f32], at: u32, samples: u32, most: u32, width: u32, per_level: u32) {
     let i = ABSOLUTE_POS;
-    let w = width as usize;
-    if i >= live[at as usize] as usize * w {
+    let f = per_level as usize;
+    let per = live[at as usize] as usize * f;
+    if per == 0 || i >= per * (width as usize / f) {
         terminate!();
     }
-    out[i] = all[source[i / w] as usize * w + i % w];
+    let level = i / per;
+    let row = i % per / f;
+    out[(level * most as usize + row) * f + i % f] = all[(level * samples as usize + source[row] as usize) * f + i % f];
 }

@@ -1,0 +1,3 @@
+// Half precision as the compiler knows it.
+#pragma once
+typedef _Float16 __half;
