@@ -4,7 +4,8 @@
 //   g++ -O2 -shared -fPIC -pthread driver.cpp -o libcuda.so -ldl && ln -s libcuda.so libnvrtc.so
 //   CUDA_PATH=<this folder> LD_LIBRARY_PATH=<where the libraries are> diorama bench check --device cuda
 //
-// Compiled kernels are kept in $CUDA_ON_CPU_CACHE, or in a folder of the process that is removed at its end.
+// Compiled kernels are kept in $CUDA_ON_CPU_CACHE, or in a folder of the process that is removed at its end. With
+// $CUDA_ON_CPU_LAUNCHES set, the end tells how often each kernel was launched.
 #include <atomic>
 #include <chrono>
 #include <csetjmp>
@@ -118,7 +119,10 @@ struct Kernel {
     void (*run)(void **);
     void (*at)(Place **, char ***, void (***)(bool));
     bool fibers;
+    std::string name;
+    uint64_t launches;
 };
+static std::vector<Kernel *> kernels;
 
 namespace {
 const size_t STACK = 128 << 10;
@@ -218,6 +222,7 @@ void run_cube(Worker &w, const Place &cube, Place *place) {
 } // namespace
 
 API Result cuLaunchKernel(Kernel *k, unsigned gx, unsigned gy, unsigned gz, unsigned bx, unsigned by, unsigned bz, unsigned shared, void *, void **params, void **) {
+    k->launches++;
     std::atomic<uint64_t> next{0};
     uint64_t cubes = uint64_t(gx) * gy * gz;
     auto work = [&] {
@@ -265,12 +270,21 @@ API Result cuModuleLoadData(void **module, const void *image) {
         fprintf(stderr, "cuda-on-cpu: %s\n", dlerror());
         return INVALID;
     }
-    auto k = new Kernel{(void (*)(void **))dlsym(lib, "cuda_on_cpu_run"), nullptr, text.find("fibers", path.size()) != std::string::npos};
+    auto k = new Kernel{(void (*)(void **))dlsym(lib, "cuda_on_cpu_run"), nullptr, text.find("fibers", path.size()) != std::string::npos, "", 0};
+    if (kernels.empty() && getenv("CUDA_ON_CPU_LAUNCHES"))
+        atexit([] {
+            for (Kernel *k : kernels) fprintf(stderr, "%8lu %s\n", (unsigned long)k->launches, k->name.c_str());
+        });
+    kernels.push_back(k);
     k->at = (decltype(k->at))dlsym(lib, "cuda_on_cpu_at");
     *module = k;
     return OK;
 }
-API Result cuModuleGetFunction(void **f, void *module, const char *) { *f = module; return OK; }
+API Result cuModuleGetFunction(void **f, void *module, const char *name) {
+    ((Kernel *)module)->name = name;
+    *f = module;
+    return OK;
+}
 API Result cuModuleUnload(void *) { return OK; }
 API Result cuFuncSetAttribute(void *, int, int) { return OK; }
 

@@ -215,11 +215,18 @@ impl GpuTrainer {
 
         let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &drawn.images, *dims));
         let codes: Vec<&Buffer> = [&direction].into_iter().chain(&appearance).collect();
-        let step = self.shape.net.forward(gpu, &self.weights.values, samples, &features, &codes, background, true);
         let left_out = gpu.either(&drawn.left_out, &marched.cut);
         let target = Target { rgba: &drawn.target, background, left_out: &left_out };
-        let d = loss::loss(gpu, s.terms, samples, &step.out, target, &marched.packed.offsets, &self.sums);
-        let g = self.shape.net.backward(gpu, &self.weights.values, samples, background, &step, &d, s.near_scaling);
+        let (net, weights, all) = (&self.shape.net, &self.weights.values, &marched.packed.offsets);
+        let g = if s.terms.distortion == 0.0 {
+            let at = net.evaluate(gpu, weights, samples, &features, &codes, true);
+            let d = loss::composite_and_loss(gpu, s.terms, samples, &at.sigma, &at.rgb, target, s.near_scaling, all, &self.sums);
+            net.gradients(gpu, weights, samples, &at, &d)
+        } else {
+            let step = net.forward(gpu, weights, samples, &features, &codes, background, true);
+            let d = loss::loss(gpu, s.terms, samples, &step.out, target, all, &self.sums);
+            net.backward(gpu, weights, samples, background, &step, &d, s.near_scaling)
+        };
 
         self.weights.step(gpu, s.t, s.rate_scale, &g.params);
         if let (false, Some(d_features)) = (self.table.frozen, &g.features) {

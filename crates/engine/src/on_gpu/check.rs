@@ -14,7 +14,7 @@ use diorama_geom::{Camera, Pose};
 use diorama_kernels::gpu::check::{Row, Table};
 use diorama_kernels::gpu::{Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
-use diorama_kernels::ops::composite::{Packed, cpu as composite};
+use diorama_kernels::ops::composite::{Composited, Packed, cpu as composite, reference};
 use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::march::MarchRays;
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
@@ -272,6 +272,39 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let want = [value, error / counted as f64];
             table.close("loss", "sums", &shape, &up(&sums[..2]), &want)?;
             table.close("loss", "counts", &shape, &up(&sums[2..]), &[s as f64, s as f64, 1.0])?;
+
+            // All of it at once, where no distortion counts.
+            let plain = Photometric { distortion: 0.0, ..photometric };
+            value = 0.0;
+            for r in 0..rays {
+                let rgb = [0, 1, 2].map(|k: usize| out.color[r * 3 + k]);
+                let (weights, first) = (&out.weights[p.range(r)], p.range(r).start);
+                let o = RayOutput { rgb, opacity: out.opacity[r], depth: out.depth[r], weights, first };
+                value +=
+                    plain.ray(r, &o, &mut RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut d_weights[p.range(r)] });
+            }
+            for reach in [0.0, near] {
+                let terms = Terms { huber, distortion: 0.0, alpha };
+                let (sigma_gpu, rgb_gpu, sums) = (up(&scene.sigma), up(&rgb), gpu.zeros(SUMS));
+                let g = loss::composite_and_loss(gpu, terms, &on_gpu, &sigma_gpu, &rgb_gpu, target, reach, &on_gpu.offsets, &sums);
+                let d = Composited { color: wide(&d_color), depth: vec![0.0; rays], opacity: wide(&d_opacity), weights: vec![0.0; s] };
+                let (sigma, background) = (wide(&scene.sigma), wide(&gpu.read(&background)?));
+                let (ds, dc, db) = reference::backward(&p, &sigma, &wide(&rgb), 3, &background, &d);
+                let kept = |i: usize| if reach > 0.0 { ((scene.t[i] + 0.5 * scene.dt[i]) / reach).min(1.0).powi(2) as f64 } else { 1.0 };
+                let shape = format!("{shape} near scaling {reach}");
+                table.close("composite + loss", "d sigma", &shape, &g.sigma, &(0..s).map(|i| ds[i] * kept(i)).collect::<Vec<_>>())?;
+                table.close(
+                    "composite + loss",
+                    "d rgb",
+                    &shape,
+                    &g.features,
+                    &(0..s * 3).map(|i| dc[i] * kept(i / 3)).collect::<Vec<_>>(),
+                )?;
+                table.close("composite + loss", "d background", &shape, &g.background, &db)?;
+                let sums = gpu.read(&sums)?;
+                table.close("composite + loss", "sums", &shape, &up(&sums[..2]), &[value, error / counted as f64])?;
+                table.close("composite + loss", "counts", &shape, &up(&sums[2..]), &[s as f64, s as f64, 1.0])?;
+            }
         }
         // Gradients close to the camera.
         let (d_sigma, d_rgb) = (random(s, 3), random(s * 3, 4));

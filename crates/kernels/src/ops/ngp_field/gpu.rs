@@ -4,7 +4,7 @@ pub mod loss;
 
 use super::{FieldNet, Head};
 use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Rows, Swap, units};
-use crate::ops::composite::gpu::{self as composite, GpuComposited, GpuPacked};
+use crate::ops::composite::gpu::{self as composite, GpuComposited, GpuGradients, GpuPacked};
 use crate::ops::fused_mlp::Mlp;
 use crate::ops::fused_mlp::gpu::fused::{Element, Fused, Kept, tensor_element};
 use crate::ops::fused_mlp::gpu::{self as mlp, columns};
@@ -83,21 +83,11 @@ impl GpuNet {
         }
     }
 
-    /// Evaluates and composites packed samples; with `keep` ready for [`GpuNet::backward`].
+    /// Densities and colours of packed samples; with `keep` ready for [`GpuNet::gradients`].
     ///
     /// # Shapes
-    /// features: as the network reads them; codes: `[R, K_i]`; background: `[R, 3]`.
-    #[allow(clippy::too_many_arguments)]
-    pub fn forward(
-        &self,
-        gpu: &Gpu,
-        params: &Buffer,
-        p: &GpuPacked,
-        features: &Buffer,
-        codes: &[&Buffer],
-        background: &Buffer,
-        keep: bool,
-    ) -> GpuStep {
+    /// features: as the network reads them; codes: `[R, K_i]`.
+    pub fn evaluate(&self, gpu: &Gpu, params: &Buffer, p: &GpuPacked, features: &Buffer, codes: &[&Buffer], keep: bool) -> Evaluated {
         let rows = p.rows();
         let mut inputs = vec![features.clone()];
         for (code, width) in codes.iter().zip(&self.net.mlp.input_widths[1..]) {
@@ -119,29 +109,31 @@ impl GpuNet {
                 (Values::Layers(values), sigma, rgb)
             }
         };
-        let out = composite::forward(gpu, p, &sigma, &rgb, 3, background);
-        GpuStep { out, inputs, values, sigma, rgb }
+        Evaluated { inputs, values, sigma, rgb }
     }
 
-    /// Gradients, given those of what compositing gave; see [`super::StepInput::near_scaling`].
+    /// [`GpuNet::evaluate`], composited on a background `[R, 3]`.
     #[allow(clippy::too_many_arguments)]
-    pub fn backward(
+    pub fn forward(
         &self,
         gpu: &Gpu,
         params: &Buffer,
         p: &GpuPacked,
+        features: &Buffer,
+        codes: &[&Buffer],
         background: &Buffer,
-        step: &GpuStep,
-        d: &GpuComposited,
-        near_scaling: f32,
-    ) -> GpuStepGradients {
+        keep: bool,
+    ) -> GpuStep {
+        let at = self.evaluate(gpu, params, p, features, codes, keep);
+        let out = composite::forward(gpu, p, &at.sigma, &at.rgb, 3, background);
+        GpuStep { out, at }
+    }
+
+    /// Gradients of parameters, features and codes, given those of densities and colours.
+    pub fn gradients(&self, gpu: &Gpu, params: &Buffer, p: &GpuPacked, at: &Evaluated, g: &GpuGradients) -> GpuStepGradients {
         let (rows, net) = (p.rows(), &self.net);
-        let g = composite::backward(gpu, p, &step.rgb, 3, background, &step.out, d);
-        if near_scaling > 0.0 {
-            soften(gpu, p, &g.sigma, &g.features, near_scaling);
-        }
-        let inputs: Vec<&Buffer> = step.inputs.iter().collect();
-        let (d_params, d_inputs) = match (&self.fused, &step.values) {
+        let inputs: Vec<&Buffer> = at.inputs.iter().collect();
+        let (d_params, d_inputs) = match (&self.fused, &at.values) {
             (Some([whole, _]), Values::Kept(kept)) => {
                 // The loss is a mean over rays.
                 let scale = (p.rays().max(1) as f32 * HALF_SCALE).log2().floor().exp2();
@@ -149,7 +141,7 @@ impl GpuNet {
             }
             (_, Values::Layers(values)) => {
                 let mut seeds: Vec<Option<Buffer>> = net.mlp.layers.iter().map(|_| None).collect();
-                for (h, channels, out, d) in [(net.sigma, 1, &step.sigma, &g.sigma), (net.rgb, 3, &step.rgb, &g.features)] {
+                for (h, channels, out, d) in [(net.sigma, 1, &at.sigma, &g.sigma), (net.rgb, 3, &at.rgb, &g.features)] {
                     let slope = linear::before_activation(gpu, &rows, channels, h.activation, out, d);
                     let width = net.mlp.layers[h.layer].width;
                     let seed = seeds[h.layer].get_or_insert_with(|| gpu.zeros(rows.most * width));
@@ -162,7 +154,8 @@ impl GpuNet {
         };
         let mut d_inputs = d_inputs.into_iter();
         let features = d_inputs.next().flatten().map(|d| {
-            if self.per_level > 0 && !self.in_levels() { turn(gpu, &rows, &d, self.per_level, net.mlp.input_widths[0], false) } else { d }
+            let turned = self.per_level > 0 && !self.in_levels();
+            if turned { turn(gpu, &rows, &d, self.per_level, net.mlp.input_widths[0], false) } else { d }
         });
         let codes = d_inputs.zip(&net.mlp.input_widths[1..]).map(|(d, width)| {
             d.map(|d| {
@@ -171,7 +164,26 @@ impl GpuNet {
                 sum
             })
         });
-        GpuStepGradients { codes: codes.collect(), params: d_params, features, background: g.background }
+        GpuStepGradients { codes: codes.collect(), params: d_params, features, background: g.background.clone() }
+    }
+
+    /// [`GpuNet::gradients`], given those of what compositing gave; see [`super::StepInput::near_scaling`].
+    #[allow(clippy::too_many_arguments)]
+    pub fn backward(
+        &self,
+        gpu: &Gpu,
+        params: &Buffer,
+        p: &GpuPacked,
+        background: &Buffer,
+        step: &GpuStep,
+        d: &GpuComposited,
+        near_scaling: f32,
+    ) -> GpuStepGradients {
+        let g = composite::backward(gpu, p, &step.at.rgb, 3, background, &step.out, d);
+        if near_scaling > 0.0 {
+            soften(gpu, p, &g.sigma, &g.features, near_scaling);
+        }
+        self.gradients(gpu, params, p, &step.at, &g)
     }
 }
 
@@ -184,13 +196,18 @@ enum Values {
     Layers(Vec<Buffer>),
 }
 
+/// Densities `[S]` and colours `[S, 3]`, and what a backward pass needs beside them.
+pub struct Evaluated {
+    inputs: Vec<Buffer>,
+    values: Values,
+    pub sigma: Buffer,
+    pub rgb: Buffer,
+}
+
 /// What a backward pass needs of the forward one.
 pub struct GpuStep {
     pub out: GpuComposited,
-    inputs: Vec<Buffer>,
-    values: Values,
-    sigma: Buffer,
-    rgb: Buffer,
+    at: Evaluated,
 }
 
 /// Gradients of a step.

@@ -1,7 +1,7 @@
 //! The photometric loss of a batch of rays: colour, opacity and distortion, each a mean over the rays.
 
 use crate::gpu::{Buffer, CUBE, Gpu, units};
-use crate::ops::composite::gpu::{GpuComposited, GpuPacked};
+use crate::ops::composite::gpu::{GpuComposited, GpuGradients, GpuPacked};
 use crate::ops::distortion;
 use cubecl::prelude::*;
 
@@ -31,6 +31,59 @@ pub struct Target<'a> {
     pub background: &'a Buffer,
     /// Rays that do not count: not 0, `[R]`.
     pub left_out: &'a Buffer,
+}
+
+/// Composites packed samples with densities `[S]` and colours `[S, 3]`, compares them, and takes the gradients back to
+/// both, all rays in one launch; adds the step's figures to `sums` `[SUMS]`. For terms without distortion, which
+/// needs sums over a ray's pairs of samples. Gradients closer than `near_scaling` are scaled as by [`super::soften`].
+#[allow(clippy::too_many_arguments)]
+pub fn composite_and_loss(
+    gpu: &Gpu,
+    terms: Terms,
+    p: &GpuPacked,
+    sigma: &Buffer,
+    rgb: &Buffer,
+    target: Target,
+    near_scaling: f32,
+    marched: &Buffer,
+    sums: &Buffer,
+) -> GpuGradients {
+    assert!(terms.distortion == 0.0, "composite and loss: no distortion");
+    let r = p.rays();
+    let (values, errors) = (gpu.empty(r), gpu.empty(r));
+    let g = GpuGradients { sigma: gpu.empty(sigma.len()), features: gpu.empty(rgb.len()), background: gpu.empty(r * 3) };
+    if r == 0 {
+        return g;
+    }
+    // SAFETY: units past the rays stop; offsets bound the samples.
+    unsafe {
+        blend_and_compare::launch_unchecked(
+            &gpu.client,
+            units(r),
+            CubeDim::new_1d(CUBE),
+            p.offsets.arg(),
+            p.t.arg(),
+            p.dt.arg(),
+            sigma.arg(),
+            rgb.arg(),
+            target.rgba.arg(),
+            target.background.arg(),
+            target.left_out.arg(),
+            g.sigma.arg(),
+            g.features.arg(),
+            g.background.arg(),
+            values.arg(),
+            errors.arg(),
+            r as u32,
+            1.0 / r as f32,
+            terms.huber,
+            terms.alpha,
+            near_scaling,
+        );
+    }
+    // Nothing is read of it.
+    add_up(gpu, p, target.left_out, &values, &errors, &values, 0.0, marched, sums);
+    g
 }
 
 /// Gradients of what compositing gave; adds the step's figures to `sums` `[SUMS]`.
@@ -63,21 +116,38 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
         );
     }
     let (spread, weights) = distortion::gpu::both(gpu, p, &out.weights, &d_spread);
-    let parts = gpu.empty(PARTS * 3);
+    add_up(gpu, p, target.left_out, &values, &errors, &spread, terms.distortion, marched, sums);
+    GpuComposited { weights, ..d }
+}
+
+/// Adds a step's figures to `sums`.
+#[allow(clippy::too_many_arguments)]
+fn add_up(
+    gpu: &Gpu,
+    p: &GpuPacked,
+    left_out: &Buffer,
+    values: &Buffer,
+    errors: &Buffer,
+    spread: &Buffer,
+    distortion: f32,
+    marched: &Buffer,
+    sums: &Buffer,
+) {
+    let (r, parts) = (p.rays() as u32, gpu.empty(PARTS * 3));
     // SAFETY: units past the parts stop; offsets hold one number more than there are rays.
     unsafe {
         gather::launch_unchecked(
             &gpu.client,
             units(PARTS),
-            cube,
-            target.left_out.arg(),
+            CubeDim::new_1d(CUBE),
+            left_out.arg(),
             values.arg(),
             errors.arg(),
             spread.arg(),
             parts.arg(),
-            r as u32,
+            r,
             PARTS as u32,
-            terms.distortion,
+            distortion,
         );
         finish::launch_unchecked(
             &gpu.client,
@@ -87,11 +157,133 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
             p.offsets.arg(),
             marched.arg(),
             sums.arg(),
-            r as u32,
+            r,
             PARTS as u32,
         );
     }
-    GpuComposited { weights, ..d }
+}
+
+/// A channel's error.
+#[derive(CubeType)]
+struct Error {
+    value: f32,
+    slope: f32,
+    squared: f32,
+}
+
+#[cube]
+fn color_error(d: f32, huber: f32) -> Error {
+    let mut value = d * d;
+    let mut slope = 2.0 * d;
+    if huber > 0.0 {
+        if d.abs() <= huber {
+            value /= 2.0 * huber;
+            slope = d / huber;
+        } else {
+            value = d.abs() - 0.5 * huber;
+            slope = 1.0f32;
+            if d < 0.0 {
+                slope = -1.0f32;
+            }
+        }
+    }
+    Error { value, slope, squared: d * d }
+}
+
+#[cube(launch_unchecked)]
+fn blend_and_compare(
+    offsets: &[u32],
+    t: &[f32],
+    dt: &[f32],
+    sigma: &[f32],
+    rgb: &[f32],
+    rgba: &[f32],
+    background: &[f32],
+    left_out: &[u32],
+    d_sigma: &mut [f32],
+    d_rgb: &mut [f32],
+    d_background: &mut [f32],
+    values: &mut [f32],
+    errors: &mut [f32],
+    rays: u32,
+    scale: f32,
+    huber: f32,
+    alpha: f32,
+    near: f32,
+) {
+    let r = ABSOLUTE_POS;
+    if r >= rays as usize {
+        terminate!();
+    }
+    let first = offsets[r] as usize;
+    let count = offsets[r + 1] as usize - first;
+    let mut light = 1.0f32;
+    let mut color = Array::<f32>::new(3usize);
+    #[unroll]
+    for k in 0..3usize {
+        color[k] = 0.0;
+    }
+    for j in 0..count {
+        let i = first + j;
+        let through = (-sigma[i] * dt[i]).exp();
+        let w = light * (1.0 - through);
+        light *= through;
+        // Kept where the gradient will be.
+        d_sigma[i] = w;
+        #[unroll]
+        for k in 0..3usize {
+            color[k] += w * rgb[i * 3 + k];
+        }
+    }
+    let mut counts = scale;
+    if left_out[r] != 0 {
+        counts = 0.0f32;
+    }
+    let a = rgba[r * 4 + 3];
+    let off = 1.0 - light - a;
+    let mut value = alpha * off * off;
+    let mut error = 0.0f32;
+    let d_opacity = counts * alpha * 2.0 * off;
+    let mut out = -d_opacity;
+    let mut d_color = Array::<f32>::new(3usize);
+    #[unroll]
+    for k in 0..3usize {
+        let behind = background[r * 3 + k];
+        let e = color_error(color[k] + light * behind - (rgba[r * 4 + k] * a + behind * (1.0 - a)), huber);
+        value += e.value / 3.0;
+        error += e.squared / 3.0;
+        let d = counts * e.slope / 3.0;
+        d_color[k] = d;
+        d_background[r * 3 + k] = light * d;
+        out += d * behind;
+    }
+    if counts == 0.0 {
+        value = 0.0f32;
+        error = 0.0f32;
+    }
+    values[r] = value;
+    errors[r] = error;
+    // From the back, where what is still behind is small.
+    let mut after = light;
+    let mut behind = light * out;
+    for j in 0..count {
+        let i = first + count - 1 - j;
+        let w = d_sigma[i];
+        let mut kept = 1.0f32;
+        if near > 0.0 {
+            let share = min((t[i] + 0.5 * dt[i]) / near, 1.0);
+            kept = share * share;
+        }
+        let mut g = 0.0f32;
+        #[unroll]
+        for k in 0..3usize {
+            g += d_color[k] * rgb[i * 3 + k];
+            d_rgb[i * 3 + k] = kept * w * d_color[k];
+        }
+        d_sigma[i] = kept * dt[i] * (after * g - behind);
+        behind += w * g;
+        after += w;
+    }
 }
 
 #[cube(launch_unchecked)]
@@ -126,23 +318,10 @@ fn compare(
     #[unroll]
     for k in 0..3usize {
         let d = color[r * 3 + k] - (rgba[r * 4 + k] * a + background[r * 3 + k] * (1.0 - a));
-        let mut v = d * d;
-        let mut slope = 2.0 * d;
-        error += v;
-        if huber > 0.0 {
-            if d.abs() <= huber {
-                v /= 2.0 * huber;
-                slope = d / huber;
-            } else {
-                v = d.abs() - 0.5 * huber;
-                slope = 1.0f32;
-                if d < 0.0 {
-                    slope = -1.0f32;
-                }
-            }
-        }
-        value += v / 3.0;
-        d_color[r * 3 + k] = counts * slope * scale / 3.0;
+        let e = color_error(d, huber);
+        error += e.squared;
+        value += e.value / 3.0;
+        d_color[r * 3 + k] = counts * e.slope * scale / 3.0;
     }
     let d = opacity[r] - a;
     value += alpha * d * d;
