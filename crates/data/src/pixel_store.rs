@@ -14,6 +14,9 @@ pub const DEFAULT_BUDGET: u64 = 4 << 30;
 /// Stream of the random numbers by which pixels are kept.
 const KEPT: u64 = 15;
 
+/// Mask values from which a pixel counts.
+const COUNTS: u8 = 128;
+
 /// Pixels of some frames, four bytes each: RGB and alpha (255 where the photograph has none).
 pub struct PixelStore {
     bytes: Vec<u8>,
@@ -86,9 +89,25 @@ impl PixelStore {
             return (x, y);
         }
         let ((w, h), (x0, y0)) = (self.sizes[i], (x / s * s, y / s * s));
-        let random = Rng::new(i as u64, KEPT).bits((y0 as u64) << 32 | x0 as u64);
+        let random = self.kept_by(i).bits((y0 as u64) << 32 | x0 as u64);
         // Squares at the right and lower edge are cut off.
         (x0 + random as u32 % s.min(w - x0), y0 + (random >> 32) as u32 % s.min(h - y0))
+    }
+
+    /// The random numbers by which frame `i`'s pixels were kept: number `y << 32 | x` of a square's corner gives the
+    /// place in the square, x by the lower half, y by the upper.
+    pub fn kept_by(&self, i: usize) -> Rng {
+        Rng::new(i as u64, KEPT)
+    }
+
+    /// RGBA of frame `i`'s kept pixels, square by square.
+    pub fn kept(&self, i: usize) -> &[[u8; 4]] {
+        self.bytes[self.offsets[i]..self.offsets[i + 1]].as_chunks().0
+    }
+
+    /// Which of them count; none: all.
+    pub fn counting(&self, i: usize) -> Option<impl Iterator<Item = bool>> {
+        self.masks[i].as_ref().map(|m| m.iter().map(|v| *v >= COUNTS))
     }
 
     pub fn len(&self) -> usize {
@@ -120,7 +139,7 @@ impl PixelStore {
     /// Whether such a pixel counts: not masked away.
     #[inline]
     pub fn counts(&self, i: usize, x: u32, y: u32) -> bool {
-        self.masks[i].as_ref().is_none_or(|m| m[self.square(i, x, y)] >= 128)
+        self.masks[i].as_ref().is_none_or(|m| m[self.square(i, x, y)] >= COUNTS)
     }
 
     /// One of so many by so many pixels is kept; 1: all are.

@@ -1,13 +1,14 @@
 //! The parts of a training step on a device against what the CPU does.
 
 use super::GpuTracer;
-use crate::fields;
+use crate::fields::{self, Batch, FieldBuffers};
 use crate::losses::{ColorLoss, Photometric};
 use crate::renderers::volume::{self, Quality, Sampling, Tracer};
 use crate::samplers::RayBatch;
 use crate::samplers::occupancy::{OCCUPIED, Occupancy};
-use crate::samplers::pixels::{self, DrawOptions, PixelSource};
-use diorama_geom::contraction::contract;
+use crate::samplers::pixels::{self, DrawOptions, ErrorMap, PixelSource};
+use crate::samplers::stratified;
+use diorama_geom::contraction::{contract, contract_backward};
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, Pose};
@@ -16,15 +17,18 @@ use diorama_kernels::gpu::{Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::composite::{Composited, Packed, cpu as composite, reference};
 use diorama_kernels::ops::hash_grid::HashGridConfig;
-use diorama_kernels::ops::march::MarchRays;
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuRays, Space};
+use diorama_kernels::ops::march::{MarchRays, Marched};
 use diorama_kernels::ops::ngp_field::gpu as field;
-use diorama_kernels::ops::ngp_field::gpu::loss::{self, SUMS, Target, Terms};
+use diorama_kernels::ops::ngp_field::gpu::loss::{self, Figures, SUMS, Target, Terms};
 use diorama_kernels::ops::ngp_field::{RayGradient, RayLoss, RayOutput};
-use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, GpuPhotographs};
-use diorama_kernels::ops::ray_generation::PosedCamera;
+use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
+use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, CELLS, GpuPhotographs};
+use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
+use diorama_kernels::ops::ray_generation::{self, CORRECTION, PosedCamera};
+use diorama_kernels::ops::sample_pdf::gpu::strata;
 use diorama_testkit::{random, random_unit, wide};
 
 /// Runs all cases.
@@ -33,14 +37,33 @@ use diorama_testkit::{random, random_unit, wide};
 /// When the device is lost; wrong results are rows with a fault.
 pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
     let mut table = Table::new(gpu);
-    for case in [draws, spaces, prunings, grids, losses, look_ups, views] {
+    for case in [draws, strata_cases, corrections, spaces, prunings, grids, losses, look_ups, views, other_views] {
         case(gpu, &mut table)?;
     }
     Ok(table.rows)
 }
 
-/// Two photographs of unlike size; the left half of the second may not be trained on.
-struct Two;
+/// Two photographs of unlike size, of which one of so many by so many pixels was kept; the left half of the second may
+/// not be trained on.
+struct Two {
+    stride: u32,
+}
+
+impl Two {
+    fn kept_by(image: usize) -> Rng {
+        Rng::new(image as u64, 77)
+    }
+
+    /// What was kept, square by square.
+    fn kept(&self) -> Vec<(usize, u32, u32)> {
+        let s = self.stride;
+        let squares = |i: usize| {
+            let (w, h) = self.size(i);
+            (0..h.div_ceil(s)).flat_map(move |y| (0..w.div_ceil(s)).map(move |x| (i, x * s, y * s)))
+        };
+        (0..2).flat_map(squares).map(|(i, x, y)| (i, self.snap(i, x, y))).map(|(i, (x, y))| (i, x, y)).collect()
+    }
+}
 
 impl PixelSource for Two {
     fn images(&self) -> usize {
@@ -48,6 +71,12 @@ impl PixelSource for Two {
     }
     fn size(&self, image: usize) -> (u32, u32) {
         [(8, 4), (33, 7)][image]
+    }
+    fn snap(&self, image: usize, x: u32, y: u32) -> (u32, u32) {
+        let (s, (w, h)) = (self.stride, self.size(image));
+        let (x0, y0) = (x / s * s, y / s * s);
+        let random = Two::kept_by(image).bits((y0 as u64) << 32 | x0 as u64);
+        (x0 + random as u32 % s.min(w - x0), y0 + (random >> 32) as u32 % s.min(h - y0))
     }
     fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4] {
         [x as u8 * 7, y as u8 * 30, image as u8, 200 + x as u8]
@@ -58,36 +87,160 @@ impl PixelSource for Two {
 }
 
 fn draws(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
-    let sizes = [Two.size(0), Two.size(1)];
-    let every: Vec<(usize, u32, u32)> =
-        (0..2).flat_map(|i| (0..sizes[i].1).flat_map(move |y| (0..sizes[i].0).map(move |x| (i, x, y)))).collect();
-    let words: Vec<u32> = every.iter().map(|(i, x, y)| u32::from_le_bytes(Two.rgba(*i, *x, *y))).collect();
-    let mut mask = vec![0u32; words.len().div_ceil(32)];
-    every.iter().enumerate().for_each(|(at, (i, x, y))| mask[at / 32] |= (Two.counts(*i, *x, *y) as u32) << (at % 32));
-    let photographs = GpuPhotographs::upload(gpu, &sizes, &words, Some(&mask));
-    let camera = PosedCamera { camera: Camera::pinhole(8, 4, 1.0), pose: Pose::look_at(DVec3::X, DVec3::ZERO, DVec3::Z) };
-    let (rng, back) = (Rng::new(3, 1), Rng::new(3, 2));
-    // Counters beyond 32 bits, too.
-    for (n, first) in [(0, 0), (1, 5), (700, (1 << 33) + 12_345)] {
-        let mut batch = RayBatch::default();
-        batch.resize(n);
-        let o = DrawOptions { cameras: &[camera; 2], first, rng, near: 0.1, cube: (0.0, 1.0), error_map: None };
-        pixels::draw(&Two, &o, &mut batch);
-        let drawn = photographs.draw(gpu, n, first, &rng, Backdrop::Random(back));
-        let (shape, exact) = (format!("R={n} from {first}"), |v: &[f32]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>());
-        table.equal("draw", "images", &shape, &drawn.images, &batch.images)?;
-        table.equal("draw", "pixels", &shape, &drawn.pixels, &exact(&batch.pixels))?;
-        table.equal("draw", "jitter", &shape, &drawn.jitter, &exact(&batch.jitter))?;
-        let refused: Vec<u32> = batch.target.chunks_exact(4).map(|t| t[0].is_nan() as u32).collect();
-        table.equal("draw", "left out", &shape, &drawn.left_out, &refused)?;
-        let background: Vec<f32> = (0..n * 3).map(|i| back.uniform(first * 3 + i as u64)).collect();
-        table.equal("draw", "background", &shape, &drawn.background, &exact(&background))?;
-        let mut got = gpu.read(&drawn.target)?;
-        got.chunks_exact_mut(4).zip(&refused).filter(|(_, r)| **r == 1).for_each(|(t, _)| t.fill(0.0));
-        batch.target.chunks_exact_mut(4).zip(&refused).filter(|(_, r)| **r == 1).for_each(|(t, _)| t.fill(0.0));
-        table.close("draw", "target", &shape, &gpu.upload(&got), &wide(&batch.target))?;
-        let color = photographs.draw(gpu, n, first, &rng, Backdrop::Color([0.25, 0.5, 0.75])).background;
-        table.close("draw", "one background", &shape, &color, &wide(&[0.25, 0.5, 0.75].repeat(n)))?;
+    // Errors whose roots add up exactly, so that the same cells are drawn.
+    let mut errors = ErrorMap::new(2);
+    errors.errors.iter_mut().enumerate().for_each(|(i, e)| *e = [0.0625, 0.0, 1.0, 0.25][i * 7 % 4]);
+    errors.refresh();
+    for (stride, map) in [(1, None), (3, None), (1, Some(&errors))] {
+        let two = Two { stride };
+        let (sizes, kept) = ([two.size(0), two.size(1)], two.kept());
+        let words: Vec<u32> = kept.iter().map(|(i, x, y)| u32::from_le_bytes(two.rgba(*i, *x, *y))).collect();
+        let mut mask = vec![0u32; words.len().div_ceil(32)];
+        kept.iter().enumerate().for_each(|(at, (i, x, y))| mask[at / 32] |= (two.counts(*i, *x, *y) as u32) << (at % 32));
+        let photographs = GpuPhotographs::upload(gpu, &sizes, stride, &[0, 1].map(Two::kept_by), &words, Some(&mask));
+        let camera = PosedCamera { camera: Camera::pinhole(8, 4, 1.0), pose: Pose::look_at(DVec3::X, DVec3::ZERO, DVec3::Z) };
+        let on_gpu = map.map(|m| GpuErrorMap::upload(gpu, &m.errors, &m.drawn));
+        let (rng, back) = (Rng::new(3, 1), Rng::new(3, 2));
+        // Counters beyond 32 bits, too.
+        for (n, first) in [(0, 0), (1, 5), (700, (1 << 33) + 12_345)] {
+            let mut batch = RayBatch::default();
+            batch.resize(n);
+            let o = DrawOptions { cameras: &[camera; 2], first, rng, near: 0.1, cube: (0.0, 1.0), error_map: map };
+            pixels::draw(&two, &o, &mut batch);
+            let drawn = photographs.draw(gpu, n, first, &rng, on_gpu.as_ref(), Backdrop::Random(back));
+            let (shape, exact) =
+                (format!("R={n} from {first} 1 of {stride}²{}", if map.is_some() { " by error" } else { "" }), |v: &[f32]| {
+                    v.iter().map(|v| v.to_bits()).collect::<Vec<_>>()
+                });
+            table.equal("draw", "images", &shape, &drawn.images, &batch.images)?;
+            table.equal("draw", "pixels", &shape, &drawn.pixels, &exact(&batch.pixels))?;
+            table.equal("draw", "jitter", &shape, &drawn.jitter, &exact(&batch.jitter))?;
+            let refused: Vec<u32> = batch.target.chunks_exact(4).map(|t| t[0].is_nan() as u32).collect();
+            table.equal("draw", "left out", &shape, &drawn.left_out, &refused)?;
+            let background: Vec<f32> = (0..n * 3).map(|i| back.uniform(first * 3 + i as u64)).collect();
+            table.equal("draw", "background", &shape, &drawn.background, &exact(&background))?;
+            let mut got = gpu.read(&drawn.target)?;
+            got.chunks_exact_mut(4).zip(&refused).filter(|(_, r)| **r == 1).for_each(|(t, _)| t.fill(0.0));
+            batch.target.chunks_exact_mut(4).zip(&refused).filter(|(_, r)| **r == 1).for_each(|(t, _)| t.fill(0.0));
+            table.close("draw", "target", &shape, &gpu.upload(&got), &wide(&batch.target))?;
+            let color = photographs.draw(gpu, n, first, &rng, on_gpu.as_ref(), Backdrop::Color([0.25, 0.5, 0.75])).background;
+            table.close("draw", "one background", &shape, &color, &wide(&[0.25, 0.5, 0.75].repeat(n)))?;
+
+            let Some(errors_gpu) = &on_gpu else { continue };
+            let (before, seen) = (errors_gpu.read(gpu)?.0, random_unit(n, 4));
+            let mut of_cell = vec![Vec::new(); before.len()];
+            for r in (0..n).filter(|r| refused[*r] == 0) {
+                let (image, (w, h)) = (batch.images[r] as usize, two.size(batch.images[r] as usize));
+                let cell = |at: f32, of: u32| ((at / of as f32 * CELLS as f32) as usize).min(CELLS - 1);
+                of_cell[(image * CELLS + cell(batch.pixels[r * 2 + 1], h)) * CELLS + cell(batch.pixels[r * 2], w)].push(seen[r] as f64);
+            }
+            let mixed = before.iter().zip(&of_cell).map(|(e, seen)| {
+                let kept = 0.9f64.powi(seen.len() as i32);
+                kept * *e as f64 + (1.0 - kept) * seen.iter().sum::<f64>() / seen.len().max(1) as f64
+            });
+            errors_gpu.record(gpu, &photographs, &drawn, &gpu.upload(&seen));
+            table.close("error map", "errors", &shape, &gpu.upload(&errors_gpu.read(gpu)?.0), &mixed.collect::<Vec<_>>())?;
+            // The next draws go by the errors of the start again.
+            let sums = errors.drawn.iter().scan(0.0, |sum, e| {
+                *sum += (*e as f64).sqrt();
+                Some(*sum)
+            });
+            table.close("error map", "sums", &shape, errors_gpu.cdf(), &sums.collect::<Vec<_>>())?;
+        }
+    }
+    Ok(())
+}
+
+/// Samples without a grid, as the CPU places them.
+fn strata_cases(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let (n, m) = (13, 29);
+    for rays in [0, 1, 70] {
+        for jitter in [None, Some((Rng::new(4, 4), (1u64 << 33) + 7))] {
+            let mut batch = RayBatch::default();
+            batch.resize(rays);
+            let near: Vec<f32> = random_unit(rays, 1);
+            batch.near_far = near.iter().enumerate().flat_map(|(i, v)| [*v, v + 0.3 * (i % 5) as f32]).collect();
+            let weights: Vec<f32> = random_unit(rays * n, 2).iter().map(|w| if *w < 0.7 { 0.0 } else { *w }).collect();
+            let (mut coarse, mut fine) = (Marched::default(), Marched::default());
+            stratified::stratified(&batch, n, jitter, &mut coarse);
+            stratified::refine(&coarse, &weights, n, m, jitter, &mut fine);
+            let first = strata::stratified(gpu, &gpu.upload(&batch.near_far), n, jitter);
+            let second = strata::refine(gpu, &first, &gpu.upload(&weights), n, m, jitter);
+            for (name, got, want) in [("stratified", first, coarse), ("refined", second, fine)] {
+                let shape = format!("R={rays} {name}{}", if jitter.is_some() { " jittered" } else { "" });
+                table.equal("strata", "offsets", &shape, &got.offsets, &want.offsets)?;
+                table.close("strata", "starts", &shape, &got.t, &wide(&want.t))?;
+                // Lengths are small differences of starts.
+                let ends = |t: &[f32], dt: &[f32]| t.iter().zip(dt).map(|(t, dt)| t + dt).collect::<Vec<f32>>();
+                let ends_gpu = ends(&gpu.read(&got.t)?, &gpu.read(&got.dt)?);
+                table.close("strata", "ends", &shape, &gpu.upload(&ends_gpu), &wide(&ends(&want.t, &want.dt)))?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Cameras with corrections, and the gradients of rays from those of samples.
+fn corrections(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let base: Vec<PosedCamera> = (0..5)
+        .map(|i| PosedCamera {
+            camera: Camera::pinhole(64, 48, 0.7),
+            pose: Pose::look_at(DVec3::new(2.0, i as f64 - 2.0, 1.0), DVec3::splat(0.5), DVec3::Z),
+        })
+        .collect();
+    let mut numbers = random(5 * CORRECTION, 3);
+    // One as given, one turned by next to nothing.
+    numbers[..CORRECTION].fill(0.0);
+    numbers[CORRECTION..2 * CORRECTION].iter_mut().for_each(|v| *v *= 1e-6);
+    let corrected: Vec<PosedCamera> =
+        base.iter().zip(numbers.chunks_exact(CORRECTION)).map(|(c, d)| c.corrected(&std::array::from_fn(|k| d[k] as f64))).collect();
+    let n = 60;
+    let index: Vec<u32> = (0..n as u32).map(|i| i % 5).collect();
+    let at: Vec<f32> = random_unit(n * 2, 4).iter().map(|v| v * 48.0).collect();
+    let (mut origins, mut dirs) = (vec![0.0; n * 3], vec![0.0; n * 3]);
+    ray_generation::cpu::forward(&corrected, &index, &at, &mut origins, &mut dirs);
+    let cameras = GpuCameras::upload(gpu, &base);
+    // Twice: corrections replace those before.
+    let kept = gpu.upload(&numbers);
+    cameras.correct(gpu, &kept, false);
+    let mut without_focal = numbers.clone();
+    without_focal.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);
+    table.close("camera corrections", "focal lengths kept", "5 cameras", &kept, &wide(&without_focal))?;
+    cameras.correct(gpu, &gpu.upload(&numbers), true);
+    let (o, d) = cameras.forward(gpu, &gpu.upload_u32(&index), &gpu.upload(&at));
+    table.close("camera corrections", "origins", "5 cameras", &o, &wide(&origins))?;
+    table.close("camera corrections", "directions", "5 cameras", &d, &wide(&dirs))?;
+
+    for rays in [0, 1, 80] {
+        let scene = Ragged::new(rays);
+        let (origins, dirs, d) = (random(rays * 3, 4), random(rays * 3, 5), random(scene.t.len() * 3, 6));
+        let (near_far, jitter) = (vec![0.0; rays * 2], vec![0.5; rays]);
+        let r = MarchRays { origins: &origins, dirs: &dirs, near_far: &near_far, jitter: &jitter, resumed: false };
+        let (on_gpu, p) = (GpuRays::upload(gpu, &r), GpuPacked::upload(gpu, &scene.packed()));
+        for space in [Space::Model, Space::Cube(4.0), Space::Centred(4.0), Space::Contracted] {
+            let (mut d_origins, mut d_dirs) = (vec![0.0f64; rays * 3], vec![0.0f64; rays * 3]);
+            for r in 0..rays {
+                for i in scene.packed().range(r) {
+                    let mid = scene.t[i] + 0.5 * scene.dt[i];
+                    let g = [0, 1, 2].map(|k: usize| d[i * 3 + k]);
+                    let x = [0, 1, 2].map(|k: usize| 2.0 * (origins[r * 3 + k] + mid * dirs[r * 3 + k] - 0.5));
+                    let g = match space {
+                        Space::Model => g,
+                        Space::Cube(w) => g.map(|v| v / w),
+                        Space::Centred(w) => g.map(|v| 2.0 * v / w),
+                        Space::Contracted => contract_backward(x, g).map(|v| 0.5 * v),
+                    };
+                    for k in 0..3 {
+                        d_origins[r * 3 + k] += g[k] as f64;
+                        d_dirs[r * 3 + k] += (mid * g[k]) as f64;
+                    }
+                }
+            }
+            let (go, gd) = march::positions_backward(gpu, &on_gpu, &p, &gpu.upload(&d), space);
+            let shape = format!("R={rays} {space:?}");
+            table.close("positions", "d origins", &shape, &go, &d_origins)?;
+            table.close("positions", "d directions", &shape, &gd, &d_dirs)?;
+        }
     }
     Ok(())
 }
@@ -133,8 +286,17 @@ fn spaces(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let cube = model.iter().map(|v| ((v - 0.5) / 4.0 + 0.5) as f64).collect::<Vec<_>>();
         let contracted =
             model.chunks_exact(3).flat_map(|m| contract([m[0], m[1], m[2]].map(|v| 2.0 * (v - 0.5))).map(|v| 0.25 * v as f64 + 0.5));
-        for (space, want) in [(Space::Model, wide(&model)), (Space::Cube(4.0), cube), (Space::Contracted, contracted.collect())] {
-            table.close("positions", "forward", format!("R={rays} {space:?}"), &march::positions(gpu, &on_gpu, &p, space), &want)?;
+        let centred = model.iter().map(|v| (2.0 * (v - 0.5) / 4.0) as f64).collect();
+        let all = [
+            (Space::Model, wide(&model)),
+            (Space::Cube(4.0), cube),
+            (Space::Contracted, contracted.collect()),
+            (Space::Centred(4.0), centred),
+        ];
+        for (space, want) in all {
+            let shape = format!("R={rays} {space:?}");
+            table.close("positions", "forward", &shape, &march::positions(gpu, &on_gpu, &p, space), &want)?;
+            table.close("positions", "points", &shape, &march::to_space(gpu, &gpu.upload(&model), space), &want)?;
         }
     }
     Ok(())
@@ -235,6 +397,7 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let (distortion, alpha) = (0.3, 0.2);
             let photometric = Photometric { batch: &batch, samples: p, background: &background, color, distortion, alpha };
             let (mut value, mut error, mut counted) = (0.0f64, 0.0f64, 0usize);
+            let mut of_rays = vec![0.0f64; rays];
             let (mut d_color, mut d_opacity, mut d_weights) = (vec![0.0; rays * 3], vec![0.0; rays], vec![0.0; s]);
             for r in 0..rays {
                 let rgb = [0, 1, 2].map(|k: usize| out.color[r * 3 + k]);
@@ -251,7 +414,8 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                 d_opacity[r] = g.opacity;
                 let target = photometric.target(r);
                 if !target[0].is_nan() {
-                    error += (0..3).map(|k| (rgb[k] - target[k]).powi(2) as f64 / 3.0).sum::<f64>();
+                    of_rays[r] = (0..3).map(|k| (rgb[k] - target[k]).powi(2) as f64 / 3.0).sum::<f64>();
+                    error += of_rays[r];
                     counted += 1;
                 }
             }
@@ -263,8 +427,10 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let rgba: Vec<f32> = batch.target.iter().map(|v| if v.is_nan() { 0.3 } else { *v }).collect();
             let (rgba, background, left_out, sums) = (up(&rgba), up(&background), gpu.upload_u32(&left_out), gpu.zeros(SUMS));
             let target = Target { rgba: &rgba, background: &background, left_out: &left_out };
-            let d = loss::loss(gpu, Terms { huber, distortion, alpha }, &on_gpu, &results, target, &on_gpu.offsets, &sums);
+            let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
+            let (d, errors) = loss::loss(gpu, Terms { huber, distortion, alpha }, &on_gpu, &results, target, figures);
             let shape = format!("R={rays} S={s} {color:?}");
+            table.close("loss", "errors", &shape, &errors, &of_rays)?;
             table.close("loss", "d color", &shape, &d.color, &wide(&d_color))?;
             table.close("loss", "d opacity", &shape, &d.opacity, &wide(&d_opacity))?;
             table.close("loss", "d weights", &shape, &d.weights, &wide(&d_weights))?;
@@ -286,7 +452,9 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             for reach in [0.0, near] {
                 let terms = Terms { huber, distortion: 0.0, alpha };
                 let (sigma_gpu, rgb_gpu, sums) = (up(&scene.sigma), up(&rgb), gpu.zeros(SUMS));
-                let g = loss::composite_and_loss(gpu, terms, &on_gpu, &sigma_gpu, &rgb_gpu, target, reach, &on_gpu.offsets, &sums);
+                let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
+                let (g, own_errors) = loss::composite_and_loss(gpu, terms, &on_gpu, &sigma_gpu, &rgb_gpu, target, reach, figures);
+                table.close("composite + loss", "errors", &shape, &own_errors, &wide(&gpu.read(&errors)?))?;
                 let d = Composited { color: wide(&d_color), depth: vec![0.0; rays], opacity: wide(&d_opacity), weights: vec![0.0; s] };
                 let (sigma, background) = (wide(&scene.sigma), wide(&gpu.read(&background)?));
                 let (ds, dc, db) = reference::backward(&p, &sigma, &wide(&rgb), 3, &background, &d);
@@ -343,7 +511,7 @@ fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                 tolerance: 0.0,
                 accelerator: None,
             };
-            let device = GpuTracer::new(gpu.clone(), &f, &occupancy).with_room(room);
+            let device = GpuTracer::new(gpu.clone(), &f, None, Some(&occupancy)).with_room(room);
             let want = on_cpu.view(&camera, &mut |_| {});
             let got = Tracer { accelerator: Some(&device), ..on_cpu }.view(&camera, &mut |_| {});
             let shape = format!("{quality:?} room {room} images={images}");
@@ -353,6 +521,58 @@ fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         }
     }
     Ok(())
+}
+
+/// Views, densities and colours of fields without a grid.
+fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let camera =
+        PosedCamera { camera: Camera::pinhole(6, 5, 0.6), pose: Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z) };
+    let (fine, coarse) = (fields::nerf(1.0, 1e-3, 2, 4, 1, 1), fields::nerf(1.0, 1e-3, 2, 4, 1, 0));
+    let plain = fields::baseline(2.0, 1e-3, 3);
+    for (name, field, guide) in [("nerf", &fine, Some(&coarse)), ("baseline", &plain, None)] {
+        let sampling = match guide {
+            Some(coarse) => Sampling::Hierarchical { coarse, samples: 8, more: 8 },
+            None => Sampling::Stratified { samples: 16 },
+        };
+        let on_cpu = Tracer {
+            field,
+            sampling,
+            backdrop: volume::Backdrop::Color([0.2, 0.5, 0.9]),
+            near: 0.1,
+            cube: (0.0, 1.0),
+            clip: None,
+            pruning: Quality::Full.pruning(),
+            appearance: None,
+            tolerance: 0.0,
+            accelerator: None,
+        };
+        // Room for all rays at once, and for some.
+        for room in [1 << 10, 100] {
+            let device = GpuTracer::new(gpu.clone(), field, guide, None).with_room(room);
+            let want = on_cpu.view(&camera, &mut |_| {});
+            let got = Tracer { accelerator: Some(&device), ..on_cpu }.view(&camera, &mut |_| {});
+            let shape = format!("{name} room {room}");
+            table.close("view", "color", &shape, &gpu.upload(&got.rgb.data), &wide(&want.rgb.data))?;
+            table.close("view", "opacity", &shape, &gpu.upload(&got.opacity.data), &wide(&want.opacity.data))?;
+            table.close("view", "depth", &shape, &gpu.upload(&got.depth.data), &wide(&want.depth.data))?;
+            let (points, mut sigma) = (random_unit(450, 1), vec![0.0; 150]);
+            field.density(&points, &mut sigma);
+            table.close("view", "densities", &shape, &gpu.upload(&device.density(&points)?), &wide(&sigma))?;
+            let dirs: Vec<f32> = points.chunks_exact(3).flat_map(|p| glam_unit(p)).collect();
+            let (offsets, t, dt): (Vec<u32>, _, _) = ((0..=150).collect(), vec![0.0; 150], vec![1e30; 150]);
+            let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
+            let batch = Batch { samples, positions: &points, dirs: &dirs, images: None, background: &vec![0.0; 450], near_scaling: 0.0 };
+            let mut buf = FieldBuffers::default();
+            field.render(&batch, &mut buf);
+            table.close("view", "own colors", &shape, &gpu.upload(&device.color(&points, &dirs)?), &wide(&buf.out.rgb))?;
+        }
+    }
+    Ok(())
+}
+
+fn glam_unit(v: &[f32]) -> [f32; 3] {
+    let length = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt().max(1e-6);
+    [v[0] / length, v[1] / length, v[2] / length]
 }
 
 fn look_ups(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {

@@ -34,10 +34,32 @@ pub enum Sampling<'a> {
     },
 }
 
-/// Traces rays through an occupancy grid elsewhere than on the CPU.
+/// How samples are placed, for who has the field and its grid already.
+#[derive(Clone, Copy, Debug)]
+pub enum Placement {
+    March(MarchConfig),
+    Stratified { samples: usize },
+    Hierarchical { samples: usize, more: usize },
+}
+
+/// Evaluates a field elsewhere than on the CPU.
 pub trait Accelerator: Send + Sync {
-    /// What rays come to before black, and the share of light that passes each; `None` where the device failed.
-    fn trace(&self, batch: &RayBatch, march: &MarchConfig, pruning: Pruning, appearance: Option<u32>) -> Option<(Traced, Vec<f32>)>;
+    /// What rays come to before black, and of marched ones the share of light that passes each; `None` where the
+    /// device failed.
+    fn trace(
+        &self,
+        batch: &RayBatch,
+        placement: &Placement,
+        pruning: Pruning,
+        appearance: Option<u32>,
+    ) -> Option<(Traced, Option<Vec<f32>>)>;
+
+    /// Densities `[N]` at model points `[N, 3]`; `None` where the device failed.
+    fn density(&self, model: &[f32]) -> Option<Vec<f32>>;
+
+    /// The field's own colours `[N, 3]` at model points, seen along unit directions, wearing the mean appearance;
+    /// `None` where the device failed.
+    fn color(&self, model: &[f32], dirs: &[f32]) -> Option<Vec<f32>>;
 
     /// Rays that are worth a call.
     fn rays(&self) -> usize;
@@ -199,6 +221,19 @@ impl Tracer<'_> {
         if let Some((min, max)) = self.clip {
             diorama_kernels::ops::ray_aabb::cpu::intersect(&batch.origins, &batch.dirs, min, max, self.near, &mut batch.near_far);
         }
+        let placement = match self.sampling {
+            Sampling::Occupancy { grid, max_samples } => Placement::March(grid.march_config(max_samples)),
+            Sampling::Stratified { samples } => Placement::Stratified { samples },
+            Sampling::Hierarchical { samples, more, .. } => Placement::Hierarchical { samples, more },
+        };
+        if let Some((mut out, light)) = self.accelerator.and_then(|a| a.trace(batch, &placement, self.pruning, self.appearance)) {
+            if let Some(light) = light
+                && (self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0)
+            {
+                out.make_up(&light, self.pruning.stop);
+            }
+            return self.before_backdrop(batch, out);
+        }
         let out = match self.sampling {
             Sampling::Occupancy { grid, max_samples } => {
                 let rays = MarchRays {
@@ -209,13 +244,6 @@ impl Tracer<'_> {
                     resumed: false,
                 };
                 let march = grid.march_config(max_samples);
-                let elsewhere = self.accelerator.and_then(|a| a.trace(batch, &march, self.pruning, self.appearance));
-                if let Some((mut out, light)) = elsewhere {
-                    if self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0 {
-                        out.make_up(&light, self.pruning.stop);
-                    }
-                    return self.before_backdrop(batch, out);
-                }
                 let (mut marched, mut positions) = (Marched::default(), Vec::new());
                 self.field.visible(&grid.bits, &rays, &march, self.pruning, &mut marched, &mut positions, buf);
                 self.composite(self.field, batch, &marched, &positions, buf);

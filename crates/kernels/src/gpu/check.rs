@@ -191,7 +191,7 @@ fn hash_grids(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                 &hash_grid::reference::forward(&grid, &pw, &tw),
             )?;
             let (dp, dt) = hash_grid::reference::backward(&grid, &pw, &tw, &wide(&d));
-            table.close("hash grid", "d points", &shape, &on_gpu.backward_positions(gpu, &p_gpu, &t_gpu, &d_gpu), &dp)?;
+            table.close("hash grid", "d points", &shape, &on_gpu.backward_positions(gpu, &rows, &p_gpu, &t_gpu, &d_gpu), &dp)?;
             let jacobian = hash_grid::reference::jacobian(&grid, &pw, &tw);
             table.close("hash grid", "jacobian", &shape, &on_gpu.jacobian(gpu, &rows, &p_gpu, &t_gpu), &jacobian)?;
             let djt = hash_grid::reference::jacobian_backward(&grid, &pw, &wide(&dj));

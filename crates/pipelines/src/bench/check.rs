@@ -1,5 +1,7 @@
 //! Every op on a GPU against its reference.
 
+#[cfg(feature = "gpu")]
+use crate::object::config::Method;
 use crate::{PipelineError, Result};
 use std::path::Path;
 
@@ -47,9 +49,20 @@ pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
     let line =
         |r: check::Row| Line { op: r.op, result: r.result, shape: r.shape, error: r.error.is_finite().then_some(r.error), fault: r.fault };
     let mut lines: Vec<Line> = rows.into_iter().map(line).collect();
-    lines.push(training(device, data, "f32")?);
+    let mut cases = vec![("loss per step", "f32", &[][..])];
     if tensor_element(&gpu).is_some() {
-        lines.push(training(device, data, "auto")?);
+        cases.push(("loss, tensor cores", "auto", &[]));
+    }
+    cases.push(("loss, refined cameras", "f32", &["camera.refine=true"]));
+    cases.push(("loss, refined focal lengths", "f32", &["camera.refine=true", "camera.refine_focal=true"]));
+    cases.push(("loss, drawn by error", "f32", &["sampling.error_map=true"]));
+    cases.push(("loss, distortion", "f32", &["loss.distortion=0.01", "background=learned"]));
+    for (result, precision, changes) in cases {
+        lines.push(training(device, data, Method::Ngp, result, precision, changes)?);
+    }
+    for (method, result) in [(Method::Nerf, "loss, nerf"), (Method::Mlp, "loss, mlp"), (Method::Baseline, "loss, baseline")] {
+        let small = ["sampling.rays=16", "sampling.samples=12", "sampling.importance=12"];
+        lines.push(training(device, data, method, result, "f32", &small)?);
     }
     Ok(Report {
         device: gpu.api.name(),
@@ -65,6 +78,9 @@ pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
 /// Steps over which losses are compared.
 #[cfg(feature = "gpu")]
 const STEPS: u64 = 50;
+/// The same of wide networks, which the CPU takes long for.
+#[cfg(feature = "gpu")]
+const WIDE_STEPS: u64 = 10;
 /// How far losses may be apart in f32, and on tensor cores.
 #[cfg(feature = "gpu")]
 const APART: [f64; 2] = [0.02, 0.05];
@@ -72,13 +88,14 @@ const APART: [f64; 2] = [0.02, 0.05];
 /// Small steps of the standard recipe on the device in the given precision, and on the CPU in f32, with the same
 /// rays: by default on the still life.
 #[cfg(feature = "gpu")]
-fn training(device: &str, data: Option<&Path>, precision: &str) -> Result<Line> {
-    use crate::object::config::{Config, Method};
+fn training(device: &str, data: Option<&Path>, method: Method, result: &'static str, precision: &str, changes: &[&str]) -> Result<Line> {
+    use crate::object::config::Config;
     use crate::object::{quickstart, recipe};
+    let steps = if method == Method::Ngp { STEPS } else { WIDE_STEPS };
     let most = APART[(precision != "f32") as usize];
     let scratch = std::env::temp_dir().join(format!("diorama-check-{}", std::process::id()));
     let folder = data.unwrap_or(&scratch);
-    let mut c = Config::new(Method::Ngp, folder.into());
+    let mut c = Config::new(method, folder.into());
     let name = match data {
         Some(d) => d.display().to_string(),
         None => {
@@ -90,10 +107,13 @@ fn training(device: &str, data: Option<&Path>, precision: &str) -> Result<Line> 
     c.data.downscale = if data.is_some() { 4 } else { 1 };
     c.run.log_every = 1;
     (c.sampling.rays, c.sampling.batch_samples, c.sampling.occupancy_points) = (64, 4096, 8192);
+    for (key, value) in changes.iter().filter_map(|c| c.split_once('=')) {
+        c.set(key, value)?;
+    }
     let mut of = |device: &str| {
         c.device = device.into();
         c.field.precision = if device == "cpu" { "f32" } else { precision }.into();
-        recipe::losses(&c, STEPS)
+        recipe::losses(&c, steps)
     };
     let curves = of("cpu").and_then(|cpu| Ok((cpu, of(device)?)));
     if data.is_none() {
@@ -105,8 +125,8 @@ fn training(device: &str, data: Option<&Path>, precision: &str) -> Result<Line> 
     let right = error <= most;
     Ok(Line {
         op: "training",
-        result: if precision == "f32" { "loss per step" } else { "loss, tensor cores" },
-        shape: format!("{STEPS} steps, {name}"),
+        result,
+        shape: format!("{steps} steps, {name}"),
         error: (right && error.is_finite()).then_some(error),
         fault: (!right).then(|| format!("a loss is {:.2} % off, {:.0} % is allowed", 100.0 * error, 100.0 * most)),
     })

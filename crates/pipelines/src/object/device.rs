@@ -6,7 +6,6 @@ use super::recipe::Photographs;
 use crate::error::{PipelineError, Result};
 use diorama_geom::rng::Rng;
 use diorama_kernels::device::Api;
-use diorama_kernels::ops::ray_generation::PosedCamera;
 #[cfg(feature = "gpu")]
 use running::Running;
 
@@ -21,6 +20,11 @@ pub(super) struct Drawing {
     pub probes: Option<Rng>,
     /// Edge of the blocks of cells that share a probe.
     pub block: usize,
+    /// Of samples without an occupancy grid.
+    pub coarse: Rng,
+    pub fine: Rng,
+    /// Whether draws go by the errors as they are after this step.
+    pub refresh_errors: bool,
     pub stretch: f32,
     pub thin: f32,
     pub rate_scale: f32,
@@ -42,54 +46,39 @@ pub(super) struct Opened {
     note: Option<String>,
 }
 
-/// Why a GPU cannot train a configuration.
-fn lacking(config: &Config) -> Option<String> {
-    let what = match config.method {
-        Method::Ngp if config.sampling.error_map => "sampling.error_map".to_string(),
-        Method::Ngp if config.camera.refine => "camera.refine".to_string(),
-        Method::Ngp => return None,
-        m => format!("method {m}"),
-    };
-    Some(format!("{what} trains on the CPU alone"))
-}
-
 /// Finds the device that a configuration asks for; `auto` is the best GPU that is no software, else the CPU.
 ///
 /// # Errors
-/// When a named GPU is not part of the build, absent, or cannot train the configuration.
+/// When a named GPU is not part of the build or absent.
 pub(super) fn open(config: &Config) -> Result<Opened> {
     match &config.device[..] {
         "cpu" => Ok(Opened::cpu(None)),
-        "auto" => Ok(Opened::best(config)),
+        "auto" => Ok(Opened::best()),
         name => {
             let api: Api = name.parse().map_err(PipelineError::Usage)?;
             if !api.is_built() {
                 return Err(PipelineError::Usage(api.not_built()));
-            }
-            if let Some(what) = lacking(config) {
-                return Err(PipelineError::Usage(format!("device {name}: {what}; use --device cpu")));
             }
             Opened::named(api)
         }
     }
 }
 
-/// Lets the named device draw a model's views; what draws them, in words. `auto` is the best GPU that is no software,
-/// else the CPU, which also draws what GPUs cannot.
+/// Lets the named device evaluate a model's field; which that is, in words. `auto` is the best GPU that is no software,
+/// else the CPU.
 ///
 /// # Errors
-/// When a named GPU is not part of the build, absent, or cannot draw the model.
+/// When a named GPU is not part of the build or absent.
 pub fn accelerate(model: &mut ObjectModel, device: &str) -> Result<String> {
-    // What is only trained differently does not matter to views.
     let mut c = Config::new(model.config.method, model.config.data.path.clone());
     c.set("device", device)?;
     let opened = open(&c)?;
     #[cfg(not(feature = "gpu"))]
     drop(opened);
     #[cfg(feature = "gpu")]
-    if let (Some(r), Some(occupancy)) = (opened.running, &model.occupancy) {
-        let tracer = diorama_engine::on_gpu::GpuTracer::new(r.gpu().clone(), &model.field, occupancy);
-        model.accelerator = Some(Box::new(tracer));
+    if let Some(r) = opened.running {
+        let (field, coarse, occupancy) = (&model.field, model.coarse.as_ref(), model.occupancy.as_ref());
+        model.accelerator = Some(Box::new(diorama_engine::on_gpu::GpuTracer::new(r.gpu().clone(), field, coarse, occupancy)));
         return Ok(r.name());
     }
     Ok(cpu_name())
@@ -117,7 +106,7 @@ impl Opened {
 
 #[cfg(not(feature = "gpu"))]
 impl Opened {
-    fn best(_: &Config) -> Opened {
+    fn best() -> Opened {
         Opened::cpu(None)
     }
 
@@ -141,7 +130,11 @@ impl Opened {
         MOST_RAYS
     }
 
-    pub fn upload(&mut self, _: &ObjectModel, _: &Photographs, _: &[PosedCamera]) -> Result<()> {
+    pub fn most_bytes(&self) -> u64 {
+        u64::MAX
+    }
+
+    pub fn upload(&mut self, _: &ObjectModel, _: &Photographs) -> Result<()> {
         Ok(())
     }
 
@@ -161,10 +154,11 @@ impl Opened {
 /// Most rays per step on a CPU; GPUs take eight times as many, as they take samples.
 const MOST_RAYS: usize = 1 << 14;
 
-/// Samples per step.
+/// Samples per step; fewer through networks whose layers' outputs all lie in memory.
 fn batch_samples(config: &Config, is_gpu: bool) -> usize {
     match config.sampling.batch_samples {
-        0 if is_gpu => 1 << 18,
+        0 if is_gpu && config.method == Method::Ngp => 1 << 18,
+        0 if is_gpu => 1 << 17,
         0 => 1 << 15,
         n => n,
     }
@@ -172,15 +166,10 @@ fn batch_samples(config: &Config, is_gpu: bool) -> usize {
 
 #[cfg(feature = "gpu")]
 impl Opened {
-    fn best(config: &Config) -> Opened {
+    fn best() -> Opened {
         use diorama_kernels::gpu::Gpu;
-        let Some(gpu) = Api::ALL.into_iter().filter(|a| a.is_built()).find_map(|a| Gpu::open_hardware(a).ok()) else {
-            return Opened::cpu(None);
-        };
-        match lacking(config) {
-            Some(what) => Opened::cpu(Some(format!("{}: {what}", gpu.name))),
-            None => Opened::gpu(gpu),
-        }
+        let found = Api::ALL.into_iter().filter(|a| a.is_built()).find_map(|a| Gpu::open_hardware(a).ok());
+        found.map_or(Opened::cpu(None), Opened::gpu)
     }
 
     fn named(api: Api) -> Result<Opened> {
@@ -215,12 +204,17 @@ impl Opened {
         if self.is_hardware() { MOST_RAYS * 8 } else { MOST_RAYS }
     }
 
+    /// Most bytes of photographs.
+    pub fn most_bytes(&self) -> u64 {
+        self.running.as_ref().map_or(u64::MAX, |r| r.gpu().largest_buffer())
+    }
+
     /// Brings the model and the photographs to the device.
     ///
     /// # Errors
     /// When they do not fit there.
-    pub fn upload(&mut self, model: &ObjectModel, photographs: &Photographs, cameras: &[PosedCamera]) -> Result<()> {
-        self.running.as_mut().map_or(Ok(()), |r| r.upload(model, photographs, cameras))
+    pub fn upload(&mut self, model: &ObjectModel, photographs: &Photographs) -> Result<()> {
+        self.running.as_mut().map_or(Ok(()), |r| r.upload(model, photographs))
     }
 
     /// One step; its figures are those of the last time that the device was asked.
@@ -255,13 +249,13 @@ mod running {
     use crate::error::{PipelineError, Result};
     use crate::object::model::ObjectModel;
     use crate::object::recipe::Photographs;
-    use diorama_engine::on_gpu::{GpuStep, GpuTrainer};
-    use diorama_engine::samplers::pixels::PixelSource;
+    use diorama_data::pixel_store::PixelStore;
+    use diorama_engine::on_gpu::{GpuStep, GpuTrainer, Placing, Trainees, TraineesMut};
+    use diorama_geom::rng::Rng;
     use diorama_kernels::gpu::{Gpu, GpuError};
     use diorama_kernels::ops::march::gpu::prune::Limits;
     use diorama_kernels::ops::ngp_field::gpu::loss::Terms;
     use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, GpuPhotographs};
-    use diorama_kernels::ops::ray_generation::PosedCamera;
 
     /// Most steps between which the device is not asked how they went.
     const UNASKED: u64 = 16;
@@ -293,14 +287,10 @@ mod running {
             format!("{} ({})", self.gpu.name, self.gpu.api.name())
         }
 
-        pub fn upload(&mut self, m: &ObjectModel, photographs: &Photographs, cameras: &[PosedCamera]) -> Result<()> {
-            if !photographs.are_whole() {
-                let cure = "raise it (--set data.memory_budget=BYTES), raise --downscale, or use --device cpu";
-                return Err(PipelineError::Usage(format!(
-                    "the photographs exceed data.memory_budget, and a GPU takes all of their pixels; {cure}"
-                )));
-            }
-            let bytes = photographs.bytes();
+        pub fn upload(&mut self, m: &ObjectModel, photographs: &Photographs) -> Result<()> {
+            let store = photographs.store();
+            // Of the smallest budgets even 1 of 64 × 64 pixels may be more.
+            let bytes: u64 = (0..store.len()).map(|i| store.kept(i).len() as u64 * 4).sum();
             let most = self.gpu.largest_buffer();
             if bytes > most {
                 return Err(PipelineError::Usage(format!(
@@ -312,9 +302,16 @@ mod running {
             }
             // What was known of steps before belongs to parameters that are gone.
             (self.last, self.rays) = (None, 0);
-            let occupancy = m.occupancy.as_ref().expect("ngp has an occupancy grid");
-            let images = resident(&self.gpu, photographs);
-            self.trainer = Some(GpuTrainer::new(self.gpu.clone(), &m.field, m.learned.as_ref(), occupancy, images, cameras, m.cube()));
+            let of = Trainees {
+                field: &m.field,
+                coarse: m.coarse.as_ref(),
+                learned: m.learned.as_ref(),
+                occupancy: m.occupancy.as_ref(),
+                corrections: m.corrections.as_ref().map(|g| (g, m.config.camera.refine_focal)),
+                error_map: m.error_map.as_ref(),
+            };
+            let images = resident(&self.gpu, store);
+            self.trainer = Some(GpuTrainer::new(self.gpu.clone(), &of, images, &m.base_cameras(), m.cube()));
             Ok(())
         }
 
@@ -324,20 +321,27 @@ mod running {
 
         pub fn step(&mut self, m: &mut ObjectModel, step: u64, d: &Drawing, room: usize) -> Result<StepFigures> {
             let (c, s) = (&m.config, &m.config.sampling);
-            let grid = m.occupancy.as_ref().expect("ngp has an occupancy grid");
+            let placing = match (&m.occupancy, &m.coarse) {
+                (Some(grid), _) => Placing::Occupancy {
+                    march: grid.march_config(s.max_samples).stretched(d.stretch),
+                    limits: Limits { stop: s.stop, min_alpha: s.min_alpha, thin: d.thin, min_weight: 0.0 },
+                    room: (room * ROOM.0, room * ROOM.1),
+                },
+                (None, Some(_)) => Placing::Hierarchical { samples: s.samples, more: s.importance, coarse: d.coarse, fine: d.fine },
+                (None, None) => Placing::Stratified { samples: s.samples, rng: d.coarse },
+            };
             let o = GpuStep {
                 rays: d.rays,
                 first: m.origin.rays,
                 pixels: d.pixels,
                 backdrop: d.background.map_or(Backdrop::Color(m.backdrop_color()), Backdrop::Random),
                 near: s.near,
-                march: grid.march_config(s.max_samples).stretched(d.stretch),
-                limits: Limits { stop: s.stop, min_alpha: s.min_alpha, thin: d.thin, min_weight: 0.0 },
+                placing,
                 terms: Terms { huber: if c.loss.color == "huber" { 0.1 } else { 0.0 }, distortion: c.loss.distortion, alpha: c.loss.alpha },
                 near_scaling: c.loss.near_scaling,
-                room: (room * ROOM.0, room * ROOM.1),
                 t: step as u32 + 1,
                 rate_scale: d.rate_scale,
+                refresh_errors: d.refresh_errors,
             };
             let points = s.occupancy_points;
             let asked = self.last.is_none() || (step + 1).is_multiple_of(UNASKED.min(c.run.log_every));
@@ -372,8 +376,15 @@ mod running {
         }
 
         pub fn download(&mut self, m: &mut ObjectModel) -> Result<()> {
-            let occupancy = m.occupancy.as_mut().expect("ngp has an occupancy grid");
-            self.trainer().download(&mut m.field, m.learned.as_mut(), occupancy).map_err(told)
+            let to = TraineesMut {
+                field: &mut m.field,
+                coarse: m.coarse.as_mut(),
+                learned: m.learned.as_mut(),
+                occupancy: m.occupancy.as_mut(),
+                corrections: m.corrections.as_mut(),
+                error_map: m.error_map.as_mut(),
+            };
+            self.trainer().download(to).map_err(told)
         }
     }
 
@@ -381,40 +392,28 @@ mod running {
         PipelineError::Device(e.to_string())
     }
 
-    /// All pixels, and which of them count.
-    fn resident(gpu: &Gpu, photographs: &Photographs) -> GpuPhotographs {
-        let sizes: Vec<(u32, u32)> = (0..photographs.images()).map(|i| photographs.size(i)).collect();
-        let every = || {
-            let within = |i: usize, (w, h): (u32, u32)| (0..h).flat_map(move |y| (0..w).map(move |x| (i, x, y)));
-            sizes.iter().enumerate().flat_map(move |(i, s)| within(i, *s))
-        };
-        let pixels: Vec<u32> = every().map(|(i, x, y)| u32::from_le_bytes(photographs.rgba(i, x, y))).collect();
-        let mut mask = vec![0u32; pixels.len().div_ceil(32)];
-        let mut all = true;
-        for (at, (i, x, y)) in every().enumerate() {
-            let counts = photographs.counts(i, x, y);
-            mask[at / 32] |= (counts as u32) << (at % 32);
-            all &= counts;
+    /// The pixels that are kept, and which of them count.
+    fn resident(gpu: &Gpu, store: &PixelStore) -> GpuPhotographs {
+        let n = store.len();
+        let sizes: Vec<(u32, u32)> = (0..n).map(|i| store.size(i)).collect();
+        let keys: Vec<Rng> = (0..n).map(|i| store.kept_by(i)).collect();
+        let pixels: Vec<u32> = (0..n).flat_map(|i| store.kept(i).iter().map(|p| u32::from_le_bytes(*p))).collect();
+        let mut mask = vec![u32::MAX; pixels.len().div_ceil(32)];
+        let (mut all, mut first) = (true, 0);
+        for i in 0..n {
+            for (at, _) in store.counting(i).into_iter().flatten().enumerate().filter(|(_, counts)| !counts) {
+                mask[(first + at) / 32] &= !(1 << ((first + at) % 32));
+                all = false;
+            }
+            first += store.kept(i).len();
         }
-        GpuPhotographs::upload(gpu, &sizes, &pixels, (!all).then_some(&mask[..]))
+        GpuPhotographs::upload(gpu, &sizes, store.stride(), &keys, &pixels, (!all).then_some(&mask[..]))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn what_gpus_cannot_train_is_said() {
-        let plain = Config::new(Method::Ngp, "x".into());
-        assert_eq!(lacking(&plain), None);
-        assert!(lacking(&Config::new(Method::Nerf, "x".into())).unwrap().contains("nerf"));
-        for key in ["sampling.error_map", "camera.refine"] {
-            let mut c = plain.clone();
-            c.set(key, "true").unwrap();
-            assert!(lacking(&c).unwrap().contains(key));
-        }
-    }
 
     #[test]
     fn a_device_outside_of_the_build_is_named_with_its_cure() {

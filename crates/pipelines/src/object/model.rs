@@ -315,7 +315,7 @@ impl ObjectModel {
 impl FieldQuery for ObjectModel {
     fn density(&self, points_in_world: &[[f32; 3]], sigma: &mut [f32]) {
         let model = self.model_points(points_in_world);
-        self.field.density(&model, sigma);
+        self.model_density(&model, sigma);
         // Per model unit to per world unit; nothing lies outside of the scene's cube.
         let (low, size) = self.cube();
         let scale = self.model_from_world.scale as f32;
@@ -327,6 +327,11 @@ impl FieldQuery for ObjectModel {
 
     fn color(&self, points_in_world: &[[f32; 3]], directions: &[[f32; 3]], rgb_srgb: &mut [[f32; 3]]) {
         const CHUNK: usize = 1 << 16;
+        let on_device = |a: &dyn Accelerator| a.color(&self.model_points(points_in_world), directions.as_flattened());
+        if let Some(rgb) = self.accelerator.as_deref().and_then(on_device) {
+            rgb_srgb.as_flattened_mut().copy_from_slice(&rgb);
+            return;
+        }
         let mut buf = FieldBuffers::default();
         for ((p, d), out) in points_in_world.chunks(CHUNK).zip(directions.chunks(CHUNK)).zip(rgb_srgb.chunks_mut(CHUNK)) {
             let n = p.len();
@@ -348,6 +353,14 @@ impl FieldQuery for ObjectModel {
 }
 
 impl ObjectModel {
+    /// Densities per model unit `[N]` at model points `[N, 3]`.
+    pub fn model_density(&self, model: &[f32], sigma: &mut [f32]) {
+        match self.accelerator.as_deref().and_then(|a| a.density(model)) {
+            Some(d) => sigma.copy_from_slice(&d),
+            None => self.field.density(model, sigma),
+        }
+    }
+
     fn model_points(&self, points_in_world: &[[f32; 3]]) -> Vec<f32> {
         points_in_world
             .iter()

@@ -36,6 +36,9 @@ const BACKGROUND: u64 = 12;
 const COARSE: u64 = 13;
 const FINE: u64 = 14;
 
+/// Steps between which draws go by the same errors.
+const ERROR_REFRESH: u64 = 16;
+
 /// Steps during which an occupancy sample stands for a block of cells, and that block's edge.
 const OCCUPANCY_WARMUP: (u64, usize) = (256, 2);
 
@@ -95,12 +98,10 @@ pub fn train(
     for note in &capture.notes {
         events(&Event::Note(note.clone()));
     }
-    let store = load_pixels(config, &capture)?;
+    let (store, budget) = load_pixels(config, &capture, &opened)?;
     if let n @ 2.. = store.stride() {
-        events(&Event::Note(format!(
-            "the photographs exceed data.memory_budget ({} MiB): one pixel of each {n} x {n} is trained on",
-            config.data.memory_budget >> 20
-        )));
+        let limit = if budget < config.data.memory_budget { "what the device holds in one piece" } else { "data.memory_budget" };
+        events(&Event::Note(format!("the photographs exceed {limit} ({} MiB): one pixel of each {n} x {n} is trained on", budget >> 20)));
     }
     let has_alpha = store.has_alpha;
     let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
@@ -184,17 +185,20 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
 /// A trainer whose run is not kept.
 fn scratch_trainer(config: &Config) -> Result<Trainer<'static>> {
     let capture = load_capture(config)?;
-    let store = load_pixels(config, &capture)?;
+    let device = device::open(config)?;
+    let (store, _) = load_pixels(config, &capture, &device)?;
     let has_alpha = store.has_alpha;
     let model = ObjectModel::new(config.clone(), capture, has_alpha)?;
-    Trainer::new(model, Photographs(store), Path::new(""), device::open(config)?)
+    Trainer::new(model, Photographs(store), Path::new(""), device)
 }
 
-fn load_pixels(config: &Config, capture: &Capture) -> Result<PixelStore> {
+/// The training pixels, and the bytes that they might take.
+fn load_pixels(config: &Config, capture: &Capture, device: &Opened) -> Result<(PixelStore, u64)> {
     let train = capture.indices(Split::Train);
     let frames: Vec<_> = train.iter().map(|&i| &capture.frames[i]).collect();
-    let options = StoreOptions { downscale: config.data.downscale, budget: config.data.memory_budget };
-    Ok(PixelStore::load(&frames, &options, &|| {})?)
+    let budget = config.data.memory_budget.min(device.most_bytes());
+    let options = StoreOptions { downscale: config.data.downscale, budget };
+    Ok((PixelStore::load(&frames, &options, &|| {})?, budget))
 }
 
 fn run_options(config: &Config) -> RunOptions {
@@ -214,16 +218,9 @@ fn run_options(config: &Config) -> RunOptions {
 pub(super) struct Photographs(PixelStore);
 
 impl Photographs {
-    /// Whether all pixels are at hand.
     #[cfg(feature = "gpu")]
-    pub fn are_whole(&self) -> bool {
-        self.0.stride() == 1
-    }
-
-    /// Bytes of all pixels.
-    #[cfg(feature = "gpu")]
-    pub fn bytes(&self) -> u64 {
-        (0..self.0.len()).map(|i| self.0.size(i)).map(|(w, h)| w as u64 * h as u64 * 4).sum()
+    pub fn store(&self) -> &PixelStore {
+        &self.0
     }
 }
 
@@ -279,7 +276,7 @@ impl<'a> Trainer<'a> {
         let o = &model.config.optim;
         let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
         let cameras = model.cameras();
-        device.upload(&model, &photographs, &cameras)?;
+        device.upload(&model, &photographs)?;
         Ok(Trainer {
             cameras,
             model,
@@ -417,6 +414,9 @@ impl<'a> Trainer<'a> {
             background: self.is_background_random().then(|| Rng::new(seed, BACKGROUND)),
             probes: (step > 0 && step.is_multiple_of(s.occupancy_every)).then(|| Rng::new(seed, OCCUPANCY)),
             block: if step <= until { block } else { 1 },
+            coarse: Rng::new(seed, COARSE),
+            fine: Rng::new(seed, FINE),
+            refresh_errors: step.is_multiple_of(ERROR_REFRESH),
             stretch: stretch(step),
             thin: THIN,
             rate_scale: self.schedule.scale(progress as f32) * m.rate_scale,
@@ -577,7 +577,7 @@ impl Trainee for Trainer<'_> {
         if self.model.corrections.is_some() {
             self.cameras = self.model.cameras();
         }
-        if step.is_multiple_of(16)
+        if step.is_multiple_of(ERROR_REFRESH)
             && let Some(map) = &mut self.model.error_map
         {
             map.refresh();
@@ -613,7 +613,7 @@ impl Trainee for Trainer<'_> {
         self.model.restore(c, self.checkpoints)?;
         self.model.rate_scale *= 0.3;
         self.cameras = self.model.cameras();
-        self.device.upload(&self.model, &self.photographs, &self.cameras)?;
+        self.device.upload(&self.model, &self.photographs)?;
         Ok(Some((self.model.origin.step, "the loss was not finite; the rate is lowered".into())))
     }
 

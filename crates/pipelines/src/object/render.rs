@@ -274,7 +274,7 @@ fn normals(model: &ObjectModel, camera: &PosedCamera, view: &View) -> Vec<[f32; 
         }
     }
     let mut sigma = vec![0.0; points.len() / 3];
-    model.field.density(&points, &mut sigma);
+    model.model_density(&points, &mut sigma);
     sigma
         .chunks_exact(6)
         .map(|s| {

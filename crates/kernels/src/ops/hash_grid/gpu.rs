@@ -51,21 +51,24 @@ impl GpuHashGrid {
     }
 
     /// Gradient of the points `[S, 3]`.
-    pub fn backward_positions(&self, gpu: &Gpu, points: &Buffer, table: &Buffer, d_out: &Buffer) -> Buffer {
+    pub fn backward_positions(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: &Buffer, d_out: &Buffer) -> Buffer {
         let (s, _) = self.work(points);
         let out = gpu.empty(s * 3);
         if s > 0 {
-            // SAFETY: units past `s` stop; rows come from the grid that sized the table.
+            let (live, at) = rows.arg();
+            // SAFETY: units past the points in use stop; rows come from the grid that sized the table.
             unsafe {
                 slope::launch_unchecked(
                     &gpu.client,
                     units(s),
                     CubeDim::new_1d(CUBE),
+                    live,
                     points.arg(),
                     self.levels.arg(),
                     table.arg(),
                     d_out.arg(),
                     out.arg(),
+                    at,
                     s as u32,
                     self.grid.levels.len() as u32,
                     self.grid.config.features,
@@ -239,9 +242,20 @@ fn scatter<A: Accumulate>(
 }
 
 #[cube(launch_unchecked)]
-fn slope(points: &[f32], levels: &[u32], table: &[f32], d_out: &[f32], out: &mut [f32], s: u32, n_levels: u32, #[comptime] f: usize) {
+fn slope(
+    live: &[u32],
+    points: &[f32],
+    levels: &[u32],
+    table: &[f32],
+    d_out: &[f32],
+    out: &mut [f32],
+    at: u32,
+    s: u32,
+    n_levels: u32,
+    #[comptime] f: usize,
+) {
     let p = ABSOLUTE_POS;
-    if p >= s as usize {
+    if p >= live[at as usize] as usize {
         terminate!();
     }
     let mut gx = 0.0f32;

@@ -82,6 +82,8 @@ pub enum Space {
     Cube(f32),
     /// All of space, contracted around the model cube, as `[0, 1]³`.
     Contracted,
+    /// As [`Space::Cube`], but as `[−1, 1]³`.
+    Centred(f32),
 }
 
 impl Space {
@@ -91,6 +93,7 @@ impl Space {
             Space::Model => (0, 1.0),
             Space::Cube(width) => (1, width),
             Space::Contracted => (2, 1.0),
+            Space::Centred(width) => (3, width),
         }
     }
 }
@@ -314,7 +317,49 @@ fn bound(offsets: &[u32], out: &mut [u32], cut: &mut [u32], n: u32, capacity: u3
     }
 }
 
-/// Writes a model point as `[0, 1]³` coordinates of a space.
+/// Model points `[N, 3]` as coordinates of a space.
+pub fn to_space(gpu: &Gpu, points: &Buffer, space: Space) -> Buffer {
+    let (out, n) = (gpu.empty(points.len()), points.len() / 3);
+    if n > 0 {
+        let (kind, width) = space.arg();
+        // SAFETY: units past the points stop.
+        unsafe {
+            convert::launch_unchecked(&gpu.client, units(n), CubeDim::new_1d(CUBE), points.arg(), out.arg(), n as u32, width, kind);
+        }
+    }
+    out
+}
+
+/// Gradients of origins and directions `[R, 3]`, given those of positions `[S, 3]` in a space.
+pub fn positions_backward(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked, d: &Buffer, space: Space) -> (Buffer, Buffer) {
+    let n = samples.rays();
+    let (d_origins, d_dirs) = (gpu.empty(n * 3), gpu.empty(n * 3));
+    if n > 0 {
+        let (kind, width) = space.arg();
+        // SAFETY: offsets bound the samples.
+        unsafe {
+            pull::launch_unchecked(
+                &gpu.client,
+                units(n),
+                CubeDim::new_1d(CUBE),
+                samples.offsets.arg(),
+                samples.t.arg(),
+                samples.dt.arg(),
+                rays.origins.arg(),
+                rays.dirs.arg(),
+                d.arg(),
+                d_origins.arg(),
+                d_dirs.arg(),
+                n as u32,
+                width,
+                kind,
+            );
+        }
+    }
+    (d_origins, d_dirs)
+}
+
+/// Writes a model point as coordinates of a space.
 #[cube]
 fn put(out: &mut [f32], at: usize, x: f32, y: f32, z: f32, width: f32, #[comptime] kind: u32) {
     if comptime!(kind == 0) {
@@ -339,6 +384,101 @@ fn put(out: &mut [f32], at: usize, x: f32, y: f32, z: f32, width: f32, #[comptim
         out[at] = cx * s + 0.5;
         out[at + 1] = cy * s + 0.5;
         out[at + 2] = cz * s + 0.5;
+    }
+    if comptime!(kind == 3) {
+        out[at] = 2.0 * (x - 0.5) / width;
+        out[at + 1] = 2.0 * (y - 0.5) / width;
+        out[at + 2] = 2.0 * (z - 0.5) / width;
+    }
+}
+
+#[cube(launch_unchecked)]
+fn convert(points: &[f32], out: &mut [f32], n: u32, width: f32, #[comptime] kind: u32) {
+    let i = ABSOLUTE_POS;
+    if i >= n as usize {
+        terminate!();
+    }
+    put(out, i * 3, points[i * 3], points[i * 3 + 1], points[i * 3 + 2], width, kind);
+}
+
+/// The sum of `d · ∂put/∂point` over a ray's samples, and the same times their distances.
+#[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
+#[cube(launch_unchecked)]
+fn pull(
+    offsets: &[u32],
+    t: &[f32],
+    dt: &[f32],
+    origins: &[f32],
+    dirs: &[f32],
+    d: &[f32],
+    d_origins: &mut [f32],
+    d_dirs: &mut [f32],
+    rays: u32,
+    width: f32,
+    #[comptime] kind: u32,
+) {
+    let r = ABSOLUTE_POS;
+    if r >= rays as usize {
+        terminate!();
+    }
+    let mut near = Array::<f32>::new(3usize);
+    let mut far = Array::<f32>::new(3usize);
+    let mut point = Array::<f32>::new(3usize);
+    #[unroll]
+    for k in 0..3usize {
+        near[k] = 0.0;
+        far[k] = 0.0;
+    }
+    for i in offsets[r] as usize..offsets[r + 1] as usize {
+        let mid = t[i] + 0.5 * dt[i];
+        let mut scale = 1.0f32;
+        let mut greatest = 0usize;
+        let mut pulled = 0.0f32;
+        if comptime!(kind == 1) {
+            scale = 1.0 / width;
+        }
+        if comptime!(kind == 3) {
+            scale = 2.0 / width;
+        }
+        if comptime!(kind == 2) {
+            // Contracted: c = s(m) x with m the greatest coordinate's size, which has a slope of its own.
+            let mut m = 0.0f32;
+            let mut along = 0.0f32;
+            #[unroll]
+            for k in 0..3usize {
+                let x = 2.0 * (origins[r * 3 + k] + mid * dirs[r * 3 + k] - 0.5);
+                point[k] = x;
+                along += d[i * 3 + k] * x;
+                if x.abs() >= m {
+                    m = x.abs();
+                    greatest = k;
+                }
+            }
+            scale = 0.5f32;
+            if m > 1.0 {
+                scale = 0.5 * (2.0 - 1.0 / m) / m;
+                pulled = 0.5 * (2.0 / m - 2.0) / (m * m) * along;
+                if point[greatest] < 0.0 {
+                    pulled = -pulled;
+                }
+            }
+        }
+        #[unroll]
+        for k in 0..3usize {
+            let mut g = scale * d[i * 3 + k];
+            if comptime!(kind == 2) {
+                if greatest == k {
+                    g += pulled;
+                }
+            }
+            near[k] += g;
+            far[k] += mid * g;
+        }
+    }
+    #[unroll]
+    for k in 0..3usize {
+        d_origins[r * 3 + k] = near[k];
+        d_dirs[r * 3 + k] = far[k];
     }
 }
 

@@ -1,6 +1,9 @@
 //! One unit per pixel, or per ray where training pixels are drawn.
 
-use crate::gpu::random::{Wide, below, halves, key, product, sum, uniform, widened};
+pub mod error_map;
+
+use self::error_map::GpuErrorMap;
+use crate::gpu::random::{Wide, below, bits, halves, key, product, sum, uniform, widened};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use cubecl::prelude::*;
 use diorama_geom::rng::Rng;
@@ -29,11 +32,19 @@ pub fn gather(gpu: &Gpu, pixels: &Buffer, at: &Buffer) -> Buffer {
 const ATTEMPTS: u32 = 5;
 /// Random numbers set aside per ray.
 const NUMBERS: u32 = 16;
+/// Numbers that describe a photograph.
+const PHOTOGRAPH: usize = 5;
+/// Rays of each 1024 that are drawn uniformly whatever the error map says.
+const UNIFORM: u32 = 512;
+/// Cells per side of the error map of one image.
+pub const CELLS: usize = 16;
 
 /// Photographs on the device.
 pub struct GpuPhotographs {
     count: usize,
-    /// Width, height and first pixel of each, `[count, 3]`.
+    /// One of each `stride × stride` pixels is there.
+    stride: u32,
+    /// [`PHOTOGRAPH`] numbers of each: width, height, first pixel, and the key by which pixels were kept.
     sizes: Buffer,
     pixels: Buffer,
     /// One bit per pixel that may be trained on; none: all may.
@@ -65,24 +76,27 @@ pub enum Backdrop {
 }
 
 impl GpuPhotographs {
-    /// Packed RGBA of all photographs, red in the lowest byte, of the given widths and heights.
+    /// Packed RGBA of all photographs, red in the lowest byte, of the given widths and heights. Of each `stride ×
+    /// stride` pixels one is there, which the photograph's random numbers name (the x of the square by the lower half
+    /// of number `y << 32 | x` of its corner, the y by the upper).
     ///
     /// # Panics
     /// When the sizes do not add up to the pixels.
-    pub fn upload(gpu: &Gpu, sizes: &[(u32, u32)], pixels: &[u32], mask: Option<&[u32]>) -> Self {
+    pub fn upload(gpu: &Gpu, sizes: &[(u32, u32)], stride: u32, keys: &[Rng], pixels: &[u32], mask: Option<&[u32]>) -> Self {
         let mut first = 0;
-        let mut rows = Vec::with_capacity(sizes.len() * 3);
-        for (w, h) in sizes {
-            rows.extend([*w, *h, first]);
-            first += w * h;
+        let mut rows = Vec::with_capacity(sizes.len() * PHOTOGRAPH);
+        for ((w, h), rng) in sizes.iter().zip(keys) {
+            let (high, low) = key(rng);
+            rows.extend([*w, *h, first, high, low]);
+            first += w.div_ceil(stride) * h.div_ceil(stride);
         }
         assert_eq!(first as usize, pixels.len(), "photographs: pixels");
         let mask = mask.map(|m| gpu.upload_u32(m));
-        GpuPhotographs { count: sizes.len(), sizes: gpu.upload_u32(&rows), pixels: gpu.upload_u32(pixels), mask }
+        GpuPhotographs { count: sizes.len(), stride, sizes: gpu.upload_u32(&rows), pixels: gpu.upload_u32(pixels), mask }
     }
 
-    /// `n` random training pixels; `first` counts those drawn before.
-    pub fn draw(&self, gpu: &Gpu, n: usize, first: u64, rng: &Rng, backdrop: Backdrop) -> Drawn {
+    /// `n` random training pixels, half of them where `errors` are high; `first` counts those drawn before.
+    pub fn draw(&self, gpu: &Gpu, n: usize, first: u64, rng: &Rng, errors: Option<&GpuErrorMap>, backdrop: Backdrop) -> Drawn {
         let d = Drawn {
             images: gpu.empty(n),
             pixels: gpu.empty(n * 2),
@@ -99,6 +113,8 @@ impl GpuPhotographs {
         let (third_high, third_low) = halves(first.wrapping_mul(3));
         // Bound where there is no mask to read.
         let mask = self.mask.as_ref().unwrap_or(&self.sizes);
+        let none = gpu.empty(1);
+        let cdf = errors.map_or(&none, |e| e.cdf());
         if n > 0 {
             // SAFETY: units past `n` stop; draws stay within the photographs.
             unsafe {
@@ -109,6 +125,7 @@ impl GpuPhotographs {
                     self.sizes.arg(),
                     self.pixels.arg(),
                     mask.arg(),
+                    cdf.arg(),
                     d.images.arg(),
                     d.pixels.arg(),
                     d.target.arg(),
@@ -120,7 +137,9 @@ impl GpuPhotographs {
                     key_low,
                     high,
                     low,
+                    self.stride,
                     self.mask.is_some(),
+                    errors.is_some(),
                 );
                 back::launch_unchecked(
                     &gpu.client,
@@ -143,11 +162,13 @@ impl GpuPhotographs {
     }
 }
 
+#[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
 fn choose(
     sizes: &[u32],
     pixels: &[u32],
     mask: &[u32],
+    cdf: &[f32],
     images: &mut [u32],
     centres: &mut [f32],
     target: &mut [f32],
@@ -159,7 +180,9 @@ fn choose(
     key_low: u32,
     high: u32,
     low: u32,
+    stride: u32,
     #[comptime] is_masked: bool,
+    #[comptime] by_error: bool,
 ) {
     let r = ABSOLUTE_POS;
     if r >= n as usize {
@@ -176,12 +199,46 @@ fn choose(
     let mut at = 0u32;
     while refused == 1 && attempt < ATTEMPTS {
         let draw = sum(&base, &widened(1 + attempt * 3));
-        image = below(&key, &draw, count);
-        let w = sizes[image as usize * 3];
-        let h = sizes[image as usize * 3 + 1];
-        x = min(u32::cast_from(uniform(&key, &sum(&draw, &widened(1u32))) * f32::cast_from(w)), w - 1);
-        y = min(u32::cast_from(uniform(&key, &sum(&draw, &widened(2u32))) * f32::cast_from(h)), h - 1);
-        at = sizes[image as usize * 3 + 2] + y * w + x;
+        let mut u = uniform(&key, &sum(&draw, &widened(1u32)));
+        let mut v = uniform(&key, &sum(&draw, &widened(2u32)));
+        if comptime!(by_error) {
+            if r as u32 % 1024 >= UNIFORM {
+                let cells = count as usize * comptime!(CELLS * CELLS);
+                // The first cell up to which the errors' roots sum to as much.
+                let wanted = uniform(&key, &draw) * cdf[cells - 1];
+                let mut from = 0usize;
+                let mut to = cells - 1;
+                while from < to {
+                    let middle = (from + to) / 2;
+                    if cdf[middle] < wanted {
+                        from = middle + 1;
+                    } else {
+                        to = middle;
+                    }
+                }
+                image = u32::cast_from(from / comptime!(CELLS * CELLS));
+                u = (f32::cast_from(from % CELLS) + u) / comptime!(CELLS as f32);
+                v = (f32::cast_from(from / CELLS % CELLS) + v) / comptime!(CELLS as f32);
+            } else {
+                image = below(&key, &draw, count);
+            }
+        } else {
+            image = below(&key, &draw, count);
+        }
+        let own = image as usize * PHOTOGRAPH;
+        let w = sizes[own];
+        let h = sizes[own + 1];
+        x = min(u32::cast_from(u * f32::cast_from(w)), w - 1);
+        y = min(u32::cast_from(v * f32::cast_from(h)), h - 1);
+        at = sizes[own + 2] + y / stride * ((w + stride - 1) / stride) + x / stride;
+        if stride > 1 {
+            // The pixel that was kept of its square.
+            let x0 = x / stride * stride;
+            let y0 = y / stride * stride;
+            let kept = bits(&Wide { high: sizes[own + 3], low: sizes[own + 4] }, &Wide { high: y0, low: x0 });
+            x = x0 + kept.low % min(stride, w - x0);
+            y = y0 + kept.high % min(stride, h - y0);
+        }
         refused = 0u32;
         if comptime!(is_masked) {
             refused = 1 - ((mask[at as usize / 32] >> (at & 31)) & 1);

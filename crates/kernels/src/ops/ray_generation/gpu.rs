@@ -20,6 +20,9 @@ const EQUIRECTANGULAR: u32 = 4;
 /// Cameras on the device.
 pub struct GpuCameras {
     count: usize,
+    /// As given.
+    base: Buffer,
+    /// With their corrections.
     numbers: Buffer,
 }
 
@@ -43,7 +46,28 @@ impl GpuCameras {
             numbers.extend((0..10).map(|i| own.get(i).copied().unwrap_or(0.0)));
         }
         let numbers: Vec<f32> = numbers.into_iter().map(|v| v as f32).collect();
-        GpuCameras { count: cameras.len(), numbers: gpu.upload(&numbers) }
+        GpuCameras { count: cameras.len(), base: gpu.upload(&numbers), numbers: gpu.upload(&numbers) }
+    }
+
+    /// Applies corrections `[cameras, 7]` to the cameras as they were given; see [`PosedCamera::corrected`]. Unless
+    /// focal lengths are `refined`, their corrections are taken back to 0.
+    pub fn correct(&self, gpu: &Gpu, corrections: &Buffer, refined: bool) {
+        assert_eq!(corrections.len(), self.count * CORRECTION, "cameras: corrections");
+        if self.count > 0 {
+            // SAFETY: units past the cameras stop.
+            unsafe {
+                adjust::launch_unchecked(
+                    &gpu.client,
+                    units(self.count),
+                    CubeDim::new_1d(CUBE),
+                    self.base.arg(),
+                    corrections.arg(),
+                    self.numbers.arg(),
+                    self.count as u32,
+                    refined,
+                );
+            }
+        }
     }
 
     /// Origins and unit directions `[R, 3]` of the rays through `pixels` `[R, 2]` of cameras `index` `[R]`.
@@ -92,6 +116,56 @@ impl GpuCameras {
             }
         }
         out
+    }
+}
+
+/// A camera turned by a rotation vector (Rodrigues' formula), moved, and with its focal lengths scaled.
+#[cube(launch_unchecked)]
+fn adjust(base: &[f32], corrections: &mut [f32], out: &mut [f32], n: u32, #[comptime] refined: bool) {
+    let camera = ABSOLUTE_POS;
+    if camera >= n as usize {
+        terminate!();
+    }
+    let at = camera * CAMERA;
+    let d = camera * CORRECTION;
+    let x = corrections[d + 3];
+    let y = corrections[d + 4];
+    let z = corrections[d + 5];
+    let angle = (x * x + y * y + z * z).sqrt();
+    // sin a / a and (1 − cos a) / a².
+    let mut s = 1.0f32;
+    let mut c = 0.5f32;
+    if angle > 1e-4 {
+        s = angle.sin() / angle;
+        let half = (0.5 * angle).sin() / angle;
+        c = 2.0 * half * half;
+    }
+    #[unroll]
+    for col in 0..3usize {
+        let vx = base[at + col];
+        let vy = base[at + 4 + col];
+        let vz = base[at + 8 + col];
+        // v + s (a × v) + c a × (a × v)
+        let cx = y * vz - z * vy;
+        let cy = z * vx - x * vz;
+        let cz = x * vy - y * vx;
+        out[at + col] = vx + s * cx + c * (y * cz - z * cy);
+        out[at + 4 + col] = vy + s * cy + c * (z * cx - x * cz);
+        out[at + 8 + col] = vz + s * cz + c * (x * cy - y * cx);
+    }
+    #[unroll]
+    for k in 0..3usize {
+        out[at + k * 4 + 3] = base[at + k * 4 + 3] + corrections[d + k];
+    }
+    if comptime!(!refined) {
+        corrections[d + 6] = 0.0;
+    }
+    let scale = corrections[d + 6].exp();
+    out[at + 12] = base[at + 12] * scale;
+    out[at + 13] = base[at + 13] * scale;
+    #[unroll]
+    for k in 14..CAMERA {
+        out[at + k] = base[at + k];
     }
 }
 

@@ -1,5 +1,7 @@
 //! One unit per new distance.
 
+pub mod strata;
+
 use super::FLOOR;
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use cubecl::prelude::*;

@@ -22,6 +22,17 @@ pub struct Terms {
     pub alpha: f32,
 }
 
+/// Where a step's figures are added.
+#[derive(Clone, Copy)]
+pub struct Figures<'a> {
+    /// `[SUMS]`
+    pub sums: &'a Buffer,
+    /// Offsets of all samples that were marched, `[R + 1]`.
+    pub marched: &'a Buffer,
+    /// Whether this is what the step is judged by; else only loss and samples are added.
+    pub is_main: bool,
+}
+
 /// What rays are to match.
 #[derive(Clone, Copy)]
 pub struct Target<'a> {
@@ -34,7 +45,7 @@ pub struct Target<'a> {
 }
 
 /// Composites packed samples with densities `[S]` and colours `[S, 3]`, compares them, and takes the gradients back to
-/// both, all rays in one launch; adds the step's figures to `sums` `[SUMS]`. For terms without distortion, which
+/// both, all rays in one launch; adds the step's figures. Also gives the squared error of each ray `[R]`. For terms without distortion, which
 /// needs sums over a ray's pairs of samples. Gradients closer than `near_scaling` are scaled as by [`super::soften`].
 #[allow(clippy::too_many_arguments)]
 pub fn composite_and_loss(
@@ -45,15 +56,14 @@ pub fn composite_and_loss(
     rgb: &Buffer,
     target: Target,
     near_scaling: f32,
-    marched: &Buffer,
-    sums: &Buffer,
-) -> GpuGradients {
+    figures: Figures,
+) -> (GpuGradients, Buffer) {
     assert!(terms.distortion == 0.0, "composite and loss: no distortion");
     let r = p.rays();
     let (values, errors) = (gpu.empty(r), gpu.empty(r));
     let g = GpuGradients { sigma: gpu.empty(sigma.len()), features: gpu.empty(rgb.len()), background: gpu.empty(r * 3) };
     if r == 0 {
-        return g;
+        return (g, errors);
     }
     // SAFETY: units past the rays stop; offsets bound the samples.
     unsafe {
@@ -82,12 +92,12 @@ pub fn composite_and_loss(
         );
     }
     // Nothing is read of it.
-    add_up(gpu, p, target.left_out, &values, &errors, &values, 0.0, marched, sums);
-    g
+    add_up(gpu, p, target.left_out, &values, &errors, &values, 0.0, figures);
+    (g, errors)
 }
 
-/// Gradients of what compositing gave; adds the step's figures to `sums` `[SUMS]`.
-pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target: Target, marched: &Buffer, sums: &Buffer) -> GpuComposited {
+/// Gradients of what compositing gave, and the squared error of each ray `[R]`; adds the step's figures.
+pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target: Target, figures: Figures) -> (GpuComposited, Buffer) {
     let r = p.rays();
     let d = GpuComposited { color: gpu.empty(r * 3), depth: gpu.zeros(r), opacity: gpu.empty(r), weights: gpu.empty(0) };
     let (values, errors, d_spread) = (gpu.empty(r), gpu.empty(r), gpu.empty(r));
@@ -116,8 +126,8 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
         );
     }
     let (spread, weights) = distortion::gpu::both(gpu, p, &out.weights, &d_spread);
-    add_up(gpu, p, target.left_out, &values, &errors, &spread, terms.distortion, marched, sums);
-    GpuComposited { weights, ..d }
+    add_up(gpu, p, target.left_out, &values, &errors, &spread, terms.distortion, figures);
+    (GpuComposited { weights, ..d }, errors)
 }
 
 /// Adds a step's figures to `sums`.
@@ -130,8 +140,7 @@ fn add_up(
     errors: &Buffer,
     spread: &Buffer,
     distortion: f32,
-    marched: &Buffer,
-    sums: &Buffer,
+    figures: Figures,
 ) {
     let (r, parts) = (p.rays() as u32, gpu.empty(PARTS * 3));
     // SAFETY: units past the parts stop; offsets hold one number more than there are rays.
@@ -155,10 +164,11 @@ fn add_up(
             CubeDim::new_1d(1),
             parts.arg(),
             p.offsets.arg(),
-            marched.arg(),
-            sums.arg(),
+            figures.marched.arg(),
+            figures.sums.arg(),
             r,
             PARTS as u32,
+            figures.is_main,
         );
     }
 }
@@ -355,7 +365,7 @@ fn gather(left_out: &[u32], values: &[f32], errors: &[f32], spread: &[f32], part
 }
 
 #[cube(launch_unchecked)]
-fn finish(parts: &[f32], offsets: &[u32], marched: &[u32], sums: &mut [f32], rays: u32, n: u32) {
+fn finish(parts: &[f32], offsets: &[u32], marched: &[u32], sums: &mut [f32], rays: u32, n: u32, #[comptime] is_main: bool) {
     let mut value = 0.0f32;
     let mut error = 0.0f32;
     let mut count = 0.0f32;
@@ -365,8 +375,10 @@ fn finish(parts: &[f32], offsets: &[u32], marched: &[u32], sums: &mut [f32], ray
         count += parts[i * 3 + 2];
     }
     sums[0] += value / f32::cast_from(rays);
-    sums[1] += error / max(count, 1.0f32);
     sums[2] += f32::cast_from(offsets[rays as usize]);
     sums[3] += f32::cast_from(marched[rays as usize]);
-    sums[4] += 1.0;
+    if comptime!(is_main) {
+        sums[1] += error / max(count, 1.0f32);
+        sums[4] += 1.0;
+    }
 }
