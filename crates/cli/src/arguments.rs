@@ -538,6 +538,7 @@ pub struct BenchCheckArgs {
 /// Parses, runs, reports.
 pub fn main() -> ExitCode {
     diorama_kernels::device::quiet_drivers();
+    diorama_kernels::device::settle_cuda_path();
     let cli = match Cli::try_parse() {
         Ok(c) => c,
         Err(e) => {

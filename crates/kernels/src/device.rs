@@ -103,6 +103,21 @@ pub fn gpus() -> Vec<GpuInfo> {
     Api::ALL.into_iter().filter(|a| a.is_built()).filter_map(found).collect()
 }
 
+/// Lets kernels without half precision be compiled where NVRTC is there but no CUDA toolkit, in whose place CubeCL
+/// insists on some folder.
+///
+/// Must be called before the program starts a thread.
+pub fn settle_cuda_path() {
+    let usual = ["/usr/local/cuda", "/opt/cuda", "/usr/bin/nvcc"];
+    if cfg!(all(feature = "cuda", target_os = "linux"))
+        && std::env::var_os("CUDA_PATH").is_none()
+        && !usual.iter().any(|p| std::path::Path::new(p).exists())
+    {
+        // SAFETY: no other thread reads the environment yet.
+        unsafe { std::env::set_var("CUDA_PATH", std::env::temp_dir()) };
+    }
+}
+
 /// Keeps Mesa's device-select layer, which asks the desktop for the preferred GPU, from complaining aloud where
 /// there is no desktop; devices are chosen here anyway.
 ///

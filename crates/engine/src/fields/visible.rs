@@ -185,7 +185,7 @@ impl Field {
     }
 
     /// The layers up to the density head, which read positions alone; their parameters come first.
-    pub(crate) fn density_net(&self, precision: diorama_kernels::gemm::Precision) -> Mlp {
+    pub fn density_net(&self, precision: diorama_kernels::gemm::Precision) -> Mlp {
         let all = &self.net.mlp;
         Mlp { precision, ..Mlp::new(all.input_widths[..1].to_vec(), all.layers[..=self.net.sigma.layer].to_vec()) }
     }

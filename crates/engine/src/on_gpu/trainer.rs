@@ -41,8 +41,8 @@ impl GpuGroup {
     fn upload(gpu: &Gpu, g: &ParamGroup) -> Self {
         GpuGroup {
             values: gpu.upload(&g.values),
-            moment1: gpu.upload(&g.moment1),
-            moment2: gpu.upload(&g.moment2),
+            moment1: gpu.upload_or_zeros(&g.moment1),
+            moment2: gpu.upload_or_zeros(&g.moment2),
             adam: g.adam,
             sparse: !g.touched.is_empty(),
             frozen: g.frozen,

@@ -193,6 +193,11 @@ impl Gpu {
         Buffer { handle: self.client.create_from_slice(f32::as_bytes(bytes)), len: data.len() }
     }
 
+    /// [`Gpu::upload`], without bringing zeros there where there is nothing else.
+    pub fn upload_or_zeros(&self, data: &[f32]) -> Buffer {
+        if data.iter().all(|v| v.to_bits() == 0) { self.zeros(data.len()) } else { self.upload(data) }
+    }
+
     pub fn upload_u32(&self, data: &[u32]) -> Buffer {
         let bytes = if data.is_empty() { &[0][..] } else { data };
         Buffer { handle: self.client.create_from_slice(u32::as_bytes(bytes)), len: data.len() }
@@ -203,18 +208,15 @@ impl Gpu {
     /// # Errors
     /// When the device was lost or ran out of memory.
     pub fn read(&self, buffer: &Buffer) -> Result<Vec<f32>, GpuError> {
-        Ok(f32::from_bytes(&self.bytes(buffer)?)[..buffer.len].to_vec())
+        let bytes = self.client.read_one(buffer.handle.clone()).map_err(|e| self.lost(&e))?;
+        Ok(f32::from_bytes(&bytes)[..buffer.len].to_vec())
     }
 
     /// # Errors
     /// As [`Gpu::read`].
     pub fn read_u32(&self, buffer: &Buffer) -> Result<Vec<u32>, GpuError> {
-        Ok(u32::from_bytes(&self.bytes(buffer)?)[..buffer.len].to_vec())
-    }
-
-    fn bytes(&self, buffer: &Buffer) -> Result<Vec<u8>, GpuError> {
-        let bytes = self.client.read_one(buffer.handle.clone());
-        bytes.map(|b| b.to_vec()).map_err(|e| GpuError::Lost(self.name.clone(), format!("{e:?}")))
+        let bytes = self.client.read_one(buffer.handle.clone()).map_err(|e| self.lost(&e))?;
+        Ok(u32::from_bytes(&bytes)[..buffer.len].to_vec())
     }
 
     /// Waits until all work is done.
@@ -222,7 +224,11 @@ impl Gpu {
     /// # Errors
     /// When the device was lost.
     pub fn sync(&self) -> Result<(), GpuError> {
-        cubecl::future::block_on(self.client.sync()).map_err(|e| GpuError::Lost(self.name.clone(), format!("{e:?}")))
+        cubecl::future::block_on(self.client.sync()).map_err(|e| self.lost(&e))
+    }
+
+    fn lost(&self, e: &dyn std::fmt::Debug) -> GpuError {
+        GpuError::Lost(self.name.clone(), brief(&format!("{e:?}")))
     }
 }
 
@@ -235,6 +241,25 @@ fn keep_compiled() {
     c.compilation.cache = true;
     c.environment.path = CacheConfig::Global;
     CubeClRuntimeConfig::try_set(c);
+}
+
+/// A failure in one line: its last cause, without a kernel's source and backtraces.
+fn brief(text: &str) -> String {
+    const MOST: usize = 240;
+    let end = [text.find("[Source]"), text.find("Backtrace")].into_iter().flatten().min().unwrap_or(text.len());
+    let cause = text[..end].rsplit("Caused by:").find(|c| !c.trim().is_empty()).unwrap_or("the device failed");
+    let line = cause.split_whitespace().collect::<Vec<_>>().join(" ");
+    match line.char_indices().nth(MOST) {
+        Some((at, _)) => format!("{}…", &line[..at]),
+        None => line,
+    }
+}
+
+/// Whether the headers are there that CUDA kernels with half precision include.
+pub(crate) fn has_cuda_headers() -> bool {
+    let own = std::env::var_os("CUDA_PATH").map(std::path::PathBuf::from);
+    let usual = ["/usr/local/cuda", "/opt/cuda", "C:/Program Files/NVIDIA GPU Computing Toolkit/CUDA"].map(std::path::PathBuf::from);
+    own.map_or(usual.to_vec(), |p| vec![p]).iter().any(|p| p.join("include/mma.h").exists())
 }
 
 fn find(api: Api) -> Option<(cubecl::Device, bool)> {
@@ -298,5 +323,18 @@ fn duplicate(from: &[f32], to: &mut [f32], n: u32) {
 fn unite(a: &[u32], b: &[u32], out: &mut [u32], n: u32) {
     if ABSOLUTE_POS < n as usize {
         out[ABSOLUTE_POS] = a[ABSOLUTE_POS] | b[ABSOLUTE_POS];
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::brief;
+
+    #[test]
+    fn failures_are_told_in_one_line() {
+        let long = "Several failures\nCaused by:\n  A launch error\nCaused by:\n  out of\n    memory\n[Source]\nfloat x;\nBacktrace: none";
+        assert_eq!(brief(long), "out of memory");
+        assert_eq!(brief(""), "the device failed");
+        assert_eq!(brief(&"é".repeat(500)).chars().count(), 241);
     }
 }

@@ -3,16 +3,23 @@
 use super::median_seconds;
 use super::ops::OpFigure;
 use crate::{PipelineError, Result};
+use diorama_engine::fields;
 use diorama_geom::rng::Rng;
+use diorama_kernels::gemm::Precision;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::Packed;
-use diorama_kernels::ops::composite::gpu::{self as composite, GpuPacked};
-use diorama_kernels::ops::fused_mlp::{self, Mlp};
+use diorama_kernels::ops::composite::gpu::{self as composite, GpuGradients, GpuPacked};
+use diorama_kernels::ops::fused_mlp::gpu::fused::Element;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
 use diorama_kernels::ops::linear::{self, Activation, BiasKind};
+use diorama_kernels::ops::ngp_field::gpu::loss::{self, Figures, SUMS, Target, Terms};
+use diorama_kernels::ops::ngp_field::gpu::{Arithmetic, GpuNet};
 use diorama_kernels::ops::spherical_harmonics;
+
+/// Samples per ray.
+const PER_RAY: usize = 32;
 
 /// Calls between two waits for the device, where it is no software.
 const BATCH: usize = 8;
@@ -123,18 +130,41 @@ fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
         let out = linear::gpu::forward(gpu, &rows, (k, n), &x, &w, None, kind, a);
         linear::gpu::backward(gpu, &rows, (k, n), &x, &w, kind, a, &out, &d);
     })?;
-    let mlp = Mlp::chain(vec![32], &[64, 64, 16], false);
-    let (params, input) = (gpu.upload(&mlp.init(&Rng::new(1, 1))), random(gpu, s * 32, 4));
-    t.row("fused_mlp", "32 -> 64 -> 64 -> 16 f32", "sample", s, 2.0 * mlp.macs() as f64, 0.0, || {
-        fused_mlp::gpu::forward(gpu, &mlp, &params, &[&input], &rows);
-    })
+    // The standard field's network: layer by layer, in one launch, and on tensor cores.
+    let grid = HashGridConfig { levels: 16, features: 2, log2_size: 4, base: 4, finest: 16 };
+    let field = fields::ngp(grid, 1.0, false, 1e-2, 0, 0, 1);
+    let (net, density) = (&field.net, field.density_net(Precision::F32));
+    let (params, features, flops) = (gpu.upload(&field.weights.values), random(gpu, s * 32, 4), 2.0 * net.mlp.macs() as f64);
+    let p = evenly(gpu, s);
+    let direction = random(gpu, p.rays() * 16, 5);
+    let g = GpuGradients { sigma: random(gpu, s, 6), features: random(gpu, s * 3, 7), background: gpu.zeros(p.rays() * 3) };
+    for (arithmetic, name) in [(Arithmetic::Layers, "layers"), (Arithmetic::Exact, "one launch"), (Arithmetic::Best, "tensor cores")] {
+        let net = GpuNet::new(gpu, net, &density, 2, &[true, false], arithmetic);
+        let element = net.element();
+        if matches!((arithmetic, element), (Arithmetic::Exact, None) | (Arithmetic::Best, None | Some(Element::F32))) {
+            continue;
+        }
+        let shape = format!("32 -> 64 -> 16, 32 -> 64 -> 64 -> 16 {name}");
+        t.row("field network", &shape, "sample", s, flops, 0.0, || {
+            net.evaluate(gpu, &params, &p, &features, &[&direction], false);
+        })?;
+        t.row("field network, forward and backward", &shape, "sample", s, 3.0 * flops, 0.0, || {
+            let at = net.evaluate(gpu, &params, &p, &features, &[&direction], true);
+            net.gradients(gpu, &params, &p, &at, &g);
+        })?;
+    }
+    Ok(())
+}
+
+/// Samples of rays with [`PER_RAY`] each.
+fn evenly(gpu: &Gpu, s: usize) -> GpuPacked {
+    let offsets: Vec<u32> = (0..=s / PER_RAY).map(|r| (r * PER_RAY) as u32).collect();
+    let (starts, lengths): (Vec<f32>, Vec<f32>) = (0..s).map(|i| ((i % PER_RAY) as f32 * 0.1, 0.1)).unzip();
+    GpuPacked::upload(gpu, &Packed { offsets: &offsets, t: &starts, dt: &lengths })
 }
 
 fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
-    let per_ray = 32;
-    let offsets: Vec<u32> = (0..=s / per_ray).map(|r| (r * per_ray) as u32).collect();
-    let (starts, lengths): (Vec<f32>, Vec<f32>) = (0..s).map(|i| ((i % per_ray) as f32 * 0.1, 0.1)).unzip();
-    let p = GpuPacked::upload(gpu, &Packed { offsets: &offsets, t: &starts, dt: &lengths });
+    let p = evenly(gpu, s);
     let (sigma, rgb, background) = (random(gpu, s, 1), random(gpu, s * 3, 2), gpu.zeros(p.rays() * 3));
     let out = composite::forward(gpu, &p, &sigma, &rgb, 3, &background);
     let d = composite::forward(gpu, &p, &sigma, &rgb, 3, &background);
@@ -143,5 +173,11 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     })?;
     t.row("composite, backward", "3 channels, 32 samples per ray", "sample", s, 0.0, 52.0, || {
         composite::backward(gpu, &p, &rgb, 3, &background, &out, &d);
+    })?;
+    let (target, left_out, sums) = (random(gpu, p.rays() * 4, 8), gpu.upload_u32(&vec![0; p.rays()]), gpu.zeros(SUMS));
+    let target = Target { rgba: &target, background: &background, left_out: &left_out };
+    t.row("composite, loss and backward", "3 channels, 32 samples per ray", "sample", s, 0.0, 64.0, || {
+        let figures = Figures { sums: &sums, marched: &p.offsets, is_main: true };
+        loss::composite_and_loss(gpu, Terms { huber: 0.0, distortion: 0.0, alpha: 0.0 }, &p, &sigma, &rgb, target, 0.0, figures);
     })
 }

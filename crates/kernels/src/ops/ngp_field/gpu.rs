@@ -5,12 +5,14 @@ pub mod loss;
 use super::{FieldNet, Head};
 use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Rows, Swap, units};
 use crate::ops::composite::gpu::{self as composite, GpuComposited, GpuGradients, GpuPacked};
-use crate::ops::fused_mlp::Mlp;
 use crate::ops::fused_mlp::gpu::fused::{Element, Fused, Kept, tensor_element};
 use crate::ops::fused_mlp::gpu::{self as mlp, columns};
+use crate::ops::fused_mlp::{Mlp, reference};
 use crate::ops::linear::gpu as linear;
+use crate::ops::linear::reference::{activate, slope};
 use crate::ops::march::gpu::prune::Pruned;
 use cubecl::prelude::*;
+use diorama_geom::rng::Rng;
 
 /// How a network is computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,12 +44,18 @@ impl GpuNet {
             Arithmetic::Best => tensor_element(gpu).unwrap_or(Element::F32),
             _ => Element::F32,
         };
-        let both = || {
+        let both = |element| {
             let whole = Fused::new(gpu, &net.mlp, &[(net.sigma, 1), (net.rgb, 3)], per_level, wanted, element)?;
             let part = Fused::new(gpu, density, &[(net.sigma, 1)], per_level, &wanted[..1], element)?;
             Some([whole, part])
         };
-        let fused = if arithmetic == Arithmetic::Layers { None } else { both() };
+        let mut fused = if arithmetic == Arithmetic::Layers { None } else { both(element) };
+        if element != Element::F32
+            && let Some([whole, _]) = &fused
+            && !agrees(gpu, net, whole, per_level)
+        {
+            fused = both(Element::F32);
+        }
         GpuNet { net: net.clone(), density: density.clone(), per_level, fused }
     }
 
@@ -185,6 +193,58 @@ impl GpuNet {
         }
         self.gradients(gpu, params, p, &step.at, &g)
     }
+}
+
+/// Whether tensor cores give about what the reference gives, forward and backward, on a few rows: a driver that
+/// multiplies wrongly must not spoil a run unseen.
+fn agrees(gpu: &Gpu, net: &FieldNet, whole: &Fused, per_level: usize) -> bool {
+    const ROWS: usize = 80;
+    let noise = |n: usize, stream: u64| -> Vec<f32> {
+        let rng = Rng::new(1, stream);
+        (0..n).map(|i| rng.uniform(i as u64) * 2.0 - 1.0).collect()
+    };
+    let wide = |v: &[f32]| v.iter().map(|v| *v as f64).collect::<Vec<f64>>();
+    let (mlp, params) = (&net.mlp, net.mlp.init(&Rng::new(1, 0)));
+    let inputs: Vec<Vec<f32>> = mlp.input_widths.iter().enumerate().map(|(i, w)| noise(ROWS * w, 1 + i as u64)).collect();
+    let d = [noise(ROWS, 11), noise(ROWS * 3, 12)];
+
+    let wide_inputs: Vec<Vec<f64>> = inputs.iter().map(|v| wide(v)).collect();
+    let refs: Vec<&[f64]> = wide_inputs.iter().map(|v| &v[..]).collect();
+    let values = reference::forward(mlp, &wide(&params), &refs, ROWS);
+    let mut seeds: Vec<Vec<f64>> = mlp.layers.iter().map(|l| vec![0.0; ROWS * l.width]).collect();
+    let mut heads = Vec::new();
+    for (h, channels, d) in [(net.sigma, 1, &d[0]), (net.rgb, 3, &d[1])] {
+        let width = mlp.layers[h.layer].width;
+        heads.push(
+            (0..ROWS * channels)
+                .map(|e| {
+                    let at = e / channels * width + h.channel + e % channels;
+                    let x = values[h.layer][at] + h.shift as f64;
+                    seeds[h.layer][at] += d[e] as f64 * slope(h.activation, x);
+                    activate(h.activation, x)
+                })
+                .collect::<Vec<f64>>(),
+        );
+    }
+    let (want, _) = reference::backward(mlp, &wide(&params), &refs, ROWS, &seeds);
+
+    let up = |v: &[f32]| gpu.upload(v);
+    let (rows, params) = (Rows::all(gpu, ROWS), up(&params));
+    let mut on_gpu: Vec<Buffer> = inputs.iter().map(|v| up(v)).collect();
+    if per_level > 0 {
+        on_gpu[0] = turn(gpu, &rows, &on_gpu[0], per_level, mlp.input_widths[0], false);
+    }
+    let refs: Vec<&Buffer> = on_gpu.iter().collect();
+    let kept = whole.forward(gpu, &params, &refs, &rows, true);
+    let (got, _) = whole.backward(gpu, &params, &refs, &kept, &rows, &[&up(&d[0]), &up(&d[1])], HALF_SCALE);
+    let energy = |v: &mut dyn Iterator<Item = f64>| v.map(|x| x * x).sum::<f64>().sqrt();
+    let close = |got: &Buffer, want: &[f64]| {
+        gpu.read(got).is_ok_and(|got| {
+            let error = energy(&mut got.iter().zip(want).map(|(g, w)| *g as f64 - w));
+            got.len() == want.len() && error <= 0.25 * energy(&mut want.iter().copied())
+        })
+    };
+    kept.heads.iter().zip(&heads).all(|(got, want)| close(got, want)) && close(&got, &want)
 }
 
 /// Times the rays: what gradients of a mean over rays are multiplied by in half precision.

@@ -8,7 +8,8 @@
 //! cube goes from tile to tile, and are added up at the end.
 
 use super::super::{Mlp, Source};
-use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
+use crate::device::Api;
+use crate::gpu::{Buffer, CUBE, Gpu, Rows, has_cuda_headers, units};
 use crate::ops::linear::gpu::{add_outer, apply, code, slope};
 use crate::ops::ngp_field::Head;
 use cubecl::ir::{ElemType, FloatKind};
@@ -325,6 +326,9 @@ pub struct Kept {
 /// The best element that the device's tensor cores multiply in planes of 32 units.
 pub fn tensor_element(gpu: &Gpu) -> Option<Element> {
     let p = gpu.client.properties();
+    if gpu.api == Api::Cuda && !has_cuda_headers() {
+        return None;
+    }
     if p.hardware.plane_size_min != 32 || p.hardware.plane_size_max != 32 {
         return None;
     }
