@@ -12,7 +12,7 @@ fn main() -> ExitCode {
         "viewer-check" => viewer_check(),
         "tidy" => step("tidy", tidy::run()),
         _ => {
-            eprintln!("usage: cargo xtask ci | gpu-check [cuda|vulkan|metal|webgpu] | viewer-check | tidy");
+            eprintln!("usage: cargo xtask ci | gpu-check [vulkan|metal|webgpu|cuda|webgpu,cuda] | viewer-check | tidy");
             false
         }
     };
@@ -46,49 +46,55 @@ fn fuzz(runs: &str) -> bool {
     built && Command::new("target/release/diorama-fuzz").arg(runs).status().is_ok_and(|s| s.success())
 }
 
-/// Builds for a device and compares every op on it with its reference.
-fn gpu_check(device: &str) -> bool {
-    let with = ["--release", "--package", "diorama", "--no-default-features", "--features", device, "--"];
-    let lint = [&["clippy"][..], &with, &["-D", "warnings"]].concat();
-    let mut args = [&["run"][..], &with, &["bench", "check", "--device", device]].concat();
+/// Builds once for devices, separated by commas, and compares every op on each with its reference.
+fn gpu_check(devices: &str) -> bool {
+    // Vulkan, or Metal on macOS, is what the default build holds, so that nothing is built anew for it.
+    let features: Vec<&str> = devices.split(',').map(|d| if ["vulkan", "metal"].contains(&d) { "native" } else { d }).collect();
+    let features = features.join(",");
+    let mut build = vec!["build", "--release", "--package", "diorama"];
+    if features != "native" {
+        build.extend(["--no-default-features", "--features", &features]);
+    }
+    if !step("build", cargo(&build)) {
+        return false;
+    }
     // Training is compared on a real capture where there is one.
     let fox = std::env::var("DIORAMA_TEST_DATA").map(|d| format!("{d}/fox")).unwrap_or_default();
-    if std::path::Path::new(&fox).is_dir() {
-        args.extend(["--data", &fox]);
+    let mut ok = true;
+    for device in devices.split(',') {
+        let mut args = vec!["bench", "check", "--device", device];
+        if std::path::Path::new(&fox).is_dir() {
+            args.extend(["--data", &fox]);
+        }
+        println!("\n$ diorama {}", args.join(" "));
+        let mut check = Command::new("target/release/diorama");
+        check.args(args);
+        let ready = device != "cuda" || has_nvidia() || play_cuda(&mut check);
+        ok &= step(device, ready && check.status().is_ok_and(|s| s.success()));
     }
-    step("clippy", cargo(&lint)) & step("gpu-check", if device == "cuda" && !has_nvidia() { cuda_on_cpu(&args) } else { cargo(&args) })
+    ok
 }
 
 fn has_nvidia() -> bool {
     Command::new("nvidia-smi").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
 }
 
-/// Runs cargo with CUDA's driver and compiler played by the CPU.
-fn cuda_on_cpu(args: &[&str]) -> bool {
+/// Has the CPU play CUDA's driver and compiler for a command; whether they could be built.
+fn play_cuda(command: &mut Command) -> bool {
     let (source, to) = (std::path::absolute("stubs/cuda-on-cpu"), std::path::absolute("target/cuda-on-cpu"));
     let (Ok(source), Ok(to)) = (source, to) else { return false };
+    println!("no NVIDIA driver here: the CPU plays CUDA");
     // Kernels that an earlier driver compiled are no use.
     let _ = std::fs::remove_dir_all(&to);
     let library = to.join("libcuda.so");
-    let made = std::fs::create_dir_all(&to).is_ok()
-        && Command::new("g++")
-            .args(["-O2", "-U_FORTIFY_SOURCE", "-shared", "-fPIC", "-pthread"])
-            .arg(source.join("driver.cpp"))
-            .arg("-o")
-            .arg(&library)
-            .arg("-ldl")
-            .status()
-            .is_ok_and(|s| s.success())
-        && std::fs::copy(&library, to.join("libnvrtc.so")).is_ok();
-    println!("\n$ cargo {} # with the CPU playing CUDA", args.join(" "));
-    made && Command::new("cargo")
-        .args(args)
-        .env("CUDA_PATH", source)
-        .env("LD_LIBRARY_PATH", &to)
-        .env("CUDA_ON_CPU_CACHE", to.join("kernels"))
-        .env("XDG_CACHE_HOME", to.join("cache"))
-        .status()
-        .is_ok_and(|s| s.success())
+    command.env("CUDA_PATH", &source).env("LD_LIBRARY_PATH", &to);
+    command.env("CUDA_ON_CPU_CACHE", to.join("kernels")).env("XDG_CACHE_HOME", to.join("cache"));
+    let mut compile = Command::new("g++");
+    compile.args(["-O2", "-U_FORTIFY_SOURCE", "-shared", "-fPIC", "-pthread"]).arg(source.join("driver.cpp"));
+    compile.arg("-o").arg(&library).arg("-ldl");
+    std::fs::create_dir_all(&to).is_ok()
+        && compile.status().is_ok_and(|s| s.success())
+        && std::fs::copy(&library, to.join("libnvrtc.so")).is_ok()
 }
 
 /// Everything that must pass before a change lands.

@@ -558,7 +558,7 @@ fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let (points, mut sigma) = (random_unit(450, 1), vec![0.0; 150]);
             field.density(&points, &mut sigma);
             table.close("view", "densities", &shape, &gpu.upload(&device.density(&points)?), &wide(&sigma))?;
-            let dirs: Vec<f32> = points.chunks_exact(3).flat_map(|p| glam_unit(p)).collect();
+            let dirs: Vec<f32> = points.chunks_exact(3).flat_map(unit).collect();
             let (offsets, t, dt): (Vec<u32>, _, _) = ((0..=150).collect(), vec![0.0; 150], vec![1e30; 150]);
             let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
             let batch = Batch { samples, positions: &points, dirs: &dirs, images: None, background: &vec![0.0; 450], near_scaling: 0.0 };
@@ -570,7 +570,7 @@ fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     Ok(())
 }
 
-fn glam_unit(v: &[f32]) -> [f32; 3] {
+fn unit(v: &[f32]) -> [f32; 3] {
     let length = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt().max(1e-6);
     [v[0] / length, v[1] / length, v[2] / length]
 }

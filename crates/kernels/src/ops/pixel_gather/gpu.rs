@@ -230,7 +230,7 @@ fn choose(
         let h = sizes[own + 1];
         x = min(u32::cast_from(u * f32::cast_from(w)), w - 1);
         y = min(u32::cast_from(v * f32::cast_from(h)), h - 1);
-        at = sizes[own + 2] + y / stride * ((w + stride - 1) / stride) + x / stride;
+        at = sizes[own + 2] + y / stride * w.div_ceil(stride) + x / stride;
         if stride > 1 {
             // The pixel that was kept of its square.
             let x0 = x / stride * stride;

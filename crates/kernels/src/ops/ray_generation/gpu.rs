@@ -163,9 +163,11 @@ fn adjust(base: &[f32], corrections: &mut [f32], out: &mut [f32], n: u32, #[comp
     let scale = corrections[d + 6].exp();
     out[at + 12] = base[at + 12] * scale;
     out[at + 13] = base[at + 13] * scale;
+    // What is neither turned, moved nor scaled.
     #[unroll]
     for k in 14..CAMERA {
-        out[at + k] = base[at + k];
+        let same = base[at + k];
+        out[at + k] = same;
     }
 }
 

@@ -1,0 +1,270 @@
+//! How the layers of a network lie in memory: packed weights, a tile's activations and gradients, what is kept.
+
+use super::BLOCK;
+use crate::ops::fused_mlp::{Mlp, Source};
+use crate::ops::linear::gpu::code;
+use crate::ops::ngp_field::Head;
+
+/// Most inputs and heads.
+const INPUTS: usize = 3;
+const HEADS: usize = 2;
+/// Widest layer, and widest input of a layer.
+const MOST_WIDTH: usize = 128;
+/// Numbers between rows in shared memory, so that rows begin in different banks.
+const PAD: usize = 8;
+
+/// What a layer reads.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub(super) struct Feed {
+    pub source: Source,
+    pub width: usize,
+    pub padded: usize,
+    /// First row in the layer's packed weight.
+    pub at: usize,
+    /// First column among a tile's activations on the way forward.
+    pub column: usize,
+    /// First column among a tile's gradients on the way back; none: its gradient is not wanted.
+    pub gradient: Option<usize>,
+    /// Whether no later layer has left a gradient there.
+    pub fresh: bool,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub(super) struct PlannedLayer {
+    pub feeds: Vec<Feed>,
+    pub inputs: Vec<usize>,
+    pub width: usize,
+    pub padded: usize,
+    /// Rows of the packed weight.
+    pub rows: usize,
+    pub relu: bool,
+    /// First number in the packed weights.
+    pub weight: usize,
+    /// First number among the parameters, and in the packed gradients.
+    pub bias: Option<(usize, usize)>,
+    /// First column among a tile's activations; none: no layer reads it.
+    pub column: Option<usize>,
+    /// First column of what is kept for the way back.
+    pub kept: Option<usize>,
+    /// First column among a tile's gradients; none: only heads give it any.
+    pub gradient: Option<usize>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub(super) struct PlannedInput {
+    pub width: usize,
+    pub padded: usize,
+    /// Numbers per level where levels come one after another, `[L, S, F]`; 0: rows `[S, K]`.
+    pub per_level: usize,
+    pub column: usize,
+    pub wanted: bool,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub(super) struct PlannedHead {
+    pub layer: usize,
+    pub channel: usize,
+    pub channels: usize,
+    pub activation: u32,
+    pub shift: u32,
+}
+
+/// A network as its kernels are built for it.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub(super) struct Plan {
+    pub tile: usize,
+    pub tensor: bool,
+    /// Greatest number of an element, as bits of an f32.
+    pub largest: u32,
+    pub layers: Vec<PlannedLayer>,
+    pub inputs: Vec<PlannedInput>,
+    pub heads: Vec<PlannedHead>,
+    /// Numbers per row: activations, sums of a layer, what is kept, and on the way back input, gradient, gradients to come.
+    pub stride: usize,
+    pub stage: usize,
+    pub kept: usize,
+    pub x: usize,
+    pub g: usize,
+    pub gradients: usize,
+    /// Weights and biases of the packed gradients.
+    pub packed: usize,
+    pub keep: bool,
+}
+
+fn padded(n: usize) -> usize {
+    n.next_multiple_of(BLOCK)
+}
+
+/// Columns in use, handed out first fit.
+#[derive(Default)]
+struct Columns {
+    taken: Vec<(usize, usize)>,
+    most: usize,
+}
+
+impl Columns {
+    fn take(&mut self, width: usize) -> usize {
+        let mut at = 0;
+        for (first, w) in &self.taken {
+            if at + width <= *first {
+                break;
+            }
+            at = at.max(first + w);
+        }
+        self.taken.push((at, width));
+        self.taken.sort_unstable();
+        self.most = self.most.max(at + width);
+        at
+    }
+
+    fn free(&mut self, at: usize) {
+        self.taken.retain(|(first, _)| *first != at);
+    }
+}
+
+impl Plan {
+    /// Plans layers up to the last that a head needs; none where the network is too large or reads too much.
+    pub fn new(mlp: &Mlp, heads: &[(Head, usize)], per_level: usize, wanted: &[bool]) -> Option<Plan> {
+        let count = heads.iter().map(|(h, _)| h.layer + 1).max()?;
+        let n_inputs = mlp.input_widths.len();
+        if n_inputs > INPUTS || heads.len() > HEADS {
+            return None;
+        }
+        let readers = |s: Source| (0..count).filter(|j| mlp.layers[*j].inputs.contains(&s)).collect::<Vec<_>>();
+        let mut inputs: Vec<PlannedInput> = (0..n_inputs)
+            .map(|i| {
+                let width = mlp.input_widths[i];
+                let per_level = if i == 0 { per_level } else { 0 };
+                PlannedInput { width, padded: padded(width), per_level, column: 0, wanted: wanted[i] }
+            })
+            .collect();
+        let mut layers: Vec<PlannedLayer> = Vec::new();
+        let (mut forward, mut weight, mut kept) = (Columns::default(), 0, 0);
+        for (j, l) in mlp.layers[..count].iter().enumerate() {
+            let mut loaded = Vec::new();
+            for s in &l.inputs {
+                if let Source::Input(i) = *s
+                    && readers(*s)[0] == j
+                    && !loaded.contains(&i)
+                {
+                    inputs[i].column = forward.take(inputs[i].padded);
+                    loaded.push(i);
+                }
+            }
+            let (mut feeds, mut at) = (Vec::new(), 0);
+            for s in &l.inputs {
+                let width = mlp.source_width(*s);
+                let column = match *s {
+                    Source::Input(i) => inputs[i].column,
+                    Source::Layer(i) => layers[i].column.expect("a layer that is read has a place"),
+                };
+                feeds.push(Feed { source: *s, width, padded: padded(width), at, column, gradient: None, fresh: true });
+                at += padded(width);
+            }
+            for f in &feeds {
+                if readers(f.source).last() == Some(&j) {
+                    forward.free(f.column);
+                }
+            }
+            let read = !readers(Source::Layer(j)).is_empty();
+            let p = padded(l.width);
+            let column = read.then(|| forward.take(p));
+            let keeps = read || l.relu;
+            let place = keeps.then_some(kept);
+            kept += if keeps { p } else { 0 };
+            if at > MOST_WIDTH || p > MOST_WIDTH || l.inputs.iter().enumerate().any(|(i, s)| l.inputs[..i].contains(s)) {
+                return None;
+            }
+            layers.push(PlannedLayer {
+                feeds,
+                inputs: loaded,
+                width: l.width,
+                padded: p,
+                rows: at,
+                relu: l.relu,
+                weight,
+                bias: l.bias.then_some((mlp.offsets[j] + mlp.fan_in(j) * l.width, 0)),
+                column,
+                kept: place,
+                gradient: None,
+            });
+            weight += at * p;
+        }
+        for l in &mut layers {
+            if let Some((_, at)) = &mut l.bias {
+                *at = weight;
+                weight += l.padded;
+            }
+        }
+        let mut back = Columns::default();
+        let mut seen = vec![false; n_inputs];
+        for j in (0..count).rev() {
+            // Its gradient is used up before those of what it read are formed.
+            if let Some(at) = layers[j].gradient {
+                back.free(at);
+            }
+            let mut passing = Vec::new();
+            for e in 0..layers[j].feeds.len() {
+                let (source, width) = (layers[j].feeds[e].source, layers[j].feeds[e].padded);
+                let (place, fresh) = match source {
+                    Source::Input(i) if !wanted[i] => (None, true),
+                    Source::Input(i) => {
+                        let at = back.take(width);
+                        passing.push(at);
+                        (Some(at), !std::mem::replace(&mut seen[i], true))
+                    }
+                    Source::Layer(i) => {
+                        let fresh = layers[i].gradient.is_none();
+                        let at = *layers[i].gradient.get_or_insert_with(|| back.take(width));
+                        (Some(at), fresh)
+                    }
+                };
+                (layers[j].feeds[e].gradient, layers[j].feeds[e].fresh) = (place, fresh);
+            }
+            passing.into_iter().for_each(|at| back.free(at));
+        }
+        let heads = heads.iter().map(|(h, channels)| PlannedHead {
+            layer: h.layer,
+            channel: h.channel,
+            channels: *channels,
+            activation: code(h.activation),
+            shift: h.shift.to_bits(),
+        });
+        let widest = |f: &dyn Fn(&PlannedLayer) -> usize| layers.iter().map(f).max().unwrap_or(0);
+        let (stage, x, g) = (widest(&|l| l.padded) + PAD, widest(&|l| l.rows) + PAD, widest(&|l| l.padded) + PAD);
+        let heads = heads.collect();
+        Some(Plan {
+            tile: 0,
+            tensor: false,
+            largest: f32::MAX.to_bits(),
+            stride: forward.most + PAD,
+            stage,
+            kept: kept.max(1),
+            x,
+            g,
+            gradients: back.most.max(BLOCK) + PAD,
+            packed: weight,
+            keep: true,
+            layers,
+            inputs,
+            heads,
+        })
+    }
+
+    /// Results of a unit that wait for the last tile.
+    pub fn sums(&self) -> usize {
+        self.layers.iter().map(|l| (l.rows / BLOCK) * (l.padded / BLOCK)).sum()
+    }
+
+    pub fn biases(&self) -> usize {
+        self.layers.iter().filter(|l| l.bias.is_some()).count()
+    }
+
+    /// Shared memory of either kernel, the larger.
+    pub fn bytes(&self, tile: usize, element: usize) -> usize {
+        let stage = if self.tensor { self.stage } else { 0 };
+        let forward = self.stride * element + stage * 4;
+        let back = (self.x + self.g) * element + self.gradients * 4;
+        tile * forward.max(back)
+    }
+}
