@@ -439,23 +439,14 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             table.close("loss", "sums", &shape, &up(&sums[..2]), &want)?;
             table.close("loss", "counts", &shape, &up(&sums[2..]), &[s as f64, s as f64, 1.0])?;
 
-            // All of it at once, where no distortion counts.
-            let plain = Photometric { distortion: 0.0, ..photometric };
-            value = 0.0;
-            for r in 0..rays {
-                let rgb = [0, 1, 2].map(|k: usize| out.color[r * 3 + k]);
-                let (weights, first) = (&out.weights[p.range(r)], p.range(r).start);
-                let o = RayOutput { rgb, opacity: out.opacity[r], depth: out.depth[r], weights, first };
-                value +=
-                    plain.ray(r, &o, &mut RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut d_weights[p.range(r)] });
-            }
+            // All of it at once.
             for reach in [0.0, near] {
-                let terms = Terms { huber, distortion: 0.0, alpha };
+                let terms = Terms { huber, distortion, alpha };
                 let (sigma_gpu, rgb_gpu, sums) = (up(&scene.sigma), up(&rgb), gpu.zeros(SUMS));
                 let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
                 let (g, own_errors) = loss::composite_and_loss(gpu, terms, &on_gpu, &sigma_gpu, &rgb_gpu, target, reach, figures);
                 table.close("composite + loss", "errors", &shape, &own_errors, &wide(&gpu.read(&errors)?))?;
-                let d = Composited { color: wide(&d_color), depth: vec![0.0; rays], opacity: wide(&d_opacity), weights: vec![0.0; s] };
+                let d = Composited { color: wide(&d_color), depth: vec![0.0; rays], opacity: wide(&d_opacity), weights: wide(&d_weights) };
                 let (sigma, background) = (wide(&scene.sigma), wide(&gpu.read(&background)?));
                 let (ds, dc, db) = reference::backward(&p, &sigma, &wide(&rgb), 3, &background, &d);
                 let kept = |i: usize| if reach > 0.0 { ((scene.t[i] + 0.5 * scene.dt[i]) / reach).min(1.0).powi(2) as f64 } else { 1.0 };

@@ -136,7 +136,7 @@ impl GpuField {
         let direction = self.shape.direction(gpu, &on.rays.dirs);
         let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &on.drawn.images, *dims));
         let codes: Vec<&Buffer> = direction.iter().chain(&appearance).collect();
-        let (g, errors, composited) = if s.terms.distortion == 0.0 && !on.wants_weights {
+        let (g, errors, composited) = if !on.wants_weights {
             let at = net.evaluate(gpu, weights, packed, &on.features, &codes, true);
             let (d, errors) = loss::composite_and_loss(gpu, s.terms, packed, &at.sigma, &at.rgb, on.target, s.near_scaling, on.figures);
             (net.gradients(gpu, weights, packed, &at, &d), errors, None)

@@ -45,8 +45,8 @@ pub struct Target<'a> {
 }
 
 /// Composites packed samples with densities `[S]` and colours `[S, 3]`, compares them, and takes the gradients back to
-/// both, all rays in one launch; adds the step's figures. Also gives the squared error of each ray `[R]`. For terms without distortion, which
-/// needs sums over a ray's pairs of samples. Gradients closer than `near_scaling` are scaled as by [`super::soften`].
+/// both, all rays in one launch; adds the step's figures. Also gives the squared error of each ray `[R]`. Gradients
+/// closer than `near_scaling` are scaled as by [`super::soften`].
 #[allow(clippy::too_many_arguments)]
 pub fn composite_and_loss(
     gpu: &Gpu,
@@ -58,7 +58,6 @@ pub fn composite_and_loss(
     near_scaling: f32,
     figures: Figures,
 ) -> (GpuGradients, Buffer) {
-    assert!(terms.distortion == 0.0, "composite and loss: no distortion");
     let r = p.rays();
     let (values, errors) = (gpu.empty(r), gpu.empty(r));
     let g = GpuGradients { sigma: gpu.empty(sigma.len()), features: gpu.empty(rgb.len()), background: gpu.empty(r * 3) };
@@ -88,10 +87,11 @@ pub fn composite_and_loss(
             1.0 / r as f32,
             terms.huber,
             terms.alpha,
+            terms.distortion,
             near_scaling,
         );
     }
-    // Nothing is read of it.
+    // The values hold the distortion already.
     add_up(gpu, p, target.left_out, &values, &errors, &values, 0.0, figures);
     (g, errors)
 }
@@ -219,6 +219,7 @@ fn blend_and_compare(
     scale: f32,
     huber: f32,
     alpha: f32,
+    distortion: f32,
     near: f32,
 ) {
     let r = ABSOLUTE_POS;
@@ -228,6 +229,8 @@ fn blend_and_compare(
     let first = offsets[r] as usize;
     let count = offsets[r + 1] as usize - first;
     let mut light = 1.0f32;
+    let mut all_w = 0.0f32;
+    let mut all_m = 0.0f32;
     let mut color = Array::<f32>::new(3usize);
     #[unroll]
     for k in 0..3usize {
@@ -238,6 +241,9 @@ fn blend_and_compare(
         let through = (-sigma[i] * dt[i]).exp();
         let w = light * (1.0 - through);
         light *= through;
+        all_w += w;
+        // Midpoints relative to the first keep the distortion's differences exact in f32.
+        all_m += w * ((t[i] - t[first]) + 0.5 * dt[i]);
         // Kept where the gradient will be.
         d_sigma[i] = w;
         #[unroll]
@@ -267,24 +273,27 @@ fn blend_and_compare(
         d_background[r * 3 + k] = light * d;
         out += d * behind;
     }
-    if counts == 0.0 {
-        value = 0.0f32;
-        error = 0.0f32;
-    }
-    values[r] = value;
-    errors[r] = error;
     // From the back, where what is still behind is small.
     let mut after = light;
     let mut behind = light * out;
+    let mut sum_w = all_w;
+    let mut sum_m = all_m;
+    let mut spread = 0.0f32;
     for j in 0..count {
         let i = first + count - 1 - j;
         let w = d_sigma[i];
+        // As in the distortion's own kernel, with the sums up to here.
+        let mid = (t[i] - t[first]) + 0.5 * dt[i];
+        let pairs = mid * (2.0 * sum_w - all_w) - (2.0 * sum_m - all_m);
+        sum_w -= w;
+        sum_m -= w * mid;
+        spread += w * (pairs + w * dt[i] / 3.0);
         let mut kept = 1.0f32;
         if near > 0.0 {
             let share = min((t[i] + 0.5 * dt[i]) / near, 1.0);
             kept = share * share;
         }
-        let mut g = 0.0f32;
+        let mut g = counts * distortion * (2.0 * pairs + w * dt[i] * 2.0 / 3.0);
         #[unroll]
         for k in 0..3usize {
             g += d_color[k] * rgb[i * 3 + k];
@@ -294,6 +303,13 @@ fn blend_and_compare(
         behind += w * g;
         after += w;
     }
+    value += distortion * spread;
+    if counts == 0.0 {
+        value = 0.0f32;
+        error = 0.0f32;
+    }
+    values[r] = value;
+    errors[r] = error;
 }
 
 #[cube(launch_unchecked)]
