@@ -141,10 +141,20 @@ pub fn train(
     Ok(Trained { device: trainer.device.name(), model: trainer.model, summary })
 }
 
-/// The losses of the first `steps` steps; writes nothing.
-pub fn losses(config: &Config, steps: u64) -> Result<Vec<f64>> {
+/// What the first steps came to.
+pub struct Beginning {
+    /// Per step.
+    pub losses: Vec<f64>,
+    /// Of the cameras, where they are refined.
+    pub corrections: Option<Vec<f32>>,
+}
+
+/// Trains the first `steps` steps; writes nothing.
+pub fn begin(config: &Config, steps: u64) -> Result<Beginning> {
     let mut trainer = scratch_trainer(config)?;
-    (0..steps).map(|step| Ok(trainer.step(step, step as f64 / steps as f64)?.loss)).collect()
+    let losses = (0..steps).map(|step| Ok(trainer.step(step, step as f64 / steps as f64)?.loss)).collect::<Result<_>>()?;
+    trainer.device.download(&mut trainer.model)?;
+    Ok(Beginning { losses, corrections: trainer.model.corrections.map(|g| g.values) })
 }
 
 /// Where a step's time goes: `warmup` steps, then `steps` measured ones; writes nothing.

@@ -32,6 +32,9 @@ const EMPTY: u32 = u32::MAX;
 /// Most results of one unit that wait for the last tile.
 const MOST_SUMS: usize = 96;
 
+/// Processors of a device that does not tell: many, since a cube too much costs little and an idle processor a lot.
+const PROCESSORS: u32 = 128;
+
 /// What activations and packed weights are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Element {
@@ -120,7 +123,7 @@ impl Fused {
                 (0..l.width).for_each(|c| (to_packed[q + c], from_packed[p + c]) = ((p + c) as u32, (q + c) as u32));
             }
         }
-        let processors = hardware.num_streaming_multiprocessors.unwrap_or(16) as usize;
+        let processors = hardware.num_streaming_multiprocessors.unwrap_or(PROCESSORS) as usize;
         let (to_packed, from_packed) = (gpu.upload_u32(&to_packed), gpu.upload_u32(&from_packed));
         Some(Fused { element, plan, to_packed, from_packed, cubes: 2 * processors })
     }
