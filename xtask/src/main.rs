@@ -50,9 +50,10 @@ fn fuzz(runs: &str) -> bool {
 fn gpu_check(devices: &str) -> bool {
     // Vulkan, or Metal on macOS, is what the default build holds, so that nothing is built anew for it.
     let features: Vec<&str> = devices.split(',').map(|d| if ["vulkan", "metal"].contains(&d) { "native" } else { d }).collect();
-    let features = features.join(",");
+    let mut features = features.join(",");
     let mut build = vec!["build", "--release", "--package", "diorama"];
     if features != "native" {
+        features += ",burn-gpu";
         build.extend(["--no-default-features", "--features", &features]);
     }
     if !step("build", cargo(&build)) {

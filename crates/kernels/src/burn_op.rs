@@ -14,6 +14,19 @@ use burn::tensor::{Shape, Tensor, TensorData};
 use std::fmt::Debug;
 use std::sync::{Arc, Mutex};
 
+#[cfg(feature = "burn-gpu")]
+pub mod check;
+#[cfg(feature = "burn-gpu")]
+mod on_gpu;
+#[cfg(feature = "burn-gpu")]
+pub use on_gpu::{Ahead, DeviceOp, OnDevice};
+
+/// Without burn on GPUs an op needs no kernels here.
+#[cfg(not(feature = "burn-gpu"))]
+pub trait DeviceOp {}
+#[cfg(not(feature = "burn-gpu"))]
+impl<T> DeviceOp for T {}
+
 /// Most inputs and outputs that an op may have.
 pub const ARITY: usize = 4;
 
@@ -28,7 +41,7 @@ pub struct In<'a> {
 pub type Out = (Vec<f32>, Vec<usize>);
 
 /// An op on slices with its backward.
-pub trait SliceOp: Debug + Send + Sync + 'static {
+pub trait SliceOp: DeviceOp + Debug + Send + Sync + 'static {
     /// At most [`ARITY`] outputs.
     fn forward(&self, inputs: &[In]) -> Vec<Out>;
     /// Gradients for the inputs given those of the outputs (`None` where an output was not used);
@@ -60,9 +73,18 @@ pub fn apply_one<const D: usize>(op: impl SliceOp, inputs: Vec<FloatTensor<Dispa
 
 /// Forward and backward of a slice op per backend.
 pub trait SliceKernels: Backend {
-    fn k_forward(inputs: &[FloatTensor<Self>], op: &OpRef) -> Vec<FloatTensor<Self>>;
-    fn k_backward(inputs: &[FloatTensor<Self>], d: Vec<Option<FloatTensor<Self>>>, op: &OpRef) -> Vec<Option<FloatTensor<Self>>>;
-    fn k_unit() -> FloatTensor<Self>;
+    /// What the way back needs besides the inputs.
+    type Kept: Debug + Clone + Send + 'static;
+
+    fn k_forward(inputs: &[FloatTensor<Self>], op: &OpRef) -> (Vec<FloatTensor<Self>>, Self::Kept);
+    fn k_backward(
+        inputs: &[FloatTensor<Self>],
+        kept: &Self::Kept,
+        d: Vec<Option<FloatTensor<Self>>>,
+        op: &OpRef,
+    ) -> Vec<Option<FloatTensor<Self>>>;
+    /// One number, where that of `like` is.
+    fn k_unit(like: &FloatTensor<Self>) -> FloatTensor<Self>;
 }
 
 fn contiguous(t: &FlexTensor) -> FlexTensor {
@@ -78,14 +100,16 @@ fn flex(data: Vec<f32>, shape: Vec<usize>) -> FlexTensor {
 }
 
 impl SliceKernels for Flex {
-    fn k_forward(inputs: &[FlexTensor], op: &OpRef) -> Vec<FlexTensor> {
+    type Kept = ();
+
+    fn k_forward(inputs: &[FlexTensor], op: &OpRef) -> (Vec<FlexTensor>, ()) {
         let inputs: Vec<FlexTensor> = inputs.iter().map(contiguous).collect();
         let shapes: Vec<Vec<usize>> = inputs.iter().map(|t| t.shape().iter().copied().collect()).collect();
         let views: Vec<In> = inputs.iter().zip(&shapes).map(|(t, s)| In { data: floats(t), shape: s }).collect();
-        op.0.forward(&views).into_iter().map(|(data, shape)| flex(data, shape)).collect()
+        (op.0.forward(&views).into_iter().map(|(data, shape)| flex(data, shape)).collect(), ())
     }
 
-    fn k_backward(inputs: &[FlexTensor], d: Vec<Option<FlexTensor>>, op: &OpRef) -> Vec<Option<FlexTensor>> {
+    fn k_backward(inputs: &[FlexTensor], _: &(), d: Vec<Option<FlexTensor>>, op: &OpRef) -> Vec<Option<FlexTensor>> {
         let inputs: Vec<FlexTensor> = inputs.iter().map(contiguous).collect();
         let d: Vec<Option<FlexTensor>> = d.iter().map(|t| t.as_ref().map(contiguous)).collect();
         let shapes: Vec<Vec<usize>> = inputs.iter().map(|t| t.shape().iter().copied().collect()).collect();
@@ -95,7 +119,7 @@ impl SliceKernels for Flex {
         out.into_iter().zip(shapes).map(|(g, shape)| g.map(|g| flex(g, shape))).collect()
     }
 
-    fn k_unit() -> FlexTensor {
+    fn k_unit(_: &FlexTensor) -> FlexTensor {
         flex(vec![0.0], vec![1])
     }
 }
@@ -103,7 +127,7 @@ impl SliceKernels for Flex {
 type Four<B> = (FloatTensor<B>, FloatTensor<B>, FloatTensor<B>, FloatTensor<B>);
 
 /// The extension that burn's dispatch learns.
-#[backend_extension(Autodiff, Flex)]
+#[backend_extension(Autodiff, Flex, Cube: cfg(feature = "burn-gpu"))]
 pub trait SliceBackend: burn::backend::Backend {
     fn slice_op(
         a: FloatTensor<Self>,
@@ -115,8 +139,8 @@ pub trait SliceBackend: burn::backend::Backend {
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
 }
 
-fn four<B: SliceKernels>(mut outputs: Vec<FloatTensor<B>>) -> Four<B> {
-    outputs.resize_with(ARITY, B::k_unit);
+fn four<B: SliceKernels>(mut outputs: Vec<FloatTensor<B>>, unit: &FloatTensor<B>) -> Four<B> {
+    outputs.resize_with(ARITY, || unit.clone());
     let mut it = outputs.into_iter();
     let mut next = || it.next().expect("resized to ARITY");
     (next(), next(), next(), next())
@@ -124,7 +148,8 @@ fn four<B: SliceKernels>(mut outputs: Vec<FloatTensor<B>>) -> Four<B> {
 
 impl SliceBackend for Flex {
     fn slice_op(a: FlexTensor, b: FlexTensor, c: FlexTensor, d: FlexTensor, n: usize, op: OpRef) -> Four<Self> {
-        four::<Flex>(Self::k_forward(&[a, b, c, d][..n], &op))
+        let unit = Self::k_unit(&a);
+        four::<Flex>(Self::k_forward(&[a, b, c, d][..n], &op).0, &unit)
     }
 }
 
@@ -143,13 +168,13 @@ impl<B: SliceKernels> Backward<B, 1> for OutputStep {
 #[derive(Debug)]
 struct JointStep;
 impl<B: SliceKernels> Backward<B, ARITY> for JointStep {
-    type State = (Vec<FloatTensor<B>>, usize, OpRef, Slots<B>);
+    type State = (Vec<FloatTensor<B>>, B::Kept, usize, OpRef, Slots<B>);
     fn backward(self, ops: Ops<Self::State, ARITY>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let (inputs, outputs, op, slots) = ops.state;
+        let (inputs, kept, outputs, op, slots) = ops.state;
         let mut d = std::mem::take(&mut *slots.lock().expect("no other holder panicked"));
         d.truncate(outputs);
         let n = inputs.len();
-        for (i, (node, g)) in ops.parents.into_iter().zip(B::k_backward(&inputs, d, &op)).enumerate() {
+        for (i, (node, g)) in ops.parents.into_iter().zip(B::k_backward(&inputs, &kept, d, &op)).enumerate() {
             if let (true, Some(node), Some(g)) = (i < n, node, g) {
                 grads.register::<B>(node.id, g);
             }
@@ -161,13 +186,14 @@ impl<B: SliceKernels, C: CheckpointStrategy> SliceBackend for Autodiff<B, C> {
     fn slice_op(a: FloatTensor<Self>, b: FloatTensor<Self>, c: FloatTensor<Self>, d: FloatTensor<Self>, n: usize, op: OpRef) -> Four<Self> {
         let (mut inputs, nodes): (Vec<_>, Vec<_>) = [a, b, c, d].into_iter().map(|t| t.into_parts()).unzip();
         inputs.truncate(n);
-        let outputs = B::k_forward(&inputs, &op);
+        let unit = B::k_unit(&inputs[0]);
+        let (outputs, kept) = B::k_forward(&inputs, &op);
         let count = outputs.len();
         let nodes: [_; ARITY] = nodes.try_into().unwrap_or_else(|_| unreachable!("four inputs"));
         match JointStep.prepare::<C>(nodes).compute_bound().stateful() {
             OpsKind::Tracked(prep) => {
                 let slots: Slots<B> = Arc::new(Mutex::new(vec![None; ARITY]));
-                let joint: FloatTensor<Self> = prep.finish((inputs, count, op, slots.clone()), B::k_unit());
+                let joint: FloatTensor<Self> = prep.finish((inputs, kept, count, op, slots.clone()), unit.clone());
                 let children = outputs
                     .into_iter()
                     .enumerate()
@@ -176,18 +202,21 @@ impl<B: SliceKernels, C: CheckpointStrategy> SliceBackend for Autodiff<B, C> {
                         OpsKind::UnTracked(prep) => prep.finish(t),
                     })
                     .collect();
-                four_autodiff::<B, C>(children)
+                four_autodiff::<B, C>(children, &unit)
             }
             OpsKind::UnTracked(prep) => {
                 drop(prep);
-                four_autodiff::<B, C>(outputs.into_iter().map(<FloatTensor<Self>>::new).collect())
+                four_autodiff::<B, C>(outputs.into_iter().map(<FloatTensor<Self>>::new).collect(), &unit)
             }
         }
     }
 }
 
-fn four_autodiff<B: SliceKernels, C: CheckpointStrategy>(mut outputs: Vec<FloatTensor<Autodiff<B, C>>>) -> Four<Autodiff<B, C>> {
-    outputs.resize_with(ARITY, || <FloatTensor<Autodiff<B, C>>>::new(B::k_unit()));
+fn four_autodiff<B: SliceKernels, C: CheckpointStrategy>(
+    mut outputs: Vec<FloatTensor<Autodiff<B, C>>>,
+    unit: &FloatTensor<B>,
+) -> Four<Autodiff<B, C>> {
+    outputs.resize_with(ARITY, || <FloatTensor<Autodiff<B, C>>>::new(unit.clone()));
     let mut it = outputs.into_iter();
     let mut next = || it.next().expect("resized to ARITY");
     (next(), next(), next(), next())

@@ -152,6 +152,8 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
     for case in cases {
         case(gpu, &mut table)?;
     }
+    #[cfg(feature = "burn-gpu")]
+    crate::burn_op::check::run(gpu, &mut table);
     Ok(table.rows)
 }
 

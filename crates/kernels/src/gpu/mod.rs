@@ -41,6 +41,8 @@ pub struct Gpu {
     pub name: String,
     /// Whether the CPU plays the device.
     pub software: bool,
+    #[cfg_attr(not(feature = "burn-gpu"), expect(dead_code, reason = "burn asks for it"))]
+    device: cubecl::Device,
     pub(crate) client: Client,
     /// Whether f32 can be added atomically; else exchanges serve.
     pub(crate) native_atomics: bool,
@@ -50,13 +52,24 @@ pub struct Gpu {
 }
 
 /// Numbers of four bytes each in the memory of a device.
-#[derive(Clone)]
+#[derive(Clone, Debug)]
 pub struct Buffer {
     handle: Handle,
     len: usize,
 }
 
 impl Buffer {
+    /// `len` numbers in memory that is there already.
+    #[cfg(feature = "burn-gpu")]
+    pub(crate) fn of(handle: Handle, len: usize) -> Buffer {
+        Buffer { handle, len }
+    }
+
+    #[cfg(feature = "burn-gpu")]
+    pub(crate) fn handle(self) -> Handle {
+        self.handle
+    }
+
     pub fn len(&self) -> usize {
         self.len
     }
@@ -131,13 +144,41 @@ impl Gpu {
         keep_compiled();
         let (device, software) = find(api).filter(|(_, software)| or_software || !software).ok_or(GpuError::NoDevice(api.name()))?;
         let client = quietly(|| device.client()).map_err(|e| GpuError::Open(api.name(), e))?;
+        Ok(Gpu::with(api, device, software, client))
+    }
+
+    fn with(api: Api, device: cubecl::Device, software: bool, client: Client) -> Gpu {
         let add = Type::atomic(f32::elem_type_native().with_vector_size(1));
         let native_atomics = client.properties().atomic_type_usage(add).contains(AtomicUsage::Add);
         let name = client.properties().identity.name.clone();
         let software = software || name == CUDA_ON_CPU;
         // A build with Vulkan speaks SPIR-V to it under any name.
         let spirv = api == Api::Vulkan || (api == Api::WebGpu && Api::Vulkan.is_built());
-        Ok(Gpu { shared: !(software && spirv), api, name, software, client, native_atomics })
+        Gpu { shared: !(software && spirv), api, name, software, device, client, native_atomics }
+    }
+
+    /// A device that burn has opened.
+    #[cfg(feature = "burn-gpu")]
+    pub(crate) fn of(device: cubecl::Device, client: Client) -> Gpu {
+        let (api, software) = match &device {
+            cubecl::Device::Cuda(_) => (Api::Cuda, false),
+            cubecl::Device::Wgpu(d) => {
+                let api = match d.backend {
+                    WgpuBackend::Vulkan => Api::Vulkan,
+                    WgpuBackend::Metal => Api::Metal,
+                    _ => Api::WebGpu,
+                };
+                (api, matches!(d.kind, WgpuDeviceKind::Cpu))
+            }
+            other => panic!("ops run on CUDA, Vulkan, Metal and WebGPU, not on {other:?}"),
+        };
+        Gpu::with(api, device, software, client)
+    }
+
+    /// The device for burn's tensors; ops in burn's graph run on it without copies.
+    #[cfg(feature = "burn-gpu")]
+    pub fn tensors(&self) -> burn::tensor::Device {
+        burn::tensor::Device::new(self.device.clone())
     }
 
     /// The same device adding without native f32 atomics.

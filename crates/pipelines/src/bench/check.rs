@@ -53,16 +53,16 @@ pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
     if tensor_element(&gpu).is_some() {
         cases.push(("loss, tensor cores", "auto", &[]));
     }
-    cases.push(("camera corrections", "f32", &["camera.refine=true"]));
-    cases.push(("corrections, focal", "f32", &["camera.refine=true", "camera.refine_focal=true"]));
+    cases.push(("d cameras", "f32", &["camera.refine=true"]));
+    cases.push(("d cameras, focal", "f32", &["camera.refine=true", "camera.refine_focal=true"]));
     cases.push(("loss, drawn by error", "f32", &["sampling.error_map=true"]));
     cases.push(("loss, distortion", "f32", &["loss.distortion=0.01", "background=learned"]));
     for (result, precision, changes) in cases {
-        lines.push(training(device, data, Method::Ngp, result, precision, changes)?);
+        lines.extend(training(device, data, Method::Ngp, result, precision, changes)?);
     }
     for (method, result) in [(Method::Nerf, "loss, nerf"), (Method::Mlp, "loss, mlp"), (Method::Baseline, "loss, baseline")] {
         let small = ["sampling.rays=16", "sampling.samples=12", "sampling.importance=12"];
-        lines.push(training(device, data, method, result, "f32", &small)?);
+        lines.extend(training(device, data, method, result, "f32", &small)?);
     }
     Ok(Report {
         device: gpu.api.name(),
@@ -81,13 +81,11 @@ const STEPS: u64 = 50;
 /// The same of wide networks, which the CPU takes long for.
 #[cfg(feature = "gpu")]
 const WIDE_STEPS: u64 = 10;
-/// Steps after which cameras' corrections are compared, few because they diverge fast: on fox, two instruction sets of one
-/// CPU are 42 % apart after 50.
+/// How far the first gradient of cameras' corrections may be apart, and the step that they take by its signs, as root mean
+/// square of that of all. Later ones diverge fast, because a sign decides where a camera goes: on fox, two instruction
+/// sets of one CPU are 42 % apart after 50 steps.
 #[cfg(feature = "gpu")]
-const REFINED_STEPS: u64 = 4;
-/// How far they may be apart, as root mean square of that of all.
-#[cfg(feature = "gpu")]
-const CORRECTIONS_APART: f64 = 0.2;
+const CAMERAS_APART: [f64; 2] = [0.02, 0.4];
 /// How far losses may be apart in f32, and on tensor cores.
 #[cfg(feature = "gpu")]
 const APART: [f64; 2] = [0.02, 0.05];
@@ -95,12 +93,19 @@ const APART: [f64; 2] = [0.02, 0.05];
 /// Small steps of the standard recipe on the device in the given precision, and on the CPU in f32, with the same
 /// rays: by default on the still life.
 #[cfg(feature = "gpu")]
-fn training(device: &str, data: Option<&Path>, method: Method, result: &'static str, precision: &str, changes: &[&str]) -> Result<Line> {
+fn training(
+    device: &str,
+    data: Option<&Path>,
+    method: Method,
+    result: &'static str,
+    precision: &str,
+    changes: &[&str],
+) -> Result<Vec<Line>> {
     use crate::object::config::Config;
     use crate::object::{quickstart, recipe};
     let refines = changes.contains(&"camera.refine=true");
     let steps = match method {
-        Method::Ngp if refines => REFINED_STEPS,
+        Method::Ngp if refines => 1,
         Method::Ngp => STEPS,
         _ => WIDE_STEPS,
     };
@@ -133,24 +138,19 @@ fn training(device: &str, data: Option<&Path>, method: Method, result: &'static 
         let _ = std::fs::remove_dir_all(&scratch);
     }
     let (cpu, gpu) = curves?;
-    let (error, most) = match (&cpu.corrections, &gpu.corrections) {
-        (Some(a), Some(b)) => {
-            let energy = |v: &mut dyn Iterator<Item = f32>| v.map(|x| (x * x) as f64).sum::<f64>().sqrt();
-            (energy(&mut a.iter().zip(b).map(|(a, b)| a - b)) / energy(&mut a.iter().copied()), CORRECTIONS_APART)
-        }
-        _ => {
-            let apart = cpu.losses.iter().zip(&gpu.losses).map(|(a, b)| (b / a - 1.0).abs());
-            (apart.fold(0.0, |a: f64, e| if e.is_nan() { e } else { a.max(e) }), most)
-        }
+    let shape = format!("{steps} step{}, {name}", if steps == 1 { "" } else { "s" });
+    let line = |result, error: f64, most: f64| {
+        let right = error <= most;
+        let fault = (!right).then(|| format!("{:.2} % off, {:.0} % is allowed", 100.0 * error, 100.0 * most));
+        Line { op: "training", result, shape: shape.clone(), error: (right && error.is_finite()).then_some(error), fault }
     };
-    let right = error <= most;
-    Ok(Line {
-        op: "training",
-        result,
-        shape: format!("{steps} steps, {name}"),
-        error: (right && error.is_finite()).then_some(error),
-        fault: (!right).then(|| format!("{:.2} % off, {:.0} % is allowed", 100.0 * error, 100.0 * most)),
-    })
+    if let (Some(a), Some(b)) = (&cpu.cameras, &gpu.cameras) {
+        let energy = |v: &mut dyn Iterator<Item = f32>| v.map(|x| (x * x) as f64).sum::<f64>().sqrt();
+        let apart = |i: usize| energy(&mut a[i].iter().zip(&b[i]).map(|(a, b)| a - b)) / energy(&mut a[i].iter().copied());
+        return Ok(vec![line(result, apart(1), CAMERAS_APART[0]), line("cameras' first step", apart(0), CAMERAS_APART[1])]);
+    }
+    let apart = cpu.losses.iter().zip(&gpu.losses).map(|(a, b)| (b / a - 1.0).abs());
+    Ok(vec![line(result, apart.fold(0.0, |a: f64, e| if e.is_nan() { e } else { a.max(e) }), most)])
 }
 
 /// This build has no GPU kernels.

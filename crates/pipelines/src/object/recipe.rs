@@ -24,7 +24,7 @@ use diorama_geom::capture::Split;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::march::{self, MarchRays, Marched};
-use diorama_kernels::ops::ray_generation::{self, PosedCamera};
+use diorama_kernels::ops::ray_generation::{self, CORRECTION, PosedCamera};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
@@ -145,21 +145,25 @@ pub fn train(
 pub struct Beginning {
     /// Per step.
     pub losses: Vec<f64>,
-    /// Of the cameras, where they are refined.
-    pub corrections: Option<Vec<f32>>,
+    /// Of the cameras, where they are refined: how far their corrections went, and the mean of its gradient that the
+    /// optimiser keeps.
+    pub cameras: Option<[Vec<f32>; 2]>,
 }
 
-/// Trains the first `steps` steps; writes nothing.
+/// Trains the first `steps` steps, from cameras a little wrong where they are refined; writes nothing.
 pub fn begin(config: &Config, steps: u64) -> Result<Beginning> {
-    let mut trainer = scratch_trainer(config)?;
+    let mut trainer = scratch_trainer(config, true)?;
+    let from = trainer.model.corrections.as_ref().map(|g| g.values.clone()).unwrap_or_default();
     let losses = (0..steps).map(|step| Ok(trainer.step(step, step as f64 / steps as f64)?.loss)).collect::<Result<_>>()?;
     trainer.device.download(&mut trainer.model)?;
-    Ok(Beginning { losses, corrections: trainer.model.corrections.map(|g| g.values) })
+    let went = |to: &[f32]| to.iter().zip(&from).map(|(to, from)| to - from).collect();
+    let cameras = trainer.model.corrections.map(|g| [went(&g.values), g.moment1]);
+    Ok(Beginning { losses, cameras })
 }
 
 /// Where a step's time goes: `warmup` steps, then `steps` measured ones; writes nothing.
 pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> {
-    let mut trainer = scratch_trainer(config)?;
+    let mut trainer = scratch_trainer(config, false)?;
     for step in 0..warmup {
         trainer.step(step, 0.0)?;
     }
@@ -192,13 +196,23 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
     })
 }
 
+/// How wrong cameras are made at most, in radians and lengths of the model.
+const WRONG: f32 = 0.01;
+
 /// A trainer whose run is not kept.
-fn scratch_trainer(config: &Config) -> Result<Trainer<'static>> {
+fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'static>> {
     let capture = load_capture(config)?;
     let device = device::open(config)?;
     let (store, _) = load_pixels(config, &capture, &device)?;
     let has_alpha = store.has_alpha;
-    let model = ObjectModel::new(config.clone(), capture, has_alpha)?;
+    let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
+    if let (true, Some(group)) = (wrong_cameras, &mut model.corrections) {
+        let rng = Rng::new(config.seed, 0);
+        for (i, v) in group.values.iter_mut().enumerate() {
+            let moves = config.camera.refine_focal || i % CORRECTION != 6;
+            *v = if moves { WRONG * (2.0 * rng.uniform(i as u64) - 1.0) } else { 0.0 };
+        }
+    }
     Trainer::new(model, Photographs(store), Path::new(""), device)
 }
 

@@ -1,7 +1,11 @@
 //! One unit per window and channel for the factors, one per pixel for the gradient.
 
 use super::{C1, C2, WINDOW, gaussian};
+#[cfg(feature = "burn-gpu")]
+use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
+#[cfg(feature = "burn-gpu")]
+use crate::{gpu::Rows, ops::linear::gpu as linear};
 use cubecl::prelude::*;
 
 /// SSIM of every window `[windows, C]` and, of its slope `α + β x + γ y`, the three factors `[windows, C, 3]`.
@@ -63,6 +67,43 @@ pub fn backward(gpu: &Gpu, (w, h, c): (usize, usize, usize), x: &Buffer, y: &Buf
         );
     }
     out
+}
+
+/// `x · factor[0]`.
+#[cfg(feature = "burn-gpu")]
+fn times(gpu: &Gpu, x: &Buffer, factor: &Buffer) -> Buffer {
+    let out = gpu.empty(x.len());
+    // SAFETY: units past the length stop.
+    unsafe {
+        scale::launch_unchecked(&gpu.client, units(x.len()), CubeDim::new_1d(CUBE), x.arg(), factor.arg(), out.arg(), x.len() as u32);
+    }
+    out
+}
+
+#[cfg(feature = "burn-gpu")]
+#[cube(launch_unchecked)]
+fn scale(x: &[f32], factor: &[f32], out: &mut [f32], len: u32) {
+    if ABSOLUTE_POS < len as usize {
+        out[ABSOLUTE_POS] = x[ABSOLUTE_POS] * factor[0];
+    }
+}
+
+#[cfg(feature = "burn-gpu")]
+impl DeviceOp for super::SsimOp {
+    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
+        let [h, w, c] = [i[0].shape[0], i[0].shape[1], i[0].shape[2]];
+        let values = forward(gpu, (w, h, c), &i[0].data, &i[1].data);
+        let sum = gpu.empty(1);
+        linear::sum_rows_part(gpu, &Rows::all(gpu, values.len()), 1, &values, (&sum).into());
+        let mean = times(gpu, &sum, &gpu.upload(&[1.0 / values.len() as f32]));
+        Ahead { outputs: vec![(mean, vec![1])], kept: vec![] }
+    }
+
+    fn back(&self, gpu: &Gpu, i: &[OnDevice], _: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
+        let Some(d) = &d[0] else { return vec![None, None] };
+        let [h, w, c] = [i[0].shape[0], i[0].shape[1], i[0].shape[2]];
+        vec![Some(times(gpu, &backward(gpu, (w, h, c), &i[0].data, &i[1].data), d)), None]
+    }
 }
 
 #[cube(launch_unchecked)]

@@ -23,6 +23,29 @@ pub(super) fn no_sum() -> cmma::Matrix<f32> {
     cmma::Matrix::<f32>::from_value(cmma::MatrixIdent::Accumulator, BLOCK, BLOCK, BLOCK, cmma::MatrixLayout::Undefined, 0.0)
 }
 
+/// Where a number of an input's tile is: in the tile, and in memory.
+#[derive(CubeType)]
+pub(super) struct Spot {
+    pub row: usize,
+    pub column: usize,
+    pub at: usize,
+}
+
+/// The `e`-th number of an input's tile; neighbouring units get neighbouring numbers, of a row or of a level.
+#[cube]
+pub(super) fn spot(e: usize, first: usize, most: u32, #[comptime] input: PlannedInput, #[comptime] tile: usize) -> Spot {
+    let f = comptime!(input.per_level);
+    if comptime!(f > 0) {
+        let row = e / f % tile;
+        let level = e / comptime!(f * tile);
+        Spot { row, column: level * f + e % f, at: (level * most as usize + first + row) * f + e % f }
+    } else {
+        let row = e / comptime!(input.padded);
+        let column = e % comptime!(input.padded);
+        Spot { row, column, at: (first + row) * comptime!(input.width) + column }
+    }
+}
+
 /// Brings an input's tile to shared memory, zeros where there is nothing.
 #[cube]
 pub(super) fn load<E: Float>(
@@ -38,26 +61,15 @@ pub(super) fn load<E: Float>(
     #[comptime] column: usize,
 ) {
     let width = comptime!(input.width);
-    let wide = comptime!(input.padded);
-    let f = comptime!(input.per_level);
+    let numbers = comptime!(tile * input.padded);
     let mut e = UNIT_POS as usize;
-    while e < comptime!(tile * wide) {
-        let mut row = e / wide;
-        let mut c = e % wide;
-        if comptime!(f > 0) {
-            // Neighbouring units read neighbouring numbers of one level.
-            row = e / f % tile;
-            c = e / comptime!(f * tile) * f + e % f;
-        }
+    while e < numbers {
+        let s = spot(e, first, most, comptime!(input.clone()), tile);
         let mut v = 0.0f32;
-        if first + row < rows && c < width {
-            let mut at = (first + row) * width + c;
-            if comptime!(f > 0) {
-                at = (c / f * most as usize + first + row) * f + c % f;
-            }
-            v = clamp(x[at], -largest, largest);
+        if first + s.row < rows && s.column < width {
+            v = clamp(x[s.at], -largest, largest);
         }
-        to[row * stride + column + c] = E::cast_from(v);
+        to[s.row * stride + column + s.column] = E::cast_from(v);
         e += CUBE as usize;
     }
 }

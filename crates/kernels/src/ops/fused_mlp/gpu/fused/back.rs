@@ -1,6 +1,6 @@
 //! The way back.
 
-use super::ahead::{factor, load, no_sum};
+use super::ahead::{factor, load, no_sum, spot};
 use super::plan::{Plan, PlannedHead, PlannedInput};
 use super::{BLOCK, PLANES};
 use crate::gpu::CUBE;
@@ -51,26 +51,16 @@ fn hand_on(
     #[comptime] fresh: bool,
 ) {
     let width = comptime!(input.width);
-    let wide = comptime!(input.padded);
-    let f = comptime!(input.per_level);
+    let numbers = comptime!(tile * input.padded);
     let mut e = UNIT_POS as usize;
-    while e < comptime!(tile * wide) {
-        let mut row = e / wide;
-        let mut c = e % wide;
-        if comptime!(f > 0) {
-            row = e / f % tile;
-            c = e / comptime!(f * tile) * f + e % f;
-        }
-        if first + row < rows && c < width {
-            let mut at = (first + row) * width + c;
-            if comptime!(f > 0) {
-                at = (c / f * most as usize + first + row) * f + c % f;
-            }
-            let v = gradients[row * stride + column + c] / scale;
+    while e < numbers {
+        let s = spot(e, first, most, comptime!(input.clone()), tile);
+        if first + s.row < rows && s.column < width {
+            let v = gradients[s.row * stride + column + s.column] / scale;
             if comptime!(fresh) {
-                to[at] = v;
+                to[s.at] = v;
             } else {
-                to[at] += v;
+                to[s.at] += v;
             }
         }
         e += CUBE as usize;

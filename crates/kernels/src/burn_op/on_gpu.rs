@@ -1,0 +1,77 @@
+//! The same bridge on burn's Cube backend: its tensors and our [`Buffer`]s are the same memory of the same device,
+//! so nothing is copied and nothing waits.
+
+use super::{Four, OpRef, SliceBackend, SliceKernels, four};
+use crate::gpu::{Buffer, Gpu};
+use burn::backend::TensorMetadata;
+use burn::tensor::{DType, Shape};
+use burn_cubecl::kernel::into_contiguous;
+use burn_cubecl::tensor::CubeTensor;
+use burn_cubecl::{CubeBackend, CubeDevice};
+
+/// A tensor as an op sees it on a device: row-major values and their shape.
+pub struct OnDevice {
+    pub data: Buffer,
+    pub shape: Vec<usize>,
+}
+
+/// What an op returns on a device.
+pub struct Ahead {
+    /// Values and shape of each output.
+    pub outputs: Vec<(Buffer, Vec<usize>)>,
+    /// What the way back needs besides the inputs.
+    pub kept: Vec<Buffer>,
+}
+
+/// An op's kernels, forward and backward as in [`super::SliceOp`].
+pub trait DeviceOp {
+    fn ahead(&self, gpu: &Gpu, inputs: &[OnDevice]) -> Ahead;
+    /// Gradients for the inputs given those of the outputs (`None` where an output was not used).
+    fn back(&self, gpu: &Gpu, inputs: &[OnDevice], kept: &[Buffer], d_outputs: &[Option<Buffer>]) -> Vec<Option<Buffer>>;
+}
+
+/// The values of an f32 tensor.
+fn on_device(t: &CubeTensor) -> OnDevice {
+    assert_eq!(t.dtype, DType::F32, "an op takes f32 tensors");
+    let t = into_contiguous(t.clone());
+    let shape: Vec<usize> = t.shape().iter().copied().collect();
+    OnDevice { data: Buffer::of(t.handle, shape.iter().product()), shape }
+}
+
+fn tensor(gpu: &Gpu, device: &CubeDevice, data: Buffer, shape: Vec<usize>) -> CubeTensor {
+    assert_eq!(data.len(), shape.iter().product::<usize>(), "a result has as many numbers as its shape says");
+    CubeTensor::new_contiguous(gpu.client.clone(), device.clone(), Shape::from(shape), data.handle(), DType::F32)
+}
+
+impl SliceKernels for CubeBackend {
+    type Kept = Vec<Buffer>;
+
+    fn k_forward(inputs: &[CubeTensor], op: &OpRef) -> (Vec<CubeTensor>, Vec<Buffer>) {
+        let device = &inputs[0].device;
+        let gpu = Gpu::of(device.clone(), inputs[0].client.clone());
+        let inputs: Vec<OnDevice> = inputs.iter().map(on_device).collect();
+        let Ahead { outputs, kept } = op.0.ahead(&gpu, &inputs);
+        (outputs.into_iter().map(|(data, shape)| tensor(&gpu, device, data, shape)).collect(), kept)
+    }
+
+    fn k_backward(inputs: &[CubeTensor], kept: &Vec<Buffer>, d: Vec<Option<CubeTensor>>, op: &OpRef) -> Vec<Option<CubeTensor>> {
+        let device = &inputs[0].device;
+        let gpu = Gpu::of(device.clone(), inputs[0].client.clone());
+        let inputs: Vec<OnDevice> = inputs.iter().map(on_device).collect();
+        let d: Vec<Option<Buffer>> = d.iter().map(|t| t.as_ref().map(|t| on_device(t).data)).collect();
+        let gradients = op.0.back(&gpu, &inputs, kept, &d);
+        gradients.into_iter().zip(inputs).map(|(g, i)| g.map(|g| tensor(&gpu, device, g, i.shape))).collect()
+    }
+
+    fn k_unit(like: &CubeTensor) -> CubeTensor {
+        let gpu = Gpu::of(like.device.clone(), like.client.clone());
+        tensor(&gpu, &like.device, gpu.zeros(1), vec![1])
+    }
+}
+
+impl SliceBackend for CubeBackend {
+    fn slice_op(a: CubeTensor, b: CubeTensor, c: CubeTensor, d: CubeTensor, n: usize, op: OpRef) -> Four<Self> {
+        let unit = Self::k_unit(&a);
+        four::<CubeBackend>(Self::k_forward(&[a, b, c, d][..n], &op).0, &unit)
+    }
+}
