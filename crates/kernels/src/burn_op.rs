@@ -83,7 +83,7 @@ pub trait SliceKernels: Backend {
         d: Vec<Option<FloatTensor<Self>>>,
         op: &OpRef,
     ) -> Vec<Option<FloatTensor<Self>>>;
-    /// One number, where that of `like` is.
+    /// One number that nobody reads, where `like` is.
     fn k_unit(like: &FloatTensor<Self>) -> FloatTensor<Self>;
 }
 

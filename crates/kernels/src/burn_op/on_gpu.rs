@@ -5,9 +5,9 @@ use super::{Four, OpRef, SliceBackend, SliceKernels, four};
 use crate::gpu::{Buffer, Gpu};
 use burn::backend::TensorMetadata;
 use burn::tensor::{DType, Shape};
+use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
-use burn_cubecl::{CubeBackend, CubeDevice};
 
 /// A tensor as an op sees it on a device: row-major values and their shape.
 pub struct OnDevice {
@@ -38,34 +38,34 @@ fn on_device(t: &CubeTensor) -> OnDevice {
     OnDevice { data: Buffer::of(t.handle, shape.iter().product()), shape }
 }
 
-fn tensor(gpu: &Gpu, device: &CubeDevice, data: Buffer, shape: Vec<usize>) -> CubeTensor {
+/// A tensor where `like` is.
+fn tensor(like: &CubeTensor, data: Buffer, shape: Vec<usize>) -> CubeTensor {
     assert_eq!(data.len(), shape.iter().product::<usize>(), "a result has as many numbers as its shape says");
-    CubeTensor::new_contiguous(gpu.client.clone(), device.clone(), Shape::from(shape), data.handle(), DType::F32)
+    CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), Shape::from(shape), data.handle(), DType::F32)
+}
+
+fn gpu_of(t: &CubeTensor) -> Gpu {
+    Gpu::of(t.device.clone(), t.client.clone())
 }
 
 impl SliceKernels for CubeBackend {
     type Kept = Vec<Buffer>;
 
     fn k_forward(inputs: &[CubeTensor], op: &OpRef) -> (Vec<CubeTensor>, Vec<Buffer>) {
-        let device = &inputs[0].device;
-        let gpu = Gpu::of(device.clone(), inputs[0].client.clone());
-        let inputs: Vec<OnDevice> = inputs.iter().map(on_device).collect();
-        let Ahead { outputs, kept } = op.0.ahead(&gpu, &inputs);
-        (outputs.into_iter().map(|(data, shape)| tensor(&gpu, device, data, shape)).collect(), kept)
+        let on: Vec<OnDevice> = inputs.iter().map(on_device).collect();
+        let Ahead { outputs, kept } = op.0.ahead(&gpu_of(&inputs[0]), &on);
+        (outputs.into_iter().map(|(data, shape)| tensor(&inputs[0], data, shape)).collect(), kept)
     }
 
     fn k_backward(inputs: &[CubeTensor], kept: &Vec<Buffer>, d: Vec<Option<CubeTensor>>, op: &OpRef) -> Vec<Option<CubeTensor>> {
-        let device = &inputs[0].device;
-        let gpu = Gpu::of(device.clone(), inputs[0].client.clone());
-        let inputs: Vec<OnDevice> = inputs.iter().map(on_device).collect();
+        let on: Vec<OnDevice> = inputs.iter().map(on_device).collect();
         let d: Vec<Option<Buffer>> = d.iter().map(|t| t.as_ref().map(|t| on_device(t).data)).collect();
-        let gradients = op.0.back(&gpu, &inputs, kept, &d);
-        gradients.into_iter().zip(inputs).map(|(g, i)| g.map(|g| tensor(&gpu, device, g, i.shape))).collect()
+        let gradients = op.0.back(&gpu_of(&inputs[0]), &on, kept, &d);
+        gradients.into_iter().zip(on).map(|(g, i)| g.map(|g| tensor(&inputs[0], g, i.shape))).collect()
     }
 
     fn k_unit(like: &CubeTensor) -> CubeTensor {
-        let gpu = Gpu::of(like.device.clone(), like.client.clone());
-        tensor(&gpu, &like.device, gpu.zeros(1), vec![1])
+        tensor(like, Buffer::of(like.client.empty(size_of::<f32>()), 1), vec![1])
     }
 }
 

@@ -155,7 +155,9 @@ pub fn begin(config: &Config, steps: u64) -> Result<Beginning> {
     let mut trainer = scratch_trainer(config, true)?;
     let from = trainer.model.corrections.as_ref().map(|g| g.values.clone()).unwrap_or_default();
     let losses = (0..steps).map(|step| Ok(trainer.step(step, step as f64 / steps as f64)?.loss)).collect::<Result<_>>()?;
-    trainer.device.download(&mut trainer.model)?;
+    if trainer.model.corrections.is_some() {
+        trainer.device.download(&mut trainer.model)?;
+    }
     let went = |to: &[f32]| to.iter().zip(&from).map(|(to, from)| to - from).collect();
     let cameras = trainer.model.corrections.map(|g| [went(&g.values), g.moment1]);
     Ok(Beginning { losses, cameras })

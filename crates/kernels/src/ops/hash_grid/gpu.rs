@@ -141,12 +141,13 @@ impl DeviceOp for super::HashGridOp {
     fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
         let (g, s) = (GpuHashGrid::new(gpu, &self.0), i[0].shape[0]);
         let out = g.forward(gpu, &Rows::all(gpu, s), &i[0].data, &i[1].data);
-        Ahead { outputs: vec![(out, vec![self.0.levels.len(), s, self.0.config.features])], kept: vec![] }
+        Ahead { outputs: vec![(out, vec![self.0.levels.len(), s, self.0.config.features])], kept: vec![g.levels] }
     }
 
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], _: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
+    fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let Some(d) = &d[0] else { return vec![None, None] };
-        let (g, rows) = (GpuHashGrid::new(gpu, &self.0), Rows::all(gpu, i[0].shape[0]));
+        let g = GpuHashGrid { grid: self.0.clone(), levels: kept[0].clone() };
+        let rows = Rows::all(gpu, i[0].shape[0]);
         let d_table = gpu.zeros(self.0.params_len());
         g.backward(gpu, &rows, &i[0].data, d, &d_table);
         vec![Some(g.backward_positions(gpu, &rows, &i[0].data, &i[1].data, d)), Some(d_table)]

@@ -42,9 +42,14 @@ pub fn forward(gpu: &Gpu, size: (usize, usize, usize), x: &Buffer, y: &Buffer) -
 }
 
 /// Gradient of the mean with respect to x, `[h, w, c]`.
-pub fn backward(gpu: &Gpu, (w, h, c): (usize, usize, usize), x: &Buffer, y: &Buffer) -> Buffer {
-    let (values, slopes, g) = windows(gpu, (w, h, c), x, y);
-    if values.is_empty() {
+pub fn backward(gpu: &Gpu, size: (usize, usize, usize), x: &Buffer, y: &Buffer) -> Buffer {
+    let (_, slopes, g) = windows(gpu, size, x, y);
+    gathered(gpu, size, x, y, &slopes, &g)
+}
+
+/// The gradient from the windows' factors.
+fn gathered(gpu: &Gpu, (w, h, c): (usize, usize, usize), x: &Buffer, y: &Buffer, slopes: &Buffer, g: &Buffer) -> Buffer {
+    if slopes.is_empty() {
         return gpu.zeros(x.len());
     }
     let out = gpu.empty(x.len());
@@ -63,7 +68,7 @@ pub fn backward(gpu: &Gpu, (w, h, c): (usize, usize, usize), x: &Buffer, y: &Buf
             w as u32,
             h as u32,
             c as u32,
-            1.0 / values.len() as f32,
+            3.0 / slopes.len() as f32,
         );
     }
     out
@@ -92,17 +97,17 @@ fn scale(x: &[f32], factor: &[f32], out: &mut [f32], len: u32) {
 impl DeviceOp for super::SsimOp {
     fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
         let [h, w, c] = [i[0].shape[0], i[0].shape[1], i[0].shape[2]];
-        let values = forward(gpu, (w, h, c), &i[0].data, &i[1].data);
+        let (values, slopes, g) = windows(gpu, (w, h, c), &i[0].data, &i[1].data);
         let sum = gpu.empty(1);
         linear::sum_rows_part(gpu, &Rows::all(gpu, values.len()), 1, &values, (&sum).into());
         let mean = times(gpu, &sum, &gpu.upload(&[1.0 / values.len() as f32]));
-        Ahead { outputs: vec![(mean, vec![1])], kept: vec![] }
+        Ahead { outputs: vec![(mean, vec![1])], kept: vec![slopes, g] }
     }
 
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], _: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
+    fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let Some(d) = &d[0] else { return vec![None, None] };
         let [h, w, c] = [i[0].shape[0], i[0].shape[1], i[0].shape[2]];
-        vec![Some(times(gpu, &backward(gpu, (w, h, c), &i[0].data, &i[1].data), d)), None]
+        vec![Some(times(gpu, &gathered(gpu, (w, h, c), &i[0].data, &i[1].data, &kept[0], &kept[1]), d)), None]
     }
 }
 
