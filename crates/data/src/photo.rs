@@ -3,7 +3,7 @@
 
 use crate::error::{DataError, Result};
 use diorama_geom::color::{srgb_from_linear, u8_from_unit};
-use diorama_geom::{Image, ImageU8};
+use diorama_geom::ImageU8;
 use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
 use std::path::Path;
 
@@ -149,17 +149,6 @@ pub fn encode_png(im: &ImageU8) -> Vec<u8> {
 /// Writes a PNG atomically.
 pub fn save_png(path: &Path, im: &ImageU8) -> Result<()> {
     crate::atomic::write(path, &encode_png(im))
-}
-
-/// Writes 16-bit millimetres (or thousandths of the scene's unit), 0 where unknown.
-pub fn save_depth_png(path: &Path, depth: &Image) -> Result<()> {
-    use image::ImageEncoder;
-    let bytes: Vec<u8> = depth.data.iter().flat_map(|d| ((d * 1000.0).clamp(0.0, 65535.0) as u16).to_ne_bytes()).collect();
-    let mut out = Vec::new();
-    image::codecs::png::PngEncoder::new(&mut out)
-        .write_image(&bytes, depth.width as u32, depth.height as u32, image::ExtendedColorType::L16)
-        .expect("a Vec takes any bytes");
-    crate::atomic::write(path, &out)
 }
 
 #[cfg(test)]
