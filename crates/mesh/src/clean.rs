@@ -1,9 +1,123 @@
-//! Removing what is not the object.
+//! Removing what is not the object: small parts, and parts that the cameras' views speak against.
 
-use diorama_geom::Mesh;
+use crate::visibility::Sight;
+use diorama_geom::{Camera, Mesh, Pose};
+use rayon::prelude::*;
 
-/// Keeps connected components that hold at least `share` of the faces of the largest one.
-pub fn remove_floaters(mesh: &mut Mesh, share: f32) {
+/// Keeps connected components that hold at least `share` of the faces of the largest one; returns how many faces went.
+pub fn remove_floaters(mesh: &mut Mesh, share: f32) -> usize {
+    let parts = components(mesh);
+    let largest = parts.iter().map(Vec::len).max().unwrap_or(0);
+    let least = (largest as f32 * share).ceil() as usize;
+    remove(mesh, parts.iter().filter(|p| p.len() < least))
+}
+
+/// Cameras that must see a part.
+const WITNESSES: usize = 3;
+/// Share of a part's faces that as many cameras must see; of a closed part, some half faces away from all of them.
+const SEEN: f64 = 0.05;
+/// Faces of a part that are asked about.
+const ASKED: usize = 500;
+/// A part stands before everything that a camera looks at where its farthest face is nearer than this share of the distance
+/// beyond which nine tenths of the main part in the picture lie.
+const BEFORE: f64 = 0.5;
+
+/// How many faces went, and why.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Removed {
+    /// In parts that fewer than three cameras see.
+    pub unseen: usize,
+    /// In parts close before a camera.
+    pub before: usize,
+}
+
+/// Removes connected components that fewer than three of the `cameras` (all, where there are fewer) see past the rest of the
+/// mesh, and those that stand before everything that some camera looks at, unless more than half of the cameras see them
+/// farther away. The part of which most is seen stays in any case, and with it faces that nobody sees, such as its underside.
+/// `slack` is the error of the surface in units of the mesh.
+pub fn remove_unseen(mesh: &mut Mesh, cameras: &[(Camera, Pose)], slack: f32) -> Removed {
+    let parts = components(mesh);
+    if parts.len() < 2 || cameras.is_empty() {
+        return Removed::default();
+    }
+    let centers: Vec<Vec<[f32; 3]>> = parts.iter().map(|p| asked(mesh, p)).collect();
+    // Of each camera and part: which of the faces asked about it sees, and how far away.
+    let views: Vec<View> = cameras.par_iter().map(|(c, pose)| View::new(&Sight::new(mesh, c, pose), &centers, slack)).collect();
+    let witnesses = WITNESSES.min(cameras.len());
+    let seen: Vec<f64> = (0..parts.len())
+        .map(|p| {
+            let by = |i: usize| views.iter().filter(|v| v.seen[p][i].is_some()).count();
+            (0..centers[p].len()).filter(|i| by(*i) >= witnesses).count() as f64 / centers[p].len().max(1) as f64
+        })
+        .collect();
+    let main = (0..parts.len()).max_by(|a, b| (seen[*a] * parts[*a].len() as f64).total_cmp(&(seen[*b] * parts[*b].len() as f64)));
+    let main = main.unwrap_or(0);
+    let is_unseen = |p: usize| p != main && seen[p] < SEEN;
+    let is_before = |p: usize| {
+        let (mut near, mut far) = (0, 0);
+        for v in &views {
+            match (v.farthest(p), v.subject(main)) {
+                (Some(d), Some(subject)) if d < BEFORE * subject => near += 1,
+                (Some(_), _) => far += 1,
+                _ => {}
+            }
+        }
+        p != main && near > 0 && far * 2 <= cameras.len()
+    };
+    let (unseen, rest): (Vec<usize>, Vec<usize>) = (0..parts.len()).partition(|p| is_unseen(*p));
+    let before: Vec<usize> = rest.into_iter().filter(|p| is_before(*p)).collect();
+    let faces = |which: &[usize]| which.iter().map(|p| parts[*p].len()).sum();
+    let removed = Removed { unseen: faces(&unseen), before: faces(&before) };
+    remove(mesh, unseen.iter().chain(&before).map(|p| &parts[*p]));
+    removed
+}
+
+/// What one camera sees of the faces that are asked about.
+struct View {
+    /// Distance of each face of each part, where the camera sees it.
+    seen: Vec<Vec<Option<f64>>>,
+    /// Distances of each part's faces in the picture, whatever stands before them, from near to far.
+    in_picture: Vec<Vec<f64>>,
+}
+
+impl View {
+    fn new(sight: &Sight, centers: &[Vec<[f32; 3]>], slack: f32) -> View {
+        let seen = |p: &[f32; 3]| sight.distance(*p).filter(|_| sight.sees(*p, slack));
+        let in_picture = |part: &Vec<[f32; 3]>| {
+            let mut d: Vec<f64> = part.iter().filter_map(|p| sight.distance(*p)).collect();
+            d.sort_by(f64::total_cmp);
+            d
+        };
+        View {
+            seen: centers.iter().map(|part| part.iter().map(seen).collect()).collect(),
+            in_picture: centers.iter().map(in_picture).collect(),
+        }
+    }
+
+    /// Distance of the farthest face that is seen of a part, none where nothing is.
+    fn farthest(&self, part: usize) -> Option<f64> {
+        self.seen[part].iter().flatten().copied().max_by(f64::total_cmp)
+    }
+
+    /// Distance beyond which nine tenths of a part in the picture lie.
+    fn subject(&self, part: usize) -> Option<f64> {
+        let d = &self.in_picture[part];
+        d.get(d.len() / 10).copied()
+    }
+}
+
+/// Middles of up to [`ASKED`] faces.
+fn asked(mesh: &Mesh, faces: &[u32]) -> Vec<[f32; 3]> {
+    let n = faces.len().min(ASKED);
+    let center = |f: u32| {
+        let [a, b, c] = mesh.faces[f as usize].map(|i| mesh.positions[i as usize]);
+        std::array::from_fn(|k| (a[k] + b[k] + c[k]) / 3.0)
+    };
+    (0..n).map(|i| center(faces[i * faces.len() / n])).collect()
+}
+
+/// Faces by connected component.
+fn components(mesh: &Mesh) -> Vec<Vec<u32>> {
     let mut parent: Vec<u32> = (0..mesh.positions.len() as u32).collect();
     fn root(parent: &mut [u32], mut i: u32) -> u32 {
         while parent[i as usize] != i {
@@ -19,18 +133,33 @@ pub fn remove_floaters(mesh: &mut Mesh, share: f32) {
             parent[b as usize] = a;
         }
     }
-    let mut faces = vec![0u32; mesh.positions.len()];
-    let roots: Vec<u32> = mesh.faces.iter().map(|f| root(&mut parent, f[0])).collect();
-    roots.iter().for_each(|r| faces[*r as usize] += 1);
-    let least = (faces.iter().max().copied().unwrap_or(0) as f32 * share).ceil() as u32;
-    let mut keep = roots.iter().map(|r| faces[*r as usize] >= least);
-    mesh.faces.retain(|_| keep.next().unwrap_or(true));
+    let mut number = vec![u32::MAX; mesh.positions.len()];
+    let mut parts: Vec<Vec<u32>> = Vec::new();
+    for (i, f) in mesh.faces.iter().enumerate() {
+        let r = root(&mut parent, f[0]) as usize;
+        if number[r] == u32::MAX {
+            number[r] = parts.len() as u32;
+            parts.push(Vec::new());
+        }
+        parts[number[r] as usize].push(i as u32);
+    }
+    parts
+}
+
+/// Removes the faces of components; returns how many.
+fn remove<'a>(mesh: &mut Mesh, parts: impl Iterator<Item = &'a Vec<u32>>) -> usize {
+    let mut gone = vec![false; mesh.faces.len()];
+    parts.flatten().for_each(|f| gone[*f as usize] = true);
+    let mut each = gone.iter();
+    mesh.faces.retain(|_| !each.next().is_some_and(|g| *g));
     mesh.compact();
+    gone.iter().filter(|g| **g).count()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::DVec3;
 
     #[test]
     fn small_islands_go_and_large_ones_stay() {
@@ -43,9 +172,95 @@ mod tests {
         m.positions.extend([[50.0, 0.0, 0.0], [51.0, 0.0, 0.0], [50.0, 1.0, 0.0]]);
         m.faces.push([12, 13, 14]);
         let mut all = m.clone();
-        remove_floaters(&mut all, 0.05);
+        assert_eq!(remove_floaters(&mut all, 0.05), 0);
         assert_eq!(all.faces.len(), 11);
-        remove_floaters(&mut m, 0.2);
+        assert_eq!(remove_floaters(&mut m, 0.2), 1);
         assert_eq!((m.faces.len(), m.positions.len()), (10, 12));
+    }
+
+    /// Adds a ball; returns its number of faces.
+    fn ball(m: &mut Mesh, center: DVec3, radius: f64, around: u32) -> usize {
+        let (first, up) = (m.positions.len() as u32, around / 2);
+        for j in 0..=up {
+            for i in 0..around {
+                let (a, b) = (i as f64 / around as f64 * std::f64::consts::TAU, j as f64 / up as f64 * std::f64::consts::PI);
+                let p = center + radius * DVec3::new(b.sin() * a.cos(), b.sin() * a.sin(), b.cos());
+                m.positions.push(p.as_vec3().to_array());
+            }
+        }
+        let before = m.faces.len();
+        for j in 0..up {
+            for i in 0..around {
+                let at = |j: u32, i: u32| first + j * around + i % around;
+                m.faces.extend([[at(j, i), at(j + 1, i), at(j + 1, i + 1)], [at(j, i), at(j + 1, i + 1), at(j, i + 1)]]);
+            }
+        }
+        m.faces.len() - before
+    }
+
+    fn camera(eye: DVec3, target: DVec3) -> (Camera, Pose) {
+        (Camera::pinhole(320, 240, 1.0), Pose::look_at(eye, target, DVec3::new(0.1, 0.2, 1.0)))
+    }
+
+    /// Twelve cameras around the origin.
+    fn ring() -> Vec<(Camera, Pose)> {
+        let eye = |i: i32| {
+            let a = i as f64 / 12.0 * std::f64::consts::TAU;
+            DVec3::new(4.0 * a.cos(), 4.0 * a.sin(), 0.5)
+        };
+        (0..12).map(|i| camera(eye(i), DVec3::ZERO)).collect()
+    }
+
+    /// Faces of balls, the first the object, that stay.
+    fn left(balls: &[(DVec3, f64)], cameras: &[(Camera, Pose)]) -> (Vec<bool>, Removed, usize) {
+        let mut m = Mesh::default();
+        let faces: Vec<usize> = balls.iter().enumerate().map(|(i, (c, r))| ball(&mut m, *c, *r, if i == 0 { 64 } else { 16 })).collect();
+        let removed = remove_unseen(&mut m, cameras, 0.02);
+        let near = |(c, r): &(DVec3, f64)| m.positions.iter().any(|p| ((DVec3::from(p.map(f64::from)) - *c).length() - r).abs() < 1e-3);
+        assert_eq!(faces.iter().sum::<usize>(), m.faces.len() + removed.unseen + removed.before);
+        (balls.iter().map(near).collect(), removed, faces[1])
+    }
+
+    #[test]
+    fn a_floater_before_one_camera_goes_although_others_see_it() {
+        let cameras = ring();
+        let eye = cameras[0].1.translation;
+        // A fifth of the way from the camera to the object.
+        let floater = (eye * 0.85, 0.1);
+        let (stays, removed, faces) = left(&[(DVec3::ZERO, 1.0), floater], &cameras);
+        assert_eq!(stays, [true, false]);
+        assert_eq!(removed, Removed { unseen: 0, before: faces });
+    }
+
+    #[test]
+    fn what_two_cameras_see_goes_and_what_three_see_stays() {
+        let mut cameras = ring();
+        let (two, three) = (DVec3::new(0.0, 0.0, 30.0), DVec3::new(0.0, 0.0, -30.0));
+        for a in [0.0f64, 2.0] {
+            cameras.push(camera(two + 3.0 * DVec3::new(a.cos(), a.sin(), 0.3), two));
+        }
+        for a in [0.0f64, 0.4, 0.8] {
+            cameras.push(camera(three + 3.0 * DVec3::new(a.cos(), a.sin(), 0.3), three));
+        }
+        let (stays, removed, faces) = left(&[(DVec3::ZERO, 1.0), (two, 0.5), (three, 0.5)], &cameras);
+        assert_eq!(stays, [true, false, true]);
+        assert_eq!(removed, Removed { unseen: faces, before: 0 });
+    }
+
+    #[test]
+    fn what_lies_within_the_object_goes_and_what_stands_beside_it_stays() {
+        let beside = DVec3::new(0.0, 1.3, 0.4);
+        let (stays, removed, faces) = left(&[(DVec3::ZERO, 1.0), (DVec3::ZERO, 0.5), (beside, 0.15)], &ring());
+        assert_eq!(stays, [true, false, true]);
+        assert_eq!(removed, Removed { unseen: faces, before: 0 });
+    }
+
+    #[test]
+    fn a_part_alone_stays_whoever_sees_it() {
+        let mut m = Mesh::default();
+        let faces = ball(&mut m, DVec3::ZERO, 1.0, 16);
+        let away = [camera(DVec3::new(3.0, 0.0, 0.0), DVec3::new(9.0, 0.0, 0.0))];
+        assert_eq!(remove_unseen(&mut m, &away, 0.02), Removed::default());
+        assert_eq!(m.faces.len(), faces);
     }
 }

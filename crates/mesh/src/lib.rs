@@ -8,3 +8,4 @@ pub mod extract;
 pub mod normal_map;
 pub mod repair;
 pub mod simplify;
+pub mod visibility;

@@ -144,7 +144,7 @@ mod tests {
     fn a_simplified_ball_shows_its_waves() {
         let grid = Grid { min: [-1.0; 3], max: [1.0; 3], resolution: 96 };
         let mut m = extract(&Waves, &grid, 10.0, Method::Cubes, &mut |_, _| {});
-        simplify::simplify(&mut m, 800);
+        simplify::simplify(&mut m, 800).unwrap();
         m.compute_normals();
         atlas::unwrap(&mut m, 256);
         set_tangents(&mut m);

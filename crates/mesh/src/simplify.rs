@@ -3,25 +3,57 @@
 use diorama_geom::Mesh;
 use meshopt::{SimplifyOptions, VertexDataAdapter};
 
-/// At most `faces` triangles where the shape allows it; a mesh that has no more is left alone.
-pub fn simplify(mesh: &mut Mesh, faces: usize) {
+/// How a mesh came to have no more faces than asked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reduction {
+    /// It had no more.
+    None,
+    /// Edges collapsed; every part is still there.
+    Collapsed,
+    /// Small parts went, too.
+    Pruned,
+    /// Vertices were clustered without regard to what is joined to what, because the topology forbids fewer faces.
+    Clustered,
+}
+
+/// Reduces a mesh to at most `faces` triangles.
+///
+/// # Errors
+/// The fewest triangles that it can have, where `faces` is below; the mesh stays as it was.
+pub fn simplify(mesh: &mut Mesh, faces: usize) -> Result<Reduction, usize> {
     if mesh.faces.len() <= faces {
-        return;
+        return Ok(Reduction::None);
     }
     let bytes: Vec<u8> = mesh.positions.iter().flatten().flat_map(|v| v.to_ne_bytes()).collect();
-    let Ok(vertices) = VertexDataAdapter::new(&bytes, 12, 0) else { return };
-    let kept = meshopt::simplify(mesh.faces.as_flattened(), &vertices, faces * 3, 1e9, SimplifyOptions::None, None);
-    mesh.faces = kept.chunks_exact(3).map(|f| [f[0], f[1], f[2]]).collect();
-    mesh.compact();
+    let vertices = VertexDataAdapter::new(&bytes, 12, 0).map_err(|_| mesh.faces.len())?;
+    let all = mesh.faces.as_flattened();
+    let collapsed = |options| meshopt::simplify(all, &vertices, faces * 3, 1e9, options, None);
+    let clustered = || meshopt::simplify_sloppy(all, &vertices, faces * 3, 1e9, None);
+    let mut fewest = mesh.faces.len();
+    for how in [Reduction::Collapsed, Reduction::Pruned, Reduction::Clustered] {
+        let kept = match how {
+            Reduction::Pruned => collapsed(SimplifyOptions::Prune),
+            Reduction::Clustered => clustered(),
+            _ => collapsed(SimplifyOptions::None),
+        };
+        let count = kept.len() / 3;
+        if (1..=faces).contains(&count) {
+            mesh.faces = kept.as_chunks::<3>().0.to_vec();
+            mesh.compact();
+            return Ok(how);
+        }
+        if count > 0 {
+            fewest = fewest.min(count);
+        }
+    }
+    Err(fewest)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_flat_grid_shrinks_and_keeps_its_bounds() {
-        let n = 40u32;
+    fn grid(n: u32) -> Mesh {
         let mut m = Mesh::default();
         for i in 0..n * n {
             m.positions.push([(i % n) as f32, (i / n) as f32, 0.0]);
@@ -32,9 +64,69 @@ mod tests {
                 m.faces.extend([[i, i + 1, i + n], [i + 1, i + n + 1, i + n]]);
             }
         }
+        m
+    }
+
+    /// An octahedron of a size at a place.
+    fn octahedron(m: &mut Mesh, center: [f32; 3], radius: f32) {
+        let first = m.positions.len() as u32;
+        for k in 0..3 {
+            for sign in [radius, -radius] {
+                let mut p = center;
+                p[k] += sign;
+                m.positions.push(p);
+            }
+        }
+        let [x, nx, y, ny, z, nz] = std::array::from_fn(|i| first + i as u32);
+        m.faces.extend([[x, y, z], [y, nx, z], [nx, ny, z], [ny, x, z], [y, x, nz], [nx, y, nz], [ny, nx, nz], [x, ny, nz]]);
+    }
+
+    #[test]
+    fn a_flat_grid_shrinks_and_keeps_its_bounds() {
+        let mut m = grid(40);
         let bounds = m.bounds();
-        simplify(&mut m, 100);
+        assert_eq!(simplify(&mut m, 100), Ok(Reduction::Collapsed));
         assert!(m.faces.len() <= 100 && !m.faces.is_empty());
         assert_eq!(m.bounds(), bounds);
+        let same = m.clone();
+        assert_eq!(simplify(&mut m, 100), Ok(Reduction::None));
+        assert_eq!(m, same);
+    }
+
+    #[test]
+    fn no_more_faces_than_asked_even_where_topology_forbids_collapses() {
+        // A thousand solids apart, which collapsing edges cannot make fewer.
+        let mut m = Mesh::default();
+        for i in 0..1000 {
+            octahedron(&mut m, [(i % 10) as f32, (i / 10 % 10) as f32, (i / 100) as f32], 0.3);
+        }
+        for faces in [2000, 500, 60] {
+            let mut reduced = m.clone();
+            let how = simplify(&mut reduced, faces);
+            assert!(how.is_ok_and(|h| h != Reduction::None), "{faces}: {how:?}");
+            assert!((1..=faces).contains(&reduced.faces.len()), "{faces}: {}", reduced.faces.len());
+        }
+        // Sheets that share one edge, all fixed by it.
+        let mut fan = Mesh { positions: vec![[0.0; 3], [0.0, 0.0, 1.0]], ..Mesh::default() };
+        for i in 0..64 {
+            let a = i as f32 * 0.098;
+            fan.positions.push([a.cos(), a.sin(), 0.5]);
+            fan.faces.push([0, 1, 2 + i]);
+        }
+        match simplify(&mut fan, 10) {
+            Ok(_) => assert!((1..=10).contains(&fan.faces.len())),
+            Err(fewest) => assert!(fewest > 10 && fan.faces.len() == 64),
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_reached_is_said_and_changes_nothing() {
+        let mut m = Mesh::default();
+        octahedron(&mut m, [0.0; 3], 1.0);
+        let same = m.clone();
+        match simplify(&mut m, 1) {
+            Ok(_) => assert_eq!(m.faces.len(), 1),
+            Err(fewest) => assert!(fewest > 1 && m == same),
+        }
     }
 }
