@@ -1,5 +1,7 @@
 //! Image quality.
 
+pub mod lpips;
+
 use diorama_geom::Image;
 use diorama_kernels::ops::ssim;
 
