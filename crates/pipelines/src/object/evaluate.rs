@@ -2,12 +2,14 @@
 
 use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
-use diorama_data::photo;
+use diorama_data::{photo, weights};
+use diorama_engine::metrics::lpips::{self, Lpips};
 use diorama_engine::metrics::{self, Scores};
 use diorama_engine::renderers::volume::{Quality, View};
 use diorama_geom::capture::Split;
 use diorama_geom::{Capture, Image, ImageU8};
 use serde::Serialize;
+use std::path::PathBuf;
 
 /// Frames of a split; held-out ones fall back to validation where there is no test split.
 pub fn held_out(capture: &Capture, split: Split) -> Vec<usize> {
@@ -30,6 +32,8 @@ pub struct ViewScore {
     pub ssim: f64,
     pub mse: f64,
     pub psnr_affine: f64,
+    /// Perceptual distance, where weights for it were given.
+    pub lpips: Option<f64>,
 }
 
 /// Means over all views.
@@ -44,7 +48,7 @@ pub struct Report {
     pub psnr_affine: f64,
     /// PSNR of the mean training photograph in place of a render: what knowing nothing gives.
     pub psnr_mean_image: Option<f64>,
-    /// Needs weights that are not part of this program.
+    /// Perceptual distance over whole pictures; its weights are the user's.
     pub lpips: Option<f64>,
     pub per_view: Vec<ViewScore>,
 }
@@ -83,6 +87,30 @@ pub fn evaluate(
     quality: Quality,
     each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
 ) -> Result<Report> {
+    evaluate_with(model, split, quality, None, each)
+}
+
+/// Reads the network and the heads of LPIPS, which may be one file or several.
+///
+/// # Errors
+/// When a file is malformed, or the network or the heads are missing.
+pub fn load_lpips(files: &[PathBuf]) -> Result<Lpips> {
+    let mut tensors = Vec::new();
+    for file in files {
+        tensors.extend(weights::read(file, &lpips::is_wanted)?.into_iter().map(|t| (t.name, t.shape, t.values)));
+    }
+    let names: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
+    Lpips::new(tensors).map_err(|e| PipelineError::Usage(format!("{}: {e}", names.join(","))))
+}
+
+/// [`evaluate`] with the perceptual distance, too.
+pub fn evaluate_with(
+    model: &ObjectModel,
+    split: Split,
+    quality: Quality,
+    lpips: Option<&Lpips>,
+    each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
+) -> Result<Report> {
     let frames = held_out(&model.capture, split);
     if frames.is_empty() {
         return Err(PipelineError::Usage("the run holds no views out; train with --split every:8 or judge --on train".into()));
@@ -98,7 +126,16 @@ pub fn evaluate(
         }
         each(&frame.name, &scored)?;
         let s = scored.scores;
-        per_view.push(ViewScore { name: frame.name.clone(), psnr: s.psnr, ssim: s.ssim, mse: s.mse, psnr_affine: s.psnr_affine });
+        let too_small = |e: String| PipelineError::Usage(format!("{}: {e}", frame.name));
+        let distance = lpips.map(|l| l.distance(&scored.view.rgb, &scored.photo)).transpose().map_err(too_small)?;
+        per_view.push(ViewScore {
+            name: frame.name.clone(),
+            psnr: s.psnr,
+            ssim: s.ssim,
+            mse: s.mse,
+            psnr_affine: s.psnr_affine,
+            lpips: distance,
+        });
     }
     let n = per_view.len() as f64;
     let average = |f: fn(&ViewScore) -> f64| per_view.iter().map(f).sum::<f64>() / n;
@@ -110,7 +147,7 @@ pub fn evaluate(
         psnr_min: per_view.iter().map(|v| v.psnr).fold(f64::INFINITY, f64::min),
         psnr_affine: average(|v| v.psnr_affine),
         psnr_mean_image: (!mean_scores.is_empty()).then(|| mean_scores.iter().sum::<f64>() / mean_scores.len() as f64),
-        lpips: None,
+        lpips: per_view.iter().map(|v| v.lpips).sum::<Option<f64>>().map(|sum| sum / n),
         per_view,
     })
 }

@@ -8,6 +8,7 @@ use diorama_geom::Mesh;
 use diorama_geom::field_query::FieldQuery;
 use diorama_geom::glam::DVec3;
 use diorama_mesh::extract::Grid;
+use diorama_mesh::simplify::Reduction;
 use diorama_mesh::{atlas, clean, color, extract, normal_map, repair, simplify};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -52,7 +53,7 @@ impl std::str::FromStr for Format {
             "stl" => Ok(Format::Stl),
             "usdz" => Ok(Format::Usdz),
             "dae" => Ok(Format::Dae),
-            _ => Err(format!("format {s:?}: expected glb, obj, ply, stl, usdz or dae")),
+            _ => Err(format!("format {s:?}: expected glb, obj, ply, stl, usdz or dae, or points as ply, las or e57")),
         }
     }
 }
@@ -82,7 +83,14 @@ pub struct ExportOptions {
     pub clip: Option<([f32; 3], [f32; 3])>,
     /// Components with fewer faces than this share of the largest one's are removed.
     pub floaters: f32,
+    /// Components that fewer than three training cameras see, or that stand close before one, are kept.
+    pub keep_unseen: bool,
 }
+
+/// Most training cameras that are asked what they see of the mesh.
+const CAMERAS: usize = 240;
+/// Attempts at few faces and a closed surface both.
+const REDUCTIONS: usize = 4;
 
 /// Defaults of [`ExportOptions`].
 pub const FACES: usize = 60_000;
@@ -116,6 +124,22 @@ pub struct Exported {
     pub extent_m: [f32; 3],
     /// Metres per unit of the capture.
     pub scale: f64,
+    /// Faces that went because they belong to parts that are small, or that the training cameras do not see or see close before
+    /// them.
+    pub removed: Removed,
+    /// What turned out otherwise than asked, one line each.
+    pub notes: Vec<String>,
+}
+
+/// Faces of parts that were removed before simplification.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Removed {
+    /// In parts smaller than [`ExportOptions::floaters`] allows.
+    pub small: usize,
+    /// In parts that fewer than three training cameras see.
+    pub unseen: usize,
+    /// In parts close before a camera.
+    pub before_cameras: usize,
 }
 
 /// Extracts, cleans, simplifies, colours and writes; `progress` is told the stage and (done, of).
@@ -130,13 +154,11 @@ pub fn export(model: &ObjectModel, o: &ExportOptions, progress: &mut dyn FnMut(&
     let level = o.level.unwrap_or_else(|| automatic_level(model, &grid));
     let mut mesh = extract::extract(model, &grid, level, o.method, &mut |i, n| progress("density", i, n));
     repair::weld(&mut mesh);
-    clean::remove_floaters(&mut mesh, o.floaters);
+    let removed = clean(model, &mut mesh, o, grid.cell());
     let texels = o.texture.unwrap_or(if o.format.has_texture() { TEXELS } else { 0 });
     let faces = o.faces.unwrap_or(if texels > 0 { FACES } else { COLORED_FACES });
-    if faces > 0 {
-        simplify::simplify(&mut mesh, faces);
-    }
-    let watertight = if o.watertight { repair::close(&mut mesh) } else { mesh.is_watertight() };
+    let mut notes = Vec::new();
+    let watertight = reduce(&mut mesh, faces, o, &mut notes)?;
     if o.watertight && !watertight && !mesh.faces.is_empty() {
         return Err(DataError::failed(
             &o.out,
@@ -175,7 +197,53 @@ pub fn export(model: &ObjectModel, o: &ExportOptions, progress: &mut dyn FnMut(&
         texture: texels,
         extent_m,
         scale,
+        removed,
+        notes,
     })
+}
+
+/// Removes parts that are no part of the object; `cell` is the error of the surface.
+fn clean(model: &ObjectModel, mesh: &mut Mesh, o: &ExportOptions, cell: f32) -> Removed {
+    let small = clean::remove_floaters(mesh, o.floaters);
+    if o.keep_unseen {
+        return Removed { small, ..Removed::default() };
+    }
+    let n = model.train.len();
+    let chosen = (0..n.min(CAMERAS)).map(|i| &model.capture.frames[model.train[i * n / n.min(CAMERAS)]]);
+    let cameras: Vec<_> = chosen.map(|f| (f.camera, f.world_from_camera)).collect();
+    let gone = clean::remove_unseen(mesh, &cameras, 1.5 * cell);
+    Removed { small, unseen: gone.unseen, before_cameras: gone.before }
+}
+
+/// Reduces the mesh to `faces` (0: as many as there are) and closes it where asked; returns whether it is closed.
+fn reduce(mesh: &mut Mesh, faces: usize, o: &ExportOptions, notes: &mut Vec<String>) -> Result<bool> {
+    let mut target = faces;
+    let mut clustered = false;
+    for _ in 0..REDUCTIONS {
+        if faces > 0 {
+            let how = simplify::simplify(mesh, target).map_err(|fewest| {
+                PipelineError::Usage(format!("--faces {faces}: this surface has at least {fewest}; ask for so many or more"))
+            })?;
+            clustered |= how == Reduction::Clustered;
+        }
+        if !o.watertight {
+            break;
+        }
+        repair::close(mesh);
+        // Filling holes takes faces, too.
+        let more = mesh.faces.len().saturating_sub(faces);
+        if faces == 0 || more == 0 {
+            break;
+        }
+        target = target.saturating_sub(2 * more).max(target / 2).max(1);
+    }
+    if clustered {
+        notes.push(format!("{faces} faces are fewer than the surface's topology allows: parts were merged; more --faces keep them"));
+    }
+    if faces > 0 && mesh.faces.len() > faces {
+        notes.push(format!("{} faces instead of {faces}: so many it takes to close the surface", mesh.faces.len()));
+    }
+    Ok(mesh.is_watertight())
 }
 
 fn check(o: &ExportOptions) -> Result<()> {
@@ -194,15 +262,25 @@ fn check(o: &ExportOptions) -> Result<()> {
     }
 }
 
+impl Size {
+    /// Meters per unit of the capture, where it does not go by the mesh's own extent; else 1.
+    pub fn meters_per_unit(self) -> f64 {
+        match self {
+            Size::Scaled(s) => s,
+            Size::Longest(_) => 1.0,
+            Size::Measured { points: [a, b], metres } => metres / (DVec3::from(a) - DVec3::from(b)).length().max(1e-12),
+        }
+    }
+}
+
 /// Metres per unit of the capture for a mesh in the capture's coordinates.
-fn metres_per_unit(mesh: &Mesh, size: Size) -> f64 {
+pub(crate) fn metres_per_unit(mesh: &Mesh, size: Size) -> f64 {
     match size {
-        Size::Scaled(s) => s,
         Size::Longest(metres) => {
             let (lo, hi) = mesh.bounds().unwrap_or_default();
             metres / (0..3).map(|k| (hi[k] - lo[k]) as f64).fold(1e-12, f64::max)
         }
-        Size::Measured { points: [a, b], metres } => metres / (DVec3::from(a) - DVec3::from(b)).length().max(1e-12),
+        _ => size.meters_per_unit(),
     }
 }
 
@@ -228,7 +306,7 @@ pub(crate) fn automatic_level(model: &ObjectModel, grid: &Grid) -> f32 {
 }
 
 /// World coordinates to those of the input.
-fn to_capture(model: &ObjectModel, mesh: &mut Mesh) {
+pub(crate) fn to_capture(model: &ObjectModel, mesh: &mut Mesh) {
     let t = model.capture.world_from_capture.inverse();
     let wide = |p: [f32; 3]| DVec3::new(p[0] as f64, p[1] as f64, p[2] as f64);
     mesh.positions.iter_mut().for_each(|p| *p = t.point(wide(*p)).as_vec3().to_array());

@@ -8,6 +8,7 @@ pub mod evaluate;
 pub mod export;
 pub(crate) mod extent;
 pub mod model;
+pub mod points;
 pub mod prepare;
 pub mod quickstart;
 pub mod recipe;

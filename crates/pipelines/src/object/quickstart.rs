@@ -91,6 +91,8 @@ pub fn quickstart(
         fps: Some(20),
         clip: None,
         quality: Quality::Full,
+        depth: Default::default(),
+        scale: None,
     };
     render::render(&model, &options, interrupt, &mut |_, _| {})?;
     note("extracting the mesh");
@@ -108,6 +110,7 @@ pub fn quickstart(
         unit_m: 1.0,
         clip: None,
         floaters: 0.05,
+        keep_unseen: false,
     };
     let mesh = export::export(&model, &options, &mut |_, _, _| {})?;
     let page = folder.join("report.html");

@@ -3,6 +3,7 @@
 use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
 use diorama_data::camera_path_json::{self, CameraPath};
+use diorama_data::depth::{DepthFormat, DepthSequence};
 use diorama_data::mp4::Video;
 use diorama_data::{DataError, photo};
 use diorama_engine::renderers::volume::{Quality, View};
@@ -13,7 +14,7 @@ use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, Image, ImageU8, Pose};
 use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched};
 use diorama_kernels::ops::ray_generation::PosedCamera;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Where the camera goes.
@@ -54,6 +55,19 @@ pub enum Layer {
     Occupancy,
 }
 
+impl Layer {
+    /// Name of a frame's picture.
+    fn file(self, i: usize) -> String {
+        match self {
+            Layer::Rgb => format!("{i:04}.png"),
+            Layer::Depth => format!("depth_{i:04}.png"),
+            Layer::Normal => format!("normal_{i:04}.png"),
+            Layer::Opacity => format!("opacity_{i:04}.png"),
+            Layer::Occupancy => format!("occupancy_{i:04}.png"),
+        }
+    }
+}
+
 impl std::str::FromStr for Layer {
     type Err = String;
 
@@ -88,6 +102,10 @@ pub struct RenderOptions {
     /// Only what lies in this box (world) is shown.
     pub clip: Option<([f32; 3], [f32; 3])>,
     pub quality: Quality,
+    /// How distances are kept beside the pictures of the depth layer.
+    pub depth: DepthFormat,
+    /// Meters per unit of the capture, where it is known.
+    pub scale: Option<f64>,
 }
 
 /// Frames per second where nobody says.
@@ -158,6 +176,7 @@ pub fn render(
         }
         _ => None,
     };
+    let mut distances = o.images.as_ref().map(|folder| DepthSequence::new(folder, o.depth, o.scale.is_some()));
     let total = path.views.len();
     for (i, v) in path.views.iter().enumerate() {
         if interrupt.load(Ordering::Relaxed) {
@@ -168,7 +187,10 @@ pub fn render(
         for (k, layer) in o.layers.iter().enumerate() {
             let image = draw_layer(model, &posed, &view, *layer);
             if let Some(folder) = &o.images {
-                save_layer(folder, i, *layer, &image, &view, model)?;
+                photo::save_png(&folder.join(layer.file(i)), &image)?;
+            }
+            if let (Layer::Depth, Some(distances)) = (layer, &mut distances) {
+                distances.push(&distance_map(model, &view, o.scale))?;
             }
             if let (0, Some(video)) = (k, &mut video) {
                 video.push(&image)?;
@@ -285,20 +307,10 @@ fn normals(model: &ObjectModel, camera: &PosedCamera, view: &View) -> Vec<[f32; 
         .collect()
 }
 
-fn save_layer(folder: &Path, i: usize, layer: Layer, image: &ImageU8, view: &View, model: &ObjectModel) -> Result<()> {
-    let name = match layer {
-        Layer::Rgb => format!("{i:04}.png"),
-        Layer::Depth => {
-            // Beside the picture, metric depth: 16 bit, thousandths of a world unit.
-            let mut metric = view.depth.clone();
-            let scale = 1.0 / model.model_from_world.scale as f32;
-            metric.data.iter_mut().for_each(|d| *d *= scale);
-            photo::save_depth_png(&folder.join(format!("depth16_{i:04}.png")), &metric)?;
-            format!("depth_{i:04}.png")
-        }
-        Layer::Normal => format!("normal_{i:04}.png"),
-        Layer::Opacity => format!("opacity_{i:04}.png"),
-        Layer::Occupancy => format!("occupancy_{i:04}.png"),
-    };
-    Ok(photo::save_png(&folder.join(name), image)?)
+/// Distances along the rays in meters, or in units of the capture where its scale is unknown; 0 where nothing is met.
+fn distance_map(model: &ObjectModel, view: &View, scale: Option<f64>) -> Image {
+    let capture_from_model = 1.0 / (model.model_from_world.scale * model.capture.world_from_capture.scale);
+    let mut out = view.depth.clone();
+    out.data.iter_mut().for_each(|d| *d = (*d as f64 * capture_from_model * scale.unwrap_or(1.0)) as f32);
+    out
 }

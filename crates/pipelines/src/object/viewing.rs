@@ -255,6 +255,7 @@ impl ViewSource for RunView {
             unit_m: 1.0,
             clip: r.clip,
             floaters: 0.01,
+            keep_unseen: false,
         };
         let made = Self::tell(export::export(&self.model(), &options, progress))?;
         Ok((out, made.scale))
