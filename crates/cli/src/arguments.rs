@@ -39,9 +39,9 @@ enum Command {
         after_help = "Examples:\n  diorama render runs/chair --video orbit.mp4\n  diorama render runs/chair --path camera_path.json --layers rgb,depth,normal --images frames/"
     )]
     Render(RenderArgs),
-    /// Extract a mesh
+    /// Extract a mesh or a point cloud
     #[command(
-        after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --scale-to 80cm -o chair.usdz\n  diorama export runs/chair --resolution 384 --faces 100000 --watertight --units mm -o chair.stl"
+        after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --scale-to 80cm -o chair.usdz\n  diorama export runs/chair --resolution 384 --faces 100000 --watertight --units mm -o chair.stl\n  diorama export runs/chair --format points --points 2000000 -o chair.ply\n  diorama export runs/chair -o chair.e57"
     )]
     Export(ExportArgs),
     /// Look at a run in the browser: views, cameras, crop box, scale, camera paths, meshes; or at a data set's cameras and points
@@ -232,6 +232,9 @@ pub struct EvalArgs {
     /// full, or fast as for previews
     #[arg(long, default_value = "full")]
     pub quality: String,
+    /// Also judge by LPIPS with these weights: AlexNet or VGG16 and the linear heads, safetensors or PyTorch's .pth, in one file or two
+    #[arg(long, value_name = "FILE[,FILE]", value_delimiter = ',')]
+    pub lpips: Vec<PathBuf>,
     /// Write each render beside its photograph into RUN/eval
     #[arg(long)]
     pub save_images: bool,
@@ -272,6 +275,12 @@ pub struct RenderArgs {
     /// [default: 30, or that of the path's file]
     #[arg(long)]
     pub fps: Option<u32>,
+    /// How the layer depth keeps distances, beside its pictures: png (16 bit, one step for the sequence, in depth.json), exr or npy (floats)
+    #[arg(long, default_value = "png")]
+    pub depth: String,
+    /// Meters per unit of the capture, for distances [default: by the length measured in the viewer, else unknown]
+    #[arg(long)]
+    pub scale: Option<f64>,
     /// Show only what lies in x0,y0,z0,x1,y1,z1 (the input's frame), or all [default: the crop box saved in the viewer, else all]
     #[arg(long, allow_hyphen_values = true)]
     pub clip: Option<String>,
@@ -292,9 +301,12 @@ pub struct ExportArgs {
     /// auto, cpu, cuda, vulkan, metal or webgpu
     #[arg(long, default_value = "auto")]
     pub device: String,
-    /// glb, obj, ply, stl, usdz or dae [default: the extension of --out]
+    /// glb, obj, ply, stl, usdz or dae; points (a point cloud: ply, las or e57) [default: the extension of --out]
     #[arg(long)]
     pub format: Option<String>,
+    /// How many points a point cloud gets [default: 1000000]
+    #[arg(long, value_name = "N")]
+    pub points: Option<usize>,
     /// The file to write
     #[arg(short, long)]
     pub out: PathBuf,
@@ -328,15 +340,18 @@ pub struct ExportArgs {
     /// Two points of the capture and their true distance: x0,y0,z0,x1,y1,z1=45cm
     #[arg(long, value_name = "POINTS=LENGTH", allow_hyphen_values = true)]
     pub measured: Option<String>,
-    /// Unit of the coordinates in obj, ply and stl: m, cm, mm or in; the others are in metres by their standards
+    /// Unit of the coordinates in obj, ply, stl and las: m, cm, mm or in; the others are in metres by their standards
     #[arg(long, default_value = "m")]
     pub units: String,
-    /// Extract only x0,y0,z0,x1,y1,z1 (the input's frame), or auto [default: the crop box saved in the viewer, else auto: what most cameras look at]
+    /// Extract only x0,y0,z0,x1,y1,z1 (the input's frame), or auto, or all (points only) [default: the crop box saved in the viewer, else auto: what most cameras look at]
     #[arg(long, allow_hyphen_values = true)]
     pub clip: Option<String>,
     /// Remove parts with fewer faces than this share of the largest part's
     #[arg(long, default_value_t = 0.01)]
     pub floaters: f32,
+    /// Keep parts that fewer than three training cameras see, and parts that stand close before one
+    #[arg(long)]
+    pub keep_unseen: bool,
     #[arg(long)]
     pub threads: Option<usize>,
     /// Replace an existing file

@@ -1,5 +1,7 @@
 //! The `diorama` command.
 
+#[macro_use]
+mod print;
 mod arguments;
 mod commands;
 mod terminal;

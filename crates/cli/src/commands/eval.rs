@@ -17,6 +17,7 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         other => return Err(PipelineError::Usage(format!("--on {other}: expected train, val or test"))),
     };
     let quality = a.quality.parse().map_err(|e| PipelineError::Usage(format!("--{e}")))?;
+    let lpips = if a.lpips.is_empty() { None } else { Some(evaluate::load_lpips(&a.lpips)?) };
     let (mut model, notes) = run_folder::load_model(&a.run)?;
     device::accelerate(&mut model, &a.device)?;
     notes.iter().for_each(|n| eprintln!("note: {n}"));
@@ -24,7 +25,7 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
     if a.save_images {
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
-    let report = evaluate::evaluate(&model, split, quality, &mut |name, v| {
+    let report = evaluate::evaluate_with(&model, split, quality, lpips.as_ref(), &mut |name, v| {
         eprintln!("{name}: psnr {:.2} ssim {:.3}", v.scores.psnr, v.scores.ssim);
         if a.save_images {
             let (r, p) = (v.view.rgb.to_u8(), v.photo.to_u8());
@@ -42,6 +43,9 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
             "{} views: psnr {:.2} dB (worst {:.2}, affine {:.2}), ssim {:.4}, mse {:.5}",
             report.views, report.psnr, report.psnr_min, report.psnr_affine, report.ssim, report.mse
         );
+        if let (Some(l), Some(network)) = (report.lpips, &lpips) {
+            println!("lpips {l:.4} ({})", network.network());
+        }
         if let Some(p) = report.psnr_mean_image {
             println!("the mean training image in place of renders: {p:.2} dB");
         }

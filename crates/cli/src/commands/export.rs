@@ -3,18 +3,16 @@
 use super::{Outcome, clip_or_crop, use_threads};
 use crate::arguments::ExportArgs;
 use diorama_data::{DataError, mesh_text};
-use diorama_pipelines::object::device;
 use diorama_pipelines::object::export::{self, ExportOptions, Size};
-use diorama_pipelines::object::{run_folder, viewing};
+use diorama_pipelines::object::model::ObjectModel;
+use diorama_pipelines::object::points::{self, PointFormat, PointOptions, Region};
+use diorama_pipelines::object::{device, run_folder, viewing};
 use diorama_pipelines::{PipelineError, Result};
 use std::time::Instant;
 
 pub fn run(a: &ExportArgs) -> Result<Outcome> {
     use_threads(a.threads)?;
-    let extension = a.out.extension().map(|e| e.to_string_lossy().into_owned());
-    let named =
-        a.format.clone().or(extension).ok_or_else(|| PipelineError::Usage("--format: expected glb, obj, ply, stl, usdz or dae".into()))?;
-    let format = named.parse().map_err(|e| PipelineError::Usage(format!("--{e}")))?;
+    let format = Format::of(a)?;
     let written = [a.out.clone()].into_iter().chain(mesh_text::companions(&a.out));
     if let Some(file) = written.filter(|_| !a.force).find(|f| f.exists()) {
         return Err(DataError::input(file, "exists; give --force to replace it or another --out").into());
@@ -38,8 +36,21 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
                 .ok_or_else(|| PipelineError::Usage(format!("--level {n}: expected auto or a number above 0")))?,
         ),
     };
-    let clip = clip_or_crop(a.clip.as_deref(), "auto", &a.run, &model)?;
+    let everything = a.clip.as_deref() == Some("all");
+    let clip = if everything { None } else { clip_or_crop(a.clip.as_deref(), "auto", &a.run, &model)? };
     device::accelerate(&mut model, &a.device)?;
+    let format = match format {
+        Format::Mesh(f) => f,
+        Format::Points(format) => {
+            let region = match clip {
+                Some((lo, hi)) => Region::Box(lo, hi),
+                None if everything => Region::Everything,
+                None => Region::Auto,
+            };
+            let points = a.points.unwrap_or(points::POINTS);
+            return export_points(a, &model, &PointOptions { format, out: a.out.clone(), points, region, size, unit_m });
+        }
+    };
     let options = ExportOptions {
         format,
         out: a.out.clone(),
@@ -54,14 +65,9 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
         unit_m,
         clip,
         floaters: a.floaters,
+        keep_unseen: a.keep_unseen,
     };
-    let mut last = Instant::now();
-    let made = export::export(&model, &options, &mut |stage, i, n| {
-        if last.elapsed().as_secs() >= 5 {
-            last = Instant::now();
-            eprintln!("{stage}: {} %", i * 100 / n.max(1));
-        }
-    })?;
+    let made = export::export(&model, &options, &mut progress())?;
     if a.json {
         println!("{}", serde_json::to_string(&made).expect("plain values"));
     } else {
@@ -79,8 +85,87 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
             made.level,
             if made.watertight { ", watertight" } else { "" }
         );
+        let r = made.removed;
+        println!(
+            "removed: {} faces of small parts, {} of parts that fewer than three cameras see, {} of parts close before a camera{}",
+            r.small,
+            r.unseen,
+            r.before_cameras,
+            if r.unseen + r.before_cameras > 0 { " (--keep-unseen keeps the latter two)" } else { "" }
+        );
+        made.notes.iter().for_each(|n| println!("note: {n}"));
     }
     Ok(Outcome::Done)
+}
+
+/// What the file will hold.
+#[derive(Clone, Copy)]
+enum Format {
+    Mesh(export::Format),
+    Points(PointFormat),
+}
+
+impl Format {
+    /// Of `--format`, else of the file's extension; flags that do not go with it are refused.
+    fn of(a: &ExportArgs) -> Result<Format> {
+        let usage = |e: String| PipelineError::Usage(format!("--{e}"));
+        let extension = a.out.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+        let named = a.format.as_deref().map(str::to_ascii_lowercase);
+        let format = match (named.as_deref(), extension.as_deref()) {
+            (Some("points"), e) => Format::Points(e.unwrap_or("ply").parse().map_err(usage)?),
+            (Some("las" | "e57"), _) => Format::Points(named.unwrap_or_default().parse().map_err(usage)?),
+            (None, Some(e @ ("las" | "e57"))) => Format::Points(e.parse().map_err(usage)?),
+            (Some(n), _) | (None, Some(n)) => Format::Mesh(n.parse().map_err(usage)?),
+            (None, None) => {
+                return Err(PipelineError::Usage("--format: expected glb, obj, ply, stl, usdz, dae or points".into()));
+            }
+        };
+        match format {
+            Format::Mesh(_) if a.clip.as_deref() == Some("all") => {
+                Err(PipelineError::Usage("--clip all: a mesh needs a box; give its corners, or --clip auto".into()))
+            }
+            Format::Mesh(_) if a.points.is_some() => {
+                Err(PipelineError::Usage("--points: only a point cloud has them; add --format points, or name a .las or .e57 file".into()))
+            }
+            Format::Points(_) if a.texture.is_some() || a.faces.is_some() || a.normal_map || a.watertight => Err(PipelineError::Usage(
+                "--faces, --texture, --normal-map and --watertight: only a mesh has them; leave them out for points".into(),
+            )),
+            _ => Ok(format),
+        }
+    }
+}
+
+fn export_points(a: &ExportArgs, model: &ObjectModel, options: &PointOptions) -> Result<Outcome> {
+    let made = points::export(model, options, &mut progress())?;
+    if a.json {
+        println!("{}", serde_json::to_string(&made).expect("plain values"));
+        return Ok(Outcome::Done);
+    }
+    println!(
+        "{}: {} points, {} KiB, {:.3} x {:.3} x {:.3} m, {:.1} s",
+        made.file.display(),
+        made.points,
+        made.bytes >> 10,
+        made.extent_m[0],
+        made.extent_m[1],
+        made.extent_m[2],
+        made.seconds
+    );
+    if made.points < made.asked {
+        println!("note: {} points instead of {}: the cameras see little surface there", made.points, made.asked);
+    }
+    Ok(Outcome::Done)
+}
+
+/// Says every few seconds how far a stage is.
+fn progress() -> impl FnMut(&str, usize, usize) {
+    let mut last = Instant::now();
+    move |stage, i, n| {
+        if last.elapsed().as_secs() >= 5 {
+            last = Instant::now();
+            eprintln!("{stage}: {} %", i * 100 / n.max(1));
+        }
+    }
 }
 
 /// Metres of a unit's name.

@@ -4,14 +4,12 @@ use super::Outcome;
 use crate::arguments::{CompletionsArgs, ManArgs};
 use diorama_data::{DataError, atomic};
 use diorama_pipelines::Result;
-use std::io::Write;
 
 /// Completions of a shell on stdout.
 pub fn completions(a: &CompletionsArgs, mut command: clap::Command) -> Result<Outcome> {
     let mut text = Vec::new();
     clap_complete::generate(a.shell, &mut command, "diorama", &mut text);
-    // A reader that closes early, such as `head`, is content.
-    let _ = std::io::stdout().write_all(&text);
+    crate::print::bytes(&text);
     Ok(Outcome::Done)
 }
 

@@ -2,8 +2,9 @@
 
 use super::{INTERRUPT, Outcome, clip_or_crop, use_threads, watch_interrupts};
 use crate::arguments::RenderArgs;
-use diorama_pipelines::object::render::{self, RenderOptions};
-use diorama_pipelines::object::{device, run_folder};
+use diorama_pipelines::object::export::Size;
+use diorama_pipelines::object::render::{self, Layer, RenderOptions};
+use diorama_pipelines::object::{device, run_folder, viewing};
 use diorama_pipelines::{PipelineError, Result};
 use std::time::Instant;
 
@@ -20,6 +21,14 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
     let layers = a.layers.iter().map(|l| l.parse().map_err(usage)).collect::<Result<Vec<_>>>()?;
     let path = a.path.parse().map_err(usage)?;
     let quality = a.quality.parse().map_err(usage)?;
+    let depth = a.depth.parse().map_err(usage)?;
+    if a.scale.is_some_and(|s| !(s > 0.0 && s.is_finite())) {
+        return Err(PipelineError::Usage("--scale: must be a number above 0".into()));
+    }
+    let scale = match (a.scale, layers.contains(&Layer::Depth)) {
+        (None, true) => viewing::read_scale(&a.run)?.map(Size::meters_per_unit),
+        (given, _) => given,
+    };
     let (mut model, notes) = run_folder::load_model(&a.run)?;
     device::accelerate(&mut model, &a.device)?;
     notes.iter().for_each(|n| eprintln!("note: {n}"));
@@ -36,6 +45,8 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
         fps: a.fps,
         clip,
         quality,
+        depth,
+        scale,
     };
     watch_interrupts();
     let start = Instant::now();
