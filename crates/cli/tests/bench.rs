@@ -40,7 +40,8 @@ fn stages_of_a_step_add_up() {
     let spent: f64 = stages.iter().map(|s| s["ms"].as_f64().unwrap() * 5e-3).sum();
     let seconds = v["seconds"].as_f64().unwrap();
     assert!(spent <= seconds * 1.001 && spent > 0.8 * seconds, "{spent} of {seconds}");
-    assert!(v["marched_per_ray"].as_f64() >= v["trained_per_ray"].as_f64());
+    let per_ray = |key: &str| v[key].as_f64().unwrap_or_else(|| panic!("{key} is missing: {v}"));
+    assert!(per_ray("trained_per_ray") > 0.0 && per_ray("marched_per_ray") >= per_ray("trained_per_ray"), "{v}");
     assert_eq!(listing(dir.path()), before, "nothing is written");
     let o = diorama(&["bench", "train", "/nowhere"]);
     assert_eq!(o.status.code(), Some(2));

@@ -1,7 +1,7 @@
 // Drives the viewer of a run in headless Chromium: node test/viewer.mjs DIORAMA RUN [PICTURES]
 // Prints a line per check and fails with the first that does not hold.
 
-import { spawn } from "node:child_process";
+import { execFileSync, spawn } from "node:child_process";
 import { existsSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import net from "node:net";
 import os from "node:os";
@@ -186,7 +186,9 @@ try {
   await page.click("#crop-save");
   await until("crop.json", () => existsSync(path.join(run, "crop.json")));
   const crop = JSON.parse(readFileSync(path.join(run, "crop.json")));
-  check("the crop box is kept for render and export", crop.min[0] < crop.max[0]);
+  const shownBox = await page.evaluate(() => [0, 1].map((end) => ["x", "y", "z"].map((axis) => Number(document.getElementById(`crop-${axis}${end}`).value))));
+  const kept = [crop.min, crop.max].every((corner, end) => corner.every((v, k) => Math.abs(v - shownBox[end][k]) < 1e-4));
+  check("the crop box is kept as it is shown", kept, `(${JSON.stringify(crop)})`);
 
   // Camera path.
   await page.click("#key-add");
@@ -243,10 +245,17 @@ try {
   await shot("mesh");
   const glb = readFileSync(path.join(run, "mesh.glb"));
   check("a GLB is made and shown", glb.subarray(0, 4).toString() === "glTF", `(${glb.length >> 10} KiB)`);
-  const root = JSON.parse(glb.subarray(20, 20 + glb.readUInt32LE(12)));
-  const at = root.accessors[root.meshes[0].primitives[0].attributes.POSITION];
-  const height = (at.max[1] - at.min[1]) / (0.25 / apart);
-  check("the mesh has the measured scale", height > 0.2 && height < 3, `(${(at.max[1] - at.min[1]).toFixed(3)} m high)`);
+  const extents = (bytes) => {
+    const root = JSON.parse(bytes.subarray(20, 20 + bytes.readUInt32LE(12)));
+    const at = root.accessors[root.meshes[0].primitives[0].attributes.POSITION];
+    return at.max.map((v, k) => v - at.min[k]);
+  };
+  // The same box without the measured length, in units of the capture.
+  const unscaled = path.join(run, "unscaled.glb");
+  execFileSync(diorama, ["export", run, "-o", unscaled, "--scale", "1", "--faces", "5000", "--resolution", "64", "--device", "cpu", "--force"]);
+  const [inMeters, inUnits] = [glb, readFileSync(unscaled)].map(extents);
+  const off = Math.max(...inMeters.map((v, k) => Math.abs(v / inUnits[k] / (0.25 / apart) - 1)));
+  check("the mesh has the measured scale", off < 0.01, `(${inMeters.map((v) => v.toFixed(3)).join(" x ")} m, ${(100 * off).toFixed(2)} % off)`);
   const [download] = await Promise.all([page.waitForEvent("download"), page.click("#screenshot")]);
   const folder = mkdtempSync(path.join(os.tmpdir(), "viewer-"));
   await download.saveAs(path.join(folder, "s.png"));
