@@ -1,6 +1,6 @@
 //! Every parser of bytes that may come from strangers, as a function that must neither crash nor hang.
 
-use diorama_data::{archive, camera_path_json, checkpoint, colmap, import, llff, photo, photo_import, splat_ply, transforms_json};
+use diorama_data::{archive, camera_path_json, checkpoint, colmap, import, llff, photo, photo_import, splat_ply, transforms_json, weights};
 use diorama_geom::{ImageU8, Similarity};
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::viewing;
@@ -31,6 +31,7 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "run_config", run: run_config, seeds: config_seeds },
     Parser { name: "crop_json", run: crop_json, seeds: crop_seeds },
     Parser { name: "splat_ply", run: splats, seeds: splat_seeds },
+    Parser { name: "weights", run: load_weights, seeds: weights_seeds },
 ];
 
 /// A parser by name.
@@ -306,4 +307,16 @@ fn splat_seeds() -> Vec<Vec<u8>> {
     let mut binary = head("binary_little_endian", 2, &floats).into_bytes();
     binary.extend([7u8; 2 * (4 + 4 + 8 + 11 * 4)]);
     vec![text.into_bytes(), binary]
+}
+
+fn load_weights(data: &[u8]) {
+    let path = file("weights.pth", data);
+    let _ = weights::read(&path, &|_| true);
+}
+
+/// What PyTorch wrote in both of its formats, and a safetensors file.
+fn weights_seeds() -> Vec<Vec<u8>> {
+    let of_torch =
+        [&include_bytes!("../../crates/data/tests/data/small.pth")[..], include_bytes!("../../crates/data/tests/data/small_legacy.pth")];
+    of_torch.iter().map(|b| b.to_vec()).chain(checkpoint_seeds()).collect()
 }
