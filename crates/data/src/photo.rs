@@ -2,8 +2,8 @@
 //! EXR and HDR (linear, encoded to sRGB and clamped).
 
 use crate::error::{DataError, Result};
-use diorama_geom::color::{srgb_from_linear, u8_from_unit};
 use diorama_geom::ImageU8;
+use diorama_geom::color::{srgb_from_linear, u8_from_unit};
 use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
 use std::path::Path;
 
