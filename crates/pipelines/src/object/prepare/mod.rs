@@ -229,10 +229,13 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
         }
     } else {
         note("choosing sharp frames of the video");
-        let Some((all, taken)) = video::extract(&o.input, &folder, o.choice, &work.join("ffmpeg.log"), interrupt)? else {
+        let Some(made) = video::extract(&video::ffmpeg()?, &o.input, &folder, o.choice, &work.join("ffmpeg.log"), interrupt)? else {
             return Ok(false);
         };
-        note(&format!("frames: {taken} of {all} taken"));
+        note(&format!("frames: {} of {} taken", made.taken, made.frames));
+        if let Some(fault) = made.fault {
+            note(&format!("the video can be decoded in part only, the rest is missing: {fault}"));
+        }
         if o.max_side < u32::MAX {
             for file in photo_import::list(&folder)? {
                 let stem = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
