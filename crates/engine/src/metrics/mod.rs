@@ -19,7 +19,8 @@ pub fn psnr(mse: f64) -> f64 {
     -10.0 * mse.max(1e-12).log10()
 }
 
-/// Compares images of equal size, 3 channels, over the pixels that `counts` admits (SSIM over all).
+/// Compares images of equal size, 3 channels, over the pixels that `counts` admits; SSIM over the windows around them, in which
+/// pixels that do not count are equal. Not numbers where no pixel counts.
 ///
 /// # Panics
 /// When sizes differ.
@@ -33,13 +34,22 @@ pub fn compare(rendered: &Image, photo: &Image, counts: impl Fn(usize, usize) ->
             .flat_map(|i| (0..c).map(move |k| i * c + k))
             .map(|e| (f(e % c, rendered.data[e] as f64) - photo.data[e] as f64).powi(2))
             .sum();
-        sum / (pixels.len() * c).max(1) as f64
+        sum / (pixels.len() * c) as f64
     };
     let mse = error(&|_, v| v);
     let fits: Vec<(f64, f64)> =
         (0..c).map(|k| affine_fit(pixels.iter().map(|i| (rendered.data[i * c + k] as f64, photo.data[i * c + k] as f64)))).collect();
     let affine = error(&|k, v| fits[k].0 * v + fits[k].1);
-    let ssim = ssim::cpu::ssim(photo.width, photo.height, c, &rendered.data, &photo.data);
+    let ssim = if pixels.len() == photo.width * photo.height {
+        ssim::cpu::ssim(photo.width, photo.height, c, &rendered.data, &photo.data)
+    } else {
+        let (mut admitted, mut shown) = (vec![false; photo.width * photo.height], photo.data.clone());
+        for i in &pixels {
+            admitted[*i] = true;
+            shown[i * c..(i + 1) * c].copy_from_slice(&rendered.data[i * c..(i + 1) * c]);
+        }
+        ssim::cpu::ssim_where(photo.width, photo.height, c, &shown, &photo.data, &|i| admitted[i])
+    };
     Scores { mse, psnr: psnr(mse), ssim, psnr_affine: psnr(affine) }
 }
 
@@ -83,6 +93,19 @@ mod tests {
         wrong.data[0] = 1.0;
         assert!(compare(&wrong, &photo, |_, _| true).psnr < 40.0);
         assert!(compare(&wrong, &photo, |x, y| x + y > 0).psnr > 100.0);
+        assert!(compare(&wrong, &photo, |_, _| false).psnr.is_nan());
+    }
+
+    #[test]
+    fn ssim_looks_at_the_pixels_that_count() {
+        let texture = |i: usize| (i * 37 % 97) as f32 / 97.0;
+        let photo = Image { width: 48, height: 32, channels: 3, data: (0..48 * 32 * 3).map(texture).collect() };
+        let mut half = photo.clone();
+        (0..half.data.len()).filter(|i| i / 3 % 48 >= 24).for_each(|i| half.data[i] = texture(i + 29));
+        let all = compare(&half, &photo, |_, _| true).ssim;
+        let left = compare(&half, &photo, |x, _| x < 24).ssim;
+        let right = compare(&half, &photo, |x, _| x >= 24).ssim;
+        assert!((left - 1.0).abs() < 1e-9 && right < 0.5 && (right..left).contains(&all), "{left} {all} {right}");
     }
 
     #[test]

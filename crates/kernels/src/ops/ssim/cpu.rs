@@ -69,23 +69,32 @@ impl Maps {
 /// # Shapes
 /// x, y `[h, w, c]`.
 pub fn ssim(w: usize, h: usize, c: usize, x: &[f32], y: &[f32]) -> f64 {
+    ssim_where(w, h, c, x, y, &|_| true)
+}
+
+/// Mean SSIM of the windows in whose middle a pixel lies, by its number in its plane, that `counts` admits; NaN where there is none.
+///
+/// # Shapes
+/// x, y `[h, w, c]`.
+pub fn ssim_where(w: usize, h: usize, c: usize, x: &[f32], y: &[f32], counts: &(dyn Fn(usize) -> bool + Sync)) -> f64 {
     if w < WINDOW || h < WINDOW {
         return f64::NAN;
     }
-    let n = (w + 1 - WINDOW) * (h + 1 - WINDOW);
+    let (across, down) = (w + 1 - WINDOW, h + 1 - WINDOW);
+    let middle = |i: usize| (i / across + WINDOW / 2) * w + i % across + WINDOW / 2;
+    let windows: Vec<usize> = (0..across * down).filter(|i| counts(middle(*i))).collect();
     let sums: Vec<f64> = (0..c)
         .into_par_iter()
         .map(|k| {
             let m = maps(w, h, c, k, x, y);
-            (0..n)
-                .map(|i| {
-                    let [a1, a2, b1, b2] = m.factors(i);
-                    a1 * a2 / (b1 * b2)
-                })
-                .sum()
+            let of = |i: &usize| {
+                let [a1, a2, b1, b2] = m.factors(*i);
+                a1 * a2 / (b1 * b2)
+            };
+            windows.iter().map(of).sum()
         })
         .collect();
-    sums.iter().sum::<f64>() / (n * c) as f64
+    sums.iter().sum::<f64>() / (windows.len() * c) as f64
 }
 
 /// Gradient of [`ssim`] with respect to x, `[h, w, c]`; zero for images smaller than the window.
