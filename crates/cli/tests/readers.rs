@@ -48,7 +48,7 @@ fn every_export_is_read_by_foreign_readers() {
     let small = ["--set", "field.log2_size=14", "--set", "field.finest=256"];
     diorama(&[&["train", capture, "-o", run, "--steps", "250", "--device", "cpu"], &small[..]].concat());
     let export = |file: &Path, more: &[&str]| {
-        let all = ["export", run, "-o", file.to_str().unwrap(), "--resolution", "64", "--faces", "2000", "--device", "cpu"];
+        let all = ["export", run, "-o", file.to_str().unwrap(), "--resolution", "64", "--faces", "2000", "--device", "cpu", "--force"];
         diorama(&[&all[..], more].concat());
     };
     let stem = dir.path().join("mesh");

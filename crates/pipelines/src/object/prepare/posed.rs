@@ -1,7 +1,7 @@
 //! Photographs whose poses are known already: copied as COLMAP's would be, poses and world as given.
 
 use super::{IMAGES, IMAGES_DONE, MASKS, POSED, Posed, PrepareOptions, finish, stems, world};
-use crate::error::Result;
+use crate::error::{PipelineError, Result};
 use diorama_data::colmap::Observed;
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::split::{self, SplitRule};
@@ -19,7 +19,7 @@ const UNTOLD: usize = 3;
 /// Reads the posed capture.
 ///
 /// # Errors
-/// When it cannot be read, or has a lens that `transforms.json` has no words for.
+/// When it cannot be read, has a lens that `transforms.json` has no words for, or lacks what is asked of it.
 pub fn read(o: &PrepareOptions) -> Result<Capture> {
     let options = ImportOptions { format: o.format, seed: o.seed, masks: o.masks, ..ImportOptions::default() };
     let capture = import::import(&o.input, &options)?;
@@ -33,6 +33,18 @@ pub fn read(o: &PrepareOptions) -> Result<Capture> {
         let what = "its lens cannot be written to transforms.json; undistort the photographs with COLMAP (image_undistorter) first";
         return Err(DataError::input(&f.image, what).into());
     }
+    let left = capture.frames.len().div_ceil(o.every);
+    if left < 3 {
+        return Err(DataError::input(&o.input, format!("--every {} leaves {left} photographs; at least 3 are needed", o.every)).into());
+    }
+    let by_points = [
+        ("--normalize-exposure", o.finish.normalize_exposure),
+        ("--remove-background auto", o.finish.background == finish::background::Background::Auto),
+    ];
+    if let Some((flag, _)) = by_points.iter().find(|f| f.1 && capture.points.is_empty()) {
+        let what = "goes by points, and the capture has none: neither COLMAP's points3D nor a ply_file_path in transforms.json";
+        return Err(PipelineError::Usage(format!("{flag}: {what}")));
+    }
     Ok(capture)
 }
 
@@ -42,10 +54,6 @@ pub fn take(capture: Capture, o: &PrepareOptions, interrupt: &AtomicBool, note: 
     let is_divided = !divided_by_default(&capture.frames);
     let chosen: Vec<usize> = (0..capture.frames.len()).step_by(o.every).collect();
     let mut frames: Vec<Frame> = chosen.iter().map(|i| capture.frames[*i].clone()).collect();
-    if frames.len() < 3 {
-        let what = format!("--every {} leaves {} photographs; at least 3 are needed", o.every, frames.len());
-        return Err(DataError::input(&o.input, what).into());
-    }
     let done = o.out.join(POSED).join(IMAGES_DONE);
     let images: Vec<PathBuf> = frames.iter().map(|f| f.image.clone()).collect();
     let stems = stems(&images);

@@ -149,13 +149,6 @@ pub fn finish(
         std::fs::create_dir_all(&masks).map_err(DataError::io(&masks, "create"))?;
     }
     let name = |f: &Frame| f.image.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    if o.normalize_exposure && found.points.is_empty() {
-        return Err(PipelineError::Usage(
-            "--normalize-exposure: the capture has no points by which photographs can be compared; \
-             it needs COLMAP's points3D or a ply_file_path in transforms.json"
-                .into(),
-        ));
-    }
     let gains = o.normalize_exposure.then(|| {
         note("comparing exposures");
         let of = |f: &Frame| match found.observed.get(&name(f)) {
