@@ -234,16 +234,18 @@ pub fn warnings(a: &Agreement, frames: &[Frame]) -> Vec<String> {
     if !wrong.is_empty() {
         let tell = |i: usize| format!("{} ({:.1} pixels)", frames[i].name, a.frames[i].error_px.unwrap_or(0.0));
         out.push(format!(
-            "{} photographs do not fit the model's points: {}; their poses may be wrong: leave them out, or run `diorama prepare`",
+            "{} of {} photographs do not fit the model's points: {}; their poses may be wrong: leave them out, or run `diorama prepare`",
             wrong.len(),
+            frames.len(),
             list(&wrong, &tell)
         ));
     }
     let alone: Vec<usize> = (0..a.frames.len()).filter(|i| a.frames[*i].shared == 0).collect();
     if !alone.is_empty() && a.error_px.is_some() {
         out.push(format!(
-            "{} photographs share no points with others: {}; nothing says that their poses are right: leave them out, or run `diorama prepare`",
+            "{} of {} photographs share no points with others: {}; nothing says that their poses are right: leave them out, or run `diorama prepare`",
             alone.len(),
+            frames.len(),
             list(&alone, &|i| frames[i].name.clone())
         ));
     }

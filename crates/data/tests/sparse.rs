@@ -156,7 +156,11 @@ fn observations_of_absent_points_are_checked_by_tracks() {
 #[test]
 fn single_photographs_are_named() {
     let one = read(&Kind { wrong: vec![5], ..GOOD }).unwrap();
-    assert!(one.notes.len() == 1 && one.notes[0].starts_with("1 photographs do not fit") && one.notes[0].contains("v5"), "{:?}", one.notes);
+    assert!(
+        one.notes.len() == 1 && one.notes[0].starts_with("1 of 8 photographs do not fit") && one.notes[0].contains("v5"),
+        "{:?}",
+        one.notes
+    );
     let alone = read(&Kind { alone: Some(2), ..GOOD }).unwrap();
     assert!(alone.notes.len() == 1 && alone.notes[0].contains("share no points with others: v2;"), "{:?}", alone.notes);
 }

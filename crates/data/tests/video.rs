@@ -31,7 +31,7 @@ fn ffmpeg() -> Option<PathBuf> {
 fn picture(number: usize) -> ImageU8 {
     let (w, h, level) = (96, 64, 40 + 7 * number as u8);
     let contrast = if number % 4 == 2 { 30 } else { 3 };
-    let at = |i: usize| if (i % w / 8 + i / w / 8) % 2 == 0 { level + contrast } else { level - contrast };
+    let at = |i: usize| if (i % w / 8 + i / w / 8).is_multiple_of(2) { level + contrast } else { level - contrast };
     ImageU8 { width: w, height: h, channels: 3, data: (0..w * h).flat_map(|i| [at(i); 3]).collect() }
 }
 
