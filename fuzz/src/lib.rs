@@ -98,6 +98,9 @@ fn colmap_binary(data: &[u8]) {
     let _ = std::fs::create_dir_all(folder().join("binary/images"));
     file("binary/cameras.bin", cameras);
     file("binary/images.bin", images);
+    // Points of numbers 0 and 7, which keypoints may name.
+    let point = |id: u64| [&id.to_le_bytes()[..], &[0; 43 - 8], &0u64.to_le_bytes()].concat();
+    file("binary/points3D.bin", &[&2u64.to_le_bytes()[..], &point(0), &point(7)].concat());
     let _ = colmap::read(&folder().join("binary"));
     let _ = colmap::registered(&folder().join("binary"));
 }
@@ -107,12 +110,17 @@ fn colmap_text(data: &[u8]) {
     let _ = std::fs::create_dir_all(folder().join("text/images"));
     file("text/cameras.txt", cameras);
     file("text/images.txt", images);
+    file("text/points3D.txt", b"7 0 0 0 1 2 3 0.5 1 0\n");
     let _ = colmap::read(&folder().join("text"));
 }
 
 fn colmap_points(data: &[u8]) {
     file("points3D.bin", data);
     let _ = colmap::points(folder());
+    let text = folder().join("points");
+    let _ = std::fs::create_dir_all(&text);
+    file("points/points3D.txt", data);
+    let _ = colmap::points(&text);
 }
 
 fn npy(data: &[u8]) {
@@ -189,7 +197,7 @@ fn colmap_binary_seeds() -> Vec<Vec<u8>> {
 }
 
 fn colmap_text_seeds() -> Vec<Vec<u8>> {
-    vec![joined(b"# cameras\n1 OPENCV 4 3 3 3 2 1.5 0.1 0 0 0\n", b"# images\n1 1 0 0 0 0 0 4 1 a.png\n0.5 0.5 -1\n")]
+    vec![joined(b"# cameras\n1 OPENCV 4 3 3 3 2 1.5 0.1 0 0 0\n", b"# images\n1 1 0 0 0 0 0 4 1 a.png\n0.5 0.5 -1 2.5 1.5 7\n")]
 }
 
 fn points_seeds() -> Vec<Vec<u8>> {
@@ -200,7 +208,7 @@ fn points_seeds() -> Vec<Vec<u8>> {
     out.extend(0.5f64.to_le_bytes());
     out.extend(1u64.to_le_bytes());
     out.extend([0; 8]);
-    vec![out]
+    vec![out, b"# points\n7 1 2 3 9 8 7 0.5 1 0 2 4\n".to_vec()]
 }
 
 fn npy_seeds() -> Vec<Vec<u8>> {

@@ -21,9 +21,9 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Photographs or a video without poses to a data set, through COLMAP
+    /// Photographs or a video to a data set, through COLMAP or with the poses that they have
     #[command(
-        after_help = "Examples:\n  diorama prepare photos/ -o data/chair\n  diorama prepare chair.mp4 -o data/chair --frames 120\n  diorama prepare photos/ -o data/chair --resume --remove-background auto\n\nCOLMAP (and ffmpeg for videos) must be installed; DIORAMA_COLMAP and DIORAMA_FFMPEG name other programs than those in PATH."
+        after_help = "Examples:\n  diorama prepare photos/ -o data/chair\n  diorama prepare chair.mp4 -o data/chair --frames 120\n  diorama prepare photos/ -o data/chair --resume --remove-background auto\n  diorama prepare posed/ -o data/chair --sfm none --remove-background auto\n\nCOLMAP (and ffmpeg for videos) must be installed; DIORAMA_COLMAP and DIORAMA_FFMPEG name other programs than those in PATH."
     )]
     Prepare(PrepareArgs),
     /// Fit a field to photographs with poses
@@ -93,14 +93,33 @@ enum Bench {
     Check(BenchCheckArgs),
 }
 
+/// Flags of verbs that read a capture with masks.
+#[derive(Args, Clone, Debug)]
+pub struct MaskArgs {
+    /// Masks beside the photographs: use (black is left out), invert or ignore [default: use]
+    #[arg(long, value_name = "use|invert|ignore")]
+    pub mask: Option<String>,
+    /// What masks leave out: object (empty space), unknown (anything), or auto, told by what they cover [default: auto]
+    #[arg(long, value_name = "auto|object|unknown")]
+    pub mask_meaning: Option<String>,
+}
+
 /// Flags of `prepare`.
 #[derive(Args, Clone, Debug)]
 pub struct PrepareArgs {
-    /// Folder of photographs, or a video
+    /// Folder of photographs, or a video; with --sfm none a capture that has poses
     pub input: PathBuf,
     /// Folder of the data set
     #[arg(short, long)]
     pub out: PathBuf,
+    /// Where poses come from: colmap, or none for a capture that has them (transforms.json, COLMAP model, poses_bounds.npy)
+    #[arg(long, default_value = "colmap")]
+    pub sfm: String,
+    /// With --sfm none: transforms, blender, colmap or llff, where a folder holds several
+    #[arg(long)]
+    pub format: Option<String>,
+    #[command(flatten)]
+    pub masks: MaskArgs,
     /// Most frames of a video; the sharpest of each stretch is taken
     #[arg(long, default_value_t = 150, conflicts_with = "fps")]
     pub frames: usize,
@@ -137,9 +156,9 @@ pub struct PrepareArgs {
     /// off, auto (by the points of what the cameras look at), or a segmentation network: NETWORK.onnx
     #[arg(long, default_value = "off")]
     pub remove_background: String,
-    /// every:N, A:B:C (percent) or all
-    #[arg(long, default_value = "every:8")]
-    pub split: String,
+    /// every:N, A:B:C (percent), all, or file: as the capture says [default: every:8; with --sfm none file]
+    #[arg(long)]
+    pub split: Option<String>,
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
     /// Fail where fewer photographs than this percentage find a pose
@@ -183,6 +202,8 @@ pub struct TrainArgs {
     /// every:N, A:B:C (percent), file or all
     #[arg(long)]
     pub split: Option<String>,
+    #[command(flatten)]
+    pub masks: MaskArgs,
     /// auto, white, black, random or learned
     #[arg(long)]
     pub background: Option<String>,
@@ -440,6 +461,8 @@ pub struct DoctorArgs {
     /// Format of a capture, where a folder holds several
     #[arg(long, requires = "data")]
     pub format: Option<String>,
+    #[command(flatten)]
+    pub masks: MaskArgs,
     #[arg(long)]
     pub json: bool,
 }

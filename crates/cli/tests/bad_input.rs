@@ -178,15 +178,20 @@ fn sizes_that_do_not_match() {
     edit(dir.path(), |j| j["frames"][3]["w"] = 25.into());
     refused(dir.path(), &[], &["view_03.png", "24×24", "25×24"]);
     let dir = copy();
-    std::fs::copy(dir.path().join("images/view_01.png"), dir.path().join("mask.png")).unwrap();
+    let mask = diorama_geom::ImageU8 { width: 24, height: 36, channels: 1, data: vec![255; 24 * 36] };
+    diorama_data::photo::save_png(&dir.path().join("mask.png"), &mask).unwrap();
     edit(dir.path(), |j| j["frames"][1]["mask_path"] = "mask.png".into());
-    let big = good().join("images/view_02.png");
-    // The mask is a photograph of another capture size: enlarge by reusing a 48-pixel render.
-    let other = tempfile::tempdir().unwrap();
-    write_capture(other.path(), 2, 48).unwrap();
-    std::fs::copy(other.path().join("images/view_01.png"), dir.path().join("mask.png")).unwrap();
-    assert!(big.exists());
-    refused(dir.path(), &[], &["mask.png", "48×48"]);
+    refused(dir.path(), &[], &["mask.png", "24×36", "24×24"]);
+}
+
+#[test]
+fn a_mask_that_cannot_be_read() {
+    let dir = copy();
+    std::fs::create_dir(dir.path().join("masks")).unwrap();
+    std::fs::write(dir.path().join("masks/view_03.jpg"), b"no picture").unwrap();
+    refused(dir.path(), &[], &["masks/view_03.jpg", "decoded"]);
+    refused(copy().path(), &["--mask", "perhaps"], &["mask", "use, invert or ignore"]);
+    refused(copy().path(), &["--mask-meaning", "thing"], &["auto, object or unknown"]);
 }
 
 #[test]

@@ -174,3 +174,167 @@ fn photographs_become_a_finished_data_set() {
     assert_eq!(kept.frames.len(), 12);
     assert!(kept.frames.iter().all(|f| photo::load(&f.image).is_ok()));
 }
+
+/// Calls `prepare`, where no COLMAP is needed or at hand.
+fn prepare(input: &Path, out: &Path, more: &[&str]) -> (Option<i32>, String, serde_json::Value) {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
+    c.env("DIORAMA_COLMAP", "no/such/program").arg("prepare").arg(input).arg("-o").arg(out).args(more).arg("--json");
+    let o = c.output().unwrap();
+    let text = String::from_utf8_lossy(&o.stderr).into_owned();
+    (o.status.code(), text, serde_json::from_slice(&o.stdout).unwrap_or_default())
+}
+
+/// Photographs with COLMAP's model beside them.
+fn posed(root: &Path) {
+    capture(&root.join("images"), &root.join("sparse/0"));
+}
+
+#[test]
+fn a_posed_capture_is_finished_without_colmap() {
+    let dir = tempfile::tempdir().unwrap();
+    let (input, out) = (dir.path().join("posed"), dir.path().join("data"));
+    posed(&input);
+    let given = import::import(&input, &Default::default()).unwrap();
+    let (code, text, made) = prepare(&input, &out, &["--sfm", "none"]);
+    assert_eq!(code, Some(0), "{text}");
+    assert_eq!(
+        (&made["images"], &made["registered"], &made["points"]),
+        (&(VIEWS as u64).into(), &(VIEWS as u64).into(), &given.points.len().into())
+    );
+    let same = |made: &diorama_geom::Capture| {
+        for f in &made.frames {
+            let g = given.frames.iter().find(|g| f.name.ends_with(&g.name)).unwrap();
+            assert!((f.world_from_camera.translation - g.world_from_camera.translation).length() < 1e-9);
+            assert!((f.world_from_camera.rotation.z_axis - g.world_from_camera.rotation.z_axis).length() < 1e-9);
+        }
+    };
+    let plain = import::import(&out, &Default::default()).unwrap();
+    same(&plain);
+    assert!(plain.frames.len() == VIEWS && plain.frames[0].image.ends_with("images/view_00.jpg"));
+    assert!(plain.points.len() == given.points.len() && (plain.points[7].position - given.points[7].position).length() < 1e-5);
+    assert!(plain.scene.aabb_scale == given.scene.aabb_scale && (plain.scene.center - given.scene.center).length() < 1e-9);
+
+    let all = ["--select", "diverse:12", "--crop", "20,10,160,170", "--normalize-exposure", "--denoise", "--remove-background", "auto"];
+    let (code, text, made) = prepare(&input, &out, &[&["--sfm", "none", "--resume"], &all[..]].concat());
+    assert_eq!(code, Some(0), "{text}");
+    let stops = made["exposure_stops"].as_array().unwrap();
+    assert!((stops[1].as_f64().unwrap() - stops[0].as_f64().unwrap() - 1.0).abs() < 0.15, "half the light is one stop: {stops:?}");
+    let finished = import::import(&out, &Default::default()).unwrap();
+    same(&finished);
+    assert_eq!(finished.frames.len(), 12);
+    for f in &finished.frames {
+        let im = photo::load(&f.image).unwrap();
+        let clear = im.data.chunks_exact(4).filter(|p| p[3] < 50).count();
+        assert_eq!((im.width, im.height, im.channels, f.camera.cx), (160, 170, 4, 80.0));
+        assert!(im.pixel(0, 0)[3] < 50 && clear * 4 > 160 * 170 && clear < 160 * 170, "{clear}");
+    }
+    // COLMAP with the same model makes the same of it.
+    let (colmap, other) = (dir.path().join("colmap"), dir.path().join("other"));
+    stand_in(&colmap, &input.join("sparse/0"));
+    let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
+    c.env("DIORAMA_COLMAP", &colmap).arg("prepare").arg(input.join("images")).arg("-o").arg(&other).args(all).arg("--json");
+    let found: serde_json::Value = serde_json::from_slice(&c.output().unwrap().stdout).unwrap();
+    for key in ["foreground", "noise"] {
+        let [a, b] = [&made, &found].map(|m| m[key].as_f64().unwrap());
+        assert!((a / b - 1.0).abs() < 0.1, "{key}: {a} {b}");
+    }
+    // The points of the data set serve where nobody says who sees them.
+    let again = dir.path().join("again");
+    let more = ["--sfm", "none", "--normalize-exposure", "--remove-background", "auto", "--max-side", "100"];
+    let (code, text, made) = prepare(&out, &again, &more);
+    assert_eq!(code, Some(0), "{text}");
+    assert!(made["foreground"].as_f64().is_some_and(|f| (0.03..0.8).contains(&f)), "{made}");
+    let small = import::import(&again, &Default::default()).unwrap();
+    same(&small);
+    assert!(small.frames.iter().all(|f| f.camera.height == 100 && photo::size(&f.image).unwrap().1 == 100));
+}
+
+#[test]
+fn masks_of_a_posed_capture_come_along() {
+    let dir = tempfile::tempdir().unwrap();
+    let (input, out) = (dir.path().join("posed"), dir.path().join("data"));
+    posed(&input);
+    std::fs::create_dir(input.join("masks")).unwrap();
+    let n = SIZE as usize;
+    for i in 0..VIEWS {
+        // White is left out; the columns that are kept differ a little.
+        let data = (0..n * n).map(|p| if (60 + i..120 + i).contains(&(p % n)) { 0 } else { 255 }).collect();
+        photo::save_png(&input.join(format!("masks/view_{i:02}.jpg.png")), &ImageU8 { width: n, height: n, channels: 1, data }).unwrap();
+    }
+    let flags = ["--sfm", "none", "--mask", "invert", "--mask-meaning", "object", "--crop", "20,10,160,170"];
+    let (code, text, _) = prepare(&input, &out, &flags);
+    assert!(code == Some(0) && text.contains("masks for 16 of 16"), "{text}");
+    let made = import::import(&out, &Default::default()).unwrap();
+    assert!(made.masks.meaning == diorama_geom::capture::MaskMeaning::Object && !made.masks.inverted);
+    let mask = photo::load_mask(made.frames[0].mask.as_ref().unwrap()).unwrap();
+    assert_eq!((mask.width, mask.height, mask.pixel(39, 5)[0], mask.pixel(40, 5)[0], mask.pixel(100, 5)[0]), (160, 170, 0, 255, 0));
+}
+
+#[test]
+fn what_none_cannot_do_is_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let (input, out) = (dir.path().join("posed"), dir.path().join("data"));
+    posed(&input);
+    std::fs::remove_file(input.join("sparse/0/points3D.bin")).unwrap();
+    for (flags, named) in [
+        (&["--sfm", "none", "--normalize-exposure"][..], "--normalize-exposure"),
+        (&["--sfm", "none", "--remove-background", "auto"], "--remove-background"),
+        (&["--sfm", "none", "--every", "9"], "--every"),
+        (&["--sfm", "all"], "--sfm"),
+        (&["--mask", "use"], "--sfm none"),
+    ] {
+        let (code, text, _) = prepare(&input, &out, flags);
+        assert!(code == Some(2) && text.contains(named) && !out.exists(), "{flags:?}: {text}");
+    }
+    let (code, text, _) = prepare(&input.join("images"), &dir.path().join("none"), &["--sfm", "none"]);
+    assert!(code == Some(2) && text.contains("transforms.json") && !dir.path().join("none").exists(), "{text}");
+}
+
+#[test]
+fn two_at_once_are_refused_and_a_dead_ones_lock_is_not() {
+    let dir = tempfile::tempdir().unwrap();
+    let (input, out) = (dir.path().join("posed"), dir.path().join("data"));
+    posed(&input);
+    std::fs::create_dir(&out).unwrap();
+    // What a process that was killed leaves.
+    std::fs::write(out.join(".lock"), b"").unwrap();
+    let first = diorama_data::lock::take(&out).unwrap();
+    let (code, text, _) = prepare(&input, &out, &["--sfm", "none"]);
+    assert!(code == Some(2) && text.contains("in use by another process"), "{text}");
+    assert!(!out.join("images").exists());
+    drop(first);
+    assert_eq!(prepare(&input, &out, &["--sfm", "none"]).0, Some(0));
+    let second = diorama_data::lock::take(&out).unwrap();
+    for flag in ["--resume", "--force"] {
+        let (code, text, _) = prepare(&input, &out, &["--sfm", "none", flag]);
+        assert!(code == Some(2) && text.contains("in use"), "{flag}: {text}");
+    }
+    drop(second);
+    assert_eq!(import::import(&out, &Default::default()).unwrap().frames.len(), VIEWS);
+}
+
+#[test]
+fn train_refuses_a_model_that_contradicts_itself_and_doctor_says_why() {
+    let dir = tempfile::tempdir().unwrap();
+    posed(dir.path());
+    // The poses of one reconstruction with the points of another: every point lies elsewhere.
+    let file = dir.path().join("sparse/0/points3D.bin");
+    let mut all = std::fs::read(&file).unwrap();
+    let mut at = 8;
+    while at < all.len() {
+        let z = f64::from_le_bytes(all[at + 24..at + 32].try_into().unwrap());
+        all[at + 24..at + 32].copy_from_slice(&(z + 3.0).to_le_bytes());
+        at += 51 + 8 * u64::from_le_bytes(all[at + 43..at + 51].try_into().unwrap()) as usize;
+    }
+    std::fs::write(&file, all).unwrap();
+    let run = dir.path().join("run");
+    let call = |arguments: &[&str]| Command::new(env!("CARGO_BIN_EXE_diorama")).args(arguments).output().unwrap();
+    let path = dir.path().to_str().unwrap();
+    let o = call(&["train", path, "-o", run.to_str().unwrap(), "--steps", "1"]);
+    let text = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert!(o.status.code() == Some(2) && text.contains("contradict") && text.contains("diorama prepare") && !run.exists(), "{text}");
+    let o = call(&["doctor", path, "--json"]);
+    let told: serde_json::Value = serde_json::from_slice(&o.stdout).unwrap();
+    let model = told["findings"].as_array().unwrap().iter().find(|f| f["subject"] == "model").unwrap().clone();
+    assert!(model["grade"] == "trouble" && model["cure"].as_str().unwrap().contains("prepare"), "{model}");
+}

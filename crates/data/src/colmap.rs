@@ -2,6 +2,7 @@
 
 use crate::error::{self, DataError, Result};
 use crate::import::{Imported, locate};
+use crate::sparse::Sparse;
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::DVec3;
 use diorama_geom::transform::rotation_from_quaternion;
@@ -27,10 +28,19 @@ const MODELS: [(&str, usize); 11] = [
 ];
 
 /// One registered image.
-struct Registered {
-    name: String,
+pub(crate) struct Registered {
+    pub id: u32,
+    pub name: String,
     camera: u32,
-    world_from_camera: Pose,
+    pub world_from_camera: Pose,
+}
+
+/// A place in an image at which something was matched.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Keypoint {
+    pub px: [f64; 2],
+    /// [`Point::id`] of the point that it shows.
+    pub point: Option<u64>,
 }
 
 /// The folder of a model at or below `root`; of several sub-models the one with most images.
@@ -61,6 +71,8 @@ pub struct Point {
     pub id: u64,
     pub position: DVec3,
     pub rgb: [u8; 3],
+    /// Mean reprojection error in pixels, as the model states it.
+    pub error: f64,
     /// Images in which it was matched.
     pub images: usize,
 }
@@ -78,58 +90,111 @@ pub struct Observed {
     pub points: Vec<([f64; 2], u64)>,
 }
 
-/// Where the points of a binary model appear, image by image.
+/// Where the points of a model appear, image by image.
 pub fn observations(model: &Path) -> Result<Vec<Observed>> {
-    /// COLMAP's number of a keypoint that is no point's.
-    const NONE: u64 = u64::MAX;
     let mut out = Vec::new();
-    read_images_bin(&model.join("images.bin"), &mut |name, keypoints| {
-        let word = |k: &[u8], i: usize| u64::from_le_bytes(k[8 * i..8 * i + 8].try_into().expect("eight bytes"));
-        let all = keypoints.chunks_exact(24).map(|k| ([f64::from_bits(word(k, 0)), f64::from_bits(word(k, 1))], word(k, 2)));
-        out.push(Observed { image: name.to_string(), points: all.filter(|p| p.1 != NONE).collect() });
+    read_images(model, &mut |image, keypoints| {
+        let points = keypoints.iter().filter_map(|k| k.point.map(|p| (k.px, p))).collect();
+        out.push(Observed { image: image.name.clone(), points });
     })?;
     Ok(out)
 }
 
-/// Points of a binary model.
+/// Points of a model; none where it holds no file of them.
 ///
 /// # Errors
-/// When the file is missing or ends too early.
+/// When the file ends too early or is malformed.
 pub fn points(model: &Path) -> Result<Vec<Point>> {
-    let file = model.join("points3D.bin");
-    let data = error::read(&file, LIMIT)?;
-    let mut b = Bytes { file: &file, data: &data };
-    let n = b.u64()?;
     let mut out = Vec::new();
+    each_point(model, &mut |point, _| out.push(point))?;
+    Ok(out)
+}
+
+/// Hands every point to `each` with its track: images by number, and which of their keypoints show it.
+pub(crate) fn each_point(model: &Path, each: &mut dyn FnMut(Point, &[(u32, u32)])) -> Result<()> {
+    let (binary, text) = (model.join("points3D.bin"), model.join("points3D.txt"));
+    if binary.exists() {
+        each_point_bin(&binary, each)
+    } else if text.exists() {
+        each_point_txt(&text, each)
+    } else {
+        Ok(())
+    }
+}
+
+fn each_point_bin(file: &Path, each: &mut dyn FnMut(Point, &[(u32, u32)])) -> Result<()> {
+    let data = error::read(file, LIMIT)?;
+    let mut b = Bytes { file, data: &data };
+    let n = b.u64()?;
+    let mut track = Vec::new();
     for _ in 0..n {
         let id = b.u64()?;
         let position = DVec3::new(b.f64()?, b.f64()?, b.f64()?);
         let rgb = b.take(3)?.try_into().expect("three bytes");
-        b.f64()?;
+        let error = b.f64()?;
         let images = b.u64()?;
-        b.take(usize::try_from(images).ok().and_then(|p| p.checked_mul(8)).unwrap_or(usize::MAX))?;
-        out.push(Point { id, position, rgb, images: images as usize });
+        let bytes = b.take(usize::try_from(images).ok().and_then(|p| p.checked_mul(8)).unwrap_or(usize::MAX))?;
+        let word = |b: &[u8]| u32::from_le_bytes(b.try_into().expect("four bytes"));
+        track.clear();
+        track.extend(bytes.chunks_exact(8).map(|t| (word(&t[..4]), word(&t[4..]))));
+        each(Point { id, position, rgb, error, images: track.len() }, &track);
     }
-    Ok(out)
+    Ok(())
+}
+
+fn each_point_txt(file: &Path, each: &mut dyn FnMut(Point, &[(u32, u32)])) -> Result<()> {
+    let mut track = Vec::new();
+    for (i, line) in text(file)?.lines().enumerate() {
+        if line.starts_with('#') || line.trim().is_empty() {
+            continue;
+        }
+        let wrong = || malformed(file, i, "expected POINT3D_ID X Y Z R G B ERROR and pairs of IMAGE_ID POINT2D_IDX");
+        let f: Vec<&str> = line.split_whitespace().collect();
+        if f.len() < 8 || f.len() % 2 == 1 {
+            return Err(wrong());
+        }
+        let number = |k: usize| f[k].parse::<f64>().map_err(|_| wrong());
+        let color = |k: usize| f[k].parse::<u8>().map_err(|_| wrong());
+        track.clear();
+        for pair in f[8..].chunks_exact(2) {
+            let [image, keypoint] = [0, 1].map(|k| pair[k].parse::<u32>().map_err(|_| wrong()));
+            track.push((image?, keypoint?));
+        }
+        let id = f[0].parse().map_err(|_| wrong())?;
+        let position = DVec3::new(number(1)?, number(2)?, number(3)?);
+        each(Point { id, position, rgb: [color(4)?, color(5)?, color(6)?], error: number(7)?, images: track.len() }, &track);
+    }
+    Ok(())
+}
+
+fn read_cameras(model: &Path) -> Result<HashMap<u32, Camera>> {
+    let binary = model.join("cameras.bin");
+    if model.join("images.bin").exists() { read_cameras_bin(&binary) } else { read_cameras_txt(&model.join("cameras.txt")) }
+}
+
+/// Registered images; `each` is handed every one with its keypoints.
+pub(crate) fn read_images(model: &Path, each: &mut dyn FnMut(&Registered, &[Keypoint])) -> Result<Vec<Registered>> {
+    let binary = model.join("images.bin");
+    if binary.exists() { read_images_bin(&binary, each) } else { read_images_txt(&model.join("images.txt"), each) }
 }
 
 /// Reads the largest model under `root`, whose photographs lie in `root/images` or `root`.
 pub fn read(root: &Path) -> Result<Imported> {
     let model = find_model(root)
         .ok_or_else(|| DataError::input(root, "holds no COLMAP model (images.bin or images.txt, in sparse/0 for example)"))?;
-    let (cameras, images, file) = if model.join("images.bin").exists() {
-        (
-            read_cameras_bin(&model.join("cameras.bin"))?,
-            read_images_bin(&model.join("images.bin"), &mut |_, _| {})?,
-            model.join("images.bin"),
-        )
-    } else {
-        (read_cameras_txt(&model.join("cameras.txt"))?, read_images_txt(&model.join("images.txt"))?, model.join("images.txt"))
-    };
+    let file = ["images.bin", "images.txt"].map(|n| model.join(n)).into_iter().find(|f| f.exists()).unwrap_or_else(|| model.clone());
+    let cameras = read_cameras(&model)?;
+    let mut sparse = Sparse::read(&model)?;
+    let mut images = read_images(&model, &mut |image, keypoints| {
+        sparse.observe(cameras.get(&image.camera), &image.world_from_camera, keypoints);
+    })?;
+    sparse.check_tracks(&model, &images, |image| cameras.get(&image.camera))?;
     let mut out = Imported { unknown_up: true, ..Imported::default() };
-    let mut images = images;
-    images.sort_by(|a, b| a.name.cmp(&b.name));
-    for im in images {
+    let mut order: Vec<usize> = (0..images.len()).collect();
+    order.sort_by(|a, b| images[*a].name.cmp(&images[*b].name));
+    let mut frame_of = vec![None; images.len()];
+    for i in order {
+        let im = &mut images[i];
         let camera = *cameras.get(&im.camera).ok_or_else(|| {
             DataError::input(&file, format!("image {} names camera {}, which the cameras file does not hold", im.name, im.camera))
         })?;
@@ -141,12 +206,15 @@ pub fn read(root: &Path) -> Result<Imported> {
             None => locate(root, &im.name, &file, "name")?,
         };
         let Some(image) = found else {
-            out.missing.push(im.name);
+            out.missing.push(std::mem::take(&mut im.name));
             continue;
         };
         let name = Path::new(&im.name).with_extension("").to_string_lossy().into_owned();
+        frame_of[i] = Some(out.frames.len() as u32);
         out.frames.push(Frame::new(name, image, camera, pose));
     }
+    (out.points, out.agreement) = sparse.finish(&frame_of, &out.frames);
+    out.model = Some(model);
     Ok(out)
 }
 
@@ -227,14 +295,15 @@ fn read_cameras_bin(file: &Path) -> Result<HashMap<u32, Camera>> {
     Ok(out)
 }
 
-/// `keypoints` is handed each image's name and bytes of 2D points, 24 each: x, y, point.
-fn read_images_bin(file: &Path, keypoints: &mut dyn FnMut(&str, &[u8])) -> Result<Vec<Registered>> {
+fn read_images_bin(file: &Path, each: &mut dyn FnMut(&Registered, &[Keypoint])) -> Result<Vec<Registered>> {
+    /// COLMAP's number of a keypoint that is no point's.
+    const NONE: u64 = u64::MAX;
     let data = error::read(file, LIMIT)?;
     let mut b = Bytes { file, data: &data };
     let n = b.u64()?;
-    let mut out = Vec::new();
+    let (mut out, mut keypoints) = (Vec::new(), Vec::new());
     for _ in 0..n {
-        b.u32()?;
+        let id = b.u32()?;
         let mut v = [0.0; 7];
         for x in &mut v {
             *x = b.f64()?;
@@ -244,9 +313,16 @@ fn read_images_bin(file: &Path, keypoints: &mut dyn FnMut(&str, &[u8])) -> Resul
         let name = String::from_utf8_lossy(b.take(end)?).into_owned();
         b.take(1)?;
         let points = b.u64()?;
-        let bytes = usize::try_from(points).ok().and_then(|p| p.checked_mul(24)).unwrap_or(usize::MAX);
-        keypoints(&name, b.take(bytes)?);
-        out.push(Registered { name, camera, world_from_camera: pose([v[0], v[1], v[2], v[3]], [v[4], v[5], v[6]]) });
+        let bytes = b.take(usize::try_from(points).ok().and_then(|p| p.checked_mul(24)).unwrap_or(usize::MAX))?;
+        let word = |k: &[u8], i: usize| u64::from_le_bytes(k[8 * i..8 * i + 8].try_into().expect("eight bytes"));
+        keypoints.clear();
+        keypoints.extend(bytes.chunks_exact(24).map(|k| Keypoint {
+            px: [f64::from_bits(word(k, 0)), f64::from_bits(word(k, 1))],
+            point: Some(word(k, 2)).filter(|p| *p != NONE),
+        }));
+        let image = Registered { id, name, camera, world_from_camera: pose([v[0], v[1], v[2], v[3]], [v[4], v[5], v[6]]) };
+        each(&image, &keypoints);
+        out.push(image);
     }
     Ok(out)
 }
@@ -280,8 +356,8 @@ fn read_cameras_txt(file: &Path) -> Result<HashMap<u32, Camera>> {
     Ok(out)
 }
 
-fn read_images_txt(file: &Path) -> Result<Vec<Registered>> {
-    let mut out = Vec::new();
+fn read_images_txt(file: &Path, each: &mut dyn FnMut(&Registered, &[Keypoint])) -> Result<Vec<Registered>> {
+    let (mut out, mut keypoints) = (Vec::new(), Vec::new());
     let all = text(file)?;
     let mut lines = all.lines().enumerate().filter(|(_, l)| !l.starts_with('#'));
     while let Some((i, line)) = lines.next() {
@@ -293,14 +369,25 @@ fn read_images_txt(file: &Path) -> Result<Vec<Registered>> {
         if f.len() < 10 {
             return Err(malformed(file, i, expected));
         }
-        let v = f[1..9].iter().map(|s| s.parse::<f64>().map_err(|_| malformed(file, i, expected))).collect::<Result<Vec<f64>>>()?;
-        out.push(Registered {
-            name: f[9..].join(" "),
-            camera: v[7] as u32,
-            world_from_camera: pose([v[0], v[1], v[2], v[3]], [v[4], v[5], v[6]]),
-        });
-        // The line of 2D points, which may be empty.
-        lines.next();
+        let v = f[..9].iter().map(|s| s.parse::<f64>().map_err(|_| malformed(file, i, expected))).collect::<Result<Vec<f64>>>()?;
+        let world_from_camera = pose([v[1], v[2], v[3], v[4]], [v[5], v[6], v[7]]);
+        let image = Registered { id: v[0] as u32, name: f[9..].join(" "), camera: v[8] as u32, world_from_camera };
+        keypoints.clear();
+        // The line of keypoints, which may be empty.
+        if let Some((k, line)) = lines.next() {
+            let wrong = || malformed(file, k, "expected groups of X Y POINT3D_ID");
+            let numbers: Vec<&str> = line.split_whitespace().collect();
+            if !numbers.len().is_multiple_of(3) {
+                return Err(wrong());
+            }
+            for n in numbers.chunks_exact(3) {
+                let [x, y] = [0, 1].map(|k| n[k].parse::<f64>().map_err(|_| wrong()));
+                let point: i64 = n[2].parse().map_err(|_| wrong())?;
+                keypoints.push(Keypoint { px: [x?, y?], point: u64::try_from(point).ok() });
+            }
+        }
+        each(&image, &keypoints);
+        out.push(image);
     }
     Ok(out)
 }

@@ -2,11 +2,12 @@
 
 use crate::archive::{self, ArchiveLimits};
 use crate::error::{DataError, Result};
+use crate::masks::{self, MaskOptions};
 use crate::split::{self, SplitRule};
-use crate::{colmap, llff, transforms_json};
-use diorama_geom::capture::{Frame, Split, focus_point};
+use crate::{colmap, llff, sparse, transforms_json};
+use diorama_geom::capture::{Agreement, Frame, MaskMeaning, Split, focus_point};
 use diorama_geom::glam::DVec3;
-use diorama_geom::{Capture, SceneBox, Similarity};
+use diorama_geom::{Capture, SceneBox, Similarity, SparsePoint};
 use std::path::{Component, Path, PathBuf};
 
 /// Descriptions of a capture that can be read.
@@ -44,11 +45,14 @@ pub struct ImportOptions {
     pub seed: u64,
     /// Fewest usable views.
     pub min_views: usize,
+    pub masks: MaskOptions,
+    /// Read a model whose poses contradict its points as well: to look at it, not to train on it.
+    pub allow_broken: bool,
 }
 
 impl Default for ImportOptions {
     fn default() -> Self {
-        ImportOptions { format: None, split: SplitRule::File, seed: 0, min_views: 3 }
+        ImportOptions { format: None, split: SplitRule::File, seed: 0, min_views: 3, masks: MaskOptions::default(), allow_broken: false }
     }
 }
 
@@ -63,6 +67,16 @@ pub struct Imported {
     pub has_own_split: bool,
     /// Whether the world is not z up yet and must be turned by the cameras' up directions.
     pub unknown_up: bool,
+    /// What the file says that masks leave out.
+    pub mask_meaning: Option<MaskMeaning>,
+    /// Points of structure from motion, in the frames' world.
+    pub points: Vec<SparsePoint>,
+    /// How well they agree with the poses, where the format tells.
+    pub agreement: Option<Agreement>,
+    /// Folder of the model that says so.
+    pub model: Option<PathBuf>,
+    /// What was skipped or assumed, one line each.
+    pub notes: Vec<String>,
 }
 
 /// Reads a capture: a folder, one of the description files in it, or a zip of it.
@@ -98,10 +112,14 @@ pub fn import(data: &Path, options: &ImportOptions) -> Result<Capture> {
         Format::Colmap => colmap::read(root)?,
         Format::Llff => llff::read(root)?,
     };
-    finish(data, imported, options)
+    finish(data, root, imported, options)
 }
 
-fn detect(root: &Path) -> Result<Format> {
+/// The format of a folder.
+///
+/// # Errors
+/// When there is none that can be read.
+pub fn detect(root: &Path) -> Result<Format> {
     if root.join("transforms.json").exists() {
         Ok(Format::Transforms)
     } else if root.join("transforms_train.json").exists() {
@@ -118,8 +136,8 @@ fn detect(root: &Path) -> Result<Format> {
     }
 }
 
-fn finish(data: &Path, mut imported: Imported, options: &ImportOptions) -> Result<Capture> {
-    let mut notes = Vec::new();
+fn finish(data: &Path, root: &Path, mut imported: Imported, options: &ImportOptions) -> Result<Capture> {
+    let mut notes = std::mem::take(&mut imported.notes);
     if !imported.missing.is_empty() {
         let shown = imported.missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
         let more = if imported.missing.len() > 3 { ", …" } else { "" };
@@ -140,18 +158,36 @@ fn finish(data: &Path, mut imported: Imported, options: &ImportOptions) -> Resul
     if n > 1 && imported.frames.iter().all(|f| (f.world_from_camera.translation - first.translation).length() < 1e-9) {
         return Err(DataError::input(data, "all cameras stand at the same place, so depth cannot be found; estimate the poses again"));
     }
+    if let Some(a) = &imported.agreement {
+        if a.is_broken() && !options.allow_broken {
+            let model = imported.model.as_deref().unwrap_or(data);
+            return Err(DataError::input(model, format!("{}; {}", sparse::broken(a), sparse::BROKEN_CURE)));
+        }
+        if !a.is_broken() {
+            notes.extend(sparse::warnings(a, &imported.frames));
+        }
+    }
     let mut seen = std::collections::HashSet::new();
     if let Some(twice) = imported.frames.iter().find(|f| !seen.insert(&f.image)) {
         notes.push(format!("{} is listed more than once", twice.name));
     }
+    let rule = masks::settle(root, &mut imported.frames, &options.masks, imported.mask_meaning, &mut notes)?;
     let world_from_capture = if imported.unknown_up { level(&mut imported.frames) } else { Similarity::IDENTITY };
+    imported.points.iter_mut().for_each(|p| p.position = world_from_capture.point(p.position));
     split::apply(&options.split, &mut imported.frames, imported.has_own_split, options.seed);
     let train = imported.frames.iter().filter(|f| f.split == Split::Train).count();
     if train < 2 {
         return Err(DataError::input(data, format!("the split leaves {train} training views of {n}; choose another --split")));
     }
     let scene = imported.scene.unwrap_or_else(|| automatic_scene(&imported.frames));
-    Ok(Capture { frames: imported.frames, world_from_capture, scene, notes })
+    Ok(Capture {
+        world_from_capture,
+        notes,
+        masks: rule,
+        points: imported.points,
+        agreement: imported.agreement,
+        ..Capture::new(imported.frames, scene)
+    })
 }
 
 /// Turns the world so that the cameras' mean up direction is +z.

@@ -21,6 +21,7 @@ pub fn read(root: &Path) -> Result<Imported> {
         .map_err(DataError::io(&folder, "read"))?
         .flatten()
         .map(|e| e.path())
+        .filter(|p| !p.file_name().is_some_and(|n| n.to_string_lossy().starts_with(crate::photo::DYNAMIC_MASK)))
         .filter(|p| {
             p.extension().and_then(|e| e.to_str()).is_some_and(|e| ["png", "jpg", "jpeg"].contains(&e.to_ascii_lowercase().as_str()))
         })

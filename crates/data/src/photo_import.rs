@@ -17,7 +17,8 @@ const JPEG_QUALITY: u8 = 96;
 pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = folder.read_dir().map_err(DataError::io(folder, "read"))?;
     let is_photo = |p: &PathBuf| {
-        let hidden = p.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.'));
+        let hidden =
+            p.file_name().is_some_and(|n| n.to_string_lossy().starts_with('.') || n.to_string_lossy().starts_with(photo::DYNAMIC_MASK));
         let extension = p.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
         !hidden && p.is_file() && extension.is_some_and(|e| EXTENSIONS.contains(&&*e))
     };

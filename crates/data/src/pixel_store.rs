@@ -2,9 +2,10 @@
 //! at random. Training draws far fewer pixels than such captures have, and memory stays bounded however large they are.
 
 use crate::error::{DataError, Result};
+use crate::masks::{self, COUNTS};
 use crate::photo;
 use diorama_geom::ImageU8;
-use diorama_geom::capture::Frame;
+use diorama_geom::capture::{Frame, MaskRule};
 use diorama_geom::rng::Rng;
 use rayon::prelude::*;
 
@@ -13,9 +14,6 @@ pub const DEFAULT_BUDGET: u64 = 4 << 30;
 
 /// Stream of the random numbers by which pixels are kept.
 const KEPT: u64 = 15;
-
-/// Mask values from which a pixel counts.
-const COUNTS: u8 = 128;
 
 /// Pixels of some frames, four bytes each: RGB and alpha (255 where the photograph has none).
 pub struct PixelStore {
@@ -34,6 +32,7 @@ pub struct PixelStore {
 pub struct StoreOptions {
     pub downscale: u32,
     pub budget: u64,
+    pub masks: MaskRule,
 }
 
 impl PixelStore {
@@ -58,7 +57,7 @@ impl PixelStore {
             let decoded: Vec<Result<Kept>> = (first..last)
                 .into_par_iter()
                 .map(|i| {
-                    let (image, mask) = decode(frames[i], out.sizes[i])?;
+                    let (image, mask) = decode(frames[i], &options.masks, out.sizes[i])?;
                     progress();
                     let mask = mask.map(|m| out.keep(i, |x, y| m.pixel(x, y)[0]));
                     Ok(Kept { rgba: out.keep(i, |x, y| rgba(&image, x, y)), mask, has_alpha: image.channels == 4 })
@@ -155,7 +154,7 @@ struct Kept {
     has_alpha: bool,
 }
 
-fn decode(frame: &Frame, size: (u32, u32)) -> Result<(ImageU8, Option<ImageU8>)> {
+fn decode(frame: &Frame, rule: &MaskRule, size: (u32, u32)) -> Result<(ImageU8, Option<ImageU8>)> {
     let full = photo::load(&frame.image)?;
     let c = &frame.camera;
     if (full.width as u32, full.height as u32) != (c.width, c.height) {
@@ -165,19 +164,9 @@ fn decode(frame: &Frame, size: (u32, u32)) -> Result<(ImageU8, Option<ImageU8>)>
         );
         return Err(DataError::input(&frame.image, message));
     }
-    let mask = match &frame.mask {
-        None => None,
-        Some(path) => {
-            let m = photo::load_mask(path)?;
-            if (m.width, m.height) != (full.width, full.height) {
-                let message =
-                    format!("the mask is {}×{} but the photograph is {}×{}; make them equal", m.width, m.height, full.width, full.height);
-                return Err(DataError::input(path, message));
-            }
-            Some(m.downsampled(size.0 as usize, size.1 as usize))
-        }
-    };
-    Ok((full.downsampled(size.0 as usize, size.1 as usize), mask))
+    let (full, mask) = masks::apply(frame, rule, full)?;
+    let (w, h) = (size.0 as usize, size.1 as usize);
+    Ok((full.downsampled(w, h), mask.map(|m| m.downsampled(w, h))))
 }
 
 fn rgba(im: &ImageU8, x: usize, y: usize) -> [u8; 4] {
@@ -218,7 +207,8 @@ mod tests {
             ImageU8 { width: 101, height: 67, channels: 1, data: (0..101 * 67).map(|i| if i % 101 < 50 { 255 } else { 0 }).collect() };
         photo::save_png(&mask, &half).unwrap();
         f.mask = Some(mask);
-        let load = |budget| PixelStore::load(&[&f, &f], &StoreOptions { downscale: 1, budget }, &|| {}).unwrap();
+        let load =
+            |budget| PixelStore::load(&[&f, &f], &StoreOptions { downscale: 1, budget, masks: MaskRule::default() }, &|| {}).unwrap();
         assert_eq!(load(u64::MAX).stride(), 1);
         let budget = 2 * 101 * 67 * 4 / 10;
         let s = load(budget);
@@ -246,14 +236,27 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let mut f = frame(dir.path(), "a.png", 8, 6, 0);
         f.camera.width = 9;
-        let options = StoreOptions { downscale: 1, budget: 1 << 20 };
+        let options = StoreOptions { downscale: 1, budget: 1 << 20, masks: MaskRule::default() };
         let e = PixelStore::load(&[&f], &options, &|| {}).err().unwrap();
         assert!(e.is_input() && e.to_string().contains("8×6"), "{e}");
         f.camera.width = 8;
         let mask = dir.path().join("m.png");
-        photo::save_png(&mask, &ImageU8 { width: 4, height: 3, channels: 1, data: vec![255; 12] }).unwrap();
+        photo::save_png(&mask, &ImageU8 { width: 3, height: 4, channels: 1, data: vec![255; 12] }).unwrap();
         f.mask = Some(mask);
         assert!(PixelStore::load(&[&f], &options, &|| {}).err().unwrap().to_string().contains("mask"));
+    }
+
+    #[test]
+    fn an_objects_mask_makes_pixels_transparent() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut f = frame(dir.path(), "a.png", 4, 1, 90);
+        let mask = dir.path().join("m.png");
+        photo::save_png(&mask, &ImageU8 { width: 4, height: 1, channels: 1, data: vec![0, 255, 0, 255] }).unwrap();
+        f.mask = Some(mask);
+        let masks = MaskRule { meaning: diorama_geom::capture::MaskMeaning::Object, inverted: false };
+        let s = PixelStore::load(&[&f], &StoreOptions { downscale: 1, budget: 1 << 20, masks }, &|| {}).unwrap();
+        assert!(s.has_alpha && (0..4).all(|x| s.counts(0, x, 0)));
+        assert_eq!([0, 1].map(|x| s.pixel(0, x, 0)[3]), [0, 255]);
     }
 
     #[test]
@@ -263,7 +266,7 @@ mod tests {
         let mask = dir.path().join("m.png");
         photo::save_png(&mask, &ImageU8 { width: 4, height: 1, channels: 1, data: vec![0, 255, 0, 255] }).unwrap();
         f.mask = Some(mask);
-        let s = PixelStore::load(&[&f], &StoreOptions { downscale: 1, budget: 1 << 20 }, &|| {}).unwrap();
+        let s = PixelStore::load(&[&f], &StoreOptions { downscale: 1, budget: 1 << 20, masks: MaskRule::default() }, &|| {}).unwrap();
         assert_eq!([0, 1, 2, 3].map(|x| s.counts(0, x, 0)), [false, true, false, true]);
     }
 }

@@ -11,6 +11,8 @@ use std::time::{Duration, Instant};
 
 /// How long a program may stay silent before it counts as hung.
 const SILENCE: Duration = Duration::from_secs(30 * 60);
+/// Lines of a failed program that are shown.
+const LAST_WORDS: usize = 3;
 /// How often an interrupt is looked for.
 const GLANCE: Duration = Duration::from_millis(100);
 
@@ -70,7 +72,7 @@ pub fn run(command: &mut Command, log: &Path, interrupt: &AtomicBool, on_line: &
         });
     }
     drop(send);
-    let mut last = String::new();
+    let mut last = std::collections::VecDeque::new();
     let mut heard = Instant::now();
     loop {
         if interrupt.load(Ordering::Relaxed) {
@@ -83,7 +85,10 @@ pub fn run(command: &mut Command, log: &Path, interrupt: &AtomicBool, on_line: &
                 writeln!(sink, "{line}").map_err(DataError::io(log, "write"))?;
                 on_line(&line);
                 if !line.trim().is_empty() {
-                    last = line;
+                    last.push_back(line);
+                    if last.len() > LAST_WORDS {
+                        last.pop_front();
+                    }
                 }
             }
             Err(RecvTimeoutError::Timeout) if heard.elapsed() > SILENCE => {
@@ -99,7 +104,10 @@ pub fn run(command: &mut Command, log: &Path, interrupt: &AtomicBool, on_line: &
         return Ok(Ended::Interrupted);
     }
     if !status.success() {
-        return Err(DataError::failed(&program, format!("failed ({status}): {last}; see {}", log.display())));
+        return Err(DataError::failed(
+            &program,
+            format!("failed ({status}): {}; see {}", last_words(last.iter().map(String::as_str)), log.display()),
+        ));
     }
     Ok(Ended::Done)
 }
@@ -128,10 +136,16 @@ pub fn read_output(command: &mut Command, read: &mut dyn FnMut(&mut dyn Read) ->
     let said = complaints.join().unwrap_or_default();
     result.map_err(DataError::io(&program, "read from"))?;
     if !status.success() {
-        let last = said.lines().rfind(|l| !l.trim().is_empty()).unwrap_or("no reason given").trim().to_string();
-        return Err(DataError::failed(&program, format!("failed ({status}): {last}")));
+        return Err(DataError::failed(&program, format!("failed ({status}): {}", last_words(said.lines()))));
     }
     Ok(())
+}
+
+/// The last lines that a program said, in one.
+fn last_words<'a>(lines: impl DoubleEndedIterator<Item = &'a str>) -> String {
+    let mut last: Vec<&str> = lines.rev().map(str::trim).filter(|l| !l.is_empty()).take(LAST_WORDS).collect();
+    last.reverse();
+    if last.is_empty() { "no reason given".into() } else { last.join("; ") }
 }
 
 fn end(child: &mut Child) {

@@ -6,11 +6,14 @@ use crate::import::{Imported, locate};
 use crate::json::{self, Object};
 use diorama_geom::capture::{Frame, Split};
 use diorama_geom::glam::{DMat3, DVec3};
-use diorama_geom::{Camera, Lens, Pose, SceneBox, Similarity};
+use diorama_geom::{Camera, Lens, Pose, SceneBox, Similarity, SparsePoint};
 use std::path::Path;
 
 /// Camera models that the JSON may name.
 const MODELS: &str = "PINHOLE, SIMPLE_PINHOLE, OPENCV, OPENCV_FISHEYE, EQUIRECTANGULAR";
+
+/// Most sparse points that are kept.
+const MOST_POINTS: usize = 2_000_000;
 
 /// Half the edge of the Blender scenes' box: the cube that instant-ngp's scale of 0.33 maps to [0, 1].
 const BLENDER_HALF: f64 = 0.5 / 0.33;
@@ -22,7 +25,36 @@ pub fn read(file: &Path, root: &Path) -> Result<Imported> {
     let mut out = Imported { scene: ngp_scene(&head)?, ..Imported::default() };
     read_frames(&head, root, Split::Train, &mut out)?;
     out.has_own_split = apply_file_lists(&head, &mut out.frames)?;
+    read_points(&head, root, &mut out)?;
+    if let Some(text) = head.text("mask_meaning")? {
+        out.mask_meaning = crate::masks::parse_meaning(text).map_err(|e| DataError::input(file, format!("mask_meaning: {e}")))?;
+    }
     Ok(out)
+}
+
+/// nerfstudio's `ply_file_path`: points in the frames' world; nobody says which photographs see them.
+fn read_points(head: &Object, root: &Path, out: &mut Imported) -> Result<()> {
+    let Some(name) = head.text("ply_file_path")? else { return Ok(()) };
+    let Some(file) = locate(root, name, head.path, "ply_file_path")? else {
+        out.notes.push(format!("ply_file_path: {name} does not exist, so there are no sparse points"));
+        return Ok(());
+    };
+    let cloud = crate::splat_ply::read(&file)?;
+    let step = cloud.len().div_ceil(MOST_POINTS).max(1);
+    if step > 1 {
+        out.notes.push(format!("{name} holds {} points; one of {step} is kept", cloud.len()));
+    }
+    let all = cloud.positions.iter().zip(&cloud.rgb_srgb).step_by(step);
+    out.points = all
+        .map(|(p, c)| SparsePoint {
+            position: DVec3::from_array(p.map(f64::from)),
+            color: c.map(diorama_geom::color::u8_from_unit),
+            error: 0.0,
+            frames: Vec::new(),
+        })
+        .filter(|p| p.position.is_finite())
+        .collect();
+    Ok(())
 }
 
 /// Reads a Blender set: `transforms_train.json` and those of `val` and `test` that exist.
@@ -80,7 +112,7 @@ fn read_frames(head: &Object, root: &Path, split: Split, out: &mut Imported) -> 
             out.missing.push(name.to_string());
             continue;
         };
-        let mask = optional_file(&frame, "mask_path", root)?.or_else(|| dynamic_mask(&image));
+        let mask = optional_file(&frame, "mask_path", root)?;
         let depth = optional_file(&frame, "depth_file_path", root)?;
         let camera = read_camera(head, &frame, &image, &mut sizes)?;
         let title = Path::new(name).with_extension("").to_string_lossy().trim_start_matches("./").to_string();
@@ -88,12 +120,6 @@ fn read_frames(head: &Object, root: &Path, split: Split, out: &mut Imported) -> 
         out.frames.push(Frame { mask, depth, time, session, split, ..Frame::new(title, image, camera, pose) });
     }
     Ok(())
-}
-
-/// instant-ngp's mask, which lies beside the photograph and is named after it.
-fn dynamic_mask(image: &Path) -> Option<std::path::PathBuf> {
-    let name = format!("{}{}.png", crate::photo::DYNAMIC_MASK, image.file_stem()?.to_str()?);
-    Some(image.with_file_name(name)).filter(|f| f.is_file())
 }
 
 fn optional_file(frame: &Object, key: &str, root: &Path) -> Result<Option<std::path::PathBuf>> {
@@ -250,6 +276,9 @@ pub fn write(path: &Path, root: &Path, capture: &diorama_geom::Capture, points: 
         "test_filenames": names(Split::Test),
         "frames": frames,
     });
+    if capture.frames.iter().any(|f| f.mask.is_some()) {
+        json["mask_meaning"] = serde_json::to_value(capture.masks.meaning).expect("a name");
+    }
     if let Some(points) = points {
         json["ply_file_path"] = points.into();
     }

@@ -9,6 +9,9 @@ use std::sync::atomic::AtomicBool;
 /// Size of the small grey frames by which sharpness is judged.
 const WIDTH: usize = 320;
 
+/// Frames that one call of ffmpeg writes: systems bound the length of a command.
+const PER_CALL: usize = 1500;
+
 /// Which frames of a video are taken.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Choice {
@@ -26,40 +29,85 @@ pub fn ffmpeg() -> Result<PathBuf> {
     process::find("ffmpeg", "DIORAMA_FFMPEG", "Debian: apt install ffmpeg")
 }
 
-/// Writes the chosen frames as `frame_00001.jpg` … into `folder`, without metadata; returns how many frames the video has and
-/// how many were written.
-///
-/// # Errors
-/// When ffmpeg is missing or the video has no frames that it can decode.
-pub fn extract(video: &Path, folder: &Path, choice: Choice, log: &Path, interrupt: &AtomicBool) -> Result<Option<(usize, usize)>> {
-    let ffmpeg = ffmpeg()?;
-    let sharpness = measure(&ffmpeg, video)?;
-    let count = match choice {
-        Choice::Count(n) => n,
-        Choice::PerSecond(fps) => ((sharpness.len() as f64 / frames_per_second(&ffmpeg, video)? * fps).round() as usize).max(1),
-    };
-    let chosen = sharpest(&sharpness, count);
-    // Runs of neighbouring frames keep the expression short.
-    let terms: Vec<String> =
-        runs(&chosen).iter().map(|(a, b)| if a == b { format!("eq(n,{a})") } else { format!("between(n,{a},{b})") }).collect();
-    let filter = folder.join("select.txt");
-    std::fs::write(&filter, format!("select='{}'", terms.join("+"))).map_err(DataError::io(&filter, "write"))?;
-    let mut c = Command::new(&ffmpeg);
-    c.args(["-hide_banner", "-nostdin", "-y", "-i"]).arg(video);
-    c.arg("-filter_script:v").arg(&filter);
-    c.args(["-vsync", "0", "-map_metadata", "-1", "-fflags", "+bitexact", "-qscale:v", "1", "-qmin", "1"])
-        .arg(folder.join("frame_%05d.jpg"));
-    let ended = process::run(&mut c, log, interrupt, &mut |_| {});
-    let _ = std::fs::remove_file(&filter);
-    Ok((ended? == Ended::Done).then_some((sharpness.len(), chosen.len())))
+/// What [`extract`] did.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Extracted {
+    /// Frames that the video has.
+    pub frames: usize,
+    /// Frames that were written.
+    pub taken: usize,
+    /// What ffmpeg said where the video could be decoded in part only.
+    pub fault: Option<String>,
 }
 
-/// Variance of the Laplacian of each frame, in small and grey.
-fn measure(ffmpeg: &Path, video: &Path) -> Result<Vec<f32>> {
+/// Writes the chosen frames as `frame_00001.jpg` … into `folder`, without metadata; none when interrupted.
+///
+/// # Errors
+/// When ffmpeg fails, or the video has no frames that it can decode; ffmpeg's own words are part of it.
+pub fn extract(
+    ffmpeg: &Path,
+    video: &Path,
+    folder: &Path,
+    choice: Choice,
+    log: &Path,
+    interrupt: &AtomicBool,
+) -> Result<Option<Extracted>> {
+    let passthrough = passthrough(ffmpeg)?;
+    let (sharpness, fault) = measure(ffmpeg, passthrough, video)?;
+    let count = match choice {
+        Choice::Count(n) => n,
+        Choice::PerSecond(fps) => ((sharpness.len() as f64 / frames_per_second(ffmpeg, video)? * fps).round() as usize).max(1),
+    };
+    let chosen = sharpest(&sharpness, count);
+    for (i, part) in chosen.chunks(PER_CALL).enumerate() {
+        // Runs of neighbouring frames keep the expression short.
+        let terms: Vec<String> =
+            runs(part).iter().map(|(a, b)| if a == b { format!("eq(n,{a})") } else { format!("between(n,{a},{b})") }).collect();
+        let mut c = Command::new(ffmpeg);
+        c.args(["-hide_banner", "-nostdin", "-y", "-i"]).arg(video);
+        c.arg("-vf").arg(format!("select='{}'", terms.join("+"))).args(passthrough);
+        c.args(["-map_metadata", "-1", "-fflags", "+bitexact", "-qscale:v", "1", "-qmin", "1"]);
+        c.arg("-start_number").arg((i * PER_CALL + 1).to_string()).arg(folder.join("frame_%05d.jpg"));
+        let ended = process::run(&mut c, log, interrupt, &mut |_| {});
+        let written = (0..part.len()).all(|k| folder.join(format!("frame_{:05}.jpg", i * PER_CALL + k + 1)).is_file());
+        match ended {
+            Ok(Ended::Interrupted) => return Ok(None),
+            // ffmpeg fails for what comes after the last frame that can be decoded, too.
+            Err(e) if !(written && fault.is_some()) => return Err(e),
+            Ok(Ended::Done) if !written => {
+                let what = format!("wrote fewer than the {} frames that it was asked for; see {}", part.len(), log.display());
+                return Err(DataError::failed(ffmpeg, what));
+            }
+            _ => {}
+        }
+    }
+    Ok(Some(Extracted { frames: sharpness.len(), taken: chosen.len(), fault }))
+}
+
+/// The option by which each decoded frame is written once, whatever its time: `-vsync` was renamed in ffmpeg 5.1, and its old name is gone
+/// from newer versions.
+fn passthrough(ffmpeg: &Path) -> Result<[&'static str; 2]> {
+    let out = Command::new(ffmpeg).arg("-version").output().map_err(DataError::io(ffmpeg, "start"))?;
+    let text = String::from_utf8_lossy(&out.stdout).into_owned();
+    let old = version(&text).is_some_and(|v| v < (5, 1));
+    Ok(if old { ["-vsync", "0"] } else { ["-fps_mode", "passthrough"] })
+}
+
+/// Major and minor number in what `ffmpeg -version` prints; none for builds of no release, which are new.
+fn version(text: &str) -> Option<(u32, u32)> {
+    let told = text.lines().next()?.strip_prefix("ffmpeg version ")?.split_whitespace().next()?;
+    let mut parts = told.trim_start_matches('n').split(|c: char| !c.is_ascii_digit());
+    let major = parts.next()?.parse().ok()?;
+    // Builds of a day begin with the year.
+    (major < 1000).then(|| (major, parts.next().and_then(|m| m.parse().ok()).unwrap_or(0)))
+}
+
+/// Variance of the Laplacian of each frame, in small and grey, and ffmpeg's words where it could not decode all.
+fn measure(ffmpeg: &Path, passthrough: [&str; 2], video: &Path) -> Result<(Vec<f32>, Option<String>)> {
     let mut c = Command::new(ffmpeg);
-    c.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-i"]).arg(video);
+    c.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-i"]).arg(video).args(passthrough);
     // Square frames: the shape does not matter for sharpness, and the size must be known.
-    c.args(["-vsync", "0", "-vf", &format!("scale={WIDTH}:{WIDTH}:flags=area,format=gray"), "-f", "rawvideo", "-"]);
+    c.args(["-vf", &format!("scale={WIDTH}:{WIDTH}:flags=area,format=gray"), "-f", "rawvideo", "-"]);
     let mut out = Vec::new();
     let mut frame = vec![0u8; WIDTH * WIDTH];
     let read = process::read_output(&mut c, &mut |pipe| {
@@ -71,11 +119,14 @@ fn measure(ffmpeg: &Path, video: &Path) -> Result<Vec<f32>> {
             }
         }
     });
-    // What could be decoded before a fault is worth having.
     match read {
-        Err(e) if out.is_empty() => Err(DataError::input(video, format!("holds no frames that can be decoded ({e}); convert it to MP4"))),
-        _ if out.is_empty() => Err(DataError::input(video, "holds no frames that can be decoded; convert it to MP4")),
-        _ => Ok(out),
+        // What could be decoded before a fault is worth having.
+        Err(e) if !out.is_empty() => Ok((out, Some(e.to_string()))),
+        // An ffmpeg that does not know its options has not looked at the video.
+        Err(e) if ["Unrecognized option", "Option not found", "No such filter"].iter().any(|w| e.to_string().contains(w)) => Err(e),
+        Err(e) => Err(DataError::input(video, format!("holds no frames that can be decoded: {e}; convert it to MP4"))),
+        Ok(()) if out.is_empty() => Err(DataError::input(video, "holds no frames; give a video, or a folder of photographs")),
+        Ok(()) => Ok((out, None)),
     }
 }
 
@@ -142,5 +193,20 @@ mod tests {
             (0..64 * 64i32).map(|i| ((0..25).map(|k| at(i % 64 + k % 5 - 2, i / 64 + k / 5 - 2)).sum::<u32>() / 25) as u8).collect();
         assert!(laplacian_variance(&sharp, 64) > 10.0 * laplacian_variance(&blurred, 64));
         assert_eq!(laplacian_variance(&[7; 64], 8), 0.0);
+    }
+
+    #[test]
+    fn versions_of_all_kinds_are_told_apart() {
+        for (text, expected) in [
+            ("ffmpeg version 4.4.2-0ubuntu0.22.04.1 Copyright (c) 2000-2021", Some((4, 4))),
+            ("ffmpeg version 5.1.9-0+deb12u1 Copyright", Some((5, 1))),
+            ("ffmpeg version n7.1 Copyright", Some((7, 1))),
+            ("ffmpeg version 8.0 Copyright", Some((8, 0))),
+            ("ffmpeg version N-118000-g1234567 Copyright", None),
+            ("ffmpeg version 2025-01-02-git-0f1a2b-full_build Copyright", None),
+            ("something else", None),
+        ] {
+            assert_eq!(version(text), expected, "{text}");
+        }
     }
 }

@@ -4,7 +4,7 @@ use diorama_data::import::{self, Format, ImportOptions};
 use diorama_data::{colmap, photo, transforms_json};
 use diorama_geom::capture::{Frame, Split};
 use diorama_geom::glam::DVec3;
-use diorama_geom::{Camera, Capture, ImageU8, Lens, Pose, SceneBox, Similarity};
+use diorama_geom::{Camera, Capture, ImageU8, Lens, Pose, SceneBox};
 use std::path::{Path, PathBuf};
 
 fn capture(root: &Path) -> Capture {
@@ -22,7 +22,7 @@ fn capture(root: &Path) -> Capture {
         })
         .collect();
     let scene = SceneBox { center: DVec3::new(0.1, 0.2, 0.3), half: 1.25, aabb_scale: 2 };
-    Capture { frames, world_from_capture: Similarity::IDENTITY, scene, notes: vec![] }
+    Capture::new(frames, scene)
 }
 
 fn same_pose(a: &Pose, b: &Pose) {

@@ -13,7 +13,7 @@ pub struct Frame {
     pub image: PathBuf,
     pub camera: Camera,
     pub world_from_camera: Pose,
-    /// Black where pixels are to be ignored.
+    /// Tells which pixels are left out; [`Capture::masks`] says how it is read and what that means.
     pub mask: Option<PathBuf>,
     pub depth: Option<PathBuf>,
     pub time: Option<f64>,
@@ -80,6 +80,81 @@ impl SceneBox {
     }
 }
 
+/// A point that structure from motion found.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SparsePoint {
+    /// In the world.
+    pub position: DVec3,
+    /// sRGB.
+    pub color: [u8; 3],
+    /// Reprojection error in pixels that the model states; 0 where it states none.
+    pub error: f32,
+    /// Frames that see it, as indices into the capture's, ascending; empty where nobody says.
+    pub frames: Vec<u32>,
+}
+
+/// How well the poses of a structure-from-motion model agree with its own points.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Agreement {
+    /// Places in photographs that are said to show a point.
+    pub observations: usize,
+    /// Those of them whose point the model does not hold.
+    pub absent: usize,
+    /// Mean and median distance in pixels between where photographs show points and where their poses put them; none where nothing
+    /// could be compared.
+    pub error_px: Option<(f64, f64)>,
+    /// Diagonal of the photographs in pixels (median), to which errors compare.
+    pub diagonal_px: f64,
+    /// Per frame of the capture, in its order.
+    pub frames: Vec<FrameAgreement>,
+}
+
+/// [`Agreement`] of one photograph.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct FrameAgreement {
+    /// Mean distance in pixels; none where nothing could be compared.
+    pub error_px: Option<f64>,
+    /// Points that it and at least one other photograph show.
+    pub shared: usize,
+}
+
+impl Agreement {
+    /// Whether the poses contradict the points, so that training on them can give fog alone: half of the points lie more than 1 % of
+    /// the diagonal from where photographs show them.
+    pub fn is_broken(&self) -> bool {
+        self.error_px.is_some_and(|(_, median)| median > 0.01 * self.diagonal_px)
+    }
+
+    /// Whether more than half of the observations are of points that the model does not hold.
+    pub fn is_mixed(&self) -> bool {
+        self.absent * 2 > self.observations
+    }
+}
+
+/// What a mask leaves out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MaskMeaning {
+    /// Empty space: pixels there are transparent.
+    Object,
+    /// Anything: pixels there are neither trained on nor scored.
+    Unknown,
+}
+
+/// How the masks of a capture are read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MaskRule {
+    pub meaning: MaskMeaning,
+    /// White is left out instead of black.
+    pub inverted: bool,
+}
+
+impl Default for MaskRule {
+    fn default() -> Self {
+        MaskRule { meaning: MaskMeaning::Unknown, inverted: false }
+    }
+}
+
 /// A posed set of photographs. The world is z up; `world_from_capture` undoes what the importer did.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Capture {
@@ -88,9 +163,30 @@ pub struct Capture {
     pub scene: SceneBox,
     /// What the importer skipped or assumed, one line each.
     pub notes: Vec<String>,
+    #[serde(default)]
+    pub masks: MaskRule,
+    /// Points of structure from motion, where there are any; not kept in a run's folder, for there may be millions.
+    #[serde(skip)]
+    pub points: Vec<SparsePoint>,
+    /// Where the poses come from a model that tells; not kept in a run's folder.
+    #[serde(skip)]
+    pub agreement: Option<Agreement>,
 }
 
 impl Capture {
+    /// Photographs about which no more is known, in their own world.
+    pub fn new(frames: Vec<Frame>, scene: SceneBox) -> Capture {
+        Capture {
+            frames,
+            world_from_capture: Similarity::IDENTITY,
+            scene,
+            notes: Vec::new(),
+            masks: MaskRule::default(),
+            points: Vec::new(),
+            agreement: None,
+        }
+    }
+
     /// Indices of the frames of one split, in order.
     pub fn indices(&self, split: Split) -> Vec<usize> {
         (0..self.frames.len()).filter(|&i| self.frames[i].split == split).collect()

@@ -18,7 +18,7 @@ pub mod transform;
 pub mod view_source;
 
 pub use camera::{Camera, Lens};
-pub use capture::{Capture, Frame, SceneBox};
+pub use capture::{Capture, Frame, SceneBox, SparsePoint};
 pub use glam;
 pub use image::{Image, ImageU8};
 pub use mesh::Mesh;

@@ -3,7 +3,7 @@
 
 use diorama_data::{photo_import, transforms_json};
 use diorama_geom::capture::{Frame, Split};
-use diorama_geom::{Camera, Capture, ImageU8, Similarity};
+use diorama_geom::{Camera, Capture, ImageU8};
 use diorama_scenes::still_life;
 use std::path::Path;
 
@@ -26,7 +26,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let split = if i % 250 == 125.min(views / 2) { Split::Test } else { Split::Train };
         frames.push(Frame { split, ..Frame::new(name, image, camera, pose) });
     }
-    let capture = Capture { frames, world_from_capture: Similarity::IDENTITY, scene: still_life::scene_box(), notes: Vec::new() };
+    let capture = Capture::new(frames, still_life::scene_box());
     transforms_json::write(&root.join("transforms.json"), root, &capture, None)?;
     Ok(())
 }

@@ -12,6 +12,9 @@ use std::process::{Command, Stdio};
 pub fn run(a: &DoctorArgs) -> Result<Outcome> {
     match &a.data {
         Some(data) => capture(data, a),
+        None if a.masks.mask.is_some() || a.masks.mask_meaning.is_some() => {
+            Err(PipelineError::Usage("--mask and --mask-meaning: give the capture's folder as well".into()))
+        }
         None => machine(a),
     }
 }
@@ -19,7 +22,9 @@ pub fn run(a: &DoctorArgs) -> Result<Outcome> {
 /// What a capture is, and what will likely go wrong.
 fn capture(data: &Path, a: &DoctorArgs) -> Result<Outcome> {
     let format = a.format.as_deref().map(str::parse).transpose().map_err(PipelineError::Usage)?;
-    let capture = import::import(data, &ImportOptions { format, min_views: 1, ..ImportOptions::default() })?;
+    let masks = super::mask_options(&a.masks)?;
+    let options = ImportOptions { format, min_views: 1, masks, allow_broken: true, ..ImportOptions::default() };
+    let capture = import::import(data, &options)?;
     let found = diagnose::diagnose(&capture)?;
     if a.json {
         println!("{}", serde_json::json!({ "capture": data, "findings": found }));

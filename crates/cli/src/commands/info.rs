@@ -44,7 +44,7 @@ fn describe_run(a: &InfoArgs) -> Result<serde_json::Value> {
 
 fn describe_capture(a: &InfoArgs) -> Result<serde_json::Value> {
     let format = a.format.as_deref().map(str::parse).transpose().map_err(PipelineError::Usage)?;
-    let c = import::import(&a.path, &ImportOptions { format, min_views: 1, ..ImportOptions::default() })?;
+    let c = import::import(&a.path, &ImportOptions { format, min_views: 1, allow_broken: true, ..ImportOptions::default() })?;
     let poses: Vec<_> = c.frames.iter().map(|f| f.world_from_camera).collect();
     let (focus, distance) = focus_point(&poses);
     let first = &c.frames[0].camera;
@@ -58,6 +58,7 @@ fn describe_capture(a: &InfoArgs) -> Result<serde_json::Value> {
         "focal_length_px": [first.fx, first.fy],
         "lens": first.lens,
         "masks": c.frames.iter().filter(|f| f.mask.is_some()).count(),
+        "points": c.points.len(),
         "focus": focus.to_array(),
         "camera_distance": distance,
         "scene_center": c.scene.center.to_array(),

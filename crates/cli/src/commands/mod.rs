@@ -13,6 +13,8 @@ pub mod render;
 pub mod train;
 pub mod view;
 
+use crate::arguments::MaskArgs;
+use diorama_data::masks::{self, MaskOptions, MaskUse};
 use diorama_pipelines::{PipelineError, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -35,6 +37,15 @@ pub fn watch_interrupts() {
         }
         eprintln!("stopping after this step; press Ctrl-C again to stop at once");
     });
+}
+
+/// What flags say of masks.
+pub fn mask_options(a: &MaskArgs) -> Result<MaskOptions> {
+    let usage = |e: String| PipelineError::Usage(format!("--{e}"));
+    Ok(MaskOptions {
+        usage: a.mask.as_deref().map_or(Ok(MaskUse::Use), str::parse).map_err(usage)?,
+        meaning: a.mask_meaning.as_deref().map_or(Ok(None), masks::parse_meaning).map_err(usage)?,
+    })
 }
 
 /// Bounds the threads of all kernels.

@@ -4,7 +4,7 @@ use super::{INTERRUPT, Outcome, use_threads, watch_interrupts};
 use crate::arguments::PrepareArgs;
 use diorama_data::split::SplitRule;
 use diorama_data::video::Choice;
-use diorama_pipelines::object::prepare::{self, Finish, PrepareOptions};
+use diorama_pipelines::object::prepare::{self, Finish, PrepareOptions, Sfm};
 use diorama_pipelines::{PipelineError, Result};
 use std::time::{Duration, Instant};
 
@@ -18,7 +18,14 @@ pub fn run(a: &PrepareArgs) -> Result<Outcome> {
     least("features", a.features >= 256, "at least 256")?;
     least("max-side", a.max_side.is_none_or(|s| s >= 64), "at least 64")?;
     least("min-registered", (0.0..=100.0).contains(&a.min_registered), "0 to 100")?;
-    let split: SplitRule = a.split.parse().map_err(usage)?;
+    let sfm: Sfm = a.sfm.parse().map_err(usage)?;
+    if sfm == Sfm::Colmap
+        && let Some(flag) =
+            [("format", &a.format), ("mask", &a.masks.mask), ("mask-meaning", &a.masks.mask_meaning)].iter().find(|f| f.1.is_some())
+    {
+        return Err(usage(format!("{}: is for captures that have poses; give --sfm none as well", flag.0)));
+    }
+    let split: Option<SplitRule> = a.split.as_deref().map(str::parse).transpose().map_err(usage)?;
     let diverse = |text: &String| {
         let n = text.strip_prefix("diverse:").and_then(|n| n.parse::<usize>().ok()).filter(|n| *n >= 3);
         n.ok_or_else(|| usage(format!("select {text}: expected diverse:N with N of at least 3")))
@@ -34,13 +41,16 @@ pub fn run(a: &PrepareArgs) -> Result<Outcome> {
         finish,
         input: a.input.clone(),
         out: a.out.clone(),
+        sfm,
+        format: a.format.as_deref().map(str::parse).transpose().map_err(usage)?,
+        masks: super::mask_options(&a.masks)?,
         choice: a.fps.map_or(Choice::Count(a.frames), Choice::PerSecond),
         every: a.every,
         max_side: a.max_side.unwrap_or(u32::MAX),
         matcher: a.matcher.parse().map_err(usage)?,
         features: a.features,
         lens: a.lens.to_uppercase(),
-        split: if split == SplitRule::File { SplitRule::Every(8) } else { split },
+        split: split.unwrap_or(SplitRule::File),
         seed: a.seed,
         min_registered: a.min_registered,
         threads: a.threads,
@@ -58,7 +68,8 @@ pub fn run(a: &PrepareArgs) -> Result<Outcome> {
         }
     };
     let Some(made) = prepare::prepare(&options, &INTERRUPT, &mut note)? else {
-        eprintln!("interrupted; go on with: diorama prepare {} -o {} --resume", a.input.display(), a.out.display());
+        let sfm = if sfm == Sfm::None { " --sfm none" } else { "" };
+        eprintln!("interrupted; go on with: diorama prepare {} -o {}{sfm} --resume", a.input.display(), a.out.display());
         return Ok(Outcome::Interrupted);
     };
     if a.json {

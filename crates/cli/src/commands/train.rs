@@ -122,6 +122,8 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
             ("--background", a.background.is_some()),
             ("--seed", a.seed.is_some()),
             ("--format", a.format.is_some()),
+            ("--mask", a.masks.mask.is_some()),
+            ("--mask-meaning", a.masks.mask_meaning.is_some()),
             ("--config", a.config.is_some()),
             ("--preset", a.preset.is_some()),
         ];
@@ -135,6 +137,8 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
     set("data.format", a.format.clone())?;
     set("data.downscale", a.downscale.map(|v| v.to_string()))?;
     set("data.split", a.split.clone())?;
+    set("data.mask", a.masks.mask.clone())?;
+    set("data.mask_meaning", a.masks.mask_meaning.clone())?;
     set("background", a.background.clone())?;
     set("device", a.device.clone())?;
     set("seed", a.seed.map(|v| v.to_string()))?;

@@ -39,7 +39,7 @@ fn source(a: &ViewArgs) -> Result<Arc<dyn ViewSource>> {
         device::accelerate(&mut model, &a.device)?;
         return Ok(RunView::new(&a.path, model, false));
     }
-    let capture = import::import(&a.path, &ImportOptions { min_views: 1, ..ImportOptions::default() })?;
+    let capture = import::import(&a.path, &ImportOptions { min_views: 1, allow_broken: true, ..ImportOptions::default() })?;
     capture.notes.iter().for_each(|n| eprintln!("note: {n}"));
     let view = PointsView::of_capture(&a.path, &capture)?;
     eprintln!("a data set of {} views with {} points; train it to see more", capture.frames.len(), view.points());

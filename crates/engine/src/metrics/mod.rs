@@ -16,12 +16,13 @@ pub struct Scores {
     pub psnr_affine: f64,
 }
 
-/// Decibels of a mean squared error of values in [0, 1].
+/// Decibels of a mean squared error of values in [0, 1]; what is not a number stays so.
 pub fn psnr(mse: f64) -> f64 {
-    -10.0 * mse.max(1e-12).log10()
+    -10.0 * if mse < 1e-12 { 1e-12 } else { mse }.log10()
 }
 
-/// Compares images of equal size, 3 channels, over the pixels that `counts` admits (SSIM over all).
+/// Compares images of equal size, 3 channels, over the pixels that `counts` admits; SSIM over the windows around them, of which
+/// the pixels that do not count are no part. Not numbers where no pixel counts.
 ///
 /// # Panics
 /// When sizes differ.
@@ -35,13 +36,19 @@ pub fn compare(rendered: &Image, photo: &Image, counts: impl Fn(usize, usize) ->
             .flat_map(|i| (0..c).map(move |k| i * c + k))
             .map(|e| (f(e % c, rendered.data[e] as f64) - photo.data[e] as f64).powi(2))
             .sum();
-        sum / (pixels.len() * c).max(1) as f64
+        sum / (pixels.len() * c) as f64
     };
     let mse = error(&|_, v| v);
     let fits: Vec<(f64, f64)> =
         (0..c).map(|k| affine_fit(pixels.iter().map(|i| (rendered.data[i * c + k] as f64, photo.data[i * c + k] as f64)))).collect();
     let affine = error(&|k, v| fits[k].0 * v + fits[k].1);
-    let ssim = ssim::cpu::ssim(photo.width, photo.height, c, &rendered.data, &photo.data);
+    let ssim = if pixels.len() == photo.width * photo.height {
+        ssim::cpu::ssim(photo.width, photo.height, c, &rendered.data, &photo.data)
+    } else {
+        let mut admitted = vec![false; photo.width * photo.height];
+        pixels.iter().for_each(|i| admitted[*i] = true);
+        ssim::cpu::ssim_where(photo.width, photo.height, c, &rendered.data, &photo.data, &admitted)
+    };
     Scores { mse, psnr: psnr(mse), ssim, psnr_affine: psnr(affine) }
 }
 
@@ -85,11 +92,27 @@ mod tests {
         wrong.data[0] = 1.0;
         assert!(compare(&wrong, &photo, |_, _| true).psnr < 40.0);
         assert!(compare(&wrong, &photo, |x, y| x + y > 0).psnr > 100.0);
+        assert!(compare(&wrong, &photo, |_, _| false).psnr.is_nan());
+    }
+
+    #[test]
+    fn ssim_looks_at_the_pixels_that_count() {
+        let texture = |i: usize| (i * 37 % 97) as f32 / 97.0;
+        let photo = Image { width: 48, height: 32, channels: 3, data: (0..48 * 32 * 3).map(texture).collect() };
+        let mut half = photo.clone();
+        (0..half.data.len()).filter(|i| i / 3 % 48 >= 24).for_each(|i| half.data[i] = texture(i + 29));
+        let all = compare(&half, &photo, |_, _| true).ssim;
+        let left = compare(&half, &photo, |x, _| x < 24).ssim;
+        let right = compare(&half, &photo, |x, _| x >= 24).ssim;
+        assert!((left - 1.0).abs() < 1e-9 && right < 0.8 && (right..left).contains(&all), "{left} {all} {right}");
+        // With all but one pixel in the corner, hardly anything changes.
+        let nearly = compare(&half, &photo, |x, y| x + y > 0).ssim;
+        assert!((nearly - all).abs() < 1e-3, "{nearly} {all}");
     }
 
     #[test]
     fn known_decibels() {
-        assert!((psnr(0.01) - 20.0).abs() < 1e-9);
+        assert!((psnr(0.01) - 20.0).abs() < 1e-9 && (psnr(0.0) - 120.0).abs() < 1e-9 && psnr(f64::NAN).is_nan());
         assert!((psnr(0.0033) - 24.81).abs() < 0.01);
     }
 }

@@ -1,6 +1,7 @@
 //! Everything that a run depends on, as written to `config.toml`.
 
 use crate::error::{PipelineError, Result};
+use diorama_data::masks::{self, MaskOptions};
 use diorama_kernels::device::Api;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -56,8 +57,32 @@ pub struct DataConfig {
     pub format: String,
     pub downscale: u32,
     pub split: String,
+    /// What is done with masks: `use` (black is left out), `invert` or `ignore`.
+    #[serde(default = "use_masks")]
+    pub mask: String,
+    /// What masks leave out: `object` (empty space), `unknown` (anything), or `auto`, told by what they cover.
+    #[serde(default = "auto")]
+    pub mask_meaning: String,
     /// Bytes that pixels may take; beyond that one of each small square is kept.
     pub memory_budget: u64,
+}
+
+fn use_masks() -> String {
+    "use".into()
+}
+
+fn auto() -> String {
+    "auto".into()
+}
+
+impl DataConfig {
+    /// How masks are to be taken.
+    pub fn masks(&self) -> Result<MaskOptions> {
+        Ok(MaskOptions {
+            usage: self.mask.parse().map_err(PipelineError::Usage)?,
+            meaning: masks::parse_meaning(&self.mask_meaning).map_err(PipelineError::Usage)?,
+        })
+    }
 }
 
 /// Shape of the field.
@@ -195,6 +220,8 @@ impl Config {
                 format: String::new(),
                 downscale: 1,
                 split: "file".into(),
+                mask: use_masks(),
+                mask_meaning: auto(),
                 memory_budget: diorama_data::pixel_store::DEFAULT_BUDGET,
             },
             field: FieldConfig {
@@ -308,6 +335,7 @@ impl Config {
         if self.data.downscale == 0 || self.run.log_every == 0 {
             return fail("data.downscale and run.log_every: at least 1");
         }
+        self.data.masks()?;
         if self.field.appearance > 0 && matches!(self.method, Method::Mlp | Method::Baseline) {
             return fail("field.appearance: only ngp and nerf have a view-dependent part that takes an appearance code");
         }
@@ -381,6 +409,8 @@ mod tests {
             ("optim.rate", "fast"),
             ("optim.rate", "inf"),
             ("data.downscale", "0"),
+            ("data.mask", "maybe"),
+            ("data.mask_meaning", "thing"),
             ("device", "gpu"),
         ] {
             assert!(c.clone().set(k, v).is_err(), "{k} = {v}");

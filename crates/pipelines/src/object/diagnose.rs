@@ -1,8 +1,8 @@
 //! What a capture is and what will likely go wrong with it, before any training.
 
 use crate::error::Result;
-use diorama_data::{photo, pixel_store, video};
-use diorama_geom::capture::{Frame, Split, focus_point};
+use diorama_data::{masks, photo, pixel_store, sparse, video};
+use diorama_geom::capture::{Agreement, Frame, MaskRule, Split, focus_point};
 use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, Capture, Lens, Pose};
@@ -54,7 +54,8 @@ pub fn diagnose(capture: &Capture) -> Result<Vec<Finding>> {
     out.extend(cameras(&capture.frames));
     out.extend(poses(capture));
     out.push(scale(capture));
-    out.extend(pixels(&capture.frames)?);
+    out.extend(capture.agreement.as_ref().map(model));
+    out.extend(pixels(capture)?);
     out.push(memory(&capture.frames));
     out.extend(capture.notes.iter().map(|n| finding("import", Grade::Note, n.clone(), "")));
     Ok(out)
@@ -261,33 +262,30 @@ struct Look {
     masked: Option<f32>,
 }
 
-fn look(f: &Frame) -> Result<Look> {
+fn look(f: &Frame, rule: &MaskRule) -> Result<Look> {
     let full = photo::load(&f.image)?;
     let clear = (full.channels == 4).then(|| {
         let open = full.data.chunks_exact(4).filter(|p| p[3] < 128).count();
         open as f32 / (full.width * full.height) as f32
     });
+    let mask = masks::of_frame(f, rule, (full.width, full.height))?;
+    let masked = mask.as_ref().map(|m| m.data.iter().filter(|v| **v < masks::COUNTS).count() as f32 / m.data.len().max(1) as f32);
     let by = (LOOK_PX as f64 / full.width.max(full.height) as f64).min(1.0);
-    let small = full.downsampled(((full.width as f64 * by) as usize).max(3), ((full.height as f64 * by) as usize).max(3));
+    let to = |v: usize| ((v as f64 * by) as usize).max(3);
+    let small = full.downsampled(to(full.width), to(full.height));
+    let mask = mask.map(|m| m.downsampled(small.width, small.height));
     let c = small.channels;
     let gray: Vec<u8> = small
         .data
         .chunks_exact(c)
         .map(|p| if c < 3 { p[0] } else { ((p[0] as u32 * 2 + p[1] as u32 * 5 + p[2] as u32) / 8) as u8 })
         .collect();
-    let opaque = |i: &usize| c < 4 || small.data[i * 4 + 3] > 127;
-    let seen: Vec<usize> = (0..gray.len()).filter(opaque).collect();
+    let counts = |i: &usize| (c < 4 || small.data[i * 4 + 3] > 127) && mask.as_ref().is_none_or(|m| m.data[*i] >= masks::COUNTS);
+    let seen: Vec<usize> = (0..gray.len()).filter(counts).collect();
     let n = seen.len().max(1) as f32;
     let mean = seen.iter().map(|i| linear_from_srgb(gray[*i] as f32 / 255.0)).sum::<f32>() / n;
     let middle = seen.iter().map(|i| gray[*i] as f32).sum::<f32>() / n;
     let variance = seen.iter().map(|i| (gray[*i] as f32 - middle).powi(2)).sum::<f32>() / n;
-    let masked = match &f.mask {
-        None => None,
-        Some(m) => {
-            let m = photo::load_mask(m)?;
-            Some(m.data.iter().filter(|v| **v == 0).count() as f32 / m.data.len().max(1) as f32)
-        }
-    };
     Ok(Look {
         stops: mean.max(1e-6).log2(),
         sharpness: video::laplacian_variance(&gray, small.width) / variance.max(1.0),
@@ -297,10 +295,30 @@ fn look(f: &Frame) -> Result<Look> {
     })
 }
 
-fn pixels(frames: &[Frame]) -> Result<Vec<Finding>> {
+/// Whether poses and points of structure from motion agree.
+fn model(a: &Agreement) -> Finding {
+    match a.error_px {
+        _ if a.is_broken() => finding("model", Grade::Trouble, sparse::broken(a), sparse::BROKEN_CURE),
+        Some((mean, _)) => {
+            finding("model", Grade::Good, format!("its points lie {mean:.1} pixels (mean) from where photographs show them"), "")
+        }
+        None => finding(
+            "model",
+            Grade::Trouble,
+            format!(
+                "{} of {} observations are of points that are not in the model: nothing says that its poses are right",
+                a.absent, a.observations
+            ),
+            "run `diorama prepare` on the photographs",
+        ),
+    }
+}
+
+fn pixels(capture: &Capture) -> Result<Vec<Finding>> {
+    let frames = &capture.frames;
     let n = frames.len();
     let opened: Vec<usize> = (0..n.min(OPENED)).map(|i| i * n / n.min(OPENED)).collect();
-    let looks: Vec<Look> = opened.par_iter().map(|i| look(&frames[*i])).collect::<Result<_>>()?;
+    let looks: Vec<Look> = opened.par_iter().map(|i| look(&frames[*i], &capture.masks)).collect::<Result<_>>()?;
     let at = |mut v: Vec<f32>, q: f32| {
         v.sort_by(f32::total_cmp);
         v[((v.len() - 1) as f32 * q) as usize]
@@ -356,7 +374,7 @@ fn pixels(frames: &[Frame]) -> Result<Vec<Finding>> {
         let share = mean(masked.clone());
         let text = format!("{} of {} views have masks, which leave out {:.0} % of their pixels", masked.len(), looks.len(), 100.0 * share);
         out.push(if share > 0.9 {
-            finding("masks", Grade::Trouble, text, "black is left out, white counts: invert the masks if it is the other way round")
+            finding("masks", Grade::Trouble, text, "black is left out, white counts: --mask invert if it is the other way round")
         } else {
             finding("masks", Grade::Good, text, "")
         });

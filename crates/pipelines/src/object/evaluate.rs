@@ -2,7 +2,7 @@
 
 use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
-use diorama_data::{photo, weights};
+use diorama_data::{masks, photo, weights};
 use diorama_engine::metrics::lpips::{self, Lpips};
 use diorama_engine::metrics::{self, Scores};
 use diorama_engine::renderers::volume::{Quality, View};
@@ -21,6 +21,9 @@ pub fn held_out(capture: &Capture, split: Split) -> Vec<usize> {
 pub struct ScoredView {
     pub view: View,
     pub photo: Image,
+    /// 255 where pixels count; none: all do.
+    pub counts: Option<ImageU8>,
+    /// Not numbers where no pixel counts.
     pub scores: Scores,
 }
 
@@ -54,7 +57,7 @@ pub struct Report {
 }
 
 /// A photograph at the run's resolution, transparent pixels on the model's backdrop.
-pub fn reference_photo(model: &ObjectModel, full: &ImageU8) -> Image {
+fn reference_photo(model: &ObjectModel, full: &ImageU8) -> Image {
     let d = model.config.data.downscale as usize;
     let small = full.downsampled((full.width / d).max(1), (full.height / d).max(1));
     let back = model.backdrop_color();
@@ -68,16 +71,43 @@ pub fn reference_photo(model: &ObjectModel, full: &ImageU8) -> Image {
     out
 }
 
-/// Renders frame `i` and scores it against `full`, its photograph at full size.
-pub fn score_view(model: &ObjectModel, i: usize, full: &ImageU8, quality: Quality) -> ScoredView {
-    let photo = reference_photo(model, full);
+/// What frame `i`'s render is compared with, and the mask of the pixels that count, where there is one.
+fn reference(model: &ObjectModel, i: usize, full: ImageU8) -> Result<(Image, Option<ImageU8>)> {
+    let (full, mask) = masks::apply(&model.capture.frames[i], &model.capture.masks, full)?;
+    let photo = reference_photo(model, &full);
+    let counts = mask.map(|m| m.downsampled(photo.width, photo.height));
+    Ok((photo, counts))
+}
+
+/// Renders frame `i` and scores it against `full`, its photograph at full size, where its mask says that pixels count.
+///
+/// # Errors
+/// When the mask cannot be decoded, or is not that of the photograph.
+pub fn score_view(model: &ObjectModel, i: usize, full: ImageU8, quality: Quality) -> Result<ScoredView> {
+    let (photo, counts) = reference(model, i, full)?;
     let view = model.tracer(quality).view(&model.posed(i), &mut |_| {});
-    let mask =
-        model.capture.frames[i].mask.as_ref().and_then(|m| photo::load_mask(m).ok()).map(|m| m.downsampled(photo.width, photo.height));
     let mut shown = view.rgb.clone();
     shown.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
-    let scores = metrics::compare(&shown, &photo, |x, y| mask.as_ref().is_none_or(|m| m.pixel(x, y)[0] >= 128));
-    ScoredView { view, photo, scores }
+    let scores = metrics::compare(&shown, &photo, admits(&counts));
+    Ok(ScoredView { view, photo, counts, scores })
+}
+
+/// Whether a pixel counts.
+fn admits(counts: &Option<ImageU8>) -> impl Fn(usize, usize) -> bool {
+    move |x, y| counts.as_ref().is_none_or(|m| m.pixel(x, y)[0] >= masks::COUNTS)
+}
+
+/// The render, with the photograph where pixels do not count.
+fn where_it_counts(scored: &ScoredView) -> Image {
+    let mut out = scored.view.rgb.clone();
+    let counts = admits(&scored.counts);
+    let width = out.width;
+    for (i, (o, p)) in out.data.chunks_exact_mut(3).zip(scored.photo.data.chunks_exact(3)).enumerate() {
+        if !counts(i % width, i / width) {
+            o.copy_from_slice(p);
+        }
+    }
+    out
 }
 
 /// Scores all views of a split; `each` sees every view as it is done.
@@ -120,25 +150,25 @@ pub fn evaluate_with(
     for i in frames {
         let frame = &model.capture.frames[i];
         let full = photo::load(&frame.image)?;
-        let scored = score_view(model, i, &full, quality);
+        let scored = score_view(model, i, full, quality)?;
         if let Some(mean) = mean.as_ref().filter(|m| (m.width, m.height) == (scored.photo.width, scored.photo.height)) {
-            mean_scores.push(metrics::compare(mean, &scored.photo, |_, _| true).psnr);
+            mean_scores.push(metrics::compare(mean, &scored.photo, admits(&scored.counts)).psnr);
         }
         each(&frame.name, &scored)?;
         let s = scored.scores;
         let too_small = |e: String| PipelineError::Usage(format!("{}: {e}", frame.name));
-        let distance = lpips.map(|l| l.distance(&scored.view.rgb, &scored.photo)).transpose().map_err(too_small)?;
+        let distance = lpips.map(|l| l.distance(&where_it_counts(&scored), &scored.photo)).transpose().map_err(too_small)?;
         per_view.push(ViewScore {
             name: frame.name.clone(),
             psnr: s.psnr,
             ssim: s.ssim,
             mse: s.mse,
             psnr_affine: s.psnr_affine,
-            lpips: distance,
+            lpips: distance.filter(|_| !s.psnr.is_nan()),
         });
     }
-    let n = per_view.len() as f64;
-    let average = |f: fn(&ViewScore) -> f64| per_view.iter().map(f).sum::<f64>() / n;
+    // Views in which no pixel counts say nothing.
+    let average = |f: fn(&ViewScore) -> f64| mean_of_numbers(per_view.iter().map(f));
     Ok(Report {
         views: per_view.len(),
         psnr: average(|v| v.psnr),
@@ -146,10 +176,15 @@ pub fn evaluate_with(
         mse: average(|v| v.mse),
         psnr_min: per_view.iter().map(|v| v.psnr).fold(f64::INFINITY, f64::min),
         psnr_affine: average(|v| v.psnr_affine),
-        psnr_mean_image: (!mean_scores.is_empty()).then(|| mean_scores.iter().sum::<f64>() / mean_scores.len() as f64),
-        lpips: per_view.iter().map(|v| v.lpips).sum::<Option<f64>>().map(|sum| sum / n),
+        psnr_mean_image: (!mean_scores.is_empty()).then(|| mean_of_numbers(mean_scores.into_iter())),
+        lpips: lpips.map(|_| mean_of_numbers(per_view.iter().filter_map(|v| v.lpips))),
         per_view,
     })
+}
+
+fn mean_of_numbers(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, n) = values.filter(|v| !v.is_nan()).fold((0.0, 0), |(sum, n), v| (sum + v, n + 1));
+    sum / n as f64
 }
 
 /// Mean of up to 24 training photographs, where all are of one size.
@@ -158,7 +193,7 @@ fn mean_image(model: &ObjectModel) -> Result<Option<Image>> {
     let mut sum: Option<Image> = None;
     let mut n = 0.0;
     for &i in model.train.iter().step_by(step) {
-        let im = reference_photo(model, &photo::load(&model.capture.frames[i].image)?);
+        let (im, _) = reference(model, i, photo::load(&model.capture.frames[i].image)?)?;
         n += 1.0;
         match &mut sum {
             None => sum = Some(im),

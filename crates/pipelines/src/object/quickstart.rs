@@ -12,7 +12,7 @@ use diorama_data::{DataError, photo, transforms_json};
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::train::{Event, Summary};
 use diorama_geom::capture::{Frame, Split};
-use diorama_geom::{Capture, ImageU8, Similarity};
+use diorama_geom::{Capture, ImageU8};
 use diorama_scenes::still_life;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -43,7 +43,7 @@ pub fn write_capture(folder: &Path, views: usize, size: u32) -> Result<()> {
         let split = if i % 8 == 0 { Split::Test } else { Split::Train };
         frames.push(Frame { split, ..Frame::new(p.name, image, p.camera, p.world_from_camera) });
     }
-    let capture = Capture { frames, world_from_capture: Similarity::IDENTITY, scene: still_life::scene_box(), notes: Vec::new() };
+    let capture = Capture::new(frames, still_life::scene_box());
     Ok(transforms_json::write(&folder.join("transforms.json"), folder, &capture, None)?)
 }
 

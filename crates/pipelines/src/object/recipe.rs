@@ -60,8 +60,19 @@ pub fn load_capture(config: &Config) -> Result<Capture> {
         "" => None,
         f => Some(f.parse().map_err(PipelineError::Usage)?),
     };
-    let options = ImportOptions { format, split, seed: config.seed, ..ImportOptions::default() };
+    let options = ImportOptions { format, split, seed: config.seed, masks: config.data.masks()?, ..ImportOptions::default() };
     Ok(import::import(&config.data.path, &options)?)
+}
+
+/// A capture that a run has kept, with the sparse points that it has not; a note says so where they cannot be had.
+fn with_points(mut kept: Capture, config: &Config) -> Capture {
+    let names = |c: &Capture| c.frames.iter().map(|f| f.name.clone()).collect::<Vec<_>>();
+    match load_capture(config) {
+        Ok(fresh) if names(&fresh) == names(&kept) => kept.points = fresh.points,
+        Ok(_) => kept.notes.push("the capture has changed since the run began: its sparse points are not used".into()),
+        Err(e) => kept.notes.push(format!("the capture's sparse points cannot be read again: {e}")),
+    }
+    kept
 }
 
 /// The device that a configuration will train on, in words.
@@ -94,7 +105,7 @@ pub fn train(
 ) -> Result<Trained> {
     let opened = device::open(config)?;
     opened.note().into_iter().for_each(|n| events(&Event::Note(n)));
-    let capture = if resume { folder.capture()? } else { load_capture(config)? };
+    let capture = if resume { with_points(folder.capture()?, config) } else { load_capture(config)? };
     for note in &capture.notes {
         events(&Event::Note(note.clone()));
     }
@@ -223,7 +234,7 @@ fn load_pixels(config: &Config, capture: &Capture, device: &Opened) -> Result<(P
     let train = capture.indices(Split::Train);
     let frames: Vec<_> = train.iter().map(|&i| &capture.frames[i]).collect();
     let budget = config.data.memory_budget.min(device.most_bytes());
-    let options = StoreOptions { downscale: config.data.downscale, budget };
+    let options = StoreOptions { downscale: config.data.downscale, budget, masks: capture.masks };
     Ok((PixelStore::load(&frames, &options, &|| {})?, budget))
 }
 
@@ -652,7 +663,10 @@ impl Trainee for Trainer<'_> {
         let mut scores = Vec::new();
         for i in few {
             if let Ok(image) = photo::load(&self.model.capture.frames[i].image) {
-                scores.push(evaluate::score_view(&self.model, i, &image, Quality::Full).scores);
+                match evaluate::score_view(&self.model, i, image, Quality::Full) {
+                    Ok(scored) => scores.push(scored.scores),
+                    Err(_) => return (f64::NAN, f64::NAN),
+                }
             }
         }
         let n = scores.len().max(1) as f64;

@@ -6,7 +6,7 @@ use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
 use diorama_data::plot::{Chart, Series};
 use diorama_data::tfevents::TfEvents;
-use diorama_data::{DataError, atomic, checkpoint, error};
+use diorama_data::{DataError, atomic, checkpoint, error, lock};
 use diorama_engine::train::Event;
 use diorama_geom::Capture;
 use std::fs::File;
@@ -33,7 +33,7 @@ impl RunFolder {
             );
         }
         let occupied =
-            path.is_dir() && !force && path.read_dir().map_err(DataError::io(path, "read"))?.flatten().any(|e| e.file_name() != ".lock");
+            path.is_dir() && !force && path.read_dir().map_err(DataError::io(path, "read"))?.flatten().any(|e| e.file_name() != lock::NAME);
         if occupied {
             return Err(DataError::input(path, "is not empty and holds no run; give --force or another --out").into());
         }
@@ -57,10 +57,7 @@ impl RunFolder {
     }
 
     fn lock(path: &Path) -> Result<RunFolder> {
-        let name = path.join(".lock");
-        let lock = File::create(&name).map_err(DataError::io(&name, "create"))?;
-        lock.try_lock().map_err(|_| DataError::input(path, "is in use by another process; wait for it or choose another --out"))?;
-        Ok(RunFolder { path: path.to_path_buf(), metrics: None, tensorboard: None, _lock: lock })
+        Ok(RunFolder { path: path.to_path_buf(), metrics: None, tensorboard: None, _lock: lock::take(path)? })
     }
 
     pub fn path(&self) -> &Path {

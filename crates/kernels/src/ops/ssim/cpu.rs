@@ -57,6 +57,12 @@ fn maps(w: usize, h: usize, c: usize, k: usize, x: &[f32], y: &[f32]) -> Maps {
 }
 
 impl Maps {
+    /// SSIM of window `i`.
+    fn at(&self, i: usize) -> f64 {
+        let [a1, a2, b1, b2] = self.factors(i);
+        a1 * a2 / (b1 * b2)
+    }
+
     /// The two factors above and below the fraction bar at window `i`.
     fn factors(&self, i: usize) -> [f64; 4] {
         let [mx, my, xx, yy, xy] = [0, 1, 2, 3, 4].map(|m: usize| self.means[m][i]);
@@ -77,15 +83,35 @@ pub fn ssim(w: usize, h: usize, c: usize, x: &[f32], y: &[f32]) -> f64 {
         .into_par_iter()
         .map(|k| {
             let m = maps(w, h, c, k, x, y);
-            (0..n)
-                .map(|i| {
-                    let [a1, a2, b1, b2] = m.factors(i);
-                    a1 * a2 / (b1 * b2)
-                })
-                .sum()
+            (0..n).map(|i| m.at(i)).sum()
         })
         .collect();
     sums.iter().sum::<f64>() / (n * c) as f64
+}
+
+/// Mean SSIM of the windows in whose middle a pixel counts, by the pixels in them that count; NaN where there is none.
+///
+/// # Shapes
+/// x, y `[h, w, c]`; counts `[h, w]`.
+pub fn ssim_where(w: usize, h: usize, c: usize, x: &[f32], y: &[f32], counts: &[bool]) -> f64 {
+    if w < WINDOW || h < WINDOW {
+        return f64::NAN;
+    }
+    let (across, down) = (w + 1 - WINDOW, h + 1 - WINDOW);
+    let middle = |i: usize| (i / across + WINDOW / 2) * w + i % across + WINDOW / 2;
+    let windows: Vec<usize> = (0..across * down).filter(|i| counts[middle(*i)]).collect();
+    let weights = blur(w, h, &counts.iter().map(|v| *v as u8 as f64).collect::<Vec<f64>>());
+    let admitted = |a: &[f32]| a.iter().enumerate().map(|(i, v)| if counts[i / c] { *v } else { 0.0 }).collect::<Vec<f32>>();
+    let (x, y) = (admitted(x), admitted(y));
+    let sums: Vec<f64> = (0..c)
+        .into_par_iter()
+        .map(|k| {
+            let mut m = maps(w, h, c, k, &x, &y);
+            m.means.iter_mut().for_each(|p| windows.iter().for_each(|i| p[*i] /= weights[*i]));
+            windows.iter().map(|i| m.at(*i)).sum()
+        })
+        .collect();
+    sums.iter().sum::<f64>() / (windows.len() * c) as f64
 }
 
 /// Gradient of [`ssim`] with respect to x, `[h, w, c]`; zero for images smaller than the window.

@@ -1,17 +1,20 @@
-//! Photographs or a video without poses become a data set: sharp frames, poses from COLMAP, the world upright and of useful size,
+//! Photographs or a video become a data set: sharp frames, poses from COLMAP or as they were given, the world upright and of useful size,
 //! photographs finished as wished, a division into training and held-out views, and a sheet that shows it all.
 
 pub mod finish;
+mod posed;
 mod sfm;
 mod sheet;
 mod world;
 
 use crate::error::{PipelineError, Result};
+use diorama_data::masks::MaskOptions;
 use diorama_data::split::{self, SplitRule};
 use diorama_data::video::{self, Choice};
-use diorama_data::{DataError, atomic, colmap, import, mesh_text, photo, photo_import, transforms_json};
-use diorama_geom::capture::Split;
-use diorama_geom::{Capture, Mesh};
+use diorama_data::{DataError, atomic, colmap, import, lock, mesh_text, photo, photo_import, transforms_json};
+use diorama_geom::capture::{Frame, MaskRule, Split};
+use diorama_geom::glam::DVec3;
+use diorama_geom::{Capture, Mesh, SceneBox};
 use serde::Serialize;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
@@ -20,12 +23,37 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub use finish::Finish;
 pub use sfm::Matcher;
 
+/// Where poses come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sfm {
+    Colmap,
+    /// They are part of the input.
+    None,
+}
+
+impl std::str::FromStr for Sfm {
+    type Err = String;
+
+    fn from_str(s: &str) -> std::result::Result<Self, String> {
+        match s {
+            "colmap" => Ok(Sfm::Colmap),
+            "none" => Ok(Sfm::None),
+            _ => Err(format!("sfm {s:?}: expected colmap or none")),
+        }
+    }
+}
+
 /// What to make a data set of, and how.
 #[derive(Clone, Debug)]
 pub struct PrepareOptions {
-    /// A folder of photographs, or a video.
+    /// A folder of photographs or a video; without structure from motion a posed capture.
     pub input: PathBuf,
     pub out: PathBuf,
+    pub sfm: Sfm,
+    /// Of a posed capture that holds several.
+    pub format: Option<import::Format>,
+    /// Of a posed capture.
+    pub masks: MaskOptions,
     /// Most frames of a video.
     pub choice: Choice,
     /// Take every n-th photograph.
@@ -38,6 +66,7 @@ pub struct PrepareOptions {
     /// COLMAP's name of the lens.
     pub lens: String,
     pub finish: Finish,
+    /// [`SplitRule::File`]: a posed capture's own, else every eighth is held out.
     pub split: SplitRule,
     pub seed: u64,
     /// Fewest photographs that need a pose, in percent.
@@ -71,8 +100,28 @@ pub struct Prepared {
 /// Names within the data set.
 const IMAGES: &str = "images";
 const WORK: &str = "colmap";
+const POSED: &str = "posed";
+const MASKS: &str = "masks";
 const POINTS: &str = "points.ply";
 const IMAGES_DONE: &str = "images.done";
+
+/// Photographs with poses, before they are finished.
+struct Posed {
+    frames: Vec<Frame>,
+    scene: SceneBox,
+    masks: MaskRule,
+    /// From the frames' world to the one in which they are finished: upright, the origin in the middle, cameras [`world::DISTANCE`] away.
+    finishing_from_world: diorama_geom::Similarity,
+    found: finish::Found,
+    /// In the frames' world.
+    points: Vec<(DVec3, [u8; 3])>,
+    images: usize,
+    lost: Vec<String>,
+    tilt: f64,
+    floor: bool,
+    /// Whether frames carry the capture's own division.
+    is_divided: bool,
+}
 
 /// Prepares a data set; none when interrupted, after which `resume` goes on. `note` is told what happens.
 ///
@@ -80,9 +129,26 @@ const IMAGES_DONE: &str = "images.done";
 /// When the input is at fault, a program is missing, or too few photographs find a pose.
 pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Prepared>> {
     // Missing programs are told before any work is done.
-    let colmap_program = sfm::program()?;
+    let colmap_program = (o.sfm == Sfm::Colmap).then(sfm::program).transpose()?;
+    if !o.input.exists() {
+        return Err(DataError::input(&o.input, "does not exist; give a folder of photographs or a video").into());
+    }
+    let given = if o.sfm == Sfm::None { Some(posed::read(o)?) } else { None };
+    let _lock = begin(o)?;
+    let posed = match (colmap_program, given) {
+        (Some(program), _) => pose(&program, o, interrupt, note)?,
+        (None, Some(capture)) => posed::take(capture, o, interrupt, note)?,
+        (None, None) => unreachable!("poses come from COLMAP or are given"),
+    };
+    match posed {
+        Some(posed) => complete(posed, o, interrupt, note),
+        None => Ok(None),
+    }
+}
+
+/// Finds poses with COLMAP; none when interrupted.
+fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Posed>> {
     let work = o.out.join(WORK);
-    begin(o)?;
     if !work.join(IMAGES_DONE).exists() && !take_images(o, &work, interrupt, note)? {
         return Ok(None);
     }
@@ -101,7 +167,7 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
         note("photographs differ in size: a lens is found for each; those of one size and zoom are found more reliably");
     }
     let kind = sfm::Photographs { names: &names, is_video, one_size, focal_ratio: read_focal_ratio(&work) };
-    let Some(model) = sfm::reconstruct(&colmap_program, o, &kind, interrupt, note)? else { return Ok(None) };
+    let Some(model) = sfm::reconstruct(program, o, &kind, interrupt, note)? else { return Ok(None) };
     let registered: HashSet<String> = colmap::registered(&model)?.into_iter().collect();
     let lost: Vec<String> = names.iter().filter(|n| !registered.contains(*n)).cloned().collect();
     enough(o, &names, &lost)?;
@@ -109,79 +175,125 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
     let points = colmap::points(&model)?;
     let mut frames = colmap::read(&o.out)?.frames;
     let placed = world::place(&mut frames, &points);
-    let in_world = points.iter().copied().zip(placed.points.iter().map(|p| p.0)).collect();
-    let found = finish::Found { model: &model, points: in_world };
-    let made = finish::finish(&o.finish, &o.out, &found, &mut frames, interrupt, note).inspect_err(|_| finish::discard(&o.out))?;
+    let observed = if o.finish.touches_pixels() { colmap::observations(&model)? } else { Vec::new() };
+    let found = finish::Found {
+        observed: observed.into_iter().map(|v| (v.image.clone(), v)).collect(),
+        points: points.iter().zip(&placed.points).map(|(p, at)| (p.id, at.0, p.images)).collect(),
+        is_visibility_known: true,
+    };
+    Ok(Some(Posed {
+        frames,
+        scene: placed.scene,
+        masks: MaskRule::default(),
+        finishing_from_world: diorama_geom::Similarity::IDENTITY,
+        found,
+        points: placed.points,
+        images: names.len(),
+        lost,
+        tilt: placed.tilt,
+        floor: placed.floor,
+        is_divided: false,
+    }))
+}
+
+/// Finishes photographs and writes the data set; none when interrupted.
+fn complete(mut p: Posed, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Prepared>> {
+    let registered = p.frames.len();
+    let to_world = p.finishing_from_world.inverse();
+    p.frames.iter_mut().for_each(|f| f.world_from_camera = p.finishing_from_world.pose(&f.world_from_camera));
+    let made = finish::finish(&o.finish, &o.out, &p.found, &mut p.frames, interrupt, note).inspect_err(|_| finish::discard(&o.out))?;
     let Some(finished) = made else {
         finish::discard(&o.out);
         return Ok(None);
     };
-    split::apply(&o.split, &mut frames, false, o.seed);
-    if frames.iter().filter(|f| f.split == Split::Train).count() < 2 {
+    p.frames.iter_mut().for_each(|f| f.world_from_camera = to_world.pose(&f.world_from_camera));
+    if !(p.is_divided && o.split == SplitRule::File) {
+        split::apply(&o.split, &mut p.frames, false, o.seed);
+    }
+    if p.frames.iter().filter(|f| f.split == Split::Train).count() < 2 {
         return Err(PipelineError::Usage(format!("--split {}: leaves fewer than 2 training views; choose another", o.split)));
     }
-    let world_from_capture = diorama_geom::Similarity::IDENTITY;
-    let capture = Capture { frames, world_from_capture, scene: placed.scene, notes: Vec::new() };
+    let capture = Capture { masks: p.masks, ..Capture::new(p.frames, p.scene) };
     finish::put_in_place(&o.out)?;
     let cloud = Mesh {
-        positions: placed.points.iter().map(|p| p.0.as_vec3().to_array()).collect(),
-        colors_srgb: placed.points.iter().map(|p| p.1.map(|v| v as f32 / 255.0)).collect(),
+        positions: p.points.iter().map(|p| p.0.as_vec3().to_array()).collect(),
+        colors_srgb: p.points.iter().map(|p| p.1.map(|v| v as f32 / 255.0)).collect(),
         ..Mesh::default()
     };
-    mesh_text::save_ply(&o.out.join(POINTS), &cloud)?;
-    transforms_json::write(&o.out.join("transforms.json"), &o.out, &capture, Some(POINTS))?;
+    let has_points = !p.points.is_empty();
+    if has_points {
+        mesh_text::save_ply(&o.out.join(POINTS), &cloud)?;
+    }
+    transforms_json::write(&o.out.join("transforms.json"), &o.out, &capture, has_points.then_some(POINTS))?;
     let sheet = o.out.join("sheet.png");
-    sheet::draw(&sheet, &capture, &placed.points)?;
+    sheet::draw(&sheet, &capture, &p.points)?;
     // What was written reads back as a capture.
     let options = import::ImportOptions { format: Some(import::Format::Transforms), ..Default::default() };
     import::import(&o.out, &options)?;
     Ok(Some(Prepared {
         folder: o.out.clone(),
-        images: names.len(),
-        registered: registered.len(),
-        lost,
-        points: points.len(),
-        tilt: placed.tilt,
-        floor: placed.floor,
-        aabb_scale: placed.scene.aabb_scale,
+        images: p.images,
+        registered,
+        lost: p.lost,
+        points: p.points.len(),
+        tilt: p.tilt,
+        floor: p.floor,
+        aabb_scale: p.scene.aabb_scale,
         held_out: capture.indices(Split::Test).len(),
         sheet,
         finished,
     }))
 }
 
-/// Makes the folder ready, or refuses.
-fn begin(o: &PrepareOptions) -> Result<()> {
-    if !o.input.exists() {
-        return Err(DataError::input(&o.input, "does not exist; give a folder of photographs or a video").into());
+/// Makes the folder ready and locks it, or refuses.
+fn begin(o: &PrepareOptions) -> Result<std::fs::File> {
+    let work = o.out.join(if o.sfm == Sfm::Colmap { WORK } else { POSED });
+    let existed = o.out.is_dir();
+    if o.resume && !existed {
+        return Err(DataError::input(&o.out, "does not exist; leave out --resume").into());
     }
+    if o.out.is_file() {
+        return Err(DataError::input(&o.out, "is a file; --out must name a folder").into());
+    }
+    // Somebody else's folder is left as it is.
+    let names = |p: &Path| -> Result<Vec<std::ffi::OsString>> {
+        Ok(std::fs::read_dir(p).map_err(DataError::io(p, "read"))?.flatten().map(|e| e.file_name()).filter(|n| n != lock::NAME).collect())
+    };
+    let ours = [WORK, POSED].iter().any(|w| o.out.join(w).is_dir());
+    let occupied = existed && !names(&o.out)?.is_empty();
+    if occupied && !ours {
+        return Err(DataError::input(&o.out, "exists and is not an earlier data set of prepare; choose another --out").into());
+    }
+    std::fs::create_dir_all(&o.out).map_err(DataError::io(&o.out, "create"))?;
+    let lock = lock::take(&o.out)?;
     if o.resume {
-        return if o.out.join(WORK).is_dir() {
-            Ok(())
+        return if work.is_dir() {
+            Ok(lock)
         } else {
             Err(DataError::input(&o.out, "holds nothing to go on from; leave out --resume").into())
         };
     }
-    if o.out.exists() && std::fs::read_dir(&o.out).map_err(DataError::io(&o.out, "read"))?.next().is_some() {
-        let ours = o.out.join(WORK).is_dir();
-        if !ours {
-            return Err(DataError::input(&o.out, "exists and is not an earlier data set of prepare; choose another --out").into());
-        }
+    if occupied {
         if !o.force {
             return Err(DataError::input(&o.out, "exists; give --resume to go on, --force to begin anew, or another --out").into());
         }
-        for part in [IMAGES, WORK, "sparse", finish::FINISHED] {
+        for part in [IMAGES, MASKS, WORK, POSED, "sparse", finish::FINISHED] {
             let folder = o.out.join(part);
             if folder.exists() {
                 std::fs::remove_dir_all(&folder).map_err(DataError::io(&folder, "remove"))?;
             }
         }
-        let _ = std::fs::remove_file(o.out.join("transforms.json"));
+        for part in ["transforms.json", POINTS] {
+            let file = o.out.join(part);
+            if file.exists() {
+                std::fs::remove_file(&file).map_err(DataError::io(&file, "remove"))?;
+            }
+        }
     }
-    for folder in [o.out.join(IMAGES), o.out.join(WORK)] {
+    for folder in [o.out.join(IMAGES), work] {
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
-    Ok(())
+    Ok(lock)
 }
 
 /// Whether all photographs have as many pixels.
@@ -214,25 +326,29 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
     let folder = o.out.join(IMAGES);
     let mut focal_ratio = None;
     if o.input.is_dir() {
-        let all: Vec<PathBuf> = photo_import::list(&o.input)?.into_iter().step_by(o.every).collect();
+        let all = photo_import::list(&o.input).map_err(|e| match import::detect(&o.input) {
+            Ok(_) => DataError::input(&o.input, "has poses already: train on it as it is, or finish its photographs with --sfm none"),
+            Err(_) => e,
+        })?;
+        let all: Vec<PathBuf> = all.into_iter().step_by(o.every).collect();
         focal_ratio = common_focal_ratio(&all);
-        let mut stems = HashSet::new();
-        for (i, source) in all.iter().enumerate() {
+        let stems = stems(&all);
+        for (i, (source, stem)) in all.iter().zip(&stems).enumerate() {
             if interrupt.load(Ordering::Relaxed) {
                 return Ok(false);
             }
-            let own = source.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            let stem = if stems.contains(&own) { format!("{own}_{i}") } else { own };
-            stems.insert(stem.clone());
-            photo_import::import(source, &folder, &stem, o.max_side)?;
+            photo_import::import(source, &folder, stem, o.max_side)?;
             note(&format!("photographs: {} of {}", i + 1, all.len()));
         }
     } else {
         note("choosing sharp frames of the video");
-        let Some((all, taken)) = video::extract(&o.input, &folder, o.choice, &work.join("ffmpeg.log"), interrupt)? else {
+        let Some(made) = video::extract(&video::ffmpeg()?, &o.input, &folder, o.choice, &work.join("ffmpeg.log"), interrupt)? else {
             return Ok(false);
         };
-        note(&format!("frames: {taken} of {all} taken"));
+        note(&format!("frames: {} of {} taken", made.taken, made.frames));
+        if let Some(fault) = made.fault {
+            note(&format!("the video can be decoded in part only, the rest is missing: {fault}"));
+        }
         if o.max_side < u32::MAX {
             for file in photo_import::list(&folder)? {
                 let stem = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -243,6 +359,18 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
     let kept = focal_ratio.map(|f| f.to_string()).unwrap_or_default();
     atomic::write(&work.join(IMAGES_DONE), kept.as_bytes())?;
     Ok(true)
+}
+
+/// Names for files, each its own.
+fn stems(files: &[PathBuf]) -> Vec<String> {
+    let mut taken = HashSet::new();
+    let stem = |(i, f): (usize, &PathBuf)| {
+        let own = f.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let stem = if taken.contains(&own) { format!("{own}_{i}") } else { own };
+        taken.insert(stem.clone());
+        stem
+    };
+    files.iter().enumerate().map(stem).collect()
 }
 
 fn enough(o: &PrepareOptions, names: &[String], lost: &[String]) -> Result<()> {

@@ -173,7 +173,7 @@ mod tests {
                 } else {
                     DVec3::new(0.5 * u(3 * i), 0.5 * u(3 * i + 1), 0.5 * u(3 * i + 2))
                 };
-                Point { id: 0, position: s.point(p), rgb: [9; 3], images: 4 }
+                Point { id: 0, position: s.point(p), rgb: [9; 3], error: 0.5, images: 4 }
             })
             .collect();
         (frames, points)

@@ -92,6 +92,11 @@ impl Subject {
         Subject { points: points.iter().filter(|p| p.2 >= 3).map(|p| (p.0, (p.1, own.contains(&p.0)))).collect() }
     }
 
+    /// Whether a point is the thing's.
+    pub fn is_own(&self, id: u64) -> bool {
+        self.points.get(&id).is_some_and(|p| p.1)
+    }
+
     /// Points that are the thing's.
     pub fn size(&self) -> usize {
         self.points.values().filter(|p| p.1).count()

@@ -12,9 +12,9 @@ mod select;
 
 use crate::error::{PipelineError, Result};
 use background::{Background, Subject};
-use diorama_data::colmap::{self, Point};
-use diorama_data::{DataError, photo, photo_import};
-use diorama_geom::capture::Frame;
+use diorama_data::colmap::Observed;
+use diorama_data::{DataError, masks, photo, photo_import};
+use diorama_geom::capture::{Frame, MaskRule};
 use diorama_geom::glam::DVec3;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -59,7 +59,7 @@ pub struct Finish {
 
 impl Finish {
     /// Whether pixels change.
-    fn touches_pixels(&self) -> bool {
+    pub fn touches_pixels(&self) -> bool {
         self.crop.is_some() || self.denoise || self.normalize_exposure || self.background != Background::Keep
     }
 }
@@ -79,15 +79,20 @@ pub struct Finished {
 
 /// Name of the folder of finished photographs within the data set.
 pub const FINISHED: &str = "finished";
+/// Folder of their masks in it, where these are cut with them.
+const MASKS: &str = "masks";
 /// Where they are made.
 const PARTIAL: &str = "finished.partial";
 
-/// What structure from motion found.
-pub struct Found<'a> {
-    /// Folder of COLMAP's model.
-    pub model: &'a Path,
-    /// Its points with their places in the upright world.
-    pub points: Vec<(Point, DVec3)>,
+/// Points by which photographs are compared and things told from their surroundings.
+#[derive(Default)]
+pub struct Found {
+    /// Where points appear, by the photograph's file name.
+    pub observed: HashMap<String, Observed>,
+    /// Numbers, places in the world of the frames that are finished, and how many photographs show them.
+    pub points: Vec<(u64, DVec3, usize)>,
+    /// Whether `observed` holds what photographs show, rather than all that lies in their direction.
+    pub is_visibility_known: bool,
 }
 
 /// Takes what [`finish`] has made in place of what an earlier call made, or removes that.
@@ -139,12 +144,14 @@ pub fn finish(
         return Ok(Some(made));
     }
     std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
-    let observed: HashMap<String, colmap::Observed> =
-        colmap::observations(found.model)?.into_iter().map(|v| (v.image.clone(), v)).collect();
+    if o.crop.is_some() && frames.iter().any(|f| f.mask.is_some()) {
+        let masks = folder.join(MASKS);
+        std::fs::create_dir_all(&masks).map_err(DataError::io(&masks, "create"))?;
+    }
     let name = |f: &Frame| f.image.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let gains = o.normalize_exposure.then(|| {
         note("comparing exposures");
-        let of = |f: &Frame| match observed.get(&name(f)) {
+        let of = |f: &Frame| match found.observed.get(&name(f)) {
             Some(seen) => Ok(exposure::colors(&photo::load(&f.image)?, seen)),
             None => Ok(Vec::new()),
         };
@@ -162,7 +169,7 @@ pub fn finish(
             exposure::apply(&mut image, g[i]);
         }
         // A mask is made of what the camera saw, before its noise is gone.
-        let alpha = remover.alpha(&image, f, observed.get(&name(f)))?;
+        let alpha = remover.alpha(&image, f, found)?;
         let sigma = if o.denoise { denoise::noise(&image) } else { 0.0 };
         image = denoise::denoise(&image, sigma);
         let mut share = 1.0;
@@ -171,10 +178,17 @@ pub fn finish(
             image = background::with_alpha(&image, &alpha);
         }
         let mut f = f.clone();
+        let stem = f.image.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         if let Some(crop) = o.crop {
+            let mask = masks::of_frame(&f, &MaskRule::default(), (image.width, image.height))?;
+            if let Some(mask) = mask {
+                let cut = crop_to(crop, mask, &mut f.clone())?;
+                let written = folder.join(MASKS).join(format!("{stem}.png"));
+                photo::save_png(&written, &cut)?;
+                f.mask = Some(root.join(FINISHED).join(MASKS).join(written.file_name().unwrap_or_default()));
+            }
             image = crop_to(crop, image, &mut f)?;
         }
-        let stem = f.image.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let written = photo_import::write(&image, &folder, &stem)?;
         f.image = root.join(FINISHED).join(written.file_name().unwrap_or_default());
         Ok((f, sigma, share))
@@ -211,8 +225,7 @@ impl Remover {
         match how {
             Background::Keep => Ok(Remover::None),
             Background::Auto => {
-                let places: Vec<(u64, DVec3, usize)> = found.points.iter().map(|(p, at)| (p.id, *at, p.images)).collect();
-                let subject = Subject::find(frames, &places);
+                let subject = Subject::find(frames, &found.points);
                 if subject.size() < FEWEST_POINTS {
                     return Err(PipelineError::Usage(format!(
                         "--remove-background auto: only {} points belong to what the cameras look at, {FEWEST_POINTS} are needed; \
@@ -232,10 +245,18 @@ impl Remover {
         }
     }
 
-    fn alpha(&self, image: &diorama_geom::ImageU8, frame: &Frame, observed: Option<&colmap::Observed>) -> Result<Option<Vec<u8>>> {
+    fn alpha(&self, image: &diorama_geom::ImageU8, frame: &Frame, found: &Found) -> Result<Option<Vec<u8>>> {
         match self {
             Remover::None => Ok(None),
-            Remover::Points(subject) => Ok(Some(subject.alpha(image, frame, observed))),
+            Remover::Points(subject) => {
+                let name = frame.image.file_name().unwrap_or_default().to_string_lossy();
+                let mut observed = found.observed.get(&*name).cloned();
+                if let (false, Some(o)) = (found.is_visibility_known, &mut observed) {
+                    // What lies behind the thing is not seen; the thing's own points lie within its outline in any case.
+                    o.points.retain(|p| subject.is_own(p.1));
+                }
+                Ok(Some(subject.alpha(image, frame, observed.as_ref())))
+            }
             #[cfg(feature = "onnx")]
             Remover::Network(network) => network.alpha(image).map(Some),
         }

@@ -1,0 +1,84 @@
+//! Exported meshes in the hands of readers that this project did not write: Khronos' glTF validator, trimesh, usd-core, pycollada
+//! (`benches/readers.sh` installs them, `DIORAMA_READERS` names their folder).
+
+use diorama_pipelines::object::quickstart::write_capture;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// The folder of readers; without it a line that says that the test was skipped, or with `DIORAMA_REQUIRE_READERS` a failure.
+fn readers() -> Option<PathBuf> {
+    let default = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../target/readers");
+    let folder = std::env::var_os("DIORAMA_READERS").map_or(default, PathBuf::from);
+    let missing = ["venv/bin/python", "node_modules/gltf-validator"].into_iter().find(|p| !folder.join(p).exists());
+    if let Some(missing) = missing {
+        let what = format!("{} is not there; run benches/readers.sh", folder.join(missing).display());
+        assert!(std::env::var_os("DIORAMA_REQUIRE_READERS").is_none(), "{what}");
+        println!("skipped: {what}");
+        return None;
+    }
+    Some(folder)
+}
+
+#[track_caller]
+fn works(c: &mut Command) -> String {
+    let o = c.output().unwrap();
+    let text = format!("{}{}", String::from_utf8_lossy(&o.stdout), String::from_utf8_lossy(&o.stderr));
+    assert!(o.status.success(), "{c:?}: {text}");
+    text
+}
+
+fn diorama(arguments: &[&str]) {
+    works(Command::new(env!("CARGO_BIN_EXE_diorama")).args(arguments));
+}
+
+/// Prints the validator's counts as JSON; fails where there are errors or warnings.
+const VALIDATE: &str = "
+const report = (r) => { console.log(JSON.stringify(r.issues)); process.exit(r.issues.numErrors + r.issues.numWarnings ? 1 : 0) };
+const bytes = new Uint8Array(require('fs').readFileSync(process.argv[1]));
+require('gltf-validator').validateBytes(bytes).then(report, (e) => { console.error(e); process.exit(1) });
+";
+
+#[test]
+fn every_export_is_read_by_foreign_readers() {
+    let Some(readers) = readers() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let (capture, run) = (dir.path().join("capture"), dir.path().join("run"));
+    write_capture(&capture, 24, 64).unwrap();
+    let (capture, run) = (capture.to_str().unwrap(), run.to_str().unwrap());
+    let small = ["--set", "field.log2_size=14", "--set", "field.finest=256"];
+    diorama(&[&["train", capture, "-o", run, "--steps", "250", "--device", "cpu"], &small[..]].concat());
+    let export = |file: &Path, more: &[&str]| {
+        let all = ["export", run, "-o", file.to_str().unwrap(), "--resolution", "64", "--faces", "2000", "--device", "cpu", "--force"];
+        diorama(&[&all[..], more].concat());
+    };
+    let stem = dir.path().join("mesh");
+    for format in ["glb", "obj", "usdz", "dae"] {
+        export(&stem.with_extension(format), &["--texture", "128"]);
+    }
+    for format in ["ply", "stl"] {
+        export(&stem.with_extension(format), &[]);
+    }
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../benches/formats.py");
+    println!("{}", works(Command::new(readers.join("venv/bin/python")).arg(&script).arg(&stem)));
+    let (lit, plain) = (dir.path().join("lit.glb"), dir.path().join("plain.glb"));
+    export(&lit, &["--texture", "128", "--normal-map"]);
+    export(&plain, &["--texture", "0"]);
+    let validate = |file: &Path| {
+        let mut c = Command::new("node");
+        c.env("NODE_PATH", readers.join("node_modules")).arg("-e").arg(VALIDATE).arg(file);
+        c
+    };
+    for file in [&stem.with_extension("glb"), &lit, &plain] {
+        println!("{}: {}", file.display(), works(&mut validate(file)));
+    }
+    // Readers that take anything would show nothing: a face that names a vertex which is not there, and a file cut off.
+    let mut damaged = std::fs::read(&plain).unwrap();
+    let last = damaged.len() - 1;
+    damaged[last - 8..].fill(0xff);
+    std::fs::write(&plain, &damaged).unwrap();
+    assert!(!validate(&plain).output().unwrap().status.success());
+    let obj = stem.with_extension("obj");
+    let text = std::fs::read(&obj).unwrap();
+    std::fs::write(&obj, &text[..text.len() / 3]).unwrap();
+    assert!(!Command::new(readers.join("venv/bin/python")).arg(&script).arg(&stem).output().unwrap().status.success());
+}
