@@ -1,6 +1,6 @@
 //! `diorama export`
 
-use super::{Outcome, clip_or_crop, use_threads};
+use super::{Outcome, clip_or_crop, note, use_threads};
 use crate::arguments::ExportArgs;
 use diorama_data::{DataError, mesh_text};
 use diorama_pipelines::object::device;
@@ -25,7 +25,7 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
     let (size, unit_m) =
         (size(a)?, unit(&a.units).ok_or_else(|| PipelineError::Usage(format!("--units {}: expected m, cm, mm or in", a.units)))?);
     let (mut model, notes) = run_folder::load_model(&a.run)?;
-    notes.iter().for_each(|n| eprintln!("note: {n}"));
+    notes.iter().for_each(|n| note(n));
     let scale = model.capture.world_from_capture.scale as f32;
     let level = match &a.level[..] {
         "auto" => None,
@@ -39,7 +39,7 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
         ),
     };
     let clip = clip_or_crop(a.clip.as_deref(), "auto", &a.run, &model)?;
-    device::accelerate(&mut model, &a.device)?;
+    device::accelerate(&mut model, &a.device, Box::new(note))?;
     let options = ExportOptions {
         format,
         out: a.out.clone(),
@@ -56,7 +56,7 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
         floaters: a.floaters,
     };
     let mut last = Instant::now();
-    let made = export::export(&model, &options, &mut |stage, i, n| {
+    let made = export::export(&model, &options, &mut note, &mut |stage, i, n| {
         if last.elapsed().as_secs() >= 5 {
             last = Instant::now();
             eprintln!("{stage}: {} %", i * 100 / n.max(1));

@@ -1,6 +1,7 @@
 //! Everything that a run depends on, as written to `config.toml`.
 
 use crate::error::{PipelineError, Result};
+use diorama_geom::Reduction;
 use diorama_kernels::device::Api;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -55,6 +56,9 @@ pub struct DataConfig {
     /// `transforms`, `blender`, `colmap` or `llff`; empty: whichever is there.
     pub format: String,
     pub downscale: u32,
+    /// Reduce the photographs until their shortest side has so many pixels; 0: `downscale` times.
+    #[serde(default)]
+    pub shortest_side: u32,
     pub split: String,
     /// Bytes that pixels may take; beyond that one of each small square is kept.
     pub memory_budget: u64,
@@ -154,7 +158,7 @@ pub struct RunConfig {
     pub save_every_seconds: f64,
     /// 0: by time alone.
     pub save_every_steps: u64,
-    /// Judge held-out views each time so many steps are done; 0: never.
+    /// Judge held-out pixels each time so many steps are done; 0: every ten seconds, within 3 % of the time.
     pub evaluate_every: u64,
 }
 
@@ -194,6 +198,7 @@ impl Config {
                 path,
                 format: String::new(),
                 downscale: 1,
+                shortest_side: 0,
                 split: "file".into(),
                 memory_budget: diorama_data::pixel_store::DEFAULT_BUDGET,
             },
@@ -240,6 +245,14 @@ impl Config {
         }
     }
 
+    /// How much smaller than the photographs the run's images are.
+    pub fn reduction(&self) -> Reduction {
+        match self.data.shortest_side {
+            0 => Reduction::Times(self.data.downscale),
+            side => Reduction::ShortestSide(side),
+        }
+    }
+
     /// Overrides one value, named by its path, for example `loss.distortion`.
     ///
     /// # Errors
@@ -282,12 +295,23 @@ impl Config {
         toml::to_string(self).expect("a configuration is a table")
     }
 
+    /// All keys with their values as text, in order.
+    pub fn values(&self) -> Vec<(String, String)> {
+        let table = toml::Value::try_from(self).expect("a configuration is a table");
+        let of = |key: String| {
+            let value = key.split('.').fold(&table, |at, part| &at[part]);
+            let text = value.as_str().map_or_else(|| value.to_string(), str::to_string);
+            (key, text)
+        };
+        keys(&table, "").into_iter().map(of).collect()
+    }
+
     /// Values that make no sense together or alone.
     pub fn check(&self) -> Result<()> {
         let fail = |m: &str| Err(PipelineError::Usage(m.to_string()));
         let f = &self.field;
-        if ![1, 2, 4, 8].contains(&f.features) || f.levels == 0 || f.base == 0 || !(4..=24).contains(&f.log2_size) {
-            return fail("field: features must be 1, 2, 4 or 8, levels and base at least 1, log2_size 4 to 24");
+        if ![1, 2, 4, 8].contains(&f.features) || !(1..=64).contains(&f.levels) || f.base == 0 || !(4..=24).contains(&f.log2_size) {
+            return fail("field: features must be 1, 2, 4 or 8, levels 1 to 64, base at least 1, log2_size 4 to 24");
         }
         if !["auto", "f32"].contains(&&f.precision[..]) {
             return fail("field.precision: expected auto or f32");
@@ -307,6 +331,9 @@ impl Config {
         }
         if self.data.downscale == 0 || self.run.log_every == 0 {
             return fail("data.downscale and run.log_every: at least 1");
+        }
+        if self.data.shortest_side > 0 && self.data.downscale > 1 {
+            return fail("data.shortest_side and data.downscale: give one of them");
         }
         if self.field.appearance > 0 && matches!(self.method, Method::Mlp | Method::Baseline) {
             return fail("field.appearance: only ngp and nerf have a view-dependent part that takes an appearance code");

@@ -1,19 +1,15 @@
 //! Scores on held-out views: full images, in the photographs' own distorted pixels.
 
+use super::fog::{self, Surfaces};
+use super::held_out::{self, GAP_DB, GAP_MEANS};
 use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
 use diorama_data::photo;
 use diorama_engine::metrics::{self, Scores};
 use diorama_engine::renderers::volume::{Quality, View};
 use diorama_geom::capture::Split;
-use diorama_geom::{Capture, Image, ImageU8};
+use diorama_geom::{Image, ImageU8};
 use serde::Serialize;
-
-/// Frames of a split; held-out ones fall back to validation where there is no test split.
-pub fn held_out(capture: &Capture, split: Split) -> Vec<usize> {
-    let frames = capture.indices(split);
-    if frames.is_empty() && split == Split::Test { capture.indices(Split::Val) } else { frames }
-}
 
 /// One view's render and scores.
 pub struct ScoredView {
@@ -30,7 +26,20 @@ pub struct ViewScore {
     pub ssim: f64,
     pub mse: f64,
     pub psnr_affine: f64,
+    /// Whether the view lies behind fog ([`super::fog`]); false where that is not asked.
+    pub behind_fog: bool,
 }
+
+/// Training views, for comparison.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct TrainingScores {
+    pub views: usize,
+    pub psnr: f64,
+    pub ssim: f64,
+}
+
+/// Most training views that are judged beside held-out ones.
+const TRAINING_VIEWS: usize = 8;
 
 /// Means over all views.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -46,13 +55,35 @@ pub struct Report {
     pub psnr_mean_image: Option<f64>,
     /// Needs weights that are not part of this program.
     pub lpips: Option<f64>,
+    /// Some training views, where they were asked for.
+    pub training: Option<TrainingScores>,
+    /// What drew the views.
+    pub device: String,
     pub per_view: Vec<ViewScore>,
+}
+
+impl Report {
+    /// How far held-out views are below training views, in dB.
+    pub fn gap(&self) -> Option<f64> {
+        self.training.as_ref().map(|t| t.psnr - self.psnr)
+    }
+
+    /// What a gap that is too large means, and what helps.
+    pub fn advice(&self) -> Option<String> {
+        let gap = self.gap().filter(|g| *g > GAP_DB)?;
+        Some(format!("held-out views are {gap:.1} dB below training views: {GAP_MEANS}"))
+    }
+
+    /// Names of the views behind fog.
+    pub fn behind_fog(&self) -> Vec<&str> {
+        self.per_view.iter().filter(|v| v.behind_fog).map(|v| &v.name[..]).collect()
+    }
 }
 
 /// A photograph at the run's resolution, transparent pixels on the model's backdrop.
 pub fn reference_photo(model: &ObjectModel, full: &ImageU8) -> Image {
-    let d = model.config.data.downscale as usize;
-    let small = full.downsampled((full.width / d).max(1), (full.height / d).max(1));
+    let (width, height) = model.config.reduction().size((full.width as u32, full.height as u32));
+    let small = full.downsampled(width as usize, height as usize);
     let back = model.backdrop_color();
     let mut out = Image::zeros(small.width, small.height, 3);
     for (o, p) in out.data.chunks_exact_mut(3).zip(small.data.chunks_exact(small.channels)) {
@@ -65,15 +96,47 @@ pub fn reference_photo(model: &ObjectModel, full: &ImageU8) -> Image {
 }
 
 /// Renders frame `i` and scores it against `full`, its photograph at full size.
-pub fn score_view(model: &ObjectModel, i: usize, full: &ImageU8, quality: Quality) -> ScoredView {
+///
+/// # Errors
+/// When its mask cannot be read, or the device that was named failed.
+pub fn score_view(model: &ObjectModel, i: usize, full: &ImageU8, quality: Quality) -> Result<ScoredView> {
     let photo = reference_photo(model, full);
+    let mask = model.capture.frames[i].mask.as_ref().map(|m| photo::load_mask(m)).transpose()?;
+    let mask = mask.map(|m| m.downsampled(photo.width, photo.height));
     let view = model.tracer(quality).view(&model.posed(i), &mut |_| {});
-    let mask =
-        model.capture.frames[i].mask.as_ref().and_then(|m| photo::load_mask(m).ok()).map(|m| m.downsampled(photo.width, photo.height));
+    model.check_device()?;
     let mut shown = view.rgb.clone();
     shown.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     let scores = metrics::compare(&shown, &photo, |x, y| mask.as_ref().is_none_or(|m| m.pixel(x, y)[0] >= 128));
-    ScoredView { view, photo, scores }
+    Ok(ScoredView { view, photo, scores })
+}
+
+/// Scores all views of a split, and some training views beside them; tells which lie behind fog. `each` sees every view of
+/// the split as it is done.
+pub fn evaluate_with_training(
+    model: &ObjectModel,
+    split: Split,
+    quality: Quality,
+    each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
+) -> Result<Report> {
+    let mut report = evaluate(model, split, quality, each)?;
+    if split == Split::Train {
+        return Ok(report);
+    }
+    let mut scores = Vec::new();
+    for i in held_out::spread(&model.train, TRAINING_VIEWS.min(report.views)) {
+        scores.push(score_view(model, i, &photo::load(&model.capture.frames[i].image)?, quality)?.scores);
+    }
+    let mean = |f: fn(&Scores) -> f64| scores.iter().map(f).sum::<f64>() / scores.len().max(1) as f64;
+    let training = TrainingScores { views: scores.len(), psnr: mean(|s| s.psnr), ssim: mean(|s| s.ssim) };
+    let middle = fog::median(scores.iter().map(|s| s.psnr).collect()).unwrap_or(training.psnr);
+    let surfaces = Surfaces::of(model);
+    for (v, i) in report.per_view.iter_mut().zip(held_out::frames(&model.capture, split)) {
+        v.behind_fog = fog::is_behind(v.psnr, middle, surfaces.near_share(model, i));
+    }
+    model.check_device()?;
+    report.training = Some(training);
+    Ok(report)
 }
 
 /// Scores all views of a split; `each` sees every view as it is done.
@@ -83,7 +146,7 @@ pub fn evaluate(
     quality: Quality,
     each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
 ) -> Result<Report> {
-    let frames = held_out(&model.capture, split);
+    let frames = held_out::frames(&model.capture, split);
     if frames.is_empty() {
         return Err(PipelineError::Usage("the run holds no views out; train with --split every:8 or judge --on train".into()));
     }
@@ -92,13 +155,20 @@ pub fn evaluate(
     for i in frames {
         let frame = &model.capture.frames[i];
         let full = photo::load(&frame.image)?;
-        let scored = score_view(model, i, &full, quality);
+        let scored = score_view(model, i, &full, quality)?;
         if let Some(mean) = mean.as_ref().filter(|m| (m.width, m.height) == (scored.photo.width, scored.photo.height)) {
             mean_scores.push(metrics::compare(mean, &scored.photo, |_, _| true).psnr);
         }
         each(&frame.name, &scored)?;
         let s = scored.scores;
-        per_view.push(ViewScore { name: frame.name.clone(), psnr: s.psnr, ssim: s.ssim, mse: s.mse, psnr_affine: s.psnr_affine });
+        per_view.push(ViewScore {
+            name: frame.name.clone(),
+            psnr: s.psnr,
+            ssim: s.ssim,
+            mse: s.mse,
+            psnr_affine: s.psnr_affine,
+            behind_fog: false,
+        });
     }
     let n = per_view.len() as f64;
     let average = |f: fn(&ViewScore) -> f64| per_view.iter().map(f).sum::<f64>() / n;
@@ -111,6 +181,8 @@ pub fn evaluate(
         psnr_affine: average(|v| v.psnr_affine),
         psnr_mean_image: (!mean_scores.is_empty()).then(|| mean_scores.iter().sum::<f64>() / mean_scores.len() as f64),
         lpips: None,
+        training: None,
+        device: model.drew_on(),
         per_view,
     })
 }

@@ -1,7 +1,8 @@
 //! What a capture is of: the box that a mesh is taken from when nobody says which.
 
 use super::model::ObjectModel;
-use diorama_engine::renderers::volume::Quality;
+use diorama_engine::renderers::volume::{Quality, Tracer};
+use diorama_geom::Frame;
 use diorama_geom::glam::DVec3;
 
 /// Most cameras that are asked, and pixels along the longer side of their views.
@@ -44,25 +45,27 @@ pub fn of(model: &ObjectModel) -> ([f32; 3], [f32; 3]) {
     narrow((lo, hi))
 }
 
+/// Points in the world of the surfaces that a frame's camera sees, in a view of `longest` pixels along its longer side.
+pub fn surface_points(model: &ObjectModel, tracer: &Tracer, f: &Frame, longest: u32) -> Vec<DVec3> {
+    let c = &f.camera;
+    let shrink = longest as f64 / c.width.max(c.height) as f64;
+    let small = c.resized(((c.width as f64 * shrink) as u32).max(1), ((c.height as f64 * shrink) as u32).max(1));
+    let posed = model.to_model(small, &f.world_from_camera);
+    let view = tracer.view(&posed, &mut |_| {});
+    let world_from_model = model.model_from_world.inverse();
+    let point = |i: usize| {
+        let along = posed.camera.direction((i % small.width as usize) as f64 + 0.5, (i / small.width as usize) as f64 + 0.5);
+        world_from_model.point(posed.pose.point(along * view.depth.data[i] as f64))
+    };
+    (0..view.depth.data.len()).filter(|i| view.opacity.data[*i] > 0.5).map(point).collect()
+}
+
 /// Points of surfaces in small views from the training cameras that many of the cameras look at.
 fn seen_points(model: &ObjectModel) -> Vec<DVec3> {
     let n = model.train.len();
     let frames: Vec<_> = (0..n.min(CAMERAS)).map(|i| &model.capture.frames[model.train[i * n / n.min(CAMERAS)]]).collect();
     let tracer = model.tracer(Quality::Fast);
-    let world_from_model = model.model_from_world.inverse();
-    let mut points = Vec::new();
-    for f in &frames {
-        let c = &f.camera;
-        let shrink = VIEW_PX as f64 / c.width.max(c.height) as f64;
-        let small = c.resized(((c.width as f64 * shrink) as u32).max(1), ((c.height as f64 * shrink) as u32).max(1));
-        let posed = model.to_model(small, &f.world_from_camera);
-        let view = tracer.view(&posed, &mut |_| {});
-        for (i, d) in view.depth.data.iter().enumerate().filter(|(i, _)| view.opacity.data[*i] > 0.5) {
-            let w = small.width as usize;
-            let along = posed.camera.direction((i % w) as f64 + 0.5, (i / w) as f64 + 0.5);
-            points.push(world_from_model.point(posed.pose.point(along * *d as f64)));
-        }
-    }
+    let mut points: Vec<DVec3> = frames.iter().flat_map(|f| surface_points(model, &tracer, f, VIEW_PX)).collect();
     let counts: Vec<usize> = points
         .iter()
         .map(|p| {
