@@ -66,7 +66,12 @@ fn every_method_trains_renders_and_exports_there() {
         let told = String::from_utf8_lossy(&out.stderr).into_owned();
         assert!(out.status.success(), "{method}: {told}");
         assert_eq!(told.contains("one pixel of each"), method == "ngp", "{told}");
-        let scores = |device: &str| json(diorama(&["eval", run, "--device", device, "--json"]))["psnr"].as_f64().unwrap();
+        let scores = |device: &str| {
+            let report = json(diorama(&["eval", run, "--device", device, "--json"]));
+            let drew = report["device"].as_str().unwrap();
+            assert!(if device == "cpu" { drew == "cpu" } else { drew.ends_with(&format!("({device})")) }, "{device}: {drew} drew");
+            report["psnr"].as_f64().unwrap()
+        };
         let (there, here) = (scores(&device), scores("cpu"));
         assert!((there - here).abs() < 0.02, "{method}: {there} dB there, {here} dB here");
         // The CPU goes on from all of it: parameters, corrections, errors.

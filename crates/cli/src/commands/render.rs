@@ -52,10 +52,10 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
     // Of a film that was interrupted there are the frames so far; before the first there is none.
     let (images, video) = (images.filter(|_| frames > 0), a.video.clone().filter(|_| frames > 0));
     if interrupted {
-        eprintln!(
-            "interrupted: {}",
-            if frames > 0 { format!("what is there has the first {frames} frames") } else { "nothing was written".into() }
-        );
+        match frames {
+            0 => eprintln!("interrupted before the first frame: nothing was written"),
+            n => eprintln!("interrupted: what was written ends with frame {n}"),
+        }
     }
     if a.json {
         println!(

@@ -14,9 +14,9 @@ pub struct Scores {
     pub psnr_affine: f64,
 }
 
-/// Decibels of a mean squared error of values in [0, 1].
+/// Decibels of a mean squared error of values in [0, 1]; of what is no number, none.
 pub fn psnr(mse: f64) -> f64 {
-    -10.0 * mse.max(1e-12).log10()
+    if mse.is_nan() { mse } else { -10.0 * mse.max(1e-12).log10() }
 }
 
 /// Compares images of equal size, 3 channels, over the pixels that `counts` admits (SSIM over all).
@@ -64,6 +64,11 @@ fn affine_fit(points: impl Iterator<Item = (f64, f64)>) -> (f64, f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_error_that_is_no_number_is_no_perfect_score() {
+        assert!(psnr(f64::NAN).is_nan() && (psnr(0.01) - 20.0).abs() < 1e-9);
+    }
 
     #[test]
     fn affine_scores_forgive_exposure_and_nothing_else() {

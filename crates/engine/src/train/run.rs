@@ -108,14 +108,14 @@ pub fn run<T: Trainee>(
             if since.steps > 0 {
                 since.end(&mut summary, (step, clock.seconds(), 1.0), (rays, samples), events);
             }
+            if !trainee.save(step, clock.seconds()).map_err(RunError::Failed)? {
+                step = go_back(trainee, step, &mut fault, events)?;
+                continue;
+            }
             if !summary.interrupted && judging.is_worth_it(step, seconds, rays) {
                 judging.judge(trainee, step, &clock, &mut summary, events)?;
             }
-            if trainee.save(step, clock.seconds()).map_err(RunError::Failed)? {
-                break;
-            }
-            step = go_back(trainee, step, &mut fault, events)?;
-            continue;
+            break;
         }
         let report = trainee.step(step, progress).map_err(RunError::Failed)?;
         if !report.loss.is_finite() {

@@ -47,3 +47,60 @@ pub fn write(path: &Path, summary: &Summary, device: &str, scores: &Report, mesh
     );
     Ok(atomic::write(path, html.as_bytes())?)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::object::evaluate::{TrainingScores, ViewScore};
+
+    fn page(device: &str, held_out: f64) -> String {
+        let dir = tempfile::tempdir().unwrap();
+        let file = dir.path().join("report.html");
+        let summary = Summary { step: 9, seconds: 1.0, rays: 1, samples: 1, loss: 0.1, psnr: 30.0, held_out: None, interrupted: false };
+        let view = |name: &str, psnr: f64, behind_fog: bool| ViewScore {
+            name: name.into(),
+            psnr,
+            ssim: 0.9,
+            mse: 0.001,
+            psnr_affine: psnr,
+            behind_fog,
+        };
+        let scores = Report {
+            views: 2,
+            psnr: held_out,
+            ssim: 0.9,
+            mse: 0.001,
+            psnr_min: held_out,
+            psnr_affine: held_out,
+            psnr_mean_image: None,
+            lpips: None,
+            training: Some(TrainingScores { views: 2, psnr: 30.0, ssim: 0.9 }),
+            device: "cpu".into(),
+            per_view: vec![view("clear", 29.0, false), view("foggy", 20.0, true)],
+        };
+        let mesh = Exported {
+            file: "a.glb".into(),
+            vertices: 3,
+            faces: 1,
+            bytes: 9,
+            seconds: 1.0,
+            watertight: false,
+            level: 1.0,
+            texture: 0,
+            extent_m: [1.0; 3],
+            scale: 1.0,
+        };
+        write(&file, &summary, device, &scores, &mesh, true).unwrap();
+        std::fs::read_to_string(file).unwrap()
+    }
+
+    #[test]
+    fn it_says_what_trained_and_marks_views_behind_fog() {
+        let (cpu, gpu) = (page("cpu", 29.0), page("NVIDIA H100 (cuda)", 24.5));
+        assert!(cpu.contains("on the CPU:") && !cpu.contains("below training views"));
+        assert!(gpu.contains("on NVIDIA H100 (cuda):") && !gpu.contains("the CPU"));
+        assert!(gpu.contains("5.5 dB below training views") && gpu.contains("fog"));
+        let row = |name: &str| cpu.lines().find(|l| l.contains(name)).unwrap().contains("behind fog");
+        assert!(row("foggy") && !row("clear"));
+    }
+}

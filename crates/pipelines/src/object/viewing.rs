@@ -128,7 +128,8 @@ fn read_path(run: &Path, world_from_capture: &Similarity) -> Result<Option<Strin
     let wrong = |e: String| DataError::input(&file, format!("{e}; save the path in the viewer again or remove the file"));
     let bytes = diorama_data::error::read(&file, 1 << 26)?;
     let text = String::from_utf8(bytes).map_err(|_| wrong("is not UTF-8 text".into()))?;
-    camera_path_json::moved(&text, &file, world_from_capture).map(Some).map_err(|e| match e {
+    let path = camera_path_json::read(&file, world_from_capture).and_then(|_| camera_path_json::moved(&text, &file, world_from_capture));
+    path.map(Some).map_err(|e| match e {
         DataError::Input { message, .. } => wrong(message).into(),
         e => e.into(),
     })
