@@ -300,7 +300,12 @@ impl Config {
         let table = toml::Value::try_from(self).expect("a configuration is a table");
         let of = |key: String| {
             let value = key.split('.').fold(&table, |at, part| &at[part]);
-            let text = value.as_str().map_or_else(|| value.to_string(), str::to_string);
+            let text = match value {
+                toml::Value::String(s) => s.clone(),
+                // As they were given, not as f64 has what f32 holds.
+                toml::Value::Float(f) if *f as f32 as f64 == *f => (*f as f32).to_string(),
+                v => v.to_string(),
+            };
             (key, text)
         };
         keys(&table, "").into_iter().map(of).collect()

@@ -203,7 +203,7 @@ impl Opened {
 const MOST_RAYS: usize = 1 << 14;
 
 /// Samples per step; fewer through networks whose layers' outputs all lie in memory.
-fn batch_samples(config: &Config, is_gpu: bool) -> usize {
+pub(super) fn batch_samples(config: &Config, is_gpu: bool) -> usize {
     match config.sampling.batch_samples {
         0 if is_gpu && config.method == Method::Ngp => 1 << 18,
         0 if is_gpu => 1 << 17,

@@ -2,6 +2,7 @@
 //! is certain counts, so that nothing is refused that would fit.
 
 use super::config::{Config, Method};
+use super::device;
 use super::export::ExportOptions;
 use super::model::{self, ObjectModel};
 use crate::error::{PipelineError, Result};
@@ -57,8 +58,8 @@ pub fn size(bytes: u64) -> String {
     if mib < 1024.0 { format!("{mib:.0} MiB") } else { format!("{:.1} GiB", mib / 1024.0) }
 }
 
-/// What training a configuration on a capture takes.
-pub fn of_training(config: &Config, capture: &Capture) -> Needs {
+/// What training a configuration on a capture takes, with so many samples in a step.
+pub fn of_training(config: &Config, capture: &Capture, samples: usize) -> Needs {
     let train = capture.indices(Split::Train);
     let (mut pixels, mut masks, mut largest) = (0u64, 0u64, 0u64);
     for f in train.iter().map(|&i| &capture.frames[i]) {
@@ -68,7 +69,7 @@ pub fn of_training(config: &Config, capture: &Capture) -> Needs {
         largest = largest.max(f.camera.width as u64 * f.camera.height as u64);
     }
     let kept = (pixels * 4).min(config.data.memory_budget);
-    let masks = masks * kept / (pixels * 4).max(1);
+    let masks = (masks as f64 * kept as f64 / (pixels * 4).max(1) as f64) as u64;
     let at_once = (2 * rayon::current_num_threads()).min(train.len()) as u64;
     // Values, gradients and two moments; a checkpoint copies all but the gradients while it is written.
     let parameters = match config.method {
@@ -77,8 +78,7 @@ pub fn of_training(config: &Config, capture: &Capture) -> Needs {
     };
     let cells = (config.sampling.occupancy_resolution as u64).saturating_pow(3).saturating_mul(model::cascades(capture) as u64);
     let occupancy = if config.method == Method::Ngp { cells.saturating_mul(9) } else { 0 };
-    let samples = if config.sampling.batch_samples > 0 { config.sampling.batch_samples as u64 } else { 1 << 15 };
-    let batch = if config.method == Method::Ngp { samples.saturating_mul(SAMPLE) } else { 0 };
+    let batch = if config.method == Method::Ngp { (samples as u64).saturating_mul(SAMPLE) } else { 0 };
     Needs(vec![
         ("photographs", kept + masks + at_once * largest * DECODED),
         ("parameters", parameters),
@@ -106,7 +106,9 @@ pub fn of_export(model: &ObjectModel, o: &ExportOptions, grid: &Grid, texels: us
 /// # Errors
 /// When it does not fit.
 pub fn check_training(config: &Config, capture: &Capture) -> Result<Option<String>> {
-    let needs = of_training(config, capture);
+    // A GPU that was named keeps its batches itself.
+    let on_host = config.device == "cpu" || config.sampling.batch_samples == 0;
+    let needs = of_training(config, capture, if on_host { device::batch_samples(config, false) } else { 0 });
     let cure = match needs.largest() {
         "photographs" => format!("--downscale 2, or --set data.memory_budget={}", (needs.of("photographs") / 4).max(1 << 20)),
         "occupancy grid" => "--set sampling.occupancy_resolution=128".into(),
@@ -158,7 +160,8 @@ mod tests {
     fn what_is_counted_is_what_a_model_has() {
         let dir = tempfile::tempdir().unwrap();
         let (c, capture) = still_life(dir.path(), &[("field.log2_size", "14")]);
-        let needs = of_training(&c, &capture);
+        let needs = of_training(&c, &capture, 9 << 10);
+        assert_eq!(needs.of("batch"), 9 << 20);
         let m = ObjectModel::new(c, capture, false).unwrap();
         let table = m.field.table.as_ref().unwrap().values.len() as f64 * 28.0;
         let counted = needs.of("parameters") as f64;
@@ -175,7 +178,7 @@ mod tests {
         let of = |sets: &[(&str, &str)]| {
             let mut c = c.clone();
             sets.iter().for_each(|(k, v)| c.set(k, v).unwrap());
-            of_training(&c, &capture).of("photographs")
+            of_training(&c, &capture, 0).of("photographs")
         };
         let decoded = of(&[("data.memory_budget", "0")]);
         let n = capture.indices(Split::Train).len() as u64;

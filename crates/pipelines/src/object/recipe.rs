@@ -611,7 +611,7 @@ impl Trainee for Trainer<'_> {
                 done => return done,
             };
             let m = &self.model;
-            let needs = memory::of_training(&m.config, &m.capture).to_string();
+            let needs = memory::of_training(&m.config, &m.capture, self.device.batch_samples(&m.config)).to_string();
             self.setback = Some(match device::aftermath(e, &m.config.device, self.device.halvings(), &needs) {
                 Aftermath::Fail(e) => return Err(e),
                 Aftermath::Cpu(why) => {
