@@ -130,9 +130,13 @@ pub fn evaluate_with_training(
     let mean = |f: fn(&Scores) -> f64| scores.iter().map(f).sum::<f64>() / scores.len().max(1) as f64;
     let training = TrainingScores { views: scores.len(), psnr: mean(|s| s.psnr), ssim: mean(|s| s.ssim) };
     let middle = fog::median(scores.iter().map(|s| s.psnr).collect()).unwrap_or(training.psnr);
-    let surfaces = Surfaces::of(model);
+    let mut surfaces = None;
     for (v, i) in report.per_view.iter_mut().zip(held_out::frames(&model.capture, split)) {
-        v.behind_fog = fog::is_behind(v.psnr, middle, surfaces.near_share(model, i));
+        // Depth is asked only where scores alone do not tell.
+        let near = fog::depends_on_depth(v.psnr, middle)
+            .then(|| surfaces.get_or_insert_with(|| Surfaces::of(model)).near_share(model, i))
+            .flatten();
+        v.behind_fog = fog::is_behind(v.psnr, middle, near);
     }
     model.check_device()?;
     report.training = Some(training);

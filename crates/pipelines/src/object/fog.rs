@@ -75,6 +75,11 @@ pub fn is_behind(psnr: f64, training: f64, near: Option<f64>) -> bool {
     psnr < training - FOG_DB || (psnr < training - GAP_DB && near.is_some_and(|n| n >= NEAR_SHARE))
 }
 
+/// Whether depth decides on such a view.
+pub fn depends_on_depth(psnr: f64, training: f64) -> bool {
+    is_behind(psnr, training, Some(1.0)) != is_behind(psnr, training, None)
+}
+
 /// The middle of some scores.
 pub fn median(mut scores: Vec<f64>) -> Option<f64> {
     scores.sort_by(f64::total_cmp);
@@ -96,6 +101,7 @@ mod tests {
         ];
         for (psnr, near, behind, why) in cases {
             assert_eq!(is_behind(psnr, 30.0, near), behind, "{why}");
+            assert_eq!(depends_on_depth(psnr, 30.0), psnr == 26.0);
         }
     }
 
