@@ -307,7 +307,7 @@ fn is_out_of_memory(text: &str) -> bool {
 /// A failure in one line: its last cause, without a kernel's source and backtraces.
 fn brief(text: &str) -> String {
     const MOST: usize = 240;
-    let end = [text.find("[Source]"), text.find("Backtrace")].into_iter().flatten().min().unwrap_or(text.len());
+    let end = [text.find("[Source]"), text.find("Backtrace"), text.find("No backtrace")].into_iter().flatten().min().unwrap_or(text.len());
     let cause = text[..end].rsplit("Caused by:").find(|c| !c.trim().is_empty()).unwrap_or("the device failed");
     let line = cause.split_whitespace().collect::<Vec<_>>().join(" ");
     match line.char_indices().nth(MOST) {
@@ -409,6 +409,7 @@ mod tests {
     fn failures_are_told_in_one_line() {
         let long = "Several failures\nCaused by:\n  A launch error\nCaused by:\n  out of\n    memory\n[Source]\nfloat x;\nBacktrace: none";
         assert_eq!(brief(long), "out of memory");
+        assert_eq!(brief("can't allocate buffer of size: 9\nNo backtrace available"), "can't allocate buffer of size: 9");
         assert_eq!(brief(""), "the device failed");
         assert_eq!(brief(&"é".repeat(500)).chars().count(), 241);
     }
