@@ -59,12 +59,15 @@ impl Source {
 
 /// What there is to look at: a run, a file of points or splats, or a data set.
 fn source(a: &ViewArgs) -> Result<Source> {
+    let is_run = ["config.toml", "checkpoints"].iter().any(|n| a.path.join(n).exists());
+    if a.data.is_some() && !is_run {
+        return Err(PipelineError::Usage(format!("--data: {} is no run, so it has no photographs elsewhere", a.path.display())));
+    }
     if a.path.is_file() && a.path.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply")) {
         let view = PointsView::of_file(&a.path)?;
         eprintln!("{} points or splats", view.points());
         return Ok(Source::Points(Arc::new(view)));
     }
-    let is_run = ["config.toml", "checkpoints"].iter().any(|n| a.path.join(n).exists());
     if is_run || !a.path.is_dir() {
         let (mut model, notes) = run_folder::load_model_of(&a.path, a.data.as_deref())?;
         notes.iter().for_each(|n| note(n));
