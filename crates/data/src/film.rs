@@ -32,7 +32,7 @@ impl FilmFormat {
 
 /// A film being written; nothing appears on disk before [`Film::finish`].
 pub enum Film {
-    Mp4(Video),
+    Mp4(Box<Video>),
     Gif(Gif),
 }
 
@@ -46,7 +46,7 @@ impl Film {
             return Err(DataError::input(folder, "is not a folder; create it or choose another --video"));
         }
         match FilmFormat::of(path)? {
-            FilmFormat::Mp4 => Video::create(path, width, height, fps).map(Film::Mp4),
+            FilmFormat::Mp4 => Video::create(path, width, height, fps).map(Box::new).map(Film::Mp4),
             FilmFormat::Gif => Gif::create(path, width, height, fps).map(Film::Gif),
         }
     }
