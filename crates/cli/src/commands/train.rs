@@ -25,7 +25,7 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
     let opened = if a.resume { Some(RunFolder::open(&a.out)?.0) } else { None };
     if let (Some(folder), Some(data)) = (&opened, &a.moved) {
         folder.move_capture(data)?;
-        config = read_config(&a.out).and_then(|moved| Ok(Config { data: moved.data, ..config }))?;
+        config.data.path = read_config(&a.out)?.data.path;
     }
     // The port is asked for before there is a folder.
     let viewing = if a.view { Some(watch(a, &config, opened.as_ref())?) } else { None };
