@@ -181,6 +181,9 @@ pub struct PrepareArgs {
 pub struct TrainArgs {
     /// Folder with photographs and transforms.json, transforms_train.json, a COLMAP model or poses_bounds.npy
     pub data: Option<PathBuf>,
+    /// With --resume: where the photographs are now, if they moved
+    #[arg(long = "data", value_name = "FOLDER", requires = "resume", conflicts_with = "data")]
+    pub moved: Option<PathBuf>,
     /// Folder of the run
     #[arg(short, long)]
     pub out: PathBuf,
@@ -214,8 +217,8 @@ pub struct TrainArgs {
     pub threads: Option<usize>,
     #[arg(long)]
     pub seed: Option<u64>,
-    /// `report`: the shortest side becomes 100 pixels
-    #[arg(long)]
+    /// `report`: the shortest side of each photograph becomes 100 pixels
+    #[arg(long, conflicts_with = "downscale")]
     pub preset: Option<String>,
     /// Override a configuration value, for example loss.distortion=0.01; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -244,6 +247,9 @@ pub struct TrainArgs {
 pub struct EvalArgs {
     /// Folder of the run
     pub run: PathBuf,
+    /// Where the photographs are now, if they moved
+    #[arg(long, value_name = "FOLDER")]
+    pub data: Option<PathBuf>,
     /// auto, cpu, cuda, vulkan, metal or webgpu
     #[arg(long, default_value = "auto")]
     pub device: String,
@@ -290,7 +296,7 @@ pub struct RenderArgs {
     /// Folder for PNG sequences [default: RUN/render unless --video is given]
     #[arg(long)]
     pub images: Option<PathBuf>,
-    /// MP4 file of the first layer
+    /// Film of the first layer: .mp4, or .gif with up to 50 frames per second
     #[arg(long)]
     pub video: Option<PathBuf>,
     /// [default: 30, or that of the path's file]
@@ -398,6 +404,9 @@ pub struct ListenArgs {
 pub struct ViewArgs {
     /// Folder of a run or of a data set, or a PLY file of points or Gaussian splats
     pub path: PathBuf,
+    /// Of a run: where its photographs are now, if they moved
+    #[arg(long, value_name = "FOLDER")]
+    pub data: Option<PathBuf>,
     /// auto, cpu, cuda, vulkan, metal or webgpu
     #[arg(long, default_value = "auto")]
     pub device: String,
@@ -416,6 +425,9 @@ pub struct CompareArgs {
     /// Folders of runs
     #[arg(required = true)]
     pub runs: Vec<PathBuf>,
+    /// Where the photographs of all runs are now, if they moved
+    #[arg(long, value_name = "FOLDER")]
+    pub data: Option<PathBuf>,
     /// Folder for curves.svg, curves.png, views.png and compare.json
     #[arg(short, long, default_value = "runs/compare")]
     pub out: PathBuf,

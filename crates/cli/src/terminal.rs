@@ -26,6 +26,8 @@ pub fn report(error: &PipelineError, json: bool) -> u8 {
 pub struct Progress {
     bar: Option<ProgressBar>,
     last_line: Option<Instant>,
+    /// PSNR of held-out pixels when they were judged last.
+    held_out: Option<f64>,
 }
 
 impl Progress {
@@ -35,7 +37,7 @@ impl Progress {
             bar.set_style(ProgressStyle::with_template("{bar:30} {msg} {eta} left").expect("a valid template"));
             bar
         });
-        Progress { bar, last_line: None }
+        Progress { bar, last_line: None, held_out: None }
     }
 
     fn line(&self, text: &str) {
@@ -50,7 +52,8 @@ impl Progress {
             Event::Started { step, .. } if *step > 0 => self.line(&format!("going on at step {step}")),
             Event::Started { .. } | Event::Saved { .. } => {}
             Event::Progress { step, seconds, progress, loss, psnr, rays_per_s, .. } => {
-                let text = format!("step {step}  {seconds:.0} s  loss {loss:.5}  psnr {psnr:.2}  {rays_per_s:.0} rays/s");
+                let held_out = self.held_out.map_or(String::new(), |p| format!("  held out {p:.2}"));
+                let text = format!("step {step}  {seconds:.0} s  loss {loss:.5}  psnr {psnr:.2}{held_out}  {rays_per_s:.0} rays/s");
                 if let Some(b) = &self.bar {
                     b.set_position((progress * 1000.0) as u64);
                     b.set_message(text);
@@ -59,7 +62,7 @@ impl Progress {
                     eprintln!("{text}");
                 }
             }
-            Event::Evaluated { step, psnr, .. } => self.line(&format!("step {step}: held-out psnr {psnr:.2} dB")),
+            Event::Evaluated { psnr, .. } => self.held_out = Some(*psnr),
             Event::Recovered { step, to_step, why } => self.line(&format!("step {step}: {why}; back to step {to_step}")),
             Event::Note(n) => self.line(&format!("note: {n}")),
             Event::Finished { step, seconds, interrupted } => {

@@ -261,16 +261,25 @@ fn fault_05_a_checkpoint_of_another_version_is_told() {
 #[test]
 fn fault_06_numbers_that_are_not_finite_name_the_frame_and_never_reach_a_checkpoint() {
     refused(&["frames[1].transform_matrix"], |c| edit(c, |j| j["frames"][1]["transform_matrix"][0][3] = 1e300.into()));
-    // A rate at which the loss leaves all bounds: recovered once, then stopped with the last good checkpoint.
+    // A rate at which the loss leaves all bounds after one step: begun again once, then stopped.
     let dir = tempfile::tempdir().unwrap();
     let run = dir.path().join("run");
-    let o = train(&good().capture, &run, &["--steps", "60", "--set", "optim.rate=1e20", "--set", "run.save_every_steps=1"]);
+    let wild = ["--method", "mlp", "--steps", "8", "--set", "sampling.rays=64", "--set", "sampling.samples=8", "--set", "optim.rate=1e30"];
+    let o = train(&good().capture, &run, &wild);
+    let told = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert!(told.contains("step 1: the loss was not finite; the rate is lowered; back to step 0"), "{told}");
+    fails(&o, 1, &["not finite at step 1, and again at step 1", "no checkpoint yet", "--set optim.rate"]);
+    assert!(!told.contains("safetensors") && !run.exists(), "{told}");
+    // The same in a run that has a checkpoint: it is named, whole and finite.
+    let gentle = ["--method", "mlp", "--steps", "2", "--set", "sampling.rays=64", "--set", "sampling.samples=8"];
+    assert!(train(&good().capture, &run, &gentle).status.success());
+    let mut c = program();
+    c.arg("train").arg("--out").arg(&run).args(["--resume", "--steps", "60", "--set", "optim.rate=1e30"]);
     let latest = checkpoint::latest(&run.join("checkpoints"));
-    if latest.exists() {
-        let c = checkpoint::read(&latest).unwrap();
-        assert!(c.tensors.iter().all(|t| t.2.iter().all(|v| v.is_finite())), "a checkpoint holds NaN");
-    }
-    assert!(matches!(o.status.code(), Some(0 | 1)) && !String::from_utf8_lossy(&o.stderr).contains("panicked"));
+    fails(&c.output().unwrap(), 1, &["not finite at step", latest.to_str().unwrap(), "is the last good checkpoint"]);
+    let kept = checkpoint::read(&latest).unwrap();
+    assert_eq!(kept.metadata["step"], "2");
+    assert!(kept.tensors.iter().all(|t| t.2.iter().all(|v| v.is_finite())), "a checkpoint holds NaN");
 }
 
 #[test]

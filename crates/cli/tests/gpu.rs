@@ -66,7 +66,12 @@ fn every_method_trains_renders_and_exports_there() {
         let told = String::from_utf8_lossy(&out.stderr).into_owned();
         assert!(out.status.success(), "{method}: {told}");
         assert_eq!(told.contains("one pixel of each"), method == "ngp", "{told}");
-        let scores = |device: &str| json(diorama(&["eval", run, "--device", device, "--json"]))["psnr"].as_f64().unwrap();
+        let scores = |device: &str| {
+            let report = json(diorama(&["eval", run, "--device", device, "--json"]));
+            let drew = report["device"].as_str().unwrap();
+            assert!(if device == "cpu" { drew == "cpu" } else { drew.ends_with(&format!("({device})")) }, "{device}: {drew} drew");
+            report["psnr"].as_f64().unwrap()
+        };
         let (there, here) = (scores(&device), scores("cpu"));
         assert!((there - here).abs() < 0.02, "{method}: {there} dB there, {here} dB here");
         // The CPU goes on from all of it: parameters, corrections, errors.
@@ -81,4 +86,27 @@ fn every_method_trains_renders_and_exports_there() {
     };
     let (there, here) = (mesh(&device), mesh("cpu"));
     assert!(here > 0 && there.abs_diff(here) * 50 <= here, "{there} vertices there, {here} here");
+}
+
+#[test]
+fn a_device_without_room_gets_half_the_batch_twice_and_then_the_bytes_are_said() {
+    let doctor = json(diorama(&["doctor", "--json"]));
+    let software = doctor["gpus"].as_array().unwrap().iter().find(|g| g["software"] == true);
+    let Some(device) = software.and_then(|g| g["device"].as_str()) else {
+        println!("skipped: only software is known to be too small");
+        return;
+    };
+    let dir = tempfile::tempdir().unwrap();
+    let (data, run) = (dir.path().join("data"), dir.path().join("run"));
+    write_capture(&data, 6, 24).unwrap();
+    let train = ["train", data.to_str().unwrap(), "-o", run.to_str().unwrap(), "--device", device, "--steps", "2", "--json"];
+    let large = ["--set", "field.log2_size=12", "--set", "sampling.rays=64", "--set", "sampling.batch_samples=90000000"];
+    let out = diorama(&[&train[..], &large].concat());
+    let told = String::from_utf8_lossy(&out.stderr).into_owned();
+    assert_eq!(out.status.code(), Some(1), "{told}");
+    assert_eq!(told.matches("the batch is halved; back to step 0").count(), 2, "{told}");
+    let error: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
+    assert_eq!(error["kind"], "memory", "{error}");
+    let text = error["error"].as_str().unwrap();
+    assert!(["GiB", "--downscale", "--device cpu"].iter().all(|p| text.contains(p)) && !run.exists(), "{text}");
 }

@@ -115,6 +115,25 @@ pub fn import(data: &Path, options: &ImportOptions) -> Result<Capture> {
     finish(data, root, imported, options)
 }
 
+/// The folder that the paths of a capture lie in: the capture itself, the folder of its description, or what its zip
+/// was unpacked to.
+///
+/// # Errors
+/// When there is nothing, or the zip cannot be unpacked.
+pub fn root(data: &Path) -> Result<PathBuf> {
+    if data.is_dir() {
+        return Ok(data.to_path_buf());
+    }
+    if !data.is_file() {
+        return Err(DataError::input(data, "does not exist; give the folder of the photographs"));
+    }
+    if data.extension().is_some_and(|e| e.eq_ignore_ascii_case("zip")) {
+        return archive::unpacked(data, &ArchiveLimits::default());
+    }
+    let parent = data.parent().filter(|p| !p.as_os_str().is_empty());
+    Ok(parent.unwrap_or(Path::new(".")).to_path_buf())
+}
+
 /// The format of a folder.
 ///
 /// # Errors

@@ -4,9 +4,9 @@
 use crate::error::{DataError, Result};
 use crate::masks::{self, COUNTS};
 use crate::photo;
-use diorama_geom::ImageU8;
 use diorama_geom::capture::{Frame, MaskRule};
 use diorama_geom::rng::Rng;
+use diorama_geom::{ImageU8, Reduction};
 use rayon::prelude::*;
 
 /// Bytes that pixels may take.
@@ -30,18 +30,18 @@ pub struct PixelStore {
 
 /// What to decode.
 pub struct StoreOptions {
-    pub downscale: u32,
+    pub reduction: Reduction,
     pub budget: u64,
     pub masks: MaskRule,
 }
 
 impl PixelStore {
-    /// Decodes `frames`, reduced `downscale` times, in parallel; `progress` is called once per photograph.
+    /// Decodes `frames`, reduced, in parallel; `progress` is called once per photograph.
     pub fn load(frames: &[&Frame], options: &StoreOptions, progress: &(dyn Fn() + Sync)) -> Result<PixelStore> {
         let sizes: Vec<(u32, u32)> = frames
             .iter()
             .map(|f| {
-                let c = f.camera.downscaled(options.downscale);
+                let c = f.camera.reduced(options.reduction);
                 (c.width, c.height)
             })
             .collect();
@@ -207,8 +207,10 @@ mod tests {
             ImageU8 { width: 101, height: 67, channels: 1, data: (0..101 * 67).map(|i| if i % 101 < 50 { 255 } else { 0 }).collect() };
         photo::save_png(&mask, &half).unwrap();
         f.mask = Some(mask);
-        let load =
-            |budget| PixelStore::load(&[&f, &f], &StoreOptions { downscale: 1, budget, masks: MaskRule::default() }, &|| {}).unwrap();
+        let load = |budget| {
+            PixelStore::load(&[&f, &f], &StoreOptions { reduction: Reduction::Times(1), budget, masks: MaskRule::default() }, &|| {})
+                .unwrap()
+        };
         assert_eq!(load(u64::MAX).stride(), 1);
         let budget = 2 * 101 * 67 * 4 / 10;
         let s = load(budget);
@@ -236,7 +238,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let mut f = frame(dir.path(), "a.png", 8, 6, 0);
         f.camera.width = 9;
-        let options = StoreOptions { downscale: 1, budget: 1 << 20, masks: MaskRule::default() };
+        let options = StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks: MaskRule::default() };
         let e = PixelStore::load(&[&f], &options, &|| {}).err().unwrap();
         assert!(e.is_input() && e.to_string().contains("8×6"), "{e}");
         f.camera.width = 8;
@@ -254,7 +256,7 @@ mod tests {
         photo::save_png(&mask, &ImageU8 { width: 4, height: 1, channels: 1, data: vec![0, 255, 0, 255] }).unwrap();
         f.mask = Some(mask);
         let masks = MaskRule { meaning: diorama_geom::capture::MaskMeaning::Object, inverted: false };
-        let s = PixelStore::load(&[&f], &StoreOptions { downscale: 1, budget: 1 << 20, masks }, &|| {}).unwrap();
+        let s = PixelStore::load(&[&f], &StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks }, &|| {}).unwrap();
         assert!(s.has_alpha && (0..4).all(|x| s.counts(0, x, 0)));
         assert_eq!([0, 1].map(|x| s.pixel(0, x, 0)[3]), [0, 255]);
     }
@@ -266,7 +268,9 @@ mod tests {
         let mask = dir.path().join("m.png");
         photo::save_png(&mask, &ImageU8 { width: 4, height: 1, channels: 1, data: vec![0, 255, 0, 255] }).unwrap();
         f.mask = Some(mask);
-        let s = PixelStore::load(&[&f], &StoreOptions { downscale: 1, budget: 1 << 20, masks: MaskRule::default() }, &|| {}).unwrap();
+        let s =
+            PixelStore::load(&[&f], &StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks: MaskRule::default() }, &|| {})
+                .unwrap();
         assert_eq!([0, 1, 2, 3].map(|x| s.counts(0, x, 0)), [false, true, false, true]);
     }
 }

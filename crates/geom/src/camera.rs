@@ -21,6 +21,32 @@ pub enum Lens {
     Equirectangular,
 }
 
+/// How much smaller than the photographs the images are that are worked on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reduction {
+    /// So many times, sizes rounded down, at least one pixel.
+    Times(u32),
+    /// Until the shortest side has so many pixels; smaller photographs stay as they are.
+    ShortestSide(u32),
+}
+
+impl Reduction {
+    /// Width and height of a reduced image.
+    pub fn size(self, (width, height): (u32, u32)) -> (u32, u32) {
+        match self {
+            Reduction::Times(n) => ((width / n.max(1)).max(1), (height / n.max(1)).max(1)),
+            Reduction::ShortestSide(side) => {
+                let shortest = width.min(height).max(1);
+                if shortest <= side {
+                    return (width, height);
+                }
+                let to = |v: u32| ((v as f64 * side as f64 / shortest as f64).round() as u32).max(1);
+                (to(width), to(height))
+            }
+        }
+    }
+}
+
 /// Intrinsics in pixels; pixel (i, j) covers `[i, i+1) × [j, j+1)`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
@@ -49,6 +75,12 @@ impl Camera {
     /// The same camera for images reduced `factor` times (sizes rounded down, at least one pixel).
     pub fn downscaled(&self, factor: u32) -> Camera {
         self.resized((self.width / factor).max(1), (self.height / factor).max(1))
+    }
+
+    /// The same camera for reduced images: each axis is scaled by its own exact share.
+    pub fn reduced(&self, by: Reduction) -> Camera {
+        let (width, height) = by.size((self.width, self.height));
+        self.resized(width, height)
     }
 
     /// Unit direction, in the camera, of the ray through pixel coordinates (x, y).
@@ -198,5 +230,22 @@ mod tests {
         let s = c.downscaled(4);
         assert_eq!((s.width, s.height), (270, 480));
         assert!((c.direction(1080.0, 0.0) - s.direction(270.0, 0.0)).length() < 1e-12);
+    }
+
+    #[test]
+    fn a_shortest_side_is_met_exactly_and_the_corners_look_where_they_did() {
+        let lens = Lens::Brown { k: [0.1, 0.01, 0.0, 0.0, 0.0, 0.0], p: [1e-3, 0.0] };
+        for (width, height, reduced) in
+            [(800, 800, (100, 100)), (1080, 1920, (100, 178)), (199, 150, (133, 100)), (640, 101, (634, 100)), (90, 60, (90, 60))]
+        {
+            let c = Camera { lens, cx: 0.4 * width as f64, ..Camera::pinhole(width, height, 0.75) };
+            let s = c.reduced(Reduction::ShortestSide(100));
+            assert_eq!((s.width, s.height), reduced);
+            for (x, y) in [(0.0, 0.0), (1.0, 1.0), (0.3, 0.8)] {
+                let at = |c: &Camera| c.direction(x * c.width as f64, y * c.height as f64);
+                assert!((at(&c) - at(&s)).length() < 1e-9, "{width} x {height}");
+            }
+        }
+        assert_eq!(Reduction::Times(8).size((1081, 7)), (135, 1));
     }
 }

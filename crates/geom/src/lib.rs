@@ -17,7 +17,7 @@ pub mod splats;
 pub mod transform;
 pub mod view_source;
 
-pub use camera::{Camera, Lens};
+pub use camera::{Camera, Lens, Reduction};
 pub use capture::{Capture, Frame, SceneBox, SparsePoint};
 pub use glam;
 pub use image::{Image, ImageU8};

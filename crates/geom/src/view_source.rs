@@ -74,6 +74,8 @@ pub struct ViewStatus {
     pub seconds: f64,
     pub loss: f64,
     pub psnr: f64,
+    /// PSNR of held-out pixels when they were judged last.
+    pub held_out: Option<f64>,
     pub rays_per_s: f64,
     pub running: bool,
 }
@@ -94,8 +96,13 @@ pub trait ViewSource: Send + Sync {
 
     fn status(&self) -> ViewStatus;
 
+    /// Frames whose views lie behind fog, as far as is known.
+    fn behind_fog(&self) -> Vec<usize> {
+        Vec::new()
+    }
+
     /// Draws a view as `[H, W, 3]` sRGB.
-    fn view(&self, request: &ViewRequest) -> ImageU8;
+    fn view(&self, request: &ViewRequest) -> Result<ImageU8, String>;
 
     /// The place in the world that a pixel shows; none where nothing is.
     fn point(&self, request: &ViewRequest, x_px: f64, y_px: f64) -> Option<[f64; 3]>;

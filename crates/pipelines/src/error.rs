@@ -12,9 +12,19 @@ pub enum PipelineError {
     /// The request cannot be met as it stands (exit code 2).
     #[error("{0}")]
     Usage(String),
-    /// The loss was not finite twice.
-    #[error("the loss was not finite twice: stopped at step {step}; {checkpoint} is the last good checkpoint; lower --set optim.rate")]
-    Diverged { step: u64, checkpoint: String },
+    /// What was learned was not finite at step `first`, and again at step `again`.
+    #[error(
+        "the loss was not finite at step {first}, and again at step {again} after going back and lowering the rate: stopped; {kept}; lower --set optim.rate"
+    )]
+    Diverged {
+        first: u64,
+        again: u64,
+        /// What is left of the run, in words.
+        kept: String,
+    },
+    /// The machine or a device has no room for the work: needs, has, cure.
+    #[error("{0}")]
+    Memory(String),
     /// A device failed or computed wrongly.
     #[error("{0}")]
     Device(String),
@@ -26,7 +36,7 @@ impl PipelineError {
         match self {
             PipelineError::Data(e) => e.is_input(),
             PipelineError::Usage(_) => true,
-            PipelineError::Diverged { .. } | PipelineError::Device(_) => false,
+            PipelineError::Diverged { .. } | PipelineError::Memory(_) | PipelineError::Device(_) => false,
         }
     }
 
@@ -37,6 +47,7 @@ impl PipelineError {
             PipelineError::Data(_) => "io",
             PipelineError::Usage(_) => "usage",
             PipelineError::Diverged { .. } => "diverged",
+            PipelineError::Memory(_) => "memory",
             PipelineError::Device(_) => "device",
         }
     }

@@ -23,11 +23,12 @@ const NEUTRAL: [(&str, &str); 11] = [
 ];
 
 /// Switch, value, and what must be on for it to matter.
-const SWITCHES: [(&str, &str, &[(&str, &str)]); 43] = [
+const SWITCHES: [(&str, &str, &[(&str, &str)]); 44] = [
     ("method", "mlp", &[]),
     ("background", "black", &[]),
     ("seed", "2", &[]),
     ("data.downscale", "2", &[]),
+    ("data.shortest_side", "20", &[]),
     ("data.split", "all", &[]),
     ("field.levels", "5", &[]),
     ("field.features", "4", &[]),

@@ -112,8 +112,14 @@ pub enum Tell {
         seconds: f64,
         loss: f64,
         psnr: f64,
+        /// Of held-out pixels.
+        held_out: Option<f64>,
         rays_per_s: f64,
         running: bool,
+    },
+    /// Photographs, by their number, that the field shows through fog.
+    Fog {
+        frames: Vec<u32>,
     },
     Working {
         what: String,

@@ -51,7 +51,7 @@ impl Session<'_> {
     fn talk(&mut self) -> Result<(), Error> {
         self.send(&scene(&*self.shared.source))?;
         let mut news = Instant::now() - NEWS;
-        let mut last = None;
+        let (mut last, mut foggy) = (None, Vec::new());
         while !self.shared.stop.load(Ordering::Relaxed) {
             self.listen()?;
             while let Ok(t) = self.told.try_recv() {
@@ -65,12 +65,20 @@ impl Session<'_> {
                     // JSON has no infinity.
                     let finite = |v: f64| if v.is_finite() { v } else { 0.0 };
                     let (step, seconds, loss, psnr) = (s.step, s.seconds, finite(s.loss), finite(s.psnr));
-                    self.send(&Tell::Status { step, seconds, loss, psnr, rays_per_s: s.rays_per_s, running: s.running })?;
+                    let held_out = s.held_out.filter(|v| v.is_finite());
+                    self.send(&Tell::Status { step, seconds, loss, psnr, held_out, rays_per_s: s.rays_per_s, running: s.running })?;
+                }
+                let fog = self.shared.source.behind_fog();
+                if fog != foggy {
+                    self.send(&Tell::Fog { frames: fog.iter().map(|f| *f as u32).collect() })?;
+                    foggy = fog;
                 }
             }
             if let Some((id, request)) = self.view.take() {
-                let image = self.shared.source.view(&request);
-                self.picture(id, &image, 85)?;
+                match self.shared.source.view(&request) {
+                    Ok(image) => self.picture(id, &image, 85)?,
+                    Err(why) => self.fail(why)?,
+                }
             }
         }
         Ok(())

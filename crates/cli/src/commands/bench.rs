@@ -95,7 +95,7 @@ pub fn train(a: &BenchTrainArgs) -> Result<Outcome> {
 pub fn render(a: &BenchRenderArgs) -> Result<Outcome> {
     use_threads(a.threads)?;
     let (mut model, notes) = run_folder::load_model(&a.run)?;
-    let device = device::accelerate(&mut model, &a.device)?;
+    let device = device::accelerate(&mut model, &a.device, Box::new(super::note))?;
     notes.iter().for_each(|n| eprintln!("note: {n}"));
     let report = bench::render::run(&model, a.repeats, device)?;
     if a.json {

@@ -3,6 +3,7 @@
 use super::Outcome;
 use crate::arguments::DoctorArgs;
 use diorama_data::import::{self, ImportOptions};
+use diorama_data::memory;
 use diorama_kernels::device::Api;
 use diorama_pipelines::object::diagnose::{self, Grade};
 use diorama_pipelines::{PipelineError, Result};
@@ -52,7 +53,7 @@ fn machine(a: &DoctorArgs) -> Result<Outcome> {
     let devices: Vec<&str> = std::iter::once("cpu").chain(gpus.iter().map(|g| g.api.name())).collect();
     let about: Vec<_> =
         gpus.iter().map(|g| serde_json::json!({ "device": g.api.name(), "name": g.name, "software": g.software })).collect();
-    let (total, available) = memory();
+    let memory::MachineMemory { total, available } = memory::of_machine();
     let ffmpeg = tool("ffmpeg", "DIORAMA_FFMPEG", "-version");
     let colmap = tool("colmap", "DIORAMA_COLMAP", "-h");
     let data = std::env::var("DIORAMA_TEST_DATA").ok().filter(|d| std::path::Path::new(d).is_dir());
@@ -102,14 +103,4 @@ fn tool(name: &str, variable: &str, flag: &str) -> Option<String> {
     let out = Command::new(program).arg(flag).stdin(Stdio::null()).output().ok()?;
     let text = String::from_utf8_lossy(&out.stdout).into_owned();
     Some(text.lines().find(|l| !l.trim().is_empty()).unwrap_or(name).trim().to_string())
-}
-
-/// Total and available bytes, where the system tells.
-fn memory() -> (Option<u64>, Option<u64>) {
-    let text = std::fs::read_to_string("/proc/meminfo").unwrap_or_default();
-    let field = |key: &str| {
-        let line = text.lines().find(|l| l.starts_with(key))?;
-        line.split_whitespace().nth(1)?.parse::<u64>().ok().map(|k| k << 10)
-    };
-    (field("MemTotal:"), field("MemAvailable:"))
 }

@@ -1,11 +1,11 @@
 //! `diorama eval`
 
-use super::{Outcome, use_threads};
+use super::{Outcome, note, use_threads};
 use crate::arguments::EvalArgs;
 use diorama_data::{DataError, photo};
 use diorama_geom::ImageU8;
 use diorama_geom::capture::Split;
-use diorama_pipelines::object::{device, evaluate, run_folder};
+use diorama_pipelines::object::{device, evaluate, kept_capture, run_folder};
 use diorama_pipelines::{PipelineError, Result};
 
 pub fn run(a: &EvalArgs) -> Result<Outcome> {
@@ -18,14 +18,15 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
     };
     let quality = a.quality.parse().map_err(|e| PipelineError::Usage(format!("--{e}")))?;
     let lpips = if a.lpips.is_empty() { None } else { Some(evaluate::load_lpips(&a.lpips)?) };
-    let (mut model, notes) = run_folder::load_model(&a.run)?;
-    device::accelerate(&mut model, &a.device)?;
-    notes.iter().for_each(|n| eprintln!("note: {n}"));
+    let (mut model, notes) = run_folder::load_model_of(&a.run, a.data.as_deref())?;
+    notes.iter().for_each(|n| note(n));
+    kept_capture::require_photographs(&model.capture)?;
+    device::accelerate(&mut model, &a.device, Box::new(note))?;
     let folder = a.run.join("eval");
     if a.save_images {
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
-    let report = evaluate::evaluate_with(&model, split, quality, lpips.as_ref(), &mut |name, v| {
+    let report = evaluate::evaluate_with_training(&model, split, quality, lpips.as_ref(), &mut |name, v| {
         eprintln!("{name}: psnr {:.2} ssim {:.3}", v.scores.psnr, v.scores.ssim);
         if a.save_images {
             let (r, p) = (v.view.rgb.to_u8(), v.photo.to_u8());
@@ -37,7 +38,10 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         Ok(())
     })?;
     if a.json {
-        println!("{}", serde_json::to_string(&report).expect("a report is JSON"));
+        let mut object = serde_json::to_value(&report).expect("a report is JSON");
+        object["gap"] = serde_json::json!(report.gap());
+        object["advice"] = serde_json::json!(report.advice());
+        println!("{object}");
     } else {
         println!(
             "{} views: psnr {:.2} dB (worst {:.2}, affine {:.2}), ssim {:.4}, mse {:.5}",
@@ -45,6 +49,13 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         );
         if let (Some(l), Some(network)) = (report.lpips, &lpips) {
             println!("lpips {l:.4} ({})", network.network());
+        }
+        if let Some(t) = &report.training {
+            println!("{} training views: psnr {:.2} dB, ssim {:.4}", t.views, t.psnr, t.ssim);
+        }
+        report.advice().into_iter().for_each(|a| println!("{a}"));
+        if let fog @ [_, ..] = &report.behind_fog()[..] {
+            println!("behind fog: {}", fog.join(", "));
         }
         if let Some(p) = report.psnr_mean_image {
             println!("the mean training image in place of renders: {p:.2} dB");

@@ -1,6 +1,6 @@
 //! `diorama export`
 
-use super::{Outcome, clip_or_crop, use_threads};
+use super::{Outcome, clip_or_crop, note, use_threads};
 use crate::arguments::ExportArgs;
 use diorama_data::{DataError, mesh_text};
 use diorama_pipelines::object::export::{self, ExportOptions, Size};
@@ -23,7 +23,7 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
     let (size, unit_m) =
         (size(a)?, unit(&a.units).ok_or_else(|| PipelineError::Usage(format!("--units {}: expected m, cm, mm or in", a.units)))?);
     let (mut model, notes) = run_folder::load_model(&a.run)?;
-    notes.iter().for_each(|n| eprintln!("note: {n}"));
+    notes.iter().for_each(|n| note(n));
     let scale = model.capture.world_from_capture.scale as f32;
     let level = match &a.level[..] {
         "auto" => None,
@@ -38,7 +38,7 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
     };
     let everything = a.clip.as_deref() == Some("all");
     let clip = if everything { None } else { clip_or_crop(a.clip.as_deref(), "auto", &a.run, &model)? };
-    device::accelerate(&mut model, &a.device)?;
+    device::accelerate(&mut model, &a.device, Box::new(note))?;
     let format = match format {
         Format::Mesh(f) => f,
         Format::Points(format) => {
@@ -67,7 +67,7 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
         floaters: a.floaters,
         keep_unseen: a.keep_unseen,
     };
-    let made = export::export(&model, &options, &mut progress())?;
+    let made = export::export(&model, &options, &mut note, &mut progress())?;
     if a.json {
         println!("{}", serde_json::to_string(&made).expect("plain values"));
     } else {

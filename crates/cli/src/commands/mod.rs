@@ -59,6 +59,11 @@ pub fn use_threads(threads: Option<usize>) -> Result<()> {
     Ok(())
 }
 
+/// Tells what the user should know.
+pub fn note(text: &str) {
+    eprintln!("note: {text}");
+}
+
 /// Six numbers `x0,y0,z0,x1,y1,z1` in the input's frame, as a box in the world.
 pub fn parse_clip(text: &str, world_from_capture: &diorama_geom::Similarity) -> Result<([f32; 3], [f32; 3])> {
     let bad = || PipelineError::Usage(format!("--clip {text}: expected x0,y0,z0,x1,y1,z1 with each second corner above the first"));

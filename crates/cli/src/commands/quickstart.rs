@@ -21,7 +21,7 @@ pub fn run(a: &QuickstartArgs) -> Result<Outcome> {
     } else {
         println!("held-out psnr {:.2} dB, ssim {:.4} after {:.0} s of training", made.psnr, made.ssim, made.train_seconds);
         println!("report     {}", made.report.display());
-        println!("video      {}", made.video.display());
+        made.video.iter().for_each(|v| println!("video      {}", v.display()));
         println!("mesh       {}", made.mesh.file.display());
         println!("curves     {}", made.folder.join("curves.svg").display());
         println!("the same with your photographs: diorama train FOLDER -o runs/mine");

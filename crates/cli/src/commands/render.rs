@@ -1,7 +1,8 @@
 //! `diorama render`
 
-use super::{INTERRUPT, Outcome, clip_or_crop, use_threads, watch_interrupts};
+use super::{INTERRUPT, Outcome, clip_or_crop, note, use_threads, watch_interrupts};
 use crate::arguments::RenderArgs;
+use diorama_data::film::FilmFormat;
 use diorama_pipelines::object::export::Size;
 use diorama_pipelines::object::render::{self, Layer, RenderOptions};
 use diorama_pipelines::object::{device, run_folder, viewing};
@@ -21,6 +22,7 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
     let layers = a.layers.iter().map(|l| l.parse().map_err(usage)).collect::<Result<Vec<_>>>()?;
     let path = a.path.parse().map_err(usage)?;
     let quality = a.quality.parse().map_err(usage)?;
+    a.video.as_deref().map(FilmFormat::of).transpose()?;
     let depth = a.depth.parse().map_err(usage)?;
     if a.scale.is_some_and(|s| !(s > 0.0 && s.is_finite())) {
         return Err(PipelineError::Usage("--scale: must be a number above 0".into()));
@@ -30,8 +32,8 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
         (given, _) => given,
     };
     let (mut model, notes) = run_folder::load_model(&a.run)?;
-    device::accelerate(&mut model, &a.device)?;
-    notes.iter().for_each(|n| eprintln!("note: {n}"));
+    notes.iter().for_each(|n| note(n));
+    device::accelerate(&mut model, &a.device, Box::new(note))?;
     let images = a.images.clone().or_else(|| a.video.is_none().then(|| a.run.join("render")));
     let clip = clip_or_crop(a.clip.as_deref(), "all", &a.run, &model)?;
     let options = RenderOptions {
@@ -58,14 +60,22 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
         }
     })?;
     let seconds = start.elapsed().as_secs_f64();
+    // Of a film that was interrupted there are the frames so far; before the first there is none.
+    let (images, video) = (images.filter(|_| frames > 0), a.video.clone().filter(|_| frames > 0));
+    if interrupted {
+        match frames {
+            0 => eprintln!("interrupted before the first frame: nothing was written"),
+            n => eprintln!("interrupted: what was written ends with frame {n}"),
+        }
+    }
     if a.json {
         println!(
             "{}",
-            serde_json::json!({ "run": a.run, "frames": frames, "seconds": seconds, "images": images, "video": a.video, "interrupted": interrupted })
+            serde_json::json!({ "run": a.run, "frames": frames, "seconds": seconds, "images": images, "video": video, "interrupted": interrupted })
         );
     } else {
         println!("{frames} frames in {seconds:.1} s");
-        images.iter().chain(a.video.iter()).for_each(|p| println!("{}", p.display()));
+        images.iter().chain(&video).for_each(|p| println!("{}", p.display()));
     }
     Ok(if interrupted { Outcome::Interrupted } else { Outcome::Done })
 }

@@ -6,26 +6,34 @@ use crate::terminal::Progress;
 use diorama_data::DataError;
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::model::ObjectModel;
-use diorama_pipelines::object::recipe;
 use diorama_pipelines::object::run_folder::{RunFolder, read_config};
 use diorama_pipelines::object::viewing::RunView;
+use diorama_pipelines::object::{memory, recipe};
 use diorama_pipelines::{PipelineError, Result};
+use diorama_viewer::Server;
 use std::sync::Arc;
 
 pub fn run(a: &TrainArgs) -> Result<Outcome> {
     use_threads(a.threads)?;
-    let config = configuration(a)?;
+    let mut config = configuration(a)?;
     if !a.resume {
         // Read the capture before anything is written.
-        recipe::load_capture(&config)?;
+        memory::check_training(&config, &recipe::load_capture(&config)?)?;
     }
     let device = recipe::device(&config)?;
     let existed = a.out.exists();
-    let mut folder = if a.resume { RunFolder::open(&a.out)?.0 } else { RunFolder::create(&a.out, a.force)? };
+    let opened = if a.resume { Some(RunFolder::open(&a.out)?.0) } else { None };
+    if let (Some(folder), Some(data)) = (&opened, &a.moved) {
+        folder.move_capture(data)?;
+        config.data.path = read_config(&a.out)?.data.path;
+    }
+    // The port is asked for before there is a folder.
+    let viewing = if a.view { Some(watch(a, &config, opened.as_ref())?) } else { None };
+    let mut folder = opened.map_or_else(|| RunFolder::create(&a.out, a.force), Ok)?;
     watch_interrupts();
     let mut progress = Progress::new();
     eprintln!("device: {device}");
-    let viewing = if a.view { Some(watch(a, &config)?) } else { None };
+    let viewing = viewing.map(|(view, server)| (view, std::thread::spawn(move || server.run(&INTERRUPT))));
     let view = viewing.as_ref().map(|v| &*v.0);
     let result = recipe::train(&config, &mut folder, a.resume, view, &INTERRUPT, &mut |e| progress.event(e));
     let recipe::Trained { model, summary, device } = match result {
@@ -52,17 +60,19 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
         "samples_per_s": summary.samples as f64 / seconds,
         "loss": finite(summary.loss),
         "psnr_train": finite(summary.psnr),
+        "psnr_held_out": summary.held_out.and_then(finite),
     });
     if a.json {
         println!("{object}");
     } else {
         println!(
-            "{}: {} steps in {:.1} s, {:.0} rays/s, psnr {:.2} dB on training rays",
+            "{}: {} steps in {:.1} s, {:.0} rays/s, psnr {:.2} dB on training rays{}",
             a.out.display(),
             summary.step,
             summary.seconds,
             summary.rays as f64 / seconds,
-            summary.psnr
+            summary.psnr,
+            summary.held_out.map_or(String::new(), |p| format!(", {p:.2} dB on held-out pixels"))
         );
         println!("next: diorama eval {}", a.out.display());
     }
@@ -73,13 +83,13 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
     Ok(if summary.interrupted { Outcome::Interrupted } else { Outcome::Done })
 }
 
-/// Serves the run while it trains.
-fn watch(a: &TrainArgs, config: &Config) -> Result<(Arc<RunView>, std::thread::JoinHandle<()>)> {
-    let model = ObjectModel::new(config.clone(), recipe::load_capture(config)?, false)?;
-    let view = RunView::new(&a.out, model, true);
+/// The run as the viewer sees it while it trains, and a server that is bound and does not serve yet.
+fn watch(a: &TrainArgs, config: &Config, resumed: Option<&RunFolder>) -> Result<(Arc<RunView>, Server)> {
+    let capture = resumed.map_or_else(|| recipe::load_capture(config), RunFolder::capture)?;
+    let view = RunView::new(&a.out, ObjectModel::new(config.clone(), capture, false)?, true)?;
     let server = super::view::listen(&a.listen, view.clone())?;
     eprintln!("view: {}", server.address());
-    Ok((view, std::thread::spawn(move || server.run(&INTERRUPT))))
+    Ok((view, server))
 }
 
 fn finite(v: f64) -> Option<f64> {
@@ -94,7 +104,7 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
             && std::path::absolute(d).ok() != std::path::absolute(&c.data.path).ok()
         {
             return Err(PipelineError::Usage(format!(
-                "--resume: {} was trained on {}, not on {}",
+                "--resume: {} was trained on {}, not on {}; if the photographs moved, give their folder as --data FOLDER instead",
                 a.out.display(),
                 c.data.path.display(),
                 d.display()
@@ -114,26 +124,10 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
             }
         }
     };
-    if a.resume {
-        let fixed = [
-            ("--method", a.method.is_some()),
-            ("--downscale", a.downscale.is_some()),
-            ("--split", a.split.is_some()),
-            ("--background", a.background.is_some()),
-            ("--seed", a.seed.is_some()),
-            ("--format", a.format.is_some()),
-            ("--mask", a.masks.mask.is_some()),
-            ("--mask-meaning", a.masks.mask_meaning.is_some()),
-            ("--config", a.config.is_some()),
-            ("--preset", a.preset.is_some()),
-        ];
-        if let Some((flag, _)) = fixed.iter().find(|f| f.1) {
-            return Err(PipelineError::Usage(format!("{flag} cannot change on --resume; start a new run with another --out")));
-        }
-    }
+    let before = a.resume.then(|| c.clone());
     let mut set = |key: &str, value: Option<String>| value.map_or(Ok(()), |v| c.set(key, &v));
     // A method that was named on top of a file keeps the file's other values.
-    set("method", a.method.clone().filter(|_| !a.resume))?;
+    set("method", a.method.clone())?;
     set("data.format", a.format.clone())?;
     set("data.downscale", a.downscale.map(|v| v.to_string()))?;
     set("data.split", a.split.clone())?;
@@ -169,10 +163,67 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
         if p != "report" {
             return Err(PipelineError::Usage(format!("--preset {p}: the only preset is report")));
         }
-        let capture = recipe::load_capture(&c)?;
-        let side = capture.frames.iter().map(|f| f.camera.width.min(f.camera.height)).min().unwrap_or(100);
-        c.data.downscale = (side / 100).max(1);
+        (c.data.shortest_side, c.data.downscale) = (100, 1);
+    }
+    if let Some(before) = before {
+        same(a, &before, &c)?;
     }
     c.check()?;
     Ok(c)
+}
+
+/// What a resumed run keeps: the same value may be said again, another one is named with the run's.
+fn same(a: &TrainArgs, before: &Config, now: &Config) -> Result<()> {
+    let changed = |flag: &str, run: &str, said: &str| {
+        let what = format!("{flag} cannot change on --resume: the run has {run}, not {said}; start a new run with another --out");
+        Err(PipelineError::Usage(what))
+    };
+    let (run, said) = (before.values(), now.values());
+    let kept = |key: &str| key == "method" || key == "background" || key == "seed" || key.starts_with("field.") || key.starts_with("data.");
+    for ((key, run), (_, said)) in run.iter().zip(&said).filter(|((key, run), (_, said))| kept(key) && run != said) {
+        let flag = FLAGS.iter().find(|f| f.1 == key).map_or(&key[..], |f| f.0);
+        // Pixels of a run may be kept more sparsely than before.
+        if key != "data.memory_budget" {
+            return changed(flag, run, said);
+        }
+    }
+    let Some(file) = &a.config else { return Ok(()) };
+    let text = std::fs::read_to_string(file).map_err(DataError::io(file, "read"))?;
+    let given = Config::from_toml(&text).map_err(|e| PipelineError::from(DataError::input(file, e)))?.values();
+    // Flags of the same command stand above the file, as they did when the run began.
+    let flagged = |key: &str| {
+        let set = a.overrides.iter().any(|o| o.split('=').next().is_some_and(|k| k.trim() == key));
+        set || FLAGS.iter().any(|f| f.1 == key && is_given(a, f.0)) || key.starts_with("run.") || ["device", "data.path"].contains(&key)
+    };
+    match run.iter().zip(&given).find(|((key, run), (_, given))| run != given && !flagged(key)) {
+        Some(((key, run), (_, given))) => changed(&format!("--config {}: {key}", file.display()), run, given),
+        None => Ok(()),
+    }
+}
+
+/// Flags and the values that they set.
+const FLAGS: [(&str, &str); 9] = [
+    ("--method", "method"),
+    ("--downscale", "data.downscale"),
+    ("--preset report", "data.shortest_side"),
+    ("--split", "data.split"),
+    ("--background", "background"),
+    ("--seed", "seed"),
+    ("--format", "data.format"),
+    ("--mask", "data.mask"),
+    ("--mask-meaning", "data.mask_meaning"),
+];
+
+fn is_given(a: &TrainArgs, flag: &str) -> bool {
+    match flag {
+        "--method" => a.method.is_some(),
+        "--downscale" => a.downscale.is_some(),
+        "--preset report" => a.preset.is_some(),
+        "--split" => a.split.is_some(),
+        "--background" => a.background.is_some(),
+        "--seed" => a.seed.is_some(),
+        "--mask" => a.masks.mask.is_some(),
+        "--mask-meaning" => a.masks.mask_meaning.is_some(),
+        _ => a.format.is_some(),
+    }
 }

@@ -75,6 +75,11 @@ mod tests {
     use super::*;
 
     #[test]
+    fn an_error_that_is_no_number_is_no_perfect_score() {
+        assert!(psnr(f64::NAN).is_nan() && (psnr(0.01) - 20.0).abs() < 1e-9);
+    }
+
+    #[test]
     fn affine_scores_forgive_exposure_and_nothing_else() {
         let photo = Image { width: 16, height: 16, channels: 3, data: (0..768).map(|i| (i * 37 % 256) as f32 / 255.0).collect() };
         let mut dim = photo.clone();

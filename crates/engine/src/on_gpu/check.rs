@@ -3,7 +3,8 @@
 use super::GpuTracer;
 use crate::fields::{self, Batch, FieldBuffers};
 use crate::losses::{ColorLoss, Photometric};
-use crate::renderers::volume::{self, Quality, Sampling, Tracer};
+use crate::renderers::supervised::Supervised;
+use crate::renderers::volume::{self, Accelerator, Quality, Sampling, Tracer, View};
 use crate::samplers::RayBatch;
 use crate::samplers::occupancy::{OCCUPIED, Occupancy};
 use crate::samplers::pixels::{self, DrawOptions, ErrorMap, PixelSource};
@@ -479,6 +480,20 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     Ok(())
 }
 
+/// A view that the device itself has drawn.
+///
+/// # Errors
+/// When it failed, or did not draw at all: what the CPU draws in its place proves nothing.
+fn drawn(gpu: &Gpu, device: GpuTracer, draw: impl FnOnce(&dyn Accelerator) -> View) -> Result<View, GpuError> {
+    let device = Supervised::new(Box::new(device), &gpu.name, true, Box::new(|_| {}));
+    let view = draw(&device);
+    match device.fatal() {
+        Some(why) => Err(GpuError::Lost(gpu.name.clone(), why)),
+        None if device.served() == 0 => Err(GpuError::Lost(gpu.name.clone(), "it drew nothing of a view".into())),
+        None => Ok(view),
+    }
+}
+
 /// Views by the device and by the CPU, with room for all samples of a batch and with so little that it is split.
 fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     let grid = HashGridConfig { levels: 3, features: 2, log2_size: 10, base: 4, finest: 16 };
@@ -504,7 +519,7 @@ fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             };
             let device = GpuTracer::new(gpu.clone(), &f, None, Some(&occupancy)).with_room(room);
             let want = on_cpu.view(&camera, &mut |_| {});
-            let got = Tracer { accelerator: Some(&device), ..on_cpu }.view(&camera, &mut |_| {});
+            let got = drawn(gpu, device, |by| Tracer { accelerator: Some(by), ..on_cpu }.view(&camera, &mut |_| {}))?;
             let shape = format!("{quality:?} room {room} images={images}");
             table.close("view", "color", &shape, &gpu.upload(&got.rgb.data), &wide(&want.rgb.data))?;
             table.close("view", "opacity", &shape, &gpu.upload(&got.opacity.data), &wide(&want.opacity.data))?;
@@ -539,9 +554,10 @@ fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         };
         // Room for all rays at once, and for some.
         for room in [1 << 10, 100] {
-            let device = GpuTracer::new(gpu.clone(), field, guide, None).with_room(room);
+            let tracer = || GpuTracer::new(gpu.clone(), field, guide, None).with_room(room);
+            let device = tracer();
             let want = on_cpu.view(&camera, &mut |_| {});
-            let got = Tracer { accelerator: Some(&device), ..on_cpu }.view(&camera, &mut |_| {});
+            let got = drawn(gpu, tracer(), |by| Tracer { accelerator: Some(by), ..on_cpu }.view(&camera, &mut |_| {}))?;
             let shape = format!("{name} room {room}");
             table.close("view", "color", &shape, &gpu.upload(&got.rgb.data), &wide(&want.rgb.data))?;
             table.close("view", "opacity", &shape, &gpu.upload(&got.opacity.data), &wide(&want.opacity.data))?;

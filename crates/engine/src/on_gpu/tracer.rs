@@ -2,6 +2,7 @@
 
 use super::shape::Shape;
 use crate::fields::{Appearance, Field, Pruning};
+use crate::renderers::supervised::Unserved;
 use crate::renderers::volume::{Accelerator, Placement, Traced};
 use crate::samplers::RayBatch;
 use crate::samplers::occupancy::Occupancy;
@@ -196,6 +197,10 @@ impl GpuTracer {
     }
 }
 
+fn unserved(e: GpuError) -> Unserved {
+    Unserved::Failed(e.to_string())
+}
+
 impl Accelerator for GpuTracer {
     fn trace(
         &self,
@@ -203,7 +208,7 @@ impl Accelerator for GpuTracer {
         placement: &Placement,
         pruning: Pruning,
         appearance: Option<u32>,
-    ) -> Option<(Traced, Option<Vec<f32>>)> {
+    ) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
         let Pruning { stop, min_alpha, thin, min_weight } = pruning;
         let mut out = (Traced::default(), Vec::new());
         let limits = Limits { stop, min_alpha, thin, min_weight };
@@ -214,17 +219,17 @@ impl Accelerator for GpuTracer {
         };
         for first in (0..batch.len()).step_by(at_once.max(1)) {
             let n = at_once.max(1).min(batch.len() - first);
-            self.part(batch, (first, n), placement, limits, appearance, &mut out).ok()?;
+            self.part(batch, (first, n), placement, limits, appearance, &mut out).map_err(unserved)?;
         }
-        Some((out.0, matches!(placement, Placement::March(_)).then_some(out.1)))
+        Ok((out.0, matches!(placement, Placement::March(_)).then_some(out.1)))
     }
 
-    fn density(&self, model: &[f32]) -> Option<Vec<f32>> {
-        GpuTracer::density(self, model).ok()
+    fn density(&self, model: &[f32]) -> Result<Vec<f32>, Unserved> {
+        GpuTracer::density(self, model).map_err(unserved)
     }
 
-    fn color(&self, model: &[f32], dirs: &[f32]) -> Option<Vec<f32>> {
-        GpuTracer::color(self, model, dirs).ok()
+    fn color(&self, model: &[f32], dirs: &[f32]) -> Result<Vec<f32>, Unserved> {
+        GpuTracer::color(self, model, dirs).map_err(unserved)
     }
 
     fn rays(&self) -> usize {

@@ -1,4 +1,5 @@
 //! From fields to images.
 
 pub mod splat;
+pub mod supervised;
 pub mod volume;

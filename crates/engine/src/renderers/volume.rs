@@ -1,5 +1,6 @@
 //! Volume rendering of whole images.
 
+use super::supervised::Unserved;
 use crate::background::LearnedBackground;
 use crate::fields::{Batch, Field, FieldBuffers, Pruning};
 use crate::samplers::occupancy::Occupancy;
@@ -44,22 +45,29 @@ pub enum Placement {
 
 /// Evaluates a field elsewhere than on the CPU.
 pub trait Accelerator: Send + Sync {
-    /// What rays come to before black, and of marched ones the share of light that passes each; `None` where the
-    /// device failed.
+    /// What rays come to before black, and of marched ones the share of light that passes each.
+    ///
+    /// # Errors
+    /// When the device failed.
     fn trace(
         &self,
         batch: &RayBatch,
         placement: &Placement,
         pruning: Pruning,
         appearance: Option<u32>,
-    ) -> Option<(Traced, Option<Vec<f32>>)>;
+    ) -> Result<(Traced, Option<Vec<f32>>), Unserved>;
 
-    /// Densities `[N]` at model points `[N, 3]`; `None` where the device failed.
-    fn density(&self, model: &[f32]) -> Option<Vec<f32>>;
+    /// Densities `[N]` at model points `[N, 3]`.
+    ///
+    /// # Errors
+    /// When the device failed.
+    fn density(&self, model: &[f32]) -> Result<Vec<f32>, Unserved>;
 
-    /// The field's own colours `[N, 3]` at model points, seen along unit directions, wearing the mean appearance;
-    /// `None` where the device failed.
-    fn color(&self, model: &[f32], dirs: &[f32]) -> Option<Vec<f32>>;
+    /// The field's own colours `[N, 3]` at model points, seen along unit directions, wearing the mean appearance.
+    ///
+    /// # Errors
+    /// When the device failed.
+    fn color(&self, model: &[f32], dirs: &[f32]) -> Result<Vec<f32>, Unserved>;
 
     /// Rays that are worth a call.
     fn rays(&self) -> usize;
@@ -82,7 +90,7 @@ pub struct Tracer<'a> {
     pub appearance: Option<u32>,
     /// Pixels are interpolated where traced neighbours differ by no more than this; 0: all are traced.
     pub tolerance: f32,
-    /// Traces instead of the CPU, unless it fails.
+    /// Traces instead of the CPU, which goes on where it fails; rays of an abandoned device come back empty.
     pub accelerator: Option<&'a dyn Accelerator>,
 }
 
@@ -151,6 +159,11 @@ pub struct Traced {
 }
 
 impl Traced {
+    /// Rays that meet nothing.
+    fn nothing(rays: usize) -> Traced {
+        Traced { rgb: vec![0.0; rays * 3], opacity: vec![0.0; rays], depth: vec![0.0; rays] }
+    }
+
     /// Scales each ray to the opacity `1 − light` that it has with the samples that were left out.
     fn make_up(&mut self, light: &[f32], stop: f32) {
         for (r, light) in light.iter().enumerate() {
@@ -226,13 +239,17 @@ impl Tracer<'_> {
             Sampling::Stratified { samples } => Placement::Stratified { samples },
             Sampling::Hierarchical { samples, more, .. } => Placement::Hierarchical { samples, more },
         };
-        if let Some((mut out, light)) = self.accelerator.and_then(|a| a.trace(batch, &placement, self.pruning, self.appearance)) {
-            if let Some(light) = light
-                && (self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0)
-            {
-                out.make_up(&light, self.pruning.stop);
+        match self.accelerator.map(|a| a.trace(batch, &placement, self.pruning, self.appearance)) {
+            Some(Ok((mut out, light))) => {
+                if let Some(light) = light
+                    && (self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0)
+                {
+                    out.make_up(&light, self.pruning.stop);
+                }
+                return self.before_backdrop(batch, out);
             }
-            return self.before_backdrop(batch, out);
+            Some(Err(Unserved::Abandoned)) => return Traced::nothing(batch.len()),
+            Some(Err(Unserved::Failed(_))) | None => {}
         }
         let out = match self.sampling {
             Sampling::Occupancy { grid, max_samples } => {

@@ -31,12 +31,14 @@ pub enum Event {
         samples: u64,
         rays_per_s: f64,
     },
-    /// Held-out views were judged.
+    /// Held-out pixels were judged.
     Evaluated {
         step: u64,
         seconds: f64,
         psnr: f64,
         mse: f64,
+        /// PSNR of each view, named by its frame.
+        views: Vec<(usize, f64)>,
     },
     Saved {
         step: u64,

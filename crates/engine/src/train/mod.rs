@@ -4,4 +4,4 @@ mod event;
 mod run;
 
 pub use event::{Event, StepReport};
-pub use run::{Origin, RunError, RunOptions, Summary, Trainee, run};
+pub use run::{HeldOut, Origin, RunError, RunOptions, Summary, Trainee, run};

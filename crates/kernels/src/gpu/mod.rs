@@ -31,6 +31,9 @@ pub enum GpuError {
     Open(&'static str, String),
     #[error("device {0}: {1}")]
     Lost(String, String),
+    /// The device has no room for what is asked of it.
+    #[error("device {0}: out of memory: {1}")]
+    Memory(String, String),
 }
 
 /// An open device.
@@ -195,6 +198,12 @@ impl Gpu {
         self.client.properties().memory.max_page_size
     }
 
+    /// Gives back memory that is no longer used.
+    pub fn release(&self) {
+        // A device that fails here fails at the next read as well, which tells.
+        let _ = self.client.memory_cleanup();
+    }
+
     /// Memory for `len` numbers of unknown value.
     pub fn empty(&self, len: usize) -> Buffer {
         Buffer { handle: self.client.empty(len.max(1) * 4), len }
@@ -269,7 +278,9 @@ impl Gpu {
     }
 
     fn lost(&self, e: &dyn std::fmt::Debug) -> GpuError {
-        GpuError::Lost(self.name.clone(), brief(&format!("{e:?}")))
+        let text = format!("{e:?}");
+        let told = (self.name.clone(), brief(&text));
+        if is_out_of_memory(&text) { GpuError::Memory(told.0, told.1) } else { GpuError::Lost(told.0, told.1) }
     }
 }
 
@@ -284,10 +295,19 @@ fn keep_compiled() {
     CubeClRuntimeConfig::try_set(c);
 }
 
+/// Whether a failure says that memory was short: CubeCL's own words, or a driver's. CubeCL puts allocations off; of one
+/// that failed it says no more than that its memory was never initialized.
+fn is_out_of_memory(text: &str) -> bool {
+    let text = text.to_lowercase().replace([' ', '_'], "");
+    ["outofmemory", "neverinitialized", "can'tallocate", "buffertoobig", "outofdevicememory", "outofhostmemory"]
+        .iter()
+        .any(|t| text.contains(t))
+}
+
 /// A failure in one line: its last cause, without a kernel's source and backtraces.
 fn brief(text: &str) -> String {
     const MOST: usize = 240;
-    let end = [text.find("[Source]"), text.find("Backtrace")].into_iter().flatten().min().unwrap_or(text.len());
+    let end = [text.find("[Source]"), text.find("Backtrace"), text.find("No backtrace")].into_iter().flatten().min().unwrap_or(text.len());
     let cause = text[..end].rsplit("Caused by:").find(|c| !c.trim().is_empty()).unwrap_or("the device failed");
     let line = cause.split_whitespace().collect::<Vec<_>>().join(" ");
     match line.char_indices().nth(MOST) {
@@ -369,12 +389,27 @@ fn unite(a: &[u32], b: &[u32], out: &mut [u32], n: u32) {
 
 #[cfg(test)]
 mod tests {
-    use super::brief;
+    use super::{brief, is_out_of_memory};
+
+    #[test]
+    fn a_full_device_is_told_apart_from_a_lost_one() {
+        for full in [
+            "Io(OutOfMemory { size: 9 })",
+            "couldn't find resource: Memory location was never initialized",
+            "BufferTooBig { size: 9 }",
+            "VK_ERROR_OUT_OF_DEVICE_MEMORY",
+            "CUDA: out of memory",
+        ] {
+            assert!(is_out_of_memory(full), "{full}");
+        }
+        assert!(!is_out_of_memory("DeviceLost: the memory of the device was reset"));
+    }
 
     #[test]
     fn failures_are_told_in_one_line() {
         let long = "Several failures\nCaused by:\n  A launch error\nCaused by:\n  out of\n    memory\n[Source]\nfloat x;\nBacktrace: none";
         assert_eq!(brief(long), "out of memory");
+        assert_eq!(brief("can't allocate buffer of size: 9\nNo backtrace available"), "can't allocate buffer of size: 9");
         assert_eq!(brief(""), "the device failed");
         assert_eq!(brief(&"é".repeat(500)).chars().count(), 241);
     }

@@ -40,7 +40,7 @@ pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
     use diorama_kernels::ops::fused_mlp::gpu::fused::tensor_element;
     let begin = std::time::Instant::now();
     let told = |e: GpuError| match e {
-        GpuError::Lost(..) => PipelineError::Device(e.to_string()),
+        GpuError::Lost(..) | GpuError::Memory(..) => PipelineError::Device(e.to_string()),
         _ => PipelineError::Usage(e.to_string()),
     };
     let gpu = Gpu::open(device.parse().map_err(PipelineError::Usage)?).map_err(told)?;

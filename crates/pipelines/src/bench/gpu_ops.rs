@@ -44,7 +44,7 @@ struct Table<'a> {
 
 fn told(e: GpuError) -> PipelineError {
     match e {
-        GpuError::Lost(..) => PipelineError::Device(e.to_string()),
+        GpuError::Lost(..) | GpuError::Memory(..) => PipelineError::Device(e.to_string()),
         _ => PipelineError::Usage(e.to_string()),
     }
 }

@@ -2,7 +2,8 @@
 
 use super::median_seconds;
 use crate::error::{PipelineError, Result};
-use crate::object::evaluate::{held_out, score_view};
+use crate::object::evaluate::score_view;
+use crate::object::held_out;
 use crate::object::model::ObjectModel;
 use diorama_data::photo;
 use diorama_engine::renderers::volume::Quality;
@@ -33,7 +34,7 @@ pub struct RenderReport {
 
 /// Draws every held-out view `repeats` times at each quality, on what [`super::super::object::device::accelerate`] named.
 pub fn run(model: &ObjectModel, repeats: usize, device: String) -> Result<RenderReport> {
-    let frames = held_out(&model.capture, Split::Test);
+    let frames = held_out::frames(&model.capture, Split::Test);
     let Some(&first) = frames.first() else {
         return Err(PipelineError::Usage("the run holds no views out; train with --split every:8".into()));
     };

@@ -1,8 +1,11 @@
 //! Runs side by side: curves, held-out images, cost.
 
 use super::evaluate;
-use super::run_folder::{charts, load_model, read_rows};
-use crate::error::Result;
+use super::held_out;
+use super::kept_capture::require_photographs;
+use super::model::ObjectModel;
+use super::run_folder::{charts, load_model_of, read_rows, read_summary};
+use crate::error::{PipelineError, Result};
 use diorama_data::{DataError, atomic, photo, plot};
 use diorama_engine::renderers::volume::Quality;
 use diorama_geom::ImageU8;
@@ -23,17 +26,33 @@ pub struct Compared {
     pub psnr: f64,
     pub ssim: f64,
     pub mse: f64,
+    /// Most bytes that training had in memory, where that is known.
+    pub peak_memory_bytes: Option<u64>,
+}
+
+/// Reads a run with all that judging it takes.
+fn complete(run: &Path, data: Option<&Path>) -> Result<(ObjectModel, Option<u64>)> {
+    let (model, _) = load_model_of(run, data)?;
+    require_photographs(&model.capture)?;
+    if held_out::frames(&model.capture, Split::Test).is_empty() {
+        return Err(PipelineError::Usage(format!("{}: holds no views out, so it cannot be compared", run.display())));
+    }
+    Ok((model, read_summary(run)?.and_then(|s| s.peak_memory_bytes)))
 }
 
 /// Scores every run, and writes `curves.svg`, `curves.png` and `views.png` (photograph, then each run)
-/// into `out`.
-pub fn compare(runs: &[PathBuf], out: &Path, note: &mut dyn FnMut(&str)) -> Result<Vec<Compared>> {
+/// into `out`; `data` is where the photographs of all runs are now, if they moved. Every run is read before the first is
+/// judged.
+pub fn compare(runs: &[PathBuf], data: Option<&Path>, out: &Path, note: &mut dyn FnMut(&str)) -> Result<Vec<Compared>> {
+    for run in runs {
+        complete(run, data)?;
+    }
     std::fs::create_dir_all(out).map_err(DataError::io(out, "create"))?;
     let mut table = Vec::new();
     let mut strips: Vec<Vec<ImageU8>> = Vec::new();
     for run in runs {
         note(&format!("judging {}", run.display()));
-        let (model, _) = load_model(run)?;
+        let (model, peak_memory_bytes) = complete(run, data)?;
         let mut views = Vec::new();
         let mut photos = Vec::new();
         let report = evaluate::evaluate(&model, Split::Test, Quality::Full, &mut |_, v| {
@@ -64,6 +83,7 @@ pub fn compare(runs: &[PathBuf], out: &Path, note: &mut dyn FnMut(&str)) -> Resu
             psnr: report.psnr,
             ssim: report.ssim,
             mse: report.mse,
+            peak_memory_bytes,
         });
     }
     let named: Vec<_> = runs.iter().map(|r| (r.file_name().unwrap_or_default().to_string_lossy().into_owned(), read_rows(r))).collect();

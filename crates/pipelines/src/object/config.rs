@@ -2,6 +2,7 @@
 
 use crate::error::{PipelineError, Result};
 use diorama_data::masks::{self, MaskOptions};
+use diorama_geom::Reduction;
 use diorama_kernels::device::Api;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -56,6 +57,9 @@ pub struct DataConfig {
     /// `transforms`, `blender`, `colmap` or `llff`; empty: whichever is there.
     pub format: String,
     pub downscale: u32,
+    /// Reduce the photographs until their shortest side has so many pixels; 0: `downscale` times.
+    #[serde(default)]
+    pub shortest_side: u32,
     pub split: String,
     /// What is done with masks: `use` (black is left out), `invert` or `ignore`.
     #[serde(default = "use_masks")]
@@ -179,7 +183,7 @@ pub struct RunConfig {
     pub save_every_seconds: f64,
     /// 0: by time alone.
     pub save_every_steps: u64,
-    /// Judge held-out views each time so many steps are done; 0: never.
+    /// Judge held-out pixels each time so many steps are done; 0: every ten seconds, within 3 % of the time.
     pub evaluate_every: u64,
 }
 
@@ -219,6 +223,7 @@ impl Config {
                 path,
                 format: String::new(),
                 downscale: 1,
+                shortest_side: 0,
                 split: "file".into(),
                 mask: use_masks(),
                 mask_meaning: auto(),
@@ -267,6 +272,14 @@ impl Config {
         }
     }
 
+    /// How much smaller than the photographs the run's images are.
+    pub fn reduction(&self) -> Reduction {
+        match self.data.shortest_side {
+            0 => Reduction::Times(self.data.downscale),
+            side => Reduction::ShortestSide(side),
+        }
+    }
+
     /// Overrides one value, named by its path, for example `loss.distortion`.
     ///
     /// # Errors
@@ -309,12 +322,28 @@ impl Config {
         toml::to_string(self).expect("a configuration is a table")
     }
 
+    /// All keys with their values as text, in order.
+    pub fn values(&self) -> Vec<(String, String)> {
+        let table = toml::Value::try_from(self).expect("a configuration is a table");
+        let of = |key: String| {
+            let value = key.split('.').fold(&table, |at, part| &at[part]);
+            let text = match value {
+                toml::Value::String(s) => s.clone(),
+                // As they were given, not as f64 has what f32 holds.
+                toml::Value::Float(f) if *f as f32 as f64 == *f => (*f as f32).to_string(),
+                v => v.to_string(),
+            };
+            (key, text)
+        };
+        keys(&table, "").into_iter().map(of).collect()
+    }
+
     /// Values that make no sense together or alone.
     pub fn check(&self) -> Result<()> {
         let fail = |m: &str| Err(PipelineError::Usage(m.to_string()));
         let f = &self.field;
-        if ![1, 2, 4, 8].contains(&f.features) || f.levels == 0 || f.base == 0 || !(4..=24).contains(&f.log2_size) {
-            return fail("field: features must be 1, 2, 4 or 8, levels and base at least 1, log2_size 4 to 24");
+        if ![1, 2, 4, 8].contains(&f.features) || !(1..=64).contains(&f.levels) || f.base == 0 || !(4..=24).contains(&f.log2_size) {
+            return fail("field: features must be 1, 2, 4 or 8, levels 1 to 64, base at least 1, log2_size 4 to 24");
         }
         if !["auto", "f32"].contains(&&f.precision[..]) {
             return fail("field.precision: expected auto or f32");
@@ -336,6 +365,9 @@ impl Config {
             return fail("data.downscale and run.log_every: at least 1");
         }
         self.data.masks()?;
+        if self.data.shortest_side > 0 && self.data.downscale > 1 {
+            return fail("data.shortest_side and data.downscale: give one of them");
+        }
         if self.field.appearance > 0 && matches!(self.method, Method::Mlp | Method::Baseline) {
             return fail("field.appearance: only ngp and nerf have a view-dependent part that takes an appearance code");
         }

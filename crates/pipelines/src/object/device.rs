@@ -4,6 +4,9 @@ use super::config::{Config, Method};
 use super::model::ObjectModel;
 use super::recipe::Photographs;
 use crate::error::{PipelineError, Result};
+use diorama_engine::renderers::supervised::Say;
+#[cfg(feature = "gpu")]
+use diorama_engine::renderers::supervised::Supervised;
 use diorama_geom::rng::Rng;
 use diorama_kernels::device::Api;
 #[cfg(feature = "gpu")]
@@ -44,6 +47,39 @@ pub(super) struct Opened {
     #[cfg(feature = "gpu")]
     running: Option<Running>,
     note: Option<String>,
+    /// How often batches were halved because memory was short.
+    halvings: u32,
+}
+
+/// Most such halvings.
+const HALVINGS: u32 = 2;
+
+/// What follows from the failure of a device in training.
+#[derive(Debug)]
+pub(super) enum Aftermath {
+    /// The step is tried again with half the batch; why, in words.
+    Halve(String),
+    /// The CPU goes on; why, in words.
+    Cpu(String),
+    Fail(PipelineError),
+}
+
+/// A device that the user named fails for good, and with `auto` the CPU goes on; but where memory is short, the batch is
+/// halved first, twice. `needs`: bytes of what training takes, in words.
+pub(super) fn aftermath(e: PipelineError, device: &str, halvings: u32, needs: &str) -> Aftermath {
+    let is_auto = device == "auto";
+    match e {
+        PipelineError::Memory(e) if halvings < HALVINGS => Aftermath::Halve(format!("{e}; the batch is halved")),
+        PipelineError::Memory(e) if is_auto => Aftermath::Cpu(format!("{e}, even with a quarter of the batch ({needs}); the CPU goes on")),
+        PipelineError::Memory(e) => Aftermath::Fail(PipelineError::Memory(format!(
+            "{e}, even with a quarter of the batch ({needs}); raise --downscale, lower --set field.log2_size, or use --device cpu"
+        ))),
+        PipelineError::Device(e) if is_auto => Aftermath::Cpu(format!("{e}; the CPU goes on")),
+        PipelineError::Device(e) => {
+            Aftermath::Fail(PipelineError::Device(format!("{e}; go on with --resume, on the CPU with --resume --device cpu")))
+        }
+        e => Aftermath::Fail(e),
+    }
 }
 
 /// Finds the device that a configuration asks for; `auto` is the best GPU that is no software, else the CPU.
@@ -65,20 +101,21 @@ pub(super) fn open(config: &Config) -> Result<Opened> {
 }
 
 /// Lets the named device evaluate a model's field; which that is, in words. `auto` is the best GPU that is no software,
-/// else the CPU.
+/// else the CPU, which goes on where that GPU fails: `say` is told so, once. The failure of a device that was named is
+/// [`ObjectModel::check_device`]'s.
 ///
 /// # Errors
 /// When a named GPU is not part of the build or absent.
-pub fn accelerate(model: &mut ObjectModel, device: &str) -> Result<String> {
+pub fn accelerate(model: &mut ObjectModel, device: &str, say: Say) -> Result<String> {
     let mut c = Config::new(model.config.method, model.config.data.path.clone());
     c.set("device", device)?;
     let opened = open(&c)?;
-    #[cfg(not(feature = "gpu"))]
-    drop(opened);
+    opened.note().iter().for_each(|n| say(n));
     #[cfg(feature = "gpu")]
     if let Some(r) = opened.running {
         let (field, coarse, occupancy) = (&model.field, model.coarse.as_ref(), model.occupancy.as_ref());
-        model.accelerator = Some(Box::new(diorama_engine::on_gpu::GpuTracer::new(r.gpu().clone(), field, coarse, occupancy)));
+        let tracer = diorama_engine::on_gpu::GpuTracer::new(r.gpu().clone(), field, coarse, occupancy);
+        model.accelerator = Some(Supervised::new(Box::new(tracer), r.name(), device != "auto", say));
         return Ok(r.name());
     }
     Ok(cpu_name())
@@ -95,7 +132,18 @@ impl Opened {
             #[cfg(feature = "gpu")]
             running: None,
             note,
+            halvings: 0,
         }
+    }
+
+    /// How often batches were halved because memory was short.
+    pub fn halvings(&self) -> u32 {
+        self.halvings
+    }
+
+    /// Halves batches from now on.
+    pub fn halve(&mut self) {
+        self.halvings += 1;
     }
 
     /// What the user is told.
@@ -155,7 +203,7 @@ impl Opened {
 const MOST_RAYS: usize = 1 << 14;
 
 /// Samples per step; fewer through networks whose layers' outputs all lie in memory.
-fn batch_samples(config: &Config, is_gpu: bool) -> usize {
+pub(super) fn batch_samples(config: &Config, is_gpu: bool) -> usize {
     match config.sampling.batch_samples {
         0 if is_gpu && config.method == Method::Ngp => 1 << 18,
         0 if is_gpu => 1 << 17,
@@ -167,9 +215,17 @@ fn batch_samples(config: &Config, is_gpu: bool) -> usize {
 #[cfg(feature = "gpu")]
 impl Opened {
     fn best() -> Opened {
-        use diorama_kernels::gpu::Gpu;
-        let found = Api::ALL.into_iter().filter(|a| a.is_built()).find_map(|a| Gpu::open_hardware(a).ok());
-        found.map_or(Opened::cpu(None), Opened::gpu)
+        use diorama_kernels::gpu::{Gpu, GpuError};
+        let mut fault = None;
+        for api in Api::ALL.into_iter().filter(|a| a.is_built()) {
+            match Gpu::open_hardware(api) {
+                Ok(gpu) => return Opened::gpu(gpu),
+                // A device that is there and does not open is worth a word.
+                Err(e @ GpuError::Open(..)) => drop(fault.get_or_insert(format!("{e}: the CPU is used"))),
+                Err(_) => {}
+            }
+        }
+        Opened::cpu(fault)
     }
 
     fn named(api: Api) -> Result<Opened> {
@@ -178,7 +234,7 @@ impl Opened {
     }
 
     fn gpu(gpu: diorama_kernels::gpu::Gpu) -> Opened {
-        Opened { running: Some(Running::new(gpu)), note: None }
+        Opened { running: Some(Running::new(gpu)), note: None, halvings: 0 }
     }
 
     pub fn is_gpu(&self) -> bool {
@@ -196,7 +252,7 @@ impl Opened {
 
     /// Samples per step.
     pub fn batch_samples(&self, config: &Config) -> usize {
-        batch_samples(config, self.is_hardware())
+        (batch_samples(config, self.is_hardware()) >> self.halvings).max(64)
     }
 
     /// Rays per step.
@@ -311,6 +367,9 @@ mod running {
                 error_map: m.error_map.as_ref(),
             };
             let images = resident(&self.gpu, store);
+            // What an earlier trainer has there makes room first.
+            self.trainer = None;
+            self.gpu.release();
             self.trainer = Some(GpuTrainer::new(self.gpu.clone(), &of, images, &m.base_cameras(), m.cube()));
             Ok(())
         }
@@ -389,7 +448,10 @@ mod running {
     }
 
     fn told(e: GpuError) -> PipelineError {
-        PipelineError::Device(e.to_string())
+        match e {
+            GpuError::Memory(..) => PipelineError::Memory(e.to_string()),
+            e => PipelineError::Device(e.to_string()),
+        }
     }
 
     /// The pixels that are kept, and which of them count.
@@ -425,6 +487,31 @@ mod tests {
         }
         let cpu = open(&Config { device: "cpu".into(), ..Config::new(Method::Ngp, "x".into()) }).unwrap_or_else(|e| panic!("{e}"));
         assert!(!cpu.is_gpu());
+    }
+
+    #[test]
+    fn a_full_device_gets_half_the_batch_twice_and_then_the_bytes_are_said() {
+        let full = || PipelineError::Memory("device X: out of memory: allocating 99 bytes".into());
+        for device in ["auto", "vulkan"] {
+            for halvings in [0, 1] {
+                let a = aftermath(full(), device, halvings, "batch 9 MiB");
+                assert!(matches!(&a, Aftermath::Halve(why) if why.contains("99 bytes") && why.contains("halved")), "{a:?}");
+            }
+        }
+        let Aftermath::Fail(e) = aftermath(full(), "vulkan", 2, "batch 9 MiB") else { panic!("it goes on") };
+        assert!(e.kind() == "memory" && !e.is_input(), "{e}");
+        for part in ["99 bytes", "batch 9 MiB", "--downscale"] {
+            assert!(e.to_string().contains(part), "{e}");
+        }
+        assert!(matches!(aftermath(full(), "auto", 2, "batch 9 MiB"), Aftermath::Cpu(why) if why.contains("batch 9 MiB")));
+    }
+
+    #[test]
+    fn a_lost_device_is_the_end_only_where_it_was_named() {
+        let lost = || PipelineError::Device("device X: gone".into());
+        assert!(matches!(aftermath(lost(), "auto", 0, ""), Aftermath::Cpu(why) if why.contains("gone")));
+        let Aftermath::Fail(e) = aftermath(lost(), "cuda", 0, "") else { panic!("it goes on") };
+        assert!(e.kind() == "device" && e.to_string().contains("--resume"), "{e}");
     }
 
     #[test]

@@ -1,5 +1,7 @@
 //! Scores on held-out views: full images, in the photographs' own distorted pixels.
 
+use super::fog::{self, Surfaces};
+use super::held_out::{self, GAP_DB, GAP_MEANS};
 use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
 use diorama_data::{masks, photo, weights};
@@ -7,15 +9,9 @@ use diorama_engine::metrics::lpips::{self, Lpips};
 use diorama_engine::metrics::{self, Scores};
 use diorama_engine::renderers::volume::{Quality, View};
 use diorama_geom::capture::Split;
-use diorama_geom::{Capture, Image, ImageU8};
+use diorama_geom::{Image, ImageU8};
 use serde::Serialize;
 use std::path::PathBuf;
-
-/// Frames of a split; held-out ones fall back to validation where there is no test split.
-pub fn held_out(capture: &Capture, split: Split) -> Vec<usize> {
-    let frames = capture.indices(split);
-    if frames.is_empty() && split == Split::Test { capture.indices(Split::Val) } else { frames }
-}
 
 /// One view's render and scores.
 pub struct ScoredView {
@@ -37,7 +33,20 @@ pub struct ViewScore {
     pub psnr_affine: f64,
     /// Perceptual distance, where weights for it were given.
     pub lpips: Option<f64>,
+    /// Whether the view lies behind fog ([`super::fog`]); false where that is not asked.
+    pub behind_fog: bool,
 }
+
+/// Training views, for comparison.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct TrainingScores {
+    pub views: usize,
+    pub psnr: f64,
+    pub ssim: f64,
+}
+
+/// Most training views that are judged beside held-out ones.
+const TRAINING_VIEWS: usize = 8;
 
 /// Means over all views.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -53,13 +62,35 @@ pub struct Report {
     pub psnr_mean_image: Option<f64>,
     /// Perceptual distance over whole pictures; its weights are the user's.
     pub lpips: Option<f64>,
+    /// Some training views, where they were asked for.
+    pub training: Option<TrainingScores>,
+    /// What drew the views.
+    pub device: String,
     pub per_view: Vec<ViewScore>,
+}
+
+impl Report {
+    /// How far held-out views are below training views, in dB.
+    pub fn gap(&self) -> Option<f64> {
+        self.training.as_ref().map(|t| t.psnr - self.psnr)
+    }
+
+    /// What a gap that is too large means, and what helps.
+    pub fn advice(&self) -> Option<String> {
+        let gap = self.gap().filter(|g| *g > GAP_DB)?;
+        Some(format!("held-out views are {gap:.1} dB below training views: {GAP_MEANS}"))
+    }
+
+    /// Names of the views behind fog.
+    pub fn behind_fog(&self) -> Vec<&str> {
+        self.per_view.iter().filter(|v| v.behind_fog).map(|v| &v.name[..]).collect()
+    }
 }
 
 /// A photograph at the run's resolution, transparent pixels on the model's backdrop.
 fn reference_photo(model: &ObjectModel, full: &ImageU8) -> Image {
-    let d = model.config.data.downscale as usize;
-    let small = full.downsampled((full.width / d).max(1), (full.height / d).max(1));
+    let (width, height) = model.config.reduction().size((full.width as u32, full.height as u32));
+    let small = full.downsampled(width as usize, height as usize);
     let back = model.backdrop_color();
     let mut out = Image::zeros(small.width, small.height, 3);
     for (o, p) in out.data.chunks_exact_mut(3).zip(small.data.chunks_exact(small.channels)) {
@@ -82,10 +113,11 @@ fn reference(model: &ObjectModel, i: usize, full: ImageU8) -> Result<(Image, Opt
 /// Renders frame `i` and scores it against `full`, its photograph at full size, where its mask says that pixels count.
 ///
 /// # Errors
-/// When the mask cannot be decoded, or is not that of the photograph.
+/// When the mask cannot be decoded, or is not that of the photograph; or when the device that was named failed.
 pub fn score_view(model: &ObjectModel, i: usize, full: ImageU8, quality: Quality) -> Result<ScoredView> {
     let (photo, counts) = reference(model, i, full)?;
     let view = model.tracer(quality).view(&model.posed(i), &mut |_| {});
+    model.check_device()?;
     let mut shown = view.rgb.clone();
     shown.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     let scores = metrics::compare(&shown, &photo, admits(&counts));
@@ -108,6 +140,39 @@ fn where_it_counts(scored: &ScoredView) -> Image {
         }
     }
     out
+}
+
+/// Scores all views of a split, and some training views beside them; tells which lie behind fog. `each` sees every view of
+/// the split as it is done.
+pub fn evaluate_with_training(
+    model: &ObjectModel,
+    split: Split,
+    quality: Quality,
+    lpips: Option<&Lpips>,
+    each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
+) -> Result<Report> {
+    let mut report = evaluate_with(model, split, quality, lpips, each)?;
+    if split == Split::Train {
+        return Ok(report);
+    }
+    let mut scores = Vec::new();
+    for i in held_out::spread(&model.train, TRAINING_VIEWS.min(report.views)) {
+        scores.push(score_view(model, i, photo::load(&model.capture.frames[i].image)?, quality)?.scores);
+    }
+    let mean = |f: fn(&Scores) -> f64| mean_of_numbers(scores.iter().map(f));
+    let training = TrainingScores { views: scores.len(), psnr: mean(|s| s.psnr), ssim: mean(|s| s.ssim) };
+    let middle = fog::median(scores.iter().map(|s| s.psnr).filter(|p| !p.is_nan()).collect()).unwrap_or(training.psnr);
+    let mut surfaces = None;
+    for (v, i) in report.per_view.iter_mut().zip(held_out::frames(&model.capture, split)) {
+        // Depth is asked only where scores alone do not tell.
+        let near = fog::depends_on_depth(v.psnr, middle)
+            .then(|| surfaces.get_or_insert_with(|| Surfaces::of(model)).near_share(model, i))
+            .flatten();
+        v.behind_fog = fog::is_behind(v.psnr, middle, near);
+    }
+    model.check_device()?;
+    report.training = Some(training);
+    Ok(report)
 }
 
 /// Scores all views of a split; `each` sees every view as it is done.
@@ -141,7 +206,7 @@ pub fn evaluate_with(
     lpips: Option<&Lpips>,
     each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
 ) -> Result<Report> {
-    let frames = held_out(&model.capture, split);
+    let frames = held_out::frames(&model.capture, split);
     if frames.is_empty() {
         return Err(PipelineError::Usage("the run holds no views out; train with --split every:8 or judge --on train".into()));
     }
@@ -165,6 +230,7 @@ pub fn evaluate_with(
             mse: s.mse,
             psnr_affine: s.psnr_affine,
             lpips: distance.filter(|_| !s.psnr.is_nan()),
+            behind_fog: false,
         });
     }
     // Views in which no pixel counts say nothing.
@@ -178,6 +244,8 @@ pub fn evaluate_with(
         psnr_affine: average(|v| v.psnr_affine),
         psnr_mean_image: (!mean_scores.is_empty()).then(|| mean_of_numbers(mean_scores.into_iter())),
         lpips: lpips.map(|_| mean_of_numbers(per_view.iter().filter_map(|v| v.lpips))),
+        training: None,
+        device: model.drew_on(),
         per_view,
     })
 }
@@ -205,4 +273,25 @@ fn mean_image(model: &ObjectModel) -> Result<Option<Image>> {
         s.data.iter_mut().for_each(|v| *v /= n);
         s
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_perceptual_distance_sees_the_photograph_where_pixels_do_not_count() {
+        let image = |data: &[f32]| Image { width: 2, height: 1, channels: 3, data: data.to_vec() };
+        let none = Image::zeros(2, 1, 1);
+        let mask = ImageU8 { width: 2, height: 1, channels: 1, data: vec![255, 0] };
+        let mut scored = ScoredView {
+            view: View { rgb: image(&[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]), opacity: none.clone(), depth: none },
+            photo: image(&[0.9; 6]),
+            counts: Some(mask),
+            scores: Scores { mse: 0.0, psnr: 0.0, ssim: 0.0, psnr_affine: 0.0 },
+        };
+        assert_eq!(where_it_counts(&scored).data, [0.1, 0.2, 0.3, 0.9, 0.9, 0.9]);
+        scored.counts = None;
+        assert_eq!(where_it_counts(&scored), scored.view.rgb);
+    }
 }

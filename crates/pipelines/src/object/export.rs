@@ -1,7 +1,7 @@
 //! From a trained field to a mesh file in the input's scale and frame.
 
 use super::model::ObjectModel;
-use super::{extent, texture};
+use super::{extent, memory, texture};
 use crate::error::{PipelineError, Result};
 use diorama_data::{DataError, collada, glb, mesh_text, usdz};
 use diorama_geom::Mesh;
@@ -142,8 +142,14 @@ pub struct Removed {
     pub before_cameras: usize,
 }
 
-/// Extracts, cleans, simplifies, colours and writes; `progress` is told the stage and (done, of).
-pub fn export(model: &ObjectModel, o: &ExportOptions, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<Exported> {
+/// Extracts, cleans, simplifies, colours and writes; `note` hears what the user should know, `progress` is told the
+/// stage and (done, of).
+pub fn export(
+    model: &ObjectModel,
+    o: &ExportOptions,
+    note: &mut dyn FnMut(&str),
+    progress: &mut dyn FnMut(&str, usize, usize),
+) -> Result<Exported> {
     let start = Instant::now();
     check(o)?;
     let (min, max) = o.clip.unwrap_or_else(|| extent::of(model));
@@ -151,11 +157,13 @@ pub fn export(model: &ObjectModel, o: &ExportOptions, progress: &mut dyn FnMut(&
         return Err(PipelineError::Usage("--clip: each highest coordinate must exceed the lowest".into()));
     }
     let grid = Grid { min, max, resolution: o.resolution };
+    let texels = o.texture.unwrap_or(if o.format.has_texture() { TEXELS } else { 0 });
+    memory::check_export(model, o, &grid, texels)?.iter().for_each(|n| note(n));
     let level = o.level.unwrap_or_else(|| automatic_level(model, &grid));
     let mut mesh = extract::extract(model, &grid, level, o.method, &mut |i, n| progress("density", i, n));
+    model.check_device()?;
     repair::weld(&mut mesh);
     let removed = clean(model, &mut mesh, o, grid.cell());
-    let texels = o.texture.unwrap_or(if o.format.has_texture() { TEXELS } else { 0 });
     let faces = o.faces.unwrap_or(if texels > 0 { FACES } else { COLORED_FACES });
     let mut notes = Vec::new();
     let watertight = reduce(&mut mesh, faces, o, &mut notes)?;
@@ -178,6 +186,7 @@ pub fn export(model: &ObjectModel, o: &ExportOptions, progress: &mut dyn FnMut(&
     } else {
         color::color_from_field(&mut mesh, model);
     }
+    model.check_device()?;
     to_capture(model, &mut mesh);
     let scale = metres_per_unit(&mesh, o.size);
     let extent = |m: &Mesh| m.bounds().map_or([0.0; 3], |(lo, hi)| std::array::from_fn(|k| hi[k] - lo[k]));

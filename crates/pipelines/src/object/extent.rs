@@ -1,7 +1,8 @@
 //! What a capture is of: the box that a mesh is taken from when nobody says which.
 
 use super::model::ObjectModel;
-use diorama_engine::renderers::volume::Quality;
+use diorama_engine::renderers::volume::{Quality, Tracer};
+use diorama_geom::Frame;
 use diorama_geom::glam::DVec3;
 
 /// Most cameras that are asked, and pixels along the longer side of their views.
@@ -83,32 +84,40 @@ fn quantile(mut v: Vec<f64>, share: f64) -> f64 {
     v.get((v.len() as f64 * share) as usize).copied().unwrap_or(0.0)
 }
 
+/// Points in the world of the surfaces that a frame's camera sees, in a view of `longest` pixels along its longer side.
+pub fn surface_points(model: &ObjectModel, tracer: &Tracer, f: &Frame, longest: u32) -> Vec<DVec3> {
+    surfaces(model, tracer, f, longest).into_iter().map(|s| s.position).collect()
+}
+
+/// [`surface_points`] with what the camera knows of them; no camera is counted yet.
+fn surfaces(model: &ObjectModel, tracer: &Tracer, f: &Frame, longest: u32) -> Vec<Seen> {
+    let c = &f.camera;
+    let shrink = longest as f64 / c.width.max(c.height) as f64;
+    let small = c.resized(((c.width as f64 * shrink) as u32).max(1), ((c.height as f64 * shrink) as u32).max(1));
+    let posed = model.to_model(small, &f.world_from_camera);
+    let view = tracer.view(&posed, &mut |_| {});
+    let world_from_model = model.model_from_world.inverse();
+    let from_middle = |v: f64, n: u32| (v / n as f64 - 0.5).abs() < 0.5 * MIDDLE;
+    let seen = |i: usize| {
+        let w = small.width as usize;
+        let (x, y) = ((i % w) as f64 + 0.5, (i / w) as f64 + 0.5);
+        let position = world_from_model.point(posed.pose.point(posed.camera.direction(x, y) * view.depth.data[i] as f64));
+        Seen {
+            position,
+            distance: (position - f.world_from_camera.translation).length(),
+            is_central: from_middle(x, small.width) && from_middle(y, small.height),
+            cameras: 0,
+        }
+    };
+    (0..view.depth.data.len()).filter(|i| view.opacity.data[*i] > 0.5).map(seen).collect()
+}
+
 /// Points of surfaces in small views from the training cameras.
 fn seen_points(model: &ObjectModel) -> Vec<Seen> {
     let n = model.train.len();
     let frames: Vec<_> = (0..n.min(CAMERAS)).map(|i| &model.capture.frames[model.train[i * n / n.min(CAMERAS)]]).collect();
     let tracer = model.tracer(Quality::Fast);
-    let world_from_model = model.model_from_world.inverse();
-    let mut points = Vec::new();
-    for f in &frames {
-        let c = &f.camera;
-        let shrink = VIEW_PX as f64 / c.width.max(c.height) as f64;
-        let small = c.resized(((c.width as f64 * shrink) as u32).max(1), ((c.height as f64 * shrink) as u32).max(1));
-        let posed = model.to_model(small, &f.world_from_camera);
-        let view = tracer.view(&posed, &mut |_| {});
-        for (i, d) in view.depth.data.iter().enumerate().filter(|(i, _)| view.opacity.data[*i] > 0.5) {
-            let w = small.width as usize;
-            let (x, y) = ((i % w) as f64 + 0.5, (i / w) as f64 + 0.5);
-            let position = world_from_model.point(posed.pose.point(posed.camera.direction(x, y) * *d as f64));
-            let from_middle = |v: f64, n: u32| (v / n as f64 - 0.5).abs() < 0.5 * MIDDLE;
-            points.push(Seen {
-                position,
-                distance: (position - f.world_from_camera.translation).length(),
-                is_central: from_middle(x, small.width) && from_middle(y, small.height),
-                cameras: 0,
-            });
-        }
-    }
+    let mut points: Vec<Seen> = frames.iter().flat_map(|f| surfaces(model, &tracer, f, VIEW_PX)).collect();
     for p in &mut points {
         let in_view = |f: &&&diorama_geom::Frame| {
             let (w, h) = (f.camera.width as f64, f.camera.height as f64);

@@ -6,6 +6,7 @@ use diorama_data::checkpoint::{Checkpoint, Entry};
 use diorama_engine::background::LearnedBackground;
 use diorama_engine::fields::{self, Batch, Field, FieldBuffers};
 use diorama_engine::params::ParamGroup;
+use diorama_engine::renderers::supervised::{Supervised, Unserved};
 use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Sampling, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::pixels::ErrorMap;
@@ -45,7 +46,20 @@ pub struct ObjectModel {
     /// Lowered once after a loss that was not finite.
     pub rate_scale: f32,
     /// Draws views instead of the CPU.
-    pub accelerator: Option<Box<dyn Accelerator>>,
+    pub accelerator: Option<Supervised>,
+}
+
+/// Shape of the hash grid of `ngp`.
+pub(super) fn hash_grid(config: &Config, capture: &Capture) -> HashGridConfig {
+    let f = &config.field;
+    let widest = if f.contraction { 2.0 } else { capture.scene.aabb_scale as f32 };
+    let finest = if f.finest > 0 { f.finest } else { (2048.0 * widest) as u32 };
+    HashGridConfig { levels: f.levels, features: f.features, log2_size: f.log2_size, base: f.base, finest }
+}
+
+/// Cascades of the occupancy grid, each twice as wide as the one inside it.
+pub(super) fn cascades(capture: &Capture) -> usize {
+    capture.scene.aabb_scale.max(1).ilog2() as usize + 1
 }
 
 impl ObjectModel {
@@ -57,18 +71,12 @@ impl ObjectModel {
         let (seed, rate, images, dims) = (config.seed, config.optim.rate, train.len(), config.field.appearance);
         let f = &config.field;
         let (field, coarse) = match config.method {
-            Method::Ngp => {
-                let widest = if f.contraction { 2.0 } else { outer };
-                let finest = if f.finest > 0 { f.finest } else { (2048.0 * widest) as u32 };
-                let grid = HashGridConfig { levels: f.levels, features: f.features, log2_size: f.log2_size, base: f.base, finest };
-                (fields::ngp(grid, outer, f.contraction, rate, images, dims, seed), None)
-            }
+            Method::Ngp => (fields::ngp(hash_grid(&config, &capture), outer, f.contraction, rate, images, dims, seed), None),
             Method::Nerf => (fields::nerf(outer, rate, images, dims, seed, 1), Some(fields::nerf(outer, rate, images, dims, seed, 0))),
             Method::Mlp => (fields::mlp(outer, rate, seed), None),
             Method::Baseline => (fields::baseline(outer, rate, seed), None),
         };
-        let cascades = capture.scene.aabb_scale.max(1).ilog2() as usize + 1;
-        let occupancy = (config.method == Method::Ngp).then(|| Occupancy::new(config.sampling.occupancy_resolution, cascades));
+        let occupancy = (config.method == Method::Ngp).then(|| Occupancy::new(config.sampling.occupancy_resolution, cascades(&capture)));
         let learned = (config.background == Background::Learned).then(|| LearnedBackground::new(Adam { rate, ..Adam::default() }));
         let corrections = config.camera.refine.then(|| {
             let adam = Adam { rate: config.camera.rate, weight_decay: config.camera.decay, ..Adam::default() };
@@ -112,7 +120,7 @@ impl ObjectModel {
     /// A frame's camera at the run's resolution, standing in model space.
     pub fn posed(&self, frame: usize) -> PosedCamera {
         let f = &self.capture.frames[frame];
-        PosedCamera { camera: f.camera.downscaled(self.config.data.downscale), pose: self.model_from_world.pose(&f.world_from_camera) }
+        PosedCamera { camera: f.camera.reduced(self.config.reduction()), pose: self.model_from_world.pose(&f.world_from_camera) }
     }
 
     /// A camera that stands in the world, in model space.
@@ -171,8 +179,23 @@ impl ObjectModel {
             pruning: quality.pruning(),
             appearance: None,
             tolerance: quality.tolerance(),
-            accelerator: self.accelerator.as_deref(),
+            accelerator: self.accelerator.as_ref().map(|a| a as &dyn Accelerator),
         }
+    }
+
+    /// # Errors
+    /// When the device that the user named has failed: what was computed since does not count.
+    pub fn check_device(&self) -> Result<()> {
+        match self.accelerator.as_ref().and_then(Supervised::fatal) {
+            Some(why) => Err(PipelineError::Device(format!("{why}; use --device cpu"))),
+            None => Ok(()),
+        }
+    }
+
+    /// What has drawn views so far, in words: a device, unless it failed or was never asked.
+    pub fn drew_on(&self) -> String {
+        let device = self.accelerator.as_ref().filter(|a| a.served() > 0 && a.failure().is_none());
+        device.map_or("cpu".into(), |a| a.name().to_string())
     }
 
     fn groups(&self) -> Vec<(String, &ParamGroup)> {
@@ -327,10 +350,11 @@ impl FieldQuery for ObjectModel {
 
     fn color(&self, points_in_world: &[[f32; 3]], directions: &[[f32; 3]], rgb_srgb: &mut [[f32; 3]]) {
         const CHUNK: usize = 1 << 16;
-        let on_device = |a: &dyn Accelerator| a.color(&self.model_points(points_in_world), directions.as_flattened());
-        if let Some(rgb) = self.accelerator.as_deref().and_then(on_device) {
-            rgb_srgb.as_flattened_mut().copy_from_slice(&rgb);
-            return;
+        let on_device = |a: &Supervised| a.color(&self.model_points(points_in_world), directions.as_flattened());
+        match self.accelerator.as_ref().map(on_device) {
+            Some(Ok(rgb)) => return rgb_srgb.as_flattened_mut().copy_from_slice(&rgb),
+            Some(Err(Unserved::Abandoned)) => return rgb_srgb.fill([0.0; 3]),
+            Some(Err(Unserved::Failed(_))) | None => {}
         }
         let mut buf = FieldBuffers::default();
         for ((p, d), out) in points_in_world.chunks(CHUNK).zip(directions.chunks(CHUNK)).zip(rgb_srgb.chunks_mut(CHUNK)) {
@@ -355,9 +379,10 @@ impl FieldQuery for ObjectModel {
 impl ObjectModel {
     /// Densities per model unit `[N]` at model points `[N, 3]`.
     pub fn model_density(&self, model: &[f32], sigma: &mut [f32]) {
-        match self.accelerator.as_deref().and_then(|a| a.density(model)) {
-            Some(d) => sigma.copy_from_slice(&d),
-            None => self.field.density(model, sigma),
+        match self.accelerator.as_ref().map(|a| a.density(model)) {
+            Some(Ok(d)) => sigma.copy_from_slice(&d),
+            Some(Err(Unserved::Abandoned)) => sigma.fill(0.0),
+            Some(Err(Unserved::Failed(_))) | None => self.field.density(model, sigma),
         }
     }
 

@@ -104,13 +104,14 @@ const STREAM: u64 = 0x706f_696e_7473;
 /// normals; `progress` is told the stage and (done, of).
 ///
 /// # Errors
-/// When no camera sees a surface in the region, or the disk refuses.
+/// When no camera sees a surface in the region, the device that was named failed, or the disk refuses.
 pub fn export(model: &ObjectModel, o: &PointOptions, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<ExportedPoints> {
     let start = Instant::now();
     if !(1..=MOST_POINTS).contains(&o.points) {
         return Err(PipelineError::Usage(format!("--points {}: must be 1 to {MOST_POINTS}", o.points)));
     }
     let mut cloud = sample(model, o, progress);
+    model.check_device()?;
     to_capture(model, &mut cloud);
     let scale = metres_per_unit(&cloud, o.size);
     let extent_m = cloud.bounds().map_or([0.0; 3], |(lo, hi)| std::array::from_fn(|k| ((hi[k] - lo[k]) as f64 * scale) as f32));

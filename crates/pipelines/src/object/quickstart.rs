@@ -27,7 +27,8 @@ pub struct Made {
     pub train_seconds: f64,
     pub steps: u64,
     pub mesh: Exported,
-    pub video: PathBuf,
+    /// None where it was interrupted before its first frame.
+    pub video: Option<PathBuf>,
     pub report: PathBuf,
     pub interrupted: bool,
 }
@@ -67,10 +68,10 @@ pub fn quickstart(
     // A small scene: a smaller table is as sharp and trains faster.
     config.field.log2_size = 17;
     config.field.finest = 512;
-    let Trained { model, summary, .. } = recipe::train(&config, &mut run, false, None, interrupt, events)?;
+    let Trained { model, summary, device } = recipe::train(&config, &mut run, false, None, interrupt, events)?;
     note("scoring held-out views");
     let mut pairs: Vec<Vec<ImageU8>> = vec![Vec::new(), Vec::new()];
-    let scores = evaluate::evaluate(&model, Split::Test, Quality::Full, &mut |_, v| {
+    let scores = evaluate::evaluate_with_training(&model, Split::Test, Quality::Full, None, &mut |_, v| {
         if pairs[0].len() < 4 {
             pairs[0].push(v.photo.to_u8());
             pairs[1].push(v.view.rgb.to_u8());
@@ -94,7 +95,7 @@ pub fn quickstart(
         depth: Default::default(),
         scale: None,
     };
-    render::render(&model, &options, interrupt, &mut |_, _| {})?;
+    let (filmed, _) = render::render(&model, &options, interrupt, &mut |_, _| {})?;
     note("extracting the mesh");
     let options = ExportOptions {
         format: Format::Glb,
@@ -112,13 +113,13 @@ pub fn quickstart(
         floaters: 0.05,
         keep_unseen: false,
     };
-    let mesh = export::export(&model, &options, &mut |_, _, _| {})?;
+    let mesh = export::export(&model, &options, note, &mut |_, _, _| {})?;
     let page = folder.join("report.html");
-    report::write(&page, &summary, &scores, &mesh)?;
-    Ok(made(folder, summary, scores, mesh, video, page))
+    report::write(&page, &summary, &device, &scores, &mesh, filmed > 0)?;
+    Ok(made(folder, summary, scores, mesh, Some(video).filter(|_| filmed > 0), page))
 }
 
-fn made(folder: &Path, summary: Summary, scores: Report, mesh: Exported, video: PathBuf, report: PathBuf) -> Made {
+fn made(folder: &Path, summary: Summary, scores: Report, mesh: Exported, video: Option<PathBuf>, report: PathBuf) -> Made {
     Made {
         folder: folder.to_path_buf(),
         psnr: scores.psnr,

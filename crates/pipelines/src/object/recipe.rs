@@ -1,24 +1,24 @@
 //! Training, from top to bottom.
 
 use super::config::{Background, Config, Method};
-use super::device::{self, Drawing, Opened};
-use super::evaluate;
+use super::device::{self, Aftermath, Drawing, Opened};
+use super::held_out::{self, HeldOutPixels};
+use super::memory;
 use super::model::ObjectModel;
-use super::run_folder::RunFolder;
+use super::run_folder::{RunFolder, RunSummary};
 use super::viewing::RunView;
 use crate::bench::train::{StageFigure, TrainReport};
 use crate::error::{PipelineError, Result};
+use diorama_data::checkpoint;
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
-use diorama_data::{checkpoint, photo};
 use diorama_engine::fields::{Batch, Field, FieldBuffers, Pruning};
 use diorama_engine::losses::{ColorLoss, Photometric};
 use diorama_engine::params::Schedule;
-use diorama_engine::renderers::volume::Quality;
 use diorama_engine::samplers::pixels::{self, DrawOptions, PixelSource};
 use diorama_engine::samplers::{RayBatch, stratified};
 use diorama_engine::stages::Stages;
-use diorama_engine::train::{self, Event, RunError, RunOptions, StepReport, Summary, Trainee};
+use diorama_engine::train::{self, Event, HeldOut, RunError, RunOptions, StepReport, Summary, Trainee};
 use diorama_geom::Capture;
 use diorama_geom::capture::Split;
 use diorama_geom::rng::Rng;
@@ -65,14 +65,17 @@ pub fn load_capture(config: &Config) -> Result<Capture> {
 }
 
 /// A capture that a run has kept, with the sparse points that it has not; a note says so where they cannot be had.
-fn with_points(mut kept: Capture, config: &Config) -> Capture {
+fn with_points(folder: &RunFolder, config: &Config) -> Result<Capture> {
+    let mut kept = folder.capture()?;
+    let mut config = config.clone();
+    config.data.path = folder.data_set()?;
     let names = |c: &Capture| c.frames.iter().map(|f| f.name.clone()).collect::<Vec<_>>();
-    match load_capture(config) {
+    match load_capture(&config) {
         Ok(fresh) if names(&fresh) == names(&kept) => kept.points = fresh.points,
         Ok(_) => kept.notes.push("the capture has changed since the run began: its sparse points are not used".into()),
         Err(e) => kept.notes.push(format!("the capture's sparse points cannot be read again: {e}")),
     }
-    kept
+    Ok(kept)
 }
 
 /// The device that a configuration will train on, in words.
@@ -105,10 +108,11 @@ pub fn train(
 ) -> Result<Trained> {
     let opened = device::open(config)?;
     opened.note().into_iter().for_each(|n| events(&Event::Note(n)));
-    let capture = if resume { with_points(folder.capture()?, config) } else { load_capture(config)? };
+    let capture = if resume { with_points(folder, config)? } else { load_capture(config)? };
     for note in &capture.notes {
         events(&Event::Note(note.clone()));
     }
+    memory::check_training(config, &capture)?.into_iter().for_each(|n| events(&Event::Note(n)));
     let (store, budget) = load_pixels(config, &capture, &opened)?;
     if let n @ 2.. = store.stride() {
         let limit = if budget < config.data.memory_budget { "what the device holds in one piece" } else { "data.memory_budget" };
@@ -116,6 +120,7 @@ pub fn train(
     }
     let has_alpha = store.has_alpha;
     let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
+    let held_out = HeldOutPixels::draw(&model)?;
     if resume {
         if checkpoint::exists(&folder.checkpoints()) {
             let (c, note) = checkpoint::load(&folder.checkpoints())?;
@@ -128,28 +133,50 @@ pub fn train(
     } else {
         folder.write_description(config, &model.capture)?;
     }
-    let options = run_options(config);
+    let options = RunOptions { held_out_rays: held_out.as_ref().map_or(0, |h| h.rays() as u64), ..run_options(config) };
     let origin = model.origin;
     let checkpoints = folder.checkpoints();
-    let mut trainer = Trainer { view, ..Trainer::new(model, Photographs(store), &checkpoints, opened)? };
-    let mut log_error = None;
+    let mut trainer = Trainer { view, held_out, ..Trainer::new(model, Photographs(store), &checkpoints, opened)? };
+    let (mut log_error, mut judged) = (None, HeldOut::default());
     let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
         if let Err(e) = folder.log(e) {
             log_error.get_or_insert(e);
         }
+        if let Event::Evaluated { views, .. } = e {
+            judged.views.clone_from(views);
+        }
         view.into_iter().for_each(|v| v.hear(e));
         events(e);
     });
-    trainer.show()?;
     if let Some(e) = log_error {
         return Err(e);
     }
     let summary = result.map_err(|e| match e {
         RunError::Failed(e) => e,
-        RunError::Diverged { step } => PipelineError::Diverged { step, checkpoint: checkpoint::latest(&checkpoints).display().to_string() },
+        RunError::Diverged { first, again } => PipelineError::Diverged { first, again, kept: kept(&checkpoints) },
     })?;
+    trainer.show()?;
     folder.draw_curves()?;
+    let name = |i: usize| trainer.model.capture.frames[i].name.clone();
+    folder.write_summary(&RunSummary {
+        steps: summary.step,
+        seconds: summary.seconds,
+        device: trainer.device.name(),
+        psnr_train: Some(summary.psnr).filter(|p| p.is_finite()),
+        psnr_held_out: summary.held_out,
+        behind_fog: held_out::far_below(&judged.views, summary.psnr).into_iter().map(name).collect(),
+        peak_memory_bytes: diorama_data::memory::peak_of_process(),
+    })?;
     Ok(Trained { device: trainer.device.name(), model: trainer.model, summary })
+}
+
+/// What a run that ended with an error leaves, in words.
+fn kept(checkpoints: &Path) -> String {
+    if checkpoint::exists(checkpoints) {
+        format!("{} is the last good checkpoint", checkpoint::latest(checkpoints).display())
+    } else {
+        "there was no checkpoint yet".into()
+    }
 }
 
 /// What the first steps came to.
@@ -234,7 +261,7 @@ fn load_pixels(config: &Config, capture: &Capture, device: &Opened) -> Result<(P
     let train = capture.indices(Split::Train);
     let frames: Vec<_> = train.iter().map(|&i| &capture.frames[i]).collect();
     let budget = config.data.memory_budget.min(device.most_bytes());
-    let options = StoreOptions { downscale: config.data.downscale, budget, masks: capture.masks };
+    let options = StoreOptions { reduction: config.reduction(), budget, masks: capture.masks };
     Ok((PixelStore::load(&frames, &options, &|| {})?, budget))
 }
 
@@ -248,6 +275,7 @@ fn run_options(config: &Config) -> RunOptions {
         save_every_seconds: r.save_every_seconds,
         save_every_steps: positive(r.save_every_steps),
         evaluate_every: positive(r.evaluate_every),
+        held_out_rays: 0,
     }
 }
 
@@ -255,6 +283,10 @@ fn run_options(config: &Config) -> RunOptions {
 pub(super) struct Photographs(PixelStore);
 
 impl Photographs {
+    pub fn new(store: PixelStore) -> Self {
+        Photographs(store)
+    }
+
     #[cfg(feature = "gpu")]
     pub fn store(&self) -> &PixelStore {
         &self.0
@@ -291,6 +323,14 @@ struct Buffers {
     field: FieldBuffers,
 }
 
+/// A device's failure that training survives; why, in words.
+enum Setback {
+    /// The CPU goes on from what the host holds.
+    Lost(String),
+    /// The device goes on from the last checkpoint, with a smaller batch.
+    Full(String),
+}
+
 struct Trainer<'a> {
     model: ObjectModel,
     photographs: Photographs,
@@ -302,8 +342,9 @@ struct Trainer<'a> {
     /// Samples before any were left out.
     marched: u64,
     device: Opened,
-    /// Why the CPU has to go on for a GPU.
-    device_lost: Option<String>,
+    /// How a device failed, and what was made of it.
+    setback: Option<Setback>,
+    held_out: Option<HeldOutPixels>,
     /// Who looks on.
     view: Option<&'a RunView>,
 }
@@ -324,7 +365,8 @@ impl<'a> Trainer<'a> {
             recovered: false,
             marched: 0,
             device,
-            device_lost: None,
+            setback: None,
+            held_out: None,
             view: None,
         })
     }
@@ -350,7 +392,7 @@ impl<'a> Trainer<'a> {
     fn rays(&self, step: u64) -> usize {
         let s = &self.model.config.sampling;
         if s.rays > 0 {
-            return s.rays;
+            return (s.rays >> self.device.halvings()).max(1);
         }
         let (from, until) = BATCH_RAMP;
         let grown = step.saturating_sub(from) as f64 / (until - from) as f64;
@@ -579,15 +621,22 @@ impl Trainee for Trainer<'_> {
         }
         if self.device.is_gpu() {
             let e = match self.step_gpu(step, progress) {
-                // The device was the program's own choice: the CPU goes on.
-                Err(PipelineError::Device(e)) if self.model.config.device == "auto" => e,
-                Err(PipelineError::Device(e)) => {
-                    return Err(PipelineError::Device(format!("{e}; go on with --resume, on the CPU with --resume --device cpu")));
-                }
-                result => return result,
+                Err(e) => e,
+                done => return done,
             };
-            self.device = Opened::cpu(None);
-            self.device_lost = Some(format!("{e}; the CPU goes on"));
+            let m = &self.model;
+            let needs = memory::of_training(&m.config, &m.capture, self.device.batch_samples(&m.config)).to_string();
+            self.setback = Some(match device::aftermath(e, &m.config.device, self.device.halvings(), &needs) {
+                Aftermath::Fail(e) => return Err(e),
+                Aftermath::Cpu(why) => {
+                    self.device = Opened::cpu(None);
+                    Setback::Lost(why)
+                }
+                Aftermath::Halve(why) => {
+                    self.device.halve();
+                    Setback::Full(why)
+                }
+            });
             return Ok(StepReport { loss: f64::NAN, ..StepReport::default() });
         }
         let first = self.model.origin.rays;
@@ -625,51 +674,65 @@ impl Trainee for Trainer<'_> {
         Ok(report)
     }
 
-    fn save(&mut self, step: u64, seconds: f64) -> Result<()> {
+    fn save(&mut self, step: u64, seconds: f64) -> Result<bool> {
         self.settle()?;
         self.device.download(&mut self.model)?;
         if self.model.is_broken() {
-            return Err(PipelineError::Diverged { step, checkpoint: checkpoint::latest(self.checkpoints).display().to_string() });
+            return Ok(false);
         }
         self.model.origin.step = step;
         self.model.origin.seconds = seconds;
         let (entries, metadata) = self.model.entries();
-        Ok(checkpoint::save(self.checkpoints, &entries, metadata)?)
+        checkpoint::save(self.checkpoints, &entries, metadata)?;
+        Ok(true)
     }
 
     fn recover(&mut self) -> Result<Option<(u64, String)>> {
-        // The host holds what the last checkpoint or evaluation brought back.
-        if let Some(why) = self.device_lost.take() {
-            return Ok(Some((self.model.origin.step, why)));
-        }
-        if self.recovered || !checkpoint::latest(self.checkpoints).exists() {
-            return Ok(None);
-        }
-        self.recovered = true;
-        let (c, _) = checkpoint::load(self.checkpoints)?;
-        self.model.restore(c, self.checkpoints)?;
-        self.model.rate_scale *= 0.3;
+        let why = match self.setback.take() {
+            // The host holds what the last checkpoint or judgement brought back.
+            Some(Setback::Lost(why)) => return Ok(Some((self.model.origin.step, why))),
+            Some(Setback::Full(why)) => {
+                self.go_back()?;
+                why
+            }
+            None if self.recovered => return Ok(None),
+            None => {
+                self.recovered = true;
+                self.go_back()?;
+                self.model.rate_scale *= 0.3;
+                "the loss was not finite; the rate is lowered".into()
+            }
+        };
         self.cameras = self.model.cameras();
         self.device.upload(&self.model, &self.photographs)?;
-        Ok(Some((self.model.origin.step, "the loss was not finite; the rate is lowered".into())))
+        Ok(Some((self.model.origin.step, why)))
     }
 
-    fn evaluate(&mut self) -> (f64, f64) {
-        if self.device.download(&mut self.model).is_err() {
-            return (f64::NAN, f64::NAN);
+    fn evaluate(&mut self) -> Result<Option<HeldOut>> {
+        let Some(pixels) = &self.held_out else { return Ok(None) };
+        match self.device.download(&mut self.model) {
+            Ok(()) => Ok(Some(pixels.judge(&self.model))),
+            // A device that fails here fails in the next step as well, which knows what to do.
+            Err(PipelineError::Device(_) | PipelineError::Memory(_)) => Ok(None),
+            Err(e) => Err(e),
         }
-        let frames = evaluate::held_out(&self.model.capture, Split::Test);
-        let few: Vec<usize> = frames.into_iter().take(4).collect();
-        let mut scores = Vec::new();
-        for i in few {
-            if let Ok(image) = photo::load(&self.model.capture.frames[i].image) {
-                match evaluate::score_view(&self.model, i, image, Quality::Full) {
-                    Ok(scored) => scores.push(scored.scores),
-                    Err(_) => return (f64::NAN, f64::NAN),
-                }
-            }
-        }
-        let n = scores.len().max(1) as f64;
-        (scores.iter().map(|s| s.psnr).sum::<f64>() / n, scores.iter().map(|s| s.mse).sum::<f64>() / n)
     }
 }
+
+impl Trainer<'_> {
+    /// Takes the model back to the last checkpoint, or to its start, which is a function of the seed.
+    fn go_back(&mut self) -> Result<()> {
+        let m = &self.model;
+        let mut fresh = ObjectModel::new(m.config.clone(), m.capture.clone(), m.has_alpha)?;
+        if checkpoint::exists(self.checkpoints) {
+            let (c, _) = checkpoint::load(self.checkpoints)?;
+            fresh.restore(c, &checkpoint::latest(self.checkpoints))?;
+        }
+        self.model = fresh;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+#[path = "recipe_tests.rs"]
+mod tests;

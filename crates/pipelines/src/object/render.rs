@@ -4,7 +4,7 @@ use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
 use diorama_data::camera_path_json::{self, CameraPath};
 use diorama_data::depth::{DepthFormat, DepthSequence};
-use diorama_data::mp4::Video;
+use diorama_data::film::Film;
 use diorama_data::{DataError, photo};
 use diorama_engine::renderers::volume::{Quality, View};
 use diorama_engine::samplers::{RayBatch, pixels};
@@ -95,7 +95,7 @@ pub struct RenderOptions {
     pub layers: Vec<Layer>,
     /// Folder for PNG sequences, if any.
     pub images: Option<PathBuf>,
-    /// MP4 of the first layer, if any.
+    /// Film of the first layer, if any, in the format that its name says.
     pub video: Option<PathBuf>,
     /// None: [`FPS`], or that of a path's file.
     pub fps: Option<u32>,
@@ -116,7 +116,7 @@ pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> 
     let frames = &model.capture.frames;
     let poses: Vec<Pose> = model.train.iter().map(|&i| frames[i].world_from_camera).collect();
     let (center, _) = focus_point(&poses);
-    let base = frames[model.train[0]].camera.downscaled(model.config.data.downscale);
+    let base = frames[model.train[0]].camera.reduced(model.config.reduction());
     let camera = view_camera(&base, o.size, o.fov);
     let n = o.frames.max(1);
     let views = |poses: Vec<Pose>| poses.into_iter().map(|p| PathView { camera, world_from_camera: p }).collect();
@@ -134,7 +134,7 @@ pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> 
             path
         }
         PathKind::HeldOut => {
-            let held = super::evaluate::held_out(&model.capture, diorama_geom::capture::Split::Test);
+            let held = super::held_out::frames(&model.capture, diorama_geom::capture::Split::Test);
             if held.is_empty() {
                 return Err(PipelineError::Usage("the run holds no views out; choose another --path".into()));
             }
@@ -159,7 +159,8 @@ fn other_size(c: &Camera, size: Option<(u32, u32)>, fov: Option<f64>) -> Camera 
     Camera::pinhole(w, h, fov.unwrap_or(same_height))
 }
 
-/// Renders a path; returns the number of frames and whether it was interrupted. `progress` is told (frame, of).
+/// Renders a path; returns the number of frames and whether it was interrupted: then the film has the frames until there,
+/// and there is none without any. `progress` is told (frame, of).
 pub fn render(
     model: &ObjectModel,
     o: &RenderOptions,
@@ -172,20 +173,22 @@ pub fn render(
     }
     let mut video = match (&o.video, path.views.first()) {
         (Some(file), Some(v)) => {
-            Some(Video::create(file, v.camera.width as usize, v.camera.height as usize, path.fps.round().max(1.0) as u32)?)
+            Some(Film::create(file, v.camera.width as usize, v.camera.height as usize, path.fps.round().max(1.0) as u32)?)
         }
         _ => None,
     };
     let mut distances = o.images.as_ref().map(|folder| DepthSequence::new(folder, o.depth, o.scale.is_some()));
     let total = path.views.len();
+    let mut done = 0;
     for (i, v) in path.views.iter().enumerate() {
         if interrupt.load(Ordering::Relaxed) {
-            return Ok((i, true));
+            break;
         }
         let posed = model.to_model(v.camera, &v.world_from_camera);
         let view = trace(model, &posed, o.clip, o.quality);
         for (k, layer) in o.layers.iter().enumerate() {
             let image = draw_layer(model, &posed, &view, *layer);
+            model.check_device()?;
             if let Some(folder) = &o.images {
                 photo::save_png(&folder.join(layer.file(i)), &image)?;
             }
@@ -196,12 +199,13 @@ pub fn render(
                 video.push(&image)?;
             }
         }
-        progress(i + 1, total);
+        done = i + 1;
+        progress(done, total);
     }
-    if let Some(v) = video {
+    if let Some(v) = video.filter(|_| done > 0) {
         v.finish()?;
     }
-    Ok((total, false))
+    Ok((done, done < total))
 }
 
 fn trace(model: &ObjectModel, camera: &PosedCamera, clip: Option<([f32; 3], [f32; 3])>, quality: Quality) -> View {

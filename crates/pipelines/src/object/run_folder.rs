@@ -1,7 +1,8 @@
 //! The folder of a run: `config.toml`, `capture.json`, `command.txt`, `metrics.jsonl`,
-//! `events.tfevents`, `curves.svg` and `.png`, `checkpoints/`.
+//! `events.tfevents`, `curves.svg` and `.png`, `summary.json`, `checkpoints/`.
 
 use super::config::Config;
+use super::kept_capture::{self, absolute};
 use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
 use diorama_data::plot::{Chart, Series};
@@ -68,23 +69,55 @@ impl RunFolder {
         self.path.join("checkpoints")
     }
 
-    /// The capture as it was imported when the run began.
+    /// The capture as it was imported when the run began, with all of its photographs.
     pub fn capture(&self) -> Result<Capture> {
-        read_capture(&self.path)
+        let capture = kept_capture::read(&self.path, None, &read_config(&self.path)?.data.path)?;
+        kept_capture::require_photographs(&capture)?;
+        Ok(capture)
+    }
+
+    /// The data set that the run was trained on, where it is now.
+    pub fn data_set(&self) -> Result<PathBuf> {
+        kept_capture::data_set(&self.path, &read_config(&self.path)?.data.path)
+    }
+
+    /// Takes note that the photographs are in `data` now.
+    ///
+    /// # Errors
+    /// When one is missing there.
+    pub fn move_capture(&self, data: &Path) -> Result<()> {
+        let mut config = read_config(&self.path)?;
+        let capture = kept_capture::read(&self.path, Some(data), &config.data.path)?;
+        kept_capture::require_photographs(&capture)?;
+        kept_capture::write(&self.path, data, &capture)?;
+        config.data.path = absolute(data);
+        Ok(atomic::write(&self.path.join("config.toml"), config.to_toml().as_bytes())?)
     }
 
     /// Clears an earlier run and writes what this one was started with.
     pub fn write_description(&self, config: &Config, capture: &Capture) -> Result<()> {
-        for name in ["config.toml", "capture.json", "command.txt", "metrics.jsonl", "events.tfevents", "curves.svg", "curves.png"] {
+        let results = ["metrics.jsonl", "events.tfevents", "curves.svg", "curves.png", SUMMARY];
+        for name in ["config.toml", "capture.json", "command.txt"].into_iter().chain(results) {
             let _ = std::fs::remove_file(self.path.join(name));
         }
         let _ = std::fs::remove_dir_all(self.checkpoints());
-        let json = serde_json::to_vec(capture).expect("a capture is JSON");
-        atomic::write(&self.path.join("capture.json"), &json)?;
+        kept_capture::write(&self.path, &config.data.path, capture)?;
         let command: Vec<String> = std::env::args().collect();
         atomic::write(&self.path.join("command.txt"), format!("{}\n", command.join(" ")).as_bytes())?;
+        // The run may be looked at from another folder.
+        let mut config = config.clone();
+        config.data.path = absolute(&config.data.path);
         atomic::write(&self.path.join("config.toml"), config.to_toml().as_bytes())?;
         Ok(())
+    }
+
+    /// Writes what the run came to so far; the peak of memory is that of all of its parts.
+    pub fn write_summary(&self, summary: &RunSummary) -> Result<()> {
+        // One that is damaged is replaced.
+        let before = read_summary(&self.path).ok().flatten().and_then(|s| s.peak_memory_bytes);
+        let peak_memory_bytes = summary.peak_memory_bytes.into_iter().chain(before).max();
+        let json = serde_json::to_vec_pretty(&RunSummary { peak_memory_bytes, ..summary.clone() }).expect("a summary is JSON");
+        Ok(atomic::write(&self.path.join(SUMMARY), &json)?)
     }
 
     /// Drops metrics past `step` and writes the TensorBoard file anew from what is left.
@@ -116,7 +149,7 @@ impl RunFolder {
                 rays_per_s: Some(rays_per_s),
                 ..Row::default()
             },
-            Event::Evaluated { step, seconds, psnr, mse } => {
+            Event::Evaluated { step, seconds, psnr, mse, .. } => {
                 Row { step, seconds, val_psnr: Some(psnr), val_mse: Some(mse), ..Row::default() }
             }
             Event::Recovered { to_step, .. } => {
@@ -235,16 +268,47 @@ pub fn read_config(path: &Path) -> Result<Config> {
     Ok(config)
 }
 
-fn read_capture(path: &Path) -> Result<Capture> {
-    let file = path.join("capture.json");
-    let bytes = error::read(&file, LIMIT)?;
-    serde_json::from_slice(&bytes).map_err(|e| DataError::input(&file, format!("is damaged: {e}; train again")).into())
+/// What a run came to, as `summary.json` keeps it.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct RunSummary {
+    pub steps: u64,
+    pub seconds: f64,
+    /// `cpu`, or what the GPU calls itself.
+    pub device: String,
+    /// Of training rays, and of held-out pixels when they were judged last; dB.
+    pub psnr_train: Option<f64>,
+    pub psnr_held_out: Option<f64>,
+    /// Names of held-out views that lie far below the training views.
+    #[serde(default)]
+    pub behind_fog: Vec<String>,
+    /// Most bytes that training had in memory, where the system tells.
+    pub peak_memory_bytes: Option<u64>,
+}
+
+const SUMMARY: &str = "summary.json";
+
+/// What a run came to; none before its end.
+///
+/// # Errors
+/// When the file is malformed.
+pub fn read_summary(path: &Path) -> Result<Option<RunSummary>> {
+    let file = path.join(SUMMARY);
+    if !file.exists() {
+        return Ok(None);
+    }
+    let wrong = |e: serde_json::Error| DataError::input(&file, format!("is damaged: {e}; remove it"));
+    Ok(Some(serde_json::from_slice(&error::read(&file, LIMIT)?).map_err(wrong)?))
 }
 
 /// A trained model, read from its folder.
 pub fn load_model(path: &Path) -> Result<(ObjectModel, Vec<String>)> {
+    load_model_of(path, None)
+}
+
+/// A trained model whose photographs are in `data` now, if that is given.
+pub fn load_model_of(path: &Path, data: Option<&Path>) -> Result<(ObjectModel, Vec<String>)> {
     let config = read_config(path)?;
-    let capture = read_capture(path)?;
+    let capture = kept_capture::read(path, data, &config.data.path)?;
     let mut model = ObjectModel::new(config, capture, false)?;
     let folder = path.join("checkpoints");
     if !checkpoint::exists(&folder) {

@@ -1,8 +1,10 @@
 //! A run as the viewer sees it: finished, or while it trains.
 
 use super::export::{self, ExportOptions, Size};
+use super::held_out;
 use super::model::ObjectModel;
 use super::render::{self, Layer};
+use super::run_folder::{RunSummary, read_summary};
 use crate::error::{PipelineError, Result};
 use diorama_data::camera_path_json;
 use diorama_data::{DataError, atomic, photo};
@@ -11,11 +13,11 @@ use diorama_engine::train::Event;
 use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
 use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewLayer, ViewRequest, ViewScene, ViewSource, ViewStatus};
-use diorama_geom::{Camera, ImageU8};
+use diorama_geom::{Camera, ImageU8, Similarity};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, RwLock};
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 /// Longest side of a small photograph.
@@ -89,18 +91,78 @@ pub struct RunView {
     shown: Mutex<Instant>,
     /// Whether anybody has looked since the model was last shown.
     looked: AtomicBool,
+    saved: Mutex<Saved>,
+    /// Held-out frames behind fog.
+    behind_fog: Mutex<Vec<usize>>,
+}
+
+/// What was saved in the viewer: in the world, as the page has it.
+#[derive(Clone, Default)]
+struct Saved {
+    crop: Option<Crop>,
+    measured: Option<MeasuredLength>,
+    path: Option<String>,
+}
+
+impl Saved {
+    fn read(run: &Path, world_from_capture: &Similarity) -> Result<Saved> {
+        let measured = match read_scale(run)? {
+            Some(Size::Measured { points, metres }) => {
+                Some(MeasuredLength { points: points.map(|p| world_from_capture.point(DVec3::from_array(p)).to_array()), metres })
+            }
+            _ => None,
+        };
+        Ok(Saved { crop: read_crop(run)?, measured, path: read_path(run, world_from_capture)? })
+    }
+}
+
+/// The camera path of a run with its cameras in the world, if one was saved.
+///
+/// # Errors
+/// When the file is malformed.
+fn read_path(run: &Path, world_from_capture: &Similarity) -> Result<Option<String>> {
+    let file = run.join("camera_path.json");
+    if !file.exists() {
+        return Ok(None);
+    }
+    let wrong = |e: String| DataError::input(&file, format!("{e}; save the path in the viewer again or remove the file"));
+    let bytes = diorama_data::error::read(&file, 1 << 26)?;
+    let text = String::from_utf8(bytes).map_err(|_| wrong("is not UTF-8 text".into()))?;
+    let path = camera_path_json::read(&file, world_from_capture).and_then(|_| camera_path_json::moved(&text, &file, world_from_capture));
+    path.map(Some).map_err(|e| match e {
+        DataError::Input { message, .. } => wrong(message).into(),
+        e => e.into(),
+    })
 }
 
 impl RunView {
-    pub fn new(folder: &Path, model: ObjectModel, running: bool) -> Arc<RunView> {
-        let status = ViewStatus { step: model.origin.step, seconds: model.origin.seconds, running, ..ViewStatus::default() };
-        Arc::new(RunView {
+    /// # Errors
+    /// When what was saved in the viewer before cannot be read.
+    pub fn new(folder: &Path, model: ObjectModel, running: bool) -> Result<Arc<RunView>> {
+        let RunSummary { behind_fog: names, psnr_held_out: held_out, .. } = read_summary(folder)?.unwrap_or_default();
+        let origin = model.origin;
+        let status = ViewStatus { step: origin.step, seconds: origin.seconds, running, held_out, ..ViewStatus::default() };
+        let behind_fog = (0..model.capture.frames.len()).filter(|i| names.contains(&model.capture.frames[*i].name)).collect();
+        Ok(Arc::new(RunView {
+            saved: Mutex::new(Saved::read(folder, &model.capture.world_from_capture)?),
+            behind_fog: Mutex::new(behind_fog),
             folder: folder.to_path_buf(),
             model: RwLock::new(Arc::new(model)),
             status: Mutex::new(status),
             shown: Mutex::new(Instant::now()),
             looked: AtomicBool::new(true),
-        })
+        }))
+    }
+
+    /// # Errors
+    /// When the device that the user named has failed.
+    pub fn check_device(&self) -> Result<()> {
+        self.model().check_device()
+    }
+
+    /// What was saved, to be changed.
+    fn saved(&self) -> std::sync::MutexGuard<'_, Saved> {
+        self.saved.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn model(&self) -> Arc<ObjectModel> {
@@ -123,11 +185,17 @@ impl RunView {
     /// Takes note of what training tells.
     pub fn hear(&self, event: &Event) {
         let Ok(mut s) = self.status.lock() else { return };
-        match *event {
-            Event::Progress { step, seconds, loss, psnr, rays_per_s, .. } => {
-                *s = ViewStatus { step, seconds, loss, psnr, rays_per_s, running: true };
+        match event {
+            &Event::Progress { step, seconds, loss, psnr, rays_per_s, .. } => {
+                *s = ViewStatus { step, seconds, loss, psnr, rays_per_s, running: true, held_out: s.held_out };
             }
-            Event::Finished { step, .. } => (s.step, s.running) = (step, false),
+            Event::Evaluated { psnr, views, .. } => {
+                s.held_out = Some(*psnr);
+                if let Ok(mut fog) = self.behind_fog.lock() {
+                    *fog = held_out::far_below(views, s.psnr);
+                }
+            }
+            Event::Finished { step, .. } => (s.step, s.running) = (*step, false),
             _ => {}
         }
     }
@@ -145,7 +213,7 @@ impl ViewSource for RunView {
         let (focus, distance) = focus_point(&poses);
         let s = m.capture.scene;
         let corner = |sign: f64| (s.center + DVec3::splat(sign * s.half * s.aabb_scale as f64)).to_array();
-        let saved = std::fs::read_to_string(self.folder.join("camera_path.json")).ok();
+        let Saved { crop, measured, path } = self.saved().clone();
         ViewScene {
             name: self.folder.file_name().unwrap_or_default().to_string_lossy().into_owned(),
             frames,
@@ -153,15 +221,9 @@ impl ViewSource for RunView {
             distance,
             world_from_capture: m.capture.world_from_capture,
             bounds: (corner(-1.0), corner(1.0)),
-            crop: read_crop(&self.folder).ok().flatten(),
-            measured: match read_scale(&self.folder) {
-                Ok(Some(Size::Measured { points, metres })) => {
-                    let to_world = |p| m.capture.world_from_capture.point(DVec3::from_array(p)).to_array();
-                    Some(MeasuredLength { points: points.map(to_world), metres })
-                }
-                _ => None,
-            },
-            path: saved.and_then(|text| self.open_path(&text).ok()),
+            crop,
+            measured,
+            path,
         }
     }
 
@@ -169,7 +231,11 @@ impl ViewSource for RunView {
         self.status.lock().map(|s| *s).unwrap_or_default()
     }
 
-    fn view(&self, r: &ViewRequest) -> ImageU8 {
+    fn behind_fog(&self) -> Vec<usize> {
+        self.behind_fog.lock().map(|f| f.clone()).unwrap_or_default()
+    }
+
+    fn view(&self, r: &ViewRequest) -> std::result::Result<ImageU8, String> {
         self.looked.store(true, Ordering::Relaxed);
         let m = self.model();
         let posed = m.to_model(r.camera, &r.world_from_camera);
@@ -180,7 +246,8 @@ impl ViewSource for RunView {
             ViewLayer::Opacity => Layer::Opacity,
             ViewLayer::Occupancy => Layer::Occupancy,
         };
-        render::picture(&m, &posed, layer, r.clip, Quality::Fast)
+        let picture = render::picture(&m, &posed, layer, r.clip, Quality::Fast);
+        Self::tell(m.check_device().map(|()| picture))
     }
 
     fn point(&self, r: &ViewRequest, x_px: f64, y_px: f64) -> Option<[f64; 3]> {
@@ -200,11 +267,13 @@ impl ViewSource for RunView {
                 let capture_from_world = self.model().capture.world_from_capture.inverse();
                 let points = points.map(|p| capture_from_world.point(DVec3::from_array(p)).to_array());
                 let json = serde_json::to_vec(&ScaleFile { points, metres }).expect("plain values");
-                Self::tell(atomic::write(&file, &json).map_err(PipelineError::from))
+                Self::tell(atomic::write(&file, &json).map_err(PipelineError::from))?;
             }
-            None if file.exists() => std::fs::remove_file(&file).map_err(|e| e.to_string()),
-            None => Ok(()),
+            None if file.exists() => std::fs::remove_file(&file).map_err(|e| e.to_string())?,
+            None => {}
         }
+        self.saved().measured = measured;
+        Ok(())
     }
 
     fn thumbnail(&self, frame: usize) -> std::result::Result<ImageU8, String> {
@@ -218,11 +287,13 @@ impl ViewSource for RunView {
         match crop {
             Some((min, max)) => {
                 let json = serde_json::to_vec(&CropFile { min, max }).expect("plain values");
-                Self::tell(atomic::write(&file, &json).map_err(PipelineError::from))
+                Self::tell(atomic::write(&file, &json).map_err(PipelineError::from))?;
             }
-            None if file.exists() => std::fs::remove_file(&file).map_err(|e| e.to_string()),
-            None => Ok(()),
+            None if file.exists() => std::fs::remove_file(&file).map_err(|e| e.to_string())?,
+            None => {}
         }
+        self.saved().crop = crop;
+        Ok(())
     }
 
     fn save_path(&self, json: &str) -> std::result::Result<PathBuf, String> {
@@ -230,6 +301,7 @@ impl ViewSource for RunView {
         let capture_from_world = self.model().capture.world_from_capture.inverse();
         let moved = camera_path_json::moved(json, &file, &capture_from_world).map_err(|e| e.to_string())?;
         atomic::write(&file, moved.as_bytes()).map_err(|e| e.to_string())?;
+        self.saved().path = Some(json.to_string());
         Ok(file)
     }
 
@@ -257,7 +329,7 @@ impl ViewSource for RunView {
             floaters: 0.01,
             keep_unseen: false,
         };
-        let made = Self::tell(export::export(&self.model(), &options, progress))?;
+        let made = Self::tell(export::export(&self.model(), &options, &mut |_| {}, progress))?;
         Ok((out, made.scale))
     }
 }

@@ -148,9 +148,9 @@ impl ViewSource for PointsView {
         ViewStatus::default()
     }
 
-    fn view(&self, r: &ViewRequest) -> ImageU8 {
+    fn view(&self, r: &ViewRequest) -> std::result::Result<ImageU8, String> {
         let view = self.draw(r);
-        match r.layer {
+        Ok(match r.layer {
             ViewLayer::Depth => {
                 let seen = || view.depth.data.iter().copied().filter(|d| *d > 0.0);
                 let (lo, hi) = seen().fold((f32::MAX, f32::MIN), |(a, b), d| (a.min(d), b.max(d)));
@@ -159,7 +159,7 @@ impl ViewSource for PointsView {
             // Points have no surface; what there is of it is opacity.
             ViewLayer::Opacity | ViewLayer::Normal | ViewLayer::Occupancy => gray(&view.opacity, |v| v),
             ViewLayer::Rgb => view.rgb.to_u8(),
-        }
+        })
     }
 
     fn point(&self, r: &ViewRequest, x_px: f64, y_px: f64) -> Option<[f64; 3]> {
@@ -177,7 +177,7 @@ impl ViewSource for PointsView {
             Some(p) => photo::load_small(p, THUMBNAIL).map_err(|e| e.to_string()),
             None => {
                 let camera = f.camera.resized(THUMBNAIL as u32, THUMBNAIL as u32 * 3 / 4);
-                Ok(self.view(&ViewRequest { camera, world_from_camera: f.world_from_camera, layer: ViewLayer::Rgb, clip: None }))
+                self.view(&ViewRequest { camera, world_from_camera: f.world_from_camera, layer: ViewLayer::Rgb, clip: None })
             }
         }
     }

@@ -25,6 +25,7 @@ const stage = new Stage(element<HTMLCanvasElement>("overlay"));
 
 let socket: WebSocket;
 let photographs: Photograph[] = [];
+let foggy = new Set<number>();
 let keys: Key[] = [];
 let distance = 4;
 let worldFromCapture: number[] = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0];
@@ -104,8 +105,12 @@ function hear(tell: Tell): void {
     case "status":
       training = tell.running;
       element("status").textContent = tell.running
-        ? `training: step ${tell.step}, ${tell.psnr.toFixed(2)} dB, ${Math.round(tell.rays_per_s)} rays/s`
-        : `step ${tell.step}`;
+        ? `training: step ${tell.step}, ${tell.psnr.toFixed(2)} dB${heldOut(tell.held_out)}, ${Math.round(tell.rays_per_s)} rays/s`
+        : `step ${tell.step}${heldOut(tell.held_out)}`;
+      break;
+    case "fog":
+      foggy = new Set(tell.frames);
+      markFog();
       break;
     case "path":
       openPath(tell.json);
@@ -289,8 +294,8 @@ function strip(): void {
   photographs.forEach((p, i) => {
     if (i % some !== 0) return;
     const b = document.createElement("button");
-    b.title = p.name + (p.held_out ? " (held out)" : "");
     b.className = p.held_out ? "held-out" : "";
+    b.dataset.frame = String(i);
     const img = document.createElement("img");
     img.dataset.frame = String(i);
     img.alt = p.name;
@@ -298,6 +303,7 @@ function strip(): void {
     b.addEventListener("click", () => lookFrom(p));
     place.append(b);
   });
+  markFog();
   // Pictures are fetched when they come into sight.
   const seen = new IntersectionObserver((entries) => {
     for (const e of entries.filter((e) => e.isIntersecting)) {
@@ -306,6 +312,19 @@ function strip(): void {
     }
   });
   place.querySelectorAll("img").forEach((i) => seen.observe(i));
+}
+
+const heldOut = (psnr: number | null) => (psnr === null ? "" : `, held out ${psnr.toFixed(2)} dB`);
+
+/** Marks the photographs that the field shows through fog. */
+function markFog(): void {
+  document.querySelectorAll<HTMLElement>("#photographs button").forEach((b) => {
+    const frame = Number(b.dataset.frame);
+    const p = photographs[frame];
+    b.classList.toggle("fog", foggy.has(frame));
+    b.title = (p?.name ?? "") + (p?.held_out ? " (held out)" : "") + (foggy.has(frame) ? " (behind fog)" : "");
+  });
+  document.body.dataset.fog = String(foggy.size);
 }
 
 function settings(): PathSettings {

@@ -11,7 +11,11 @@ world_from_capture: [number, number, number, number, number, number, number, num
 /**
  * Two points of the world, and the metres between them.
  */
-measured: [number, number, number, number, number, number, number] | null, path: string | null, } | { "kind": "picked", point: [number, number, number] | null, } | { "kind": "status", step: number, seconds: number, loss: number, psnr: number, rays_per_s: number, running: boolean, } | { "kind": "working", what: string, percent: number, } | { "kind": "exported", file: string, glb: boolean, 
+measured: [number, number, number, number, number, number, number] | null, path: string | null, } | { "kind": "picked", point: [number, number, number] | null, } | { "kind": "status", step: number, seconds: number, loss: number, psnr: number, 
+/**
+ * Of held-out pixels.
+ */
+held_out: number | null, rays_per_s: number, running: boolean, } | { "kind": "fog", frames: Array<number>, } | { "kind": "working", what: string, percent: number, } | { "kind": "exported", file: string, glb: boolean, 
 /**
  * Metres of the mesh per unit of the capture.
  */

@@ -276,6 +276,8 @@ try {
   const seenViews = await until("a view in training", shown);
   const later = await until("later steps", async () => (await step()) > early + 50 && (await step()));
   await until("views without a touch", async () => (await shown()) > seenViews + 2);
+  await until("held-out pixels", () => other.evaluate(() => /held out \d+\.\d+ dB/.test(document.getElementById("status").textContent)));
+  check("training shows held-out beside training PSNR, and how many views are behind fog", await other.evaluate(() => document.body.dataset.fog !== undefined));
   check("training shows its steps and views by itself", true, `(steps ${early} to ${later})`);
   if (pictures) await other.screenshot({ path: path.join(pictures, "training.png") });
   const code = await live.stop();

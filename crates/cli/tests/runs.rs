@@ -1,0 +1,313 @@
+//! Runs that are moved, repeated, interrupted, compared and judged, by the real program.
+
+use diorama_pipelines::object::quickstart::write_capture;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+const SMALL: [&str; 8] =
+    ["--device", "cpu", "--set", "field.log2_size=12", "--set", "sampling.batch_samples=4096", "--set", "sampling.occupancy_points=2048"];
+
+struct Good {
+    _folder: tempfile::TempDir,
+    capture: PathBuf,
+    run: PathBuf,
+}
+
+/// A capture and a short run on it, made once.
+fn good() -> &'static Good {
+    static GOOD: OnceLock<Good> = OnceLock::new();
+    GOOD.get_or_init(|| {
+        let folder = tempfile::tempdir().unwrap();
+        let (capture, run) = (folder.path().join("capture"), folder.path().join("run"));
+        write_capture(&capture, 16, 48).unwrap();
+        works(folder.path(), &[&["train", s(&capture), "-o", s(&run), "--steps", "60"], &SMALL[..]].concat());
+        Good { _folder: folder, capture, run }
+    })
+}
+
+fn s(p: &Path) -> &str {
+    p.to_str().unwrap()
+}
+
+fn call(folder: &Path, arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_diorama")).args(arguments).current_dir(folder).output().unwrap()
+}
+
+/// What a call from `folder` prints, which succeeds.
+#[track_caller]
+fn works(folder: &Path, arguments: &[&str]) -> String {
+    let o = call(folder, arguments);
+    assert!(o.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&o.stderr));
+    String::from_utf8(o.stdout).unwrap()
+}
+
+/// A call fails with one line that holds all of `parts`; all that it says.
+#[track_caller]
+fn fails(folder: &Path, arguments: &[&str], code: i32, parts: &[&str]) -> String {
+    let o = call(folder, arguments);
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert_eq!(o.status.code(), Some(code), "{arguments:?}: {said}");
+    let errors: Vec<&str> = said.lines().filter(|l| l.starts_with("diorama: ")).collect();
+    assert_eq!(errors.len(), 1, "{said}");
+    parts.iter().for_each(|p| assert!(errors[0].contains(p), "{p:?} is not in {said}"));
+    said
+}
+
+fn copy_all(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).unwrap();
+    for e in from.read_dir().unwrap().flatten() {
+        let target = to.join(e.file_name());
+        if e.path().is_dir() {
+            copy_all(&e.path(), &target);
+        } else {
+            std::fs::copy(e.path(), target).unwrap();
+        }
+    }
+}
+
+/// A copy of the good run that a case may spoil.
+fn copy() -> (tempfile::TempDir, PathBuf) {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("copy");
+    copy_all(&good().run, &run);
+    (dir, run)
+}
+
+#[test]
+fn runs_and_photographs_may_move() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| {
+        let folder = dir.path().join(name);
+        std::fs::create_dir_all(&folder).unwrap();
+        folder
+    };
+    let (home, elsewhere) = (at("home"), at("elsewhere"));
+    write_capture(&home.join("data"), 8, 24).unwrap();
+    // Begun with paths that mean something in one folder only.
+    works(&home, &[&["train", "data", "-o", "run", "--steps", "4"], &SMALL[..]].concat());
+    let eval = |from: &Path, run: &str, more: &[&str]| works(from, &[&["eval", run, "--device", "cpu"], more].concat());
+    eval(&elsewhere, "../home/run", &[]);
+    works(&elsewhere, &["compare", "../home/run", "-o", "cmp"]);
+    works(&elsewhere, &["train", "-o", "../home/run", "--resume", "--steps", "6"]);
+    // The whole of it to another place.
+    let moved = dir.path().join("moved");
+    std::fs::rename(&home, &moved).unwrap();
+    eval(&elsewhere, "../moved/run", &[]);
+    // Run and photographs to different places.
+    let (run, data) = (dir.path().join("far/run"), dir.path().join("photographs"));
+    at("far");
+    std::fs::rename(moved.join("run"), &run).unwrap();
+    std::fs::rename(moved.join("data"), &data).unwrap();
+    for verb in [&["eval", s(&run)][..], &["compare", s(&run)], &["train", "-o", s(&run), "--resume", "--steps", "8"]] {
+        fails(&elsewhere, verb, 2, &[".png", "does not exist", "--data"]);
+    }
+    eval(&elsewhere, s(&run), &["--data", s(&data)]);
+    works(&elsewhere, &["compare", s(&run), "--data", "../photographs", "-o", "cmp"]);
+    fails(&elsewhere, &["eval", s(&run), "--data", s(&elsewhere)], 2, &["elsewhere", "holds no images"]);
+    // Neither of these looks at photographs.
+    works(&elsewhere, &["render", s(&run), "--frames", "1", "--size", "16x16", "--device", "cpu"]);
+    works(&elsewhere, &["export", s(&run), "-o", "a.ply", "--resolution", "16", "--level", "0.01", "--device", "cpu"]);
+    fails(&elsewhere, &["view", s(&data), "--data", s(&data), "--port", "0"], 2, &["--data", "is no run"]);
+    // Going on takes note of the new place.
+    works(&elsewhere, &["train", "-o", s(&run), "--resume", "--data", "../photographs", "--steps", "8"]);
+    eval(dir.path(), s(&run), &[]);
+}
+
+#[test]
+fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
+    let dir = tempfile::tempdir().unwrap();
+    let capture = s(&good().capture);
+    let command =
+        ["train", capture, "-o", "run", "--steps", "4", "--downscale", "2", "--split", "every:4", "--seed", "7", "--method", "ngp"];
+    let more = ["--background", "white", "--format", "transforms"];
+    let all = [&command[..], &more, &SMALL].concat();
+    works(dir.path(), &all);
+    works(dir.path(), &[&all[..], &["--resume"]].concat());
+    for (flag, value, had) in [
+        ("--downscale", "4", "2"),
+        ("--split", "every:8", "every:4"),
+        ("--seed", "8", "7"),
+        ("--method", "nerf", "ngp"),
+        ("--background", "black", "white"),
+        ("--set", "field.log2_size=13", "12"),
+    ] {
+        let named = if flag == "--set" { "field.log2_size" } else { flag };
+        let said = value.rsplit('=').next().unwrap();
+        let parts = [&format!("{named} cannot change")[..], &format!("has {had}, not {said}")];
+        fails(dir.path(), &["train", "-o", "run", "--resume", flag, value], 2, &parts);
+    }
+    // A configuration that the run began with, and one that says something else.
+    std::fs::copy(dir.path().join("run/config.toml"), dir.path().join("same.toml")).unwrap();
+    let text = std::fs::read_to_string(dir.path().join("same.toml")).unwrap();
+    std::fs::write(dir.path().join("other.toml"), text.replace("distortion = 0.01", "distortion = 0.5")).unwrap();
+    works(dir.path(), &["train", "-o", "run", "--resume", "--config", "same.toml"]);
+    fails(dir.path(), &["train", "-o", "run", "--resume", "--config", "other.toml"], 2, &["loss.distortion", "0.01", "0.5"]);
+}
+
+#[test]
+fn the_preset_of_the_report_gives_exactly_100_pixels() {
+    let dir = tempfile::tempdir().unwrap();
+    write_capture(&dir.path().join("data"), 6, 150).unwrap();
+    works(dir.path(), &[&["train", "data", "-o", "run", "--steps", "1", "--preset", "report"], &SMALL[..]].concat());
+    works(dir.path(), &["render", "run", "--path", "held-out", "--images", "frames", "--device", "cpu", "--quality", "fast"]);
+    assert_eq!(diorama_data::photo::size(&dir.path().join("frames/0000.png")).unwrap(), (100, 100));
+    let report: serde_json::Value =
+        serde_json::from_str(&works(dir.path(), &["eval", "run", "--quality", "fast", "--device", "cpu", "--json"])).unwrap();
+    assert!(report["psnr"].as_f64().unwrap().is_finite());
+}
+
+#[test]
+fn what_does_not_fit_into_memory_is_refused_with_needs_has_and_cure() {
+    let dir = tempfile::tempdir().unwrap();
+    let table = ["--set", "field.log2_size=24", "--set", "field.levels=64", "--set", "field.features=8", "--json"];
+    let all = [&["train", s(&good().capture), "-o", "run", "--steps", "1", "--device", "cpu"], &table[..]].concat();
+    fails(dir.path(), &all, 1, &["parameters 1", "GiB", "are available", "--set field.log2_size=19"]);
+    let told: serde_json::Value = serde_json::from_slice(&call(dir.path(), &all).stdout).unwrap();
+    assert_eq!((told["kind"].as_str(), told["exit_code"].as_i64()), (Some("memory"), Some(1)));
+    assert!(!dir.path().join("run").exists());
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interrupted_film_has_the_frames_so_far() {
+    let dir = tempfile::tempdir().unwrap();
+    let film = |name: &str, frames: usize| {
+        let child = Command::new(env!("CARGO_BIN_EXE_diorama"))
+            .args(["render", s(&good().run), "--device", "cpu", "--size", "64x64", "--frames", "2000", "--video", name])
+            .args(["--images", "frames"])
+            .current_dir(dir.path())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let begin = Instant::now();
+        while !dir.path().join(format!("frames/{frames:04}.png")).exists() {
+            assert!(begin.elapsed() < Duration::from_secs(100), "no frames come");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+        let o = child.wait_with_output().unwrap();
+        let _ = std::fs::remove_dir_all(dir.path().join("frames"));
+        let (out, said) = (String::from_utf8_lossy(&o.stdout).into_owned(), String::from_utf8_lossy(&o.stderr).into_owned());
+        assert_eq!(o.status.code(), Some(130), "{said}");
+        let done: usize = out.split(' ').next().unwrap().parse().unwrap();
+        assert!((frames..2000).contains(&done) && said.contains(&format!("ends with frame {done}")), "{out}{said}");
+        assert!(out.contains(name), "{out}");
+        (std::fs::read(dir.path().join(name)).unwrap(), done)
+    };
+    let (mp4, done) = film("a.mp4", 2);
+    let stsz = mp4.windows(4).position(|w| w == b"stsz").unwrap();
+    assert_eq!(u32::from_be_bytes(mp4[stsz + 12..stsz + 16].try_into().unwrap()) as usize, done, "frames of the film");
+    assert!(mp4[4..8] == *b"ftyp" && mp4.windows(4).any(|w| w == b"mdat"));
+    let (gif, _) = film("a.gif", 1);
+    assert!(gif.starts_with(b"GIF89a") && gif.last() == Some(&0x3b), "it has its end");
+}
+
+#[test]
+fn films_are_what_their_names_say() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = s(&good().run);
+    works(dir.path(), &["render", run, "--frames", "3", "--size", "32x24", "--video", "a.gif", "--device", "cpu"]);
+    assert_eq!(diorama_data::photo::size(&dir.path().join("a.gif")).unwrap(), (32, 24));
+    assert!(std::fs::read(dir.path().join("a.gif")).unwrap().starts_with(b"GIF89a"));
+    for (name, why) in [("a.webm", "not as .webm"), ("film", "names no format"), ("no/a.mp4", "not a folder")] {
+        fails(dir.path(), &["render", run, "--frames", "3", "--size", "32x24", "--video", name, "--device", "cpu"], 2, &[why]);
+        assert!(!dir.path().join(name).exists());
+    }
+}
+
+#[test]
+fn every_run_is_looked_at_before_the_first_is_judged() {
+    let dir = tempfile::tempdir().unwrap();
+    let (_copy, damaged) = copy();
+    std::fs::remove_dir_all(damaged.join("checkpoints")).unwrap();
+    for (second, why) in [("missing", "not a run folder"), (s(&damaged), "no checkpoint")] {
+        let said = fails(dir.path(), &["compare", s(&good().run), second, "-o", "cmp"], 2, &[second, why]);
+        assert!(!said.contains("judging") && !dir.path().join("cmp").exists(), "{said}");
+    }
+}
+
+#[test]
+fn compare_shows_the_memory_of_training() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = s(&good().run);
+    let table: serde_json::Value = serde_json::from_str(&works(dir.path(), &["compare", run, "-o", "cmp", "--json"])).unwrap();
+    let text = works(dir.path(), &["compare", run, "-o", "cmp"]);
+    assert!(text.lines().next().unwrap().contains("memory"), "{text}");
+    if cfg!(target_os = "linux") {
+        assert!((10 << 20..8 << 30).contains(&table[0]["peak_memory_bytes"].as_u64().unwrap()), "{table}");
+        assert!(text.contains("MiB") || text.contains("GiB"), "{text}");
+    }
+}
+
+#[test]
+fn what_was_saved_in_the_viewer_is_never_ignored() {
+    for (name, text) in [
+        ("crop.json", "{\"min\":[0,0,0]"),
+        ("crop.json", "{\"min\":[0,0,0],\"max\":[0,1,1]}"),
+        ("scale.json", "{\"points\":[[0,0,0],[0,0,0]],\"metres\":1}"),
+        ("camera_path.json", "{}"),
+        ("camera_path.json", "[]"),
+    ] {
+        let (_dir, run) = copy();
+        std::fs::write(run.join(name), text).unwrap();
+        fails(&run, &["view", s(&run), "--port", "0", "--device", "cpu"], 2, &[name, "remove the file"]);
+    }
+}
+
+#[test]
+fn a_port_in_use_leaves_no_folder() {
+    let dir = tempfile::tempdir().unwrap();
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = taken.local_addr().unwrap().port().to_string();
+    let view = ["--view", "--port", &port];
+    fails(dir.path(), &[&["train", s(&good().capture), "-o", "run", "--steps", "1"], &view[..], &SMALL].concat(), 2, &["--port", "in use"]);
+    assert!(!dir.path().join("run").exists());
+}
+
+#[test]
+fn held_out_photographs_that_cannot_be_read_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("data");
+    copy_all(&good().capture, &data);
+    std::fs::write(data.join("images/view_08.png"), b"no picture").unwrap();
+    let all = [&["train", "data", "-o", "run", "--steps", "1", "--split", "every:8"], &SMALL[..]].concat();
+    fails(dir.path(), &all, 2, &["view_08.png"]);
+    assert!(!dir.path().join("run").exists());
+}
+
+#[test]
+fn training_and_eval_tell_of_held_out_and_training_views() {
+    let dir = tempfile::tempdir().unwrap();
+    let all = [&["train", s(&good().capture), "-o", "run", "--steps", "40", "--json", "--split", "every:4"], &SMALL[..]].concat();
+    let trained: serde_json::Value =
+        serde_json::from_str(&works(dir.path(), &[&all[..], &["--set", "run.evaluate_every=10", "--set", "run.log_every=10"]].concat()))
+            .unwrap();
+    assert!((3.0..60.0).contains(&trained["psnr_held_out"].as_f64().unwrap()), "{trained}");
+    let log = std::fs::read_to_string(dir.path().join("run/metrics.jsonl")).unwrap();
+    assert_eq!(log.lines().filter(|l| l.contains("val_psnr")).count(), 4, "{log}");
+    assert!(std::fs::read_to_string(dir.path().join("run/curves.svg")).unwrap().contains("held out"));
+    let report: serde_json::Value = serde_json::from_str(&works(dir.path(), &["eval", "run", "--device", "cpu", "--json"])).unwrap();
+    assert_eq!((report["views"].as_u64(), report["training"]["views"].as_u64()), (Some(4), Some(4)));
+    let gap = report["training"]["psnr"].as_f64().unwrap() - report["psnr"].as_f64().unwrap();
+    assert!((report["gap"].as_f64().unwrap() - gap).abs() < 1e-9);
+    assert!(report["per_view"][0]["behind_fog"].is_boolean());
+    // A run that knows its training views by heart: two of them, opposite each other.
+    let json = dir.path().join("few/transforms.json");
+    copy_all(&good().capture, &dir.path().join("few"));
+    let mut few: serde_json::Value = serde_json::from_slice(&std::fs::read(&json).unwrap()).unwrap();
+    let names = |i: &[usize]| i.iter().map(|i| few["frames"][*i]["file_path"].clone()).collect::<Vec<_>>();
+    let (train, test) = (names(&[1, 2]), names(&[0, 5, 8, 12]));
+    (few["train_filenames"], few["test_filenames"]) = (train.clone().into(), test.clone().into());
+    few["frames"].as_array_mut().unwrap().retain(|f| train.contains(&f["file_path"]) || test.contains(&f["file_path"]));
+    std::fs::write(&json, few.to_string()).unwrap();
+    works(dir.path(), &[&["train", "few", "-o", "by_heart", "--steps", "300"], &SMALL[..]].concat());
+    let said = works(dir.path(), &["eval", "by_heart", "--device", "cpu"]);
+    for part in ["training views: psnr", "dB below training views", "fog", "helps", "behind fog: "] {
+        assert!(said.contains(part), "{part:?} is not in {said}");
+    }
+    let summary: serde_json::Value = serde_json::from_slice(&std::fs::read(dir.path().join("by_heart/summary.json")).unwrap()).unwrap();
+    assert!(!summary["behind_fog"].as_array().unwrap().is_empty(), "{summary}");
+}
