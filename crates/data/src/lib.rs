@@ -10,6 +10,7 @@ pub mod colmap;
 pub mod error;
 pub mod glb;
 pub mod import;
+pub mod jpeg;
 pub mod json;
 pub mod llff;
 pub mod mesh_text;
