@@ -3,7 +3,7 @@
 use crate::archive::{self, ArchiveLimits};
 use crate::error::{DataError, Result};
 use crate::split::{self, SplitRule};
-use crate::{colmap, llff, transforms_json};
+use crate::{colmap, llff, photo_check, transforms_json};
 use diorama_geom::capture::{Frame, Split, focus_point};
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Capture, SceneBox, Similarity};
@@ -44,11 +44,13 @@ pub struct ImportOptions {
     pub seed: u64,
     /// Fewest usable views.
     pub min_views: usize,
+    /// Leave out photographs whose head cannot be read; see [`photo_check::leave_out_broken`] for all else.
+    pub skip_broken: bool,
 }
 
 impl Default for ImportOptions {
     fn default() -> Self {
-        ImportOptions { format: None, split: SplitRule::File, seed: 0, min_views: 3 }
+        ImportOptions { format: None, split: SplitRule::File, seed: 0, min_views: 3, skip_broken: false }
     }
 }
 
@@ -61,9 +63,14 @@ pub struct Imported {
     /// Names of listed images that do not exist.
     pub missing: Vec<String>,
     pub has_own_split: bool,
+    /// Undoes what the file's author did to the poses; none: nothing.
+    pub frames_from_capture: Option<Similarity>,
     /// Whether the world is not z up yet and must be turned by the cameras' up directions.
     pub unknown_up: bool,
 }
+
+/// Folders that photographs may lie in, the best first; the last are copies of the first at a part of its size.
+pub const IMAGE_FOLDERS: [&str; 5] = ["images", ".", "images_2", "images_4", "images_8"];
 
 /// Reads a capture: a folder, one of the description files in it, or a zip of it.
 ///
@@ -125,6 +132,7 @@ fn finish(data: &Path, mut imported: Imported, options: &ImportOptions) -> Resul
         let more = if imported.missing.len() > 3 { ", …" } else { "" };
         notes.push(format!("{} listed images do not exist and are skipped ({shown}{more})", imported.missing.len()));
     }
+    notes.extend(photo_check::fit(&mut imported.frames, options.skip_broken)?);
     let n = imported.frames.len();
     if n < options.min_views {
         return Err(DataError::input(
@@ -144,7 +152,8 @@ fn finish(data: &Path, mut imported: Imported, options: &ImportOptions) -> Resul
     if let Some(twice) = imported.frames.iter().find(|f| !seen.insert(&f.image)) {
         notes.push(format!("{} is listed more than once", twice.name));
     }
-    let world_from_capture = if imported.unknown_up { level(&mut imported.frames) } else { Similarity::IDENTITY };
+    let leveled = if imported.unknown_up { level(&mut imported.frames) } else { Similarity::IDENTITY };
+    let world_from_capture = imported.frames_from_capture.map_or(leveled, |f| leveled.after(&f));
     split::apply(&options.split, &mut imported.frames, imported.has_own_split, options.seed);
     let train = imported.frames.iter().filter(|f| f.split == Split::Train).count();
     if train < 2 {

@@ -299,12 +299,7 @@ impl Frame {
         let listed = head.get(1..1 + 2 * n)?;
         let parameters = head.get(1 + 2 * n..4 + 2 * n)?;
         let band = if self.is_progressive {
-            Band {
-                from: parameters[0] as usize,
-                to: (parameters[1] as usize).min(63),
-                high: parameters[2] >> 4,
-                low: parameters[2] & 15,
-            }
+            Band { from: parameters[0] as usize, to: (parameters[1] as usize).min(63), high: parameters[2] >> 4, low: parameters[2] & 15 }
         } else {
             Band { from: 0, to: 63, high: 0, low: 0 }
         };

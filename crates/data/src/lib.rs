@@ -16,6 +16,7 @@ pub mod llff;
 pub mod mesh_text;
 pub mod mp4;
 pub mod photo;
+pub mod photo_check;
 pub mod photo_import;
 pub mod pixel_store;
 pub mod plot;

@@ -6,7 +6,7 @@ use image::{DynamicImage, ImageBuffer, ImageFormat};
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-const SIZE: (u32, u32) = (23, 17);
+const SIZE: (u32, u32) = (13, 9);
 
 fn noise(x: u32, y: u32, k: u32) -> u32 {
     (x * 7919 + y * 104_729 + k * 1_299_709).wrapping_mul(2_654_435_761) >> 8
@@ -62,7 +62,8 @@ fn what_is_cut_off_anywhere_is_refused_by_name_unless_nothing_is_lost() {
     for (name, bytes) in files() {
         let whole = photo::load_full(&saved(dir.path(), name, &bytes)).unwrap();
         let mut refused = 0;
-        for n in 0..bytes.len() {
+        // Every length near the end, where little is lost, and a third of the others.
+        for n in (0..bytes.len()).filter(|n| n % 3 == 0 || n + 200 > bytes.len()) {
             match photo::load_full(&saved(dir.path(), name, &bytes[..n])) {
                 Ok(cut) => assert!(cut == whole, "{name} of {n} of {} bytes decodes to something else", bytes.len()),
                 Err(e) => {
@@ -163,11 +164,11 @@ fn a_value_that_is_not_a_number_is_told_with_its_pixel() {
     let dir = tempfile::tempdir().unwrap();
     for (value, word) in [(f32::NAN, "not a number"), (f32::INFINITY, "inf"), (1e6, "1000000")] {
         let mut im = linear().into_rgb32f();
-        im.get_pixel_mut(5, 11)[1] = value;
+        im.get_pixel_mut(5, 7)[1] = value;
         let path = saved(dir.path(), "bad.exr", &encode(&DynamicImage::ImageRgb32F(im), ImageFormat::OpenExr));
         let e = photo::load_full(&path).unwrap_err();
         let text = e.to_string();
-        assert!(e.is_input() && text.contains("bad.exr") && text.contains("(5, 11)") && text.contains(word), "{text}");
+        assert!(e.is_input() && text.contains("bad.exr") && text.contains("(5, 7)") && text.contains(word), "{text}");
         assert!(text.contains("green") && !text.contains('\n'), "{text}");
     }
 }

@@ -69,7 +69,7 @@ fn seen_points(model: &ObjectModel) -> Vec<DVec3> {
             let in_view = |f: &&&diorama_geom::Frame| {
                 let (w, h) = (f.camera.width as f64, f.camera.height as f64);
                 let q = f.world_from_camera.inverse().point(*p);
-                q.z > 0.0 && f.camera.project(q).is_some_and(|px| (0.0..w).contains(&px.x) && (0.0..h).contains(&px.y))
+                f.camera.project(q).is_some_and(|px| (0.0..w).contains(&px.x) && (0.0..h).contains(&px.y))
             };
             frames.iter().filter(in_view).count()
         })
