@@ -69,6 +69,14 @@ impl Photo {
         }
     }
 
+    /// 1, 3 or 4.
+    pub fn channels(&self) -> usize {
+        match self {
+            Photo::Eight(im) => im.channels,
+            Photo::Sixteen(im) | Photo::Linear(im) => im.channels,
+        }
+    }
+
     /// Area average over the exact pixel footprint, in the photograph's own space.
     pub fn downsampled(&self, width: usize, height: usize) -> Photo {
         match self {
@@ -104,6 +112,14 @@ fn encoded(im: &Image) -> Image {
         p.iter_mut().take(3).for_each(|v| *v = srgb_from_linear(*v));
     }
     out
+}
+
+/// Whether two sizes are the same picture, but for the rounding of sides.
+pub fn is_same_aspect(a: (u32, u32), b: (u32, u32)) -> bool {
+    let ([aw, ah], [bw, bh]) = ([a.0, a.1].map(f64::from), [b.0, b.1].map(f64::from));
+    // The larger picture's shape, at the smaller one's size, differs by less than a pixel.
+    let ((w, h), (large_w, large_h)) = if aw * ah <= bw * bh { ((aw, ah), (bw, bh)) } else { ((bw, bh), (aw, ah)) };
+    (large_h * w / large_w - h).abs() <= 1.0 || (large_w * h / large_h - w).abs() <= 1.0
 }
 
 /// What helps where a file is damaged.

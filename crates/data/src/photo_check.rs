@@ -83,14 +83,6 @@ pub fn left_out(broken: &[DataError]) -> Option<String> {
     (!names.is_empty()).then(|| format!("{} {some} left out: {}", names.len(), names.join(", ")))
 }
 
-/// Whether two sizes are the same picture, but for the rounding of sides.
-fn is_same_aspect(a: (u32, u32), b: (u32, u32)) -> bool {
-    let ([aw, ah], [bw, bh]) = ([a.0, a.1].map(f64::from), [b.0, b.1].map(f64::from));
-    // The larger picture's shape, at the smaller one's size, differs by less than a pixel.
-    let ((w, h), (large_w, large_h)) = if aw * ah <= bw * bh { ((aw, ah), (bw, bh)) } else { ((bw, bh), (aw, ah)) };
-    (large_h * w / large_w - h).abs() <= 1.0 || (large_w * h / large_h - w).abs() <= 1.0
-}
-
 /// Gives cameras their photographs' sizes.
 fn scaled(frames: &mut [(Frame, Header)]) -> Result<Vec<String>> {
     let mut changes: BTreeMap<((u32, u32), (u32, u32)), usize> = BTreeMap::new();
@@ -99,7 +91,7 @@ fn scaled(frames: &mut [(Frame, Header)]) -> Result<Vec<String>> {
         if is == said {
             continue;
         }
-        let turned = header.is_turned && is_same_aspect((is.1, is.0), said);
+        let turned = header.is_turned && photo::is_same_aspect((is.1, is.0), said);
         if turned {
             return Err(DataError::input(
                 &f.image,
@@ -110,7 +102,7 @@ fn scaled(frames: &mut [(Frame, Header)]) -> Result<Vec<String>> {
                 ),
             ));
         }
-        if !is_same_aspect(is, said) {
+        if !photo::is_same_aspect(is, said) {
             return Err(DataError::input(
                 &f.image,
                 format!(
@@ -155,7 +147,7 @@ fn depth_fits(f: &Frame) -> Result<()> {
         return Err(DataError::input(file, "not a depth map that can be read; give PNG of 16 bits, EXR or NPY, or remove depth_file_path"));
     };
     let photo = (f.camera.width, f.camera.height);
-    if is_same_aspect(size, photo) {
+    if photo::is_same_aspect(size, photo) {
         return Ok(());
     }
     Err(DataError::input(

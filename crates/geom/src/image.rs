@@ -2,6 +2,24 @@
 
 use crate::color::u8_from_unit;
 
+/// How the values of stored pixels are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PixelFormat {
+    /// 8 bits for 0 to 1.
+    Unorm8,
+    /// 16 bits for 0 to 1.
+    Unorm16,
+    /// Floats of 16 bits (IEEE 754 binary16).
+    Half,
+}
+
+impl PixelFormat {
+    /// Bytes of a pixel of four values.
+    pub fn bytes(self) -> usize {
+        if self == PixelFormat::Unorm8 { 4 } else { 8 }
+    }
+}
+
 /// `[H, W, C]` of f32.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image {

@@ -42,6 +42,9 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
             "{} views: psnr {:.2} dB (worst {:.2}, affine {:.2}), ssim {:.4}, mse {:.5}",
             report.views, report.psnr, report.psnr_min, report.psnr_affine, report.ssim, report.mse
         );
+        if model.is_linear() {
+            println!("scored in {}: the photographs hold linear light", report.scored_in);
+        }
         if let Some(p) = report.psnr_mean_image {
             println!("the mean training image in place of renders: {p:.2} dB");
         }

@@ -124,6 +124,7 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
             ("--format", a.format.is_some()),
             ("--config", a.config.is_some()),
             ("--preset", a.preset.is_some()),
+            ("--skip-broken", a.skip_broken && !c.data.skip_broken),
         ];
         if let Some((flag, _)) = fixed.iter().find(|f| f.1) {
             return Err(PipelineError::Usage(format!("{flag} cannot change on --resume; start a new run with another --out")));
@@ -138,6 +139,7 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
     set("background", a.background.clone())?;
     set("device", a.device.clone())?;
     set("seed", a.seed.map(|v| v.to_string()))?;
+    set("data.skip_broken", (a.skip_broken && !a.resume).then(|| "true".into()))?;
     if let Some(s) = a.seconds {
         if !(s.is_finite() && s > 0.0) {
             return Err(PipelineError::Usage(format!("--seconds {s}: must be greater than 0")));

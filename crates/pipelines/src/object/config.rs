@@ -58,6 +58,9 @@ pub struct DataConfig {
     pub split: String,
     /// Bytes that pixels may take; beyond that one of each small square is kept.
     pub memory_budget: u64,
+    /// Leave out photographs that cannot be decoded, instead of refusing the capture.
+    #[serde(default)]
+    pub skip_broken: bool,
 }
 
 /// Shape of the field.
@@ -196,6 +199,7 @@ impl Config {
                 downscale: 1,
                 split: "file".into(),
                 memory_budget: diorama_data::pixel_store::DEFAULT_BUDGET,
+                skip_broken: false,
             },
             field: FieldConfig {
                 levels: 16,

@@ -2,11 +2,12 @@
 
 use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
-use diorama_data::photo;
+use diorama_data::photo::{self, Photo};
+use diorama_engine::losses;
 use diorama_engine::metrics::{self, Scores};
 use diorama_engine::renderers::volume::{Quality, View};
 use diorama_geom::capture::Split;
-use diorama_geom::{Capture, Image, ImageU8};
+use diorama_geom::{Capture, Image};
 use serde::Serialize;
 
 /// Frames of a split; held-out ones fall back to validation where there is no test split.
@@ -46,26 +47,35 @@ pub struct Report {
     pub psnr_mean_image: Option<f64>,
     /// Needs weights that are not part of this program.
     pub lpips: Option<f64>,
+    /// The space in which views and photographs are compared.
+    pub scored_in: &'static str,
     pub per_view: Vec<ViewScore>,
 }
 
-/// A photograph at the run's resolution, transparent pixels on the model's backdrop.
-pub fn reference_photo(model: &ObjectModel, full: &ImageU8) -> Image {
+/// A photograph at the run's resolution, transparent pixels on the model's backdrop: sRGB up to white.
+pub fn reference_photo(model: &ObjectModel, full: &Photo) -> Image {
     let d = model.config.data.downscale as usize;
-    let small = full.downsampled((full.width / d).max(1), (full.height / d).max(1));
+    let (w, h) = full.size();
+    let small = full.downsampled((w / d).max(1), (h / d).max(1));
+    // What a field of linear light was trained on is blended there, too.
+    let (small, is_linear) = match small {
+        Photo::Linear(im) if model.is_linear() => (im, true),
+        other => (other.into_srgb(), false),
+    };
     let back = model.backdrop_color();
     let mut out = Image::zeros(small.width, small.height, 3);
     for (o, p) in out.data.chunks_exact_mut(3).zip(small.data.chunks_exact(small.channels)) {
-        let a = if small.channels == 4 { p[3] as f32 / 255.0 } else { 1.0 };
+        let a = if small.channels == 4 { p[3] } else { 1.0 };
         for k in 0..3 {
-            o[k] = p[k.min(small.channels - 1)] as f32 / 255.0 * a + back[k] * (1.0 - a);
+            let v = p[k.min(small.channels - 1)] * a + back[k] * (1.0 - a);
+            o[k] = if is_linear { losses::shown(v) } else { v.clamp(0.0, 1.0) };
         }
     }
     out
 }
 
 /// Renders frame `i` and scores it against `full`, its photograph at full size.
-pub fn score_view(model: &ObjectModel, i: usize, full: &ImageU8, quality: Quality) -> ScoredView {
+pub fn score_view(model: &ObjectModel, i: usize, full: &Photo, quality: Quality) -> ScoredView {
     let photo = reference_photo(model, full);
     let view = model.tracer(quality).view(&model.posed(i), &mut |_| {});
     let mask =
@@ -91,7 +101,7 @@ pub fn evaluate(
     let (mut per_view, mut mean_scores) = (Vec::new(), Vec::new());
     for i in frames {
         let frame = &model.capture.frames[i];
-        let full = photo::load(&frame.image)?;
+        let full = photo::load_full(&frame.image)?;
         let scored = score_view(model, i, &full, quality);
         if let Some(mean) = mean.as_ref().filter(|m| (m.width, m.height) == (scored.photo.width, scored.photo.height)) {
             mean_scores.push(metrics::compare(mean, &scored.photo, |_, _| true).psnr);
@@ -111,6 +121,7 @@ pub fn evaluate(
         psnr_affine: average(|v| v.psnr_affine),
         psnr_mean_image: (!mean_scores.is_empty()).then(|| mean_scores.iter().sum::<f64>() / mean_scores.len() as f64),
         lpips: None,
+        scored_in: if model.is_linear() { "sRGB, of linear light up to white" } else { "sRGB" },
         per_view,
     })
 }
@@ -121,7 +132,7 @@ fn mean_image(model: &ObjectModel) -> Result<Option<Image>> {
     let mut sum: Option<Image> = None;
     let mut n = 0.0;
     for &i in model.train.iter().step_by(step) {
-        let im = reference_photo(model, &photo::load(&model.capture.frames[i].image)?);
+        let im = reference_photo(model, &photo::load_full(&model.capture.frames[i].image)?);
         n += 1.0;
         match &mut sum {
             None => sum = Some(im),

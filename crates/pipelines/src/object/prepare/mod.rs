@@ -46,6 +46,8 @@ pub struct PrepareOptions {
     /// Go on from what an earlier call left.
     pub resume: bool,
     pub force: bool,
+    /// Leave out photographs that cannot be decoded.
+    pub skip_broken: bool,
 }
 
 /// What was made.
@@ -56,6 +58,8 @@ pub struct Prepared {
     pub registered: usize,
     /// Photographs without a pose.
     pub lost: Vec<String>,
+    /// Photographs that could not be decoded and were left out.
+    pub broken: Vec<String>,
     pub points: usize,
     /// Mean angle between the cameras' own up directions and the world's, in degrees.
     pub tilt: f64,
@@ -73,6 +77,10 @@ const IMAGES: &str = "images";
 const WORK: &str = "colmap";
 const POINTS: &str = "points.ply";
 const IMAGES_DONE: &str = "images.done";
+/// Within [`WORK`]: photographs of linear light as COLMAP can read them, PNGs of 8 bits under the same names.
+const SEEN: &str = "seen";
+/// Within [`WORK`]: names of the broken photographs that were left out, a line each.
+const BROKEN: &str = "images.broken";
 
 /// Prepares a data set; none when interrupted, after which `resume` goes on. `note` is told what happens.
 ///
@@ -140,6 +148,7 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
         images: names.len(),
         registered: registered.len(),
         lost,
+        broken: std::fs::read_to_string(work.join(BROKEN)).unwrap_or_default().lines().map(String::from).collect(),
         points: points.len(),
         tilt: placed.tilt,
         floor: placed.floor,
@@ -213,6 +222,7 @@ fn common_focal_ratio(all: &[PathBuf]) -> Option<f64> {
 fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<bool> {
     let folder = o.out.join(IMAGES);
     let mut focal_ratio = None;
+    let mut broken = Vec::new();
     if o.input.is_dir() {
         let all: Vec<PathBuf> = photo_import::list(&o.input)?.into_iter().step_by(o.every).collect();
         focal_ratio = common_focal_ratio(&all);
@@ -224,7 +234,14 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
             let own = source.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             let stem = if stems.contains(&own) { format!("{own}_{i}") } else { own };
             stems.insert(stem.clone());
-            photo_import::import(source, &folder, &stem, o.max_side)?;
+            match photo_import::import(source, &folder, &stem, o.max_side) {
+                Ok(taken) => see(&taken, work)?,
+                Err(e) if o.skip_broken && e.is_input() => {
+                    note(&format!("left out: {e}"));
+                    broken.push(source.file_name().unwrap_or_default().to_string_lossy().into_owned());
+                }
+                Err(e) => return Err(e.into()),
+            }
             note(&format!("photographs: {} of {}", i + 1, all.len()));
         }
     } else {
@@ -240,9 +257,20 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
             }
         }
     }
+    atomic::write(&work.join(BROKEN), broken.join("\n").as_bytes())?;
     let kept = focal_ratio.map(|f| f.to_string()).unwrap_or_default();
     atomic::write(&work.join(IMAGES_DONE), kept.as_bytes())?;
     Ok(true)
+}
+
+/// Makes a picture that COLMAP can read of a photograph of linear light.
+fn see(taken: &Path, work: &Path) -> Result<()> {
+    if photo::header(taken)?.depth == photo::Depth::Linear {
+        let folder = work.join(SEEN);
+        std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
+        photo::save_png(&folder.join(taken.file_name().unwrap_or_default()), &photo::load(taken)?)?;
+    }
+    Ok(())
 }
 
 fn enough(o: &PrepareOptions, names: &[String], lost: &[String]) -> Result<()> {

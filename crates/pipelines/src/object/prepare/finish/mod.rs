@@ -139,6 +139,9 @@ pub fn finish(
         return Ok(Some(made));
     }
     std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
+    if frames.iter().any(|f| photo::header(&f.image).is_ok_and(|h| h.depth > photo::Depth::Eight)) {
+        note("photographs of more than 8 bits are finished in 8 bits");
+    }
     let observed: HashMap<String, colmap::Observed> =
         colmap::observations(found.model)?.into_iter().map(|v| (v.image.clone(), v)).collect();
     let name = |f: &Frame| f.image.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -175,7 +178,7 @@ pub fn finish(
             image = crop_to(crop, image, &mut f)?;
         }
         let stem = f.image.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        let written = photo_import::write(&image, &folder, &stem)?;
+        let written = photo_import::write_like(&f.image, &image, &folder, &stem)?;
         f.image = root.join(FINISHED).join(written.file_name().unwrap_or_default());
         Ok((f, sigma, share))
     };
