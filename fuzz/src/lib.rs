@@ -24,6 +24,7 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "poses_bounds_npy", run: npy, seeds: npy_seeds },
     Parser { name: "checkpoint", run: load_checkpoint, seeds: checkpoint_seeds },
     Parser { name: "photo", run: decode_photo, seeds: photo_seeds },
+    Parser { name: "cut_photo", run: cut_photo, seeds: cut_seeds },
     Parser { name: "jpeg_metadata", run: strip_jpeg, seeds: photo_seeds },
     Parser { name: "zip", run: unzip, seeds: zip_seeds },
     Parser { name: "http_request", run: http, seeds: http_seeds },
@@ -139,9 +140,42 @@ fn decode_photo(data: &[u8]) {
     let path = file("photo.png", data);
     // Mutations may claim any size; those beyond the limits must be refused, those below need not be decoded here.
     if photo::size(&path).is_ok_and(|(w, h)| w as u64 * h as u64 <= 1 << 16) {
-        let _ = photo::load(&path);
+        let _ = photo::load_full(&path);
     }
     let _ = photo::is_turned(&path);
+}
+
+/// Files of formats that nothing here can write.
+const FILES: [&[u8]; 5] = [
+    include_bytes!("../../crates/data/tests/photos/baseline.jpg"),
+    include_bytes!("../../crates/data/tests/photos/progressive.jpg"),
+    include_bytes!("../../crates/data/tests/photos/lossy.webp"),
+    include_bytes!("../../crates/data/tests/photos/lzw.tiff"),
+    include_bytes!("../../crates/data/tests/photos/deflate.tiff"),
+];
+
+/// A photograph that is cut off must be refused, unless nothing of it is lost: a byte names the format, two the place of the cut in
+/// 65,536ths, one the width; the others are pixels.
+fn cut_photo(data: &[u8]) {
+    let [kind, low, high, width, rest @ ..] = data else { return };
+    let (w, h) = (*width as usize % 40 + 1, 12);
+    let at = |i: usize| if rest.is_empty() { 0 } else { rest[i % rest.len()] };
+    let rgb = ImageU8 { width: w, height: h, channels: 3, data: (0..w * h * 3).map(at).collect() };
+    let whole = match kind % 8 {
+        0 => photo::encode_png(&rgb),
+        1 => std::fs::read(photo_import::write(&rgb, folder(), "whole").expect("a scratch file")).expect("a scratch file"),
+        2 => {
+            let path = folder().join("whole.exr");
+            photo::save_exr(&path, &rgb.to_f32()).expect("a scratch file");
+            std::fs::read(path).expect("a scratch file")
+        }
+        n => FILES[n as usize - 3].to_vec(),
+    };
+    let want = photo::load_full(&file("cut", &whole)).expect("a whole photograph");
+    let length = u16::from_le_bytes([*low, *high]) as usize * whole.len() >> 16;
+    if let Ok(got) = photo::load_full(&file("cut", &whole[..length])) {
+        assert!(got == want, "{length} of {} bytes decode to something else", whole.len());
+    }
 }
 
 fn strip_jpeg(data: &[u8]) {
@@ -238,7 +272,12 @@ fn photo_seeds() -> Vec<Vec<u8>> {
     let rgb = ImageU8 { width: 16, height: 12, channels: 3, data };
     let rgba = ImageU8 { width: 4, height: 4, channels: 4, data: (0..64).collect() };
     let jpeg = photo_import::write(&rgb, folder(), "seed").expect("a scratch file");
-    vec![std::fs::read(jpeg).expect("a scratch file"), photo::encode_png(&rgb), photo::encode_png(&rgba)]
+    let own = [std::fs::read(jpeg).expect("a scratch file"), photo::encode_png(&rgb), photo::encode_png(&rgba)];
+    own.into_iter().chain(FILES.map(|f| f.to_vec())).collect()
+}
+
+fn cut_seeds() -> Vec<Vec<u8>> {
+    (0..8).map(|kind| [&[kind, 0xff, 0xf0, 23][..], &(0..60).map(|i| (i * 37) as u8).collect::<Vec<u8>>()].concat()).collect()
 }
 
 fn zip_seeds() -> Vec<Vec<u8>> {

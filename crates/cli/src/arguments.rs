@@ -161,6 +161,9 @@ pub struct PrepareArgs {
     pub split: Option<String>,
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
+    /// Leave out photographs that cannot be decoded, for example because they were cut off, and list them
+    #[arg(long)]
+    pub skip_broken: bool,
     /// Fail where fewer photographs than this percentage find a pose
     #[arg(long, default_value_t = 80.0)]
     pub min_registered: f64,
@@ -217,6 +220,9 @@ pub struct TrainArgs {
     pub threads: Option<usize>,
     #[arg(long)]
     pub seed: Option<u64>,
+    /// Leave out photographs that cannot be decoded, for example because they were cut off, and list them
+    #[arg(long)]
+    pub skip_broken: bool,
     /// `report`: the shortest side of each photograph becomes 100 pixels
     #[arg(long, conflicts_with = "downscale")]
     pub preset: Option<String>,

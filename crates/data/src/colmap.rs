@@ -1,7 +1,7 @@
 //! COLMAP models: `cameras`, `images` and `points3D`, binary or text; world to camera, quaternion (w, x, y, z).
 
 use crate::error::{self, DataError, Result};
-use crate::import::{Imported, locate};
+use crate::import::{self, Imported, locate};
 use crate::sparse::Sparse;
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::DVec3;
@@ -178,7 +178,7 @@ pub(crate) fn read_images(model: &Path, each: &mut dyn FnMut(&Registered, &[Keyp
     if binary.exists() { read_images_bin(&binary, each) } else { read_images_txt(&model.join("images.txt"), each) }
 }
 
-/// Reads the largest model under `root`, whose photographs lie in `root/images` or `root`.
+/// Reads the largest model under `root`, whose photographs lie in `root/images`, in `root`, or reduced in `root/images_2` and so on.
 pub fn read(root: &Path) -> Result<Imported> {
     let model = find_model(root)
         .ok_or_else(|| DataError::input(root, "holds no COLMAP model (images.bin or images.txt, in sparse/0 for example)"))?;
@@ -200,11 +200,13 @@ pub fn read(root: &Path) -> Result<Imported> {
         })?;
         let pose = crate::transforms_json::rigid(im.world_from_camera)
             .map_err(|e| DataError::input(&file, format!("image {}: {e}; run COLMAP again", im.name)))?;
-        let inside = format!("images/{}", im.name);
-        let found = match locate(root, &inside, &file, "name")? {
-            Some(p) => Some(p),
-            None => locate(root, &im.name, &file, "name")?,
-        };
+        let mut found = None;
+        for folder in import::IMAGE_FOLDERS {
+            found = locate(root, &format!("{folder}/{}", im.name), &file, "name")?;
+            if found.is_some() {
+                break;
+            }
+        }
         let Some(image) = found else {
             out.missing.push(std::mem::take(&mut im.name));
             continue;

@@ -4,7 +4,7 @@ use crate::archive::{self, ArchiveLimits};
 use crate::error::{DataError, Result};
 use crate::masks::{self, MaskOptions};
 use crate::split::{self, SplitRule};
-use crate::{colmap, llff, sparse, transforms_json};
+use crate::{colmap, llff, photo_check, sparse, transforms_json};
 use diorama_geom::capture::{Agreement, Frame, MaskMeaning, Split, focus_point};
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Capture, SceneBox, Similarity, SparsePoint};
@@ -48,11 +48,21 @@ pub struct ImportOptions {
     pub masks: MaskOptions,
     /// Read a model whose poses contradict its points as well: to look at it, not to train on it.
     pub allow_broken: bool,
+    /// Leave out photographs whose head cannot be read; see [`photo_check::leave_out_broken`] for all else.
+    pub skip_broken: bool,
 }
 
 impl Default for ImportOptions {
     fn default() -> Self {
-        ImportOptions { format: None, split: SplitRule::File, seed: 0, min_views: 3, masks: MaskOptions::default(), allow_broken: false }
+        ImportOptions {
+            format: None,
+            split: SplitRule::File,
+            seed: 0,
+            min_views: 3,
+            masks: MaskOptions::default(),
+            allow_broken: false,
+            skip_broken: false,
+        }
     }
 }
 
@@ -65,6 +75,8 @@ pub struct Imported {
     /// Names of listed images that do not exist.
     pub missing: Vec<String>,
     pub has_own_split: bool,
+    /// Undoes what the file's author did to the poses; none: nothing.
+    pub frames_from_capture: Option<Similarity>,
     /// Whether the world is not z up yet and must be turned by the cameras' up directions.
     pub unknown_up: bool,
     /// What the file says that masks leave out.
@@ -78,6 +90,9 @@ pub struct Imported {
     /// What was skipped or assumed, one line each.
     pub notes: Vec<String>,
 }
+
+/// Folders that photographs may lie in, the best first; the last are copies of the first at a part of its size.
+pub const IMAGE_FOLDERS: [&str; 5] = ["images", ".", "images_2", "images_4", "images_8"];
 
 /// Reads a capture: a folder, one of the description files in it, or a zip of it.
 ///
@@ -162,6 +177,9 @@ fn finish(data: &Path, root: &Path, mut imported: Imported, options: &ImportOpti
         let more = if imported.missing.len() > 3 { ", …" } else { "" };
         notes.push(format!("{} listed images do not exist and are skipped ({shown}{more})", imported.missing.len()));
     }
+    let fitted = photo_check::fit(&mut imported.frames, options.skip_broken)?;
+    sparse::keep(&mut imported.points, imported.agreement.as_mut(), &fitted.kept);
+    notes.extend(fitted.notes);
     let n = imported.frames.len();
     if n < options.min_views {
         return Err(DataError::input(
@@ -191,8 +209,9 @@ fn finish(data: &Path, root: &Path, mut imported: Imported, options: &ImportOpti
         notes.push(format!("{} is listed more than once", twice.name));
     }
     let rule = masks::settle(root, &mut imported.frames, &options.masks, imported.mask_meaning, &mut notes)?;
-    let world_from_capture = if imported.unknown_up { level(&mut imported.frames) } else { Similarity::IDENTITY };
-    imported.points.iter_mut().for_each(|p| p.position = world_from_capture.point(p.position));
+    let leveled = if imported.unknown_up { level(&mut imported.frames) } else { Similarity::IDENTITY };
+    imported.points.iter_mut().for_each(|p| p.position = leveled.point(p.position));
+    let world_from_capture = imported.frames_from_capture.map_or(leveled, |f| leveled.after(&f));
     split::apply(&options.split, &mut imported.frames, imported.has_own_split, options.seed);
     let train = imported.frames.iter().filter(|f| f.split == Split::Train).count();
     if train < 2 {
@@ -205,6 +224,7 @@ fn finish(data: &Path, root: &Path, mut imported: Imported, options: &ImportOpti
         masks: rule,
         points: imported.points,
         agreement: imported.agreement,
+        broken: fitted.broken,
         ..Capture::new(imported.frames, scene)
     })
 }

@@ -2,20 +2,21 @@
 //! centre; height, width, focal length) and the nearest and farthest depth.
 
 use crate::error::{self, DataError, Result};
-use crate::import::Imported;
+use crate::import::{self, Imported};
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::{Camera, Lens, Pose};
 use std::path::{Path, PathBuf};
 
-/// Reads `poses_bounds.npy` and the photographs in `images`, matched in order of name.
+/// Reads `poses_bounds.npy` and the photographs in `images` (or reduced in `images_2` and so on), matched in order of name.
 pub fn read(root: &Path) -> Result<Imported> {
     let file = root.join("poses_bounds.npy");
     let (shape, values) = read_npy(&file)?;
     if shape.len() != 2 || shape[1] != 17 {
         return Err(DataError::input(&file, format!("has shape {shape:?}; expected [images, 17]")));
     }
-    let folder = root.join("images");
+    let mut folders = import::IMAGE_FOLDERS.iter().filter(|f| **f != ".").map(|f| root.join(f));
+    let folder = folders.find(|f| f.is_dir()).unwrap_or(root.join("images"));
     let mut images: Vec<PathBuf> = folder
         .read_dir()
         .map_err(DataError::io(&folder, "read"))?
@@ -30,7 +31,12 @@ pub fn read(root: &Path) -> Result<Imported> {
     if images.len() != shape[0] {
         return Err(DataError::input(
             &file,
-            format!("holds {} poses but images/ holds {} photographs; they must match", shape[0], images.len()),
+            format!(
+                "holds {} poses but {}/ holds {} photographs; they must match",
+                shape[0],
+                folder.file_name().unwrap_or_default().to_string_lossy(),
+                images.len()
+            ),
         ));
     }
     let mut out = Imported { unknown_up: true, ..Imported::default() };

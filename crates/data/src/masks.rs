@@ -1,9 +1,9 @@
 //! Masks: where they lie beside photographs, what they leave out, and how they are read.
 
 use crate::error::{DataError, Result};
-use crate::photo;
-use diorama_geom::ImageU8;
+use crate::photo::{self, Photo};
 use diorama_geom::capture::{Frame, MaskMeaning, MaskRule};
+use diorama_geom::{Image, ImageU8};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -256,25 +256,41 @@ pub fn of_frame(frame: &Frame, rule: &MaskRule, (width, height): (usize, usize))
     Ok(Some(mask.downsampled(width, height)))
 }
 
-/// A photograph whose pixels outside of the mask are transparent.
-pub fn cut_out(image: &ImageU8, mask: &ImageU8) -> ImageU8 {
-    let rgba = image.data.chunks_exact(image.channels).zip(&mask.data).flat_map(|(p, m)| {
+/// A photograph whose pixels outside of the mask are transparent, with all of its range.
+pub fn cut_out(photo: &Photo, mask: &ImageU8) -> Photo {
+    let in_floats = |im: &Image| {
+        let data = rgba(&im.data, im.channels, 1.0, mask, |alpha, m| alpha * m as f32 / 255.0);
+        Image { channels: 4, data, ..*im }
+    };
+    match photo {
+        Photo::Eight(im) => {
+            let data = rgba(&im.data, im.channels, 255, mask, |alpha, m| ((alpha as u32 * m as u32 + 127) / 255) as u8);
+            Photo::Eight(ImageU8 { channels: 4, data, ..*im })
+        }
+        Photo::Sixteen(im) => Photo::Sixteen(in_floats(im)),
+        Photo::Linear(im) => Photo::Linear(in_floats(im)),
+    }
+}
+
+/// Pixels with an alpha that `through` makes of their own and of the mask.
+fn rgba<T: Copy>(data: &[T], channels: usize, opaque: T, mask: &ImageU8, through: impl Fn(T, u8) -> T) -> Vec<T> {
+    let pixels = data.chunks_exact(channels).zip(&mask.data).flat_map(|(p, m)| {
         let at = |k: usize| p[k.min(p.len() - 1)];
-        let alpha = if p.len() == 4 { p[3] } else { 255 };
-        [at(0), at(1), at(2), ((alpha as u32 * *m as u32 + 127) / 255) as u8]
+        let alpha = if p.len() == 4 { p[3] } else { opaque };
+        [at(0), at(1), at(2), through(alpha, *m)]
     });
-    ImageU8 { channels: 4, data: rgba.collect(), ..*image }
+    pixels.collect()
 }
 
 /// A photograph with what its mask makes of it: transparent pixels where masks mean an object, else the mask itself.
 ///
 /// # Errors
 /// As [`of_frame`].
-pub fn apply(frame: &Frame, rule: &MaskRule, image: ImageU8) -> Result<(ImageU8, Option<ImageU8>)> {
-    match of_frame(frame, rule, (image.width, image.height))? {
-        None => Ok((image, None)),
-        Some(mask) if rule.meaning == MaskMeaning::Object => Ok((cut_out(&image, &mask), None)),
-        Some(mask) => Ok((image, Some(mask))),
+pub fn apply(frame: &Frame, rule: &MaskRule, photo: Photo) -> Result<(Photo, Option<ImageU8>)> {
+    match of_frame(frame, rule, photo.size())? {
+        None => Ok((photo, None)),
+        Some(mask) if rule.meaning == MaskMeaning::Object => Ok((cut_out(&photo, &mask), None)),
+        Some(mask) => Ok((photo, Some(mask))),
     }
 }
 
@@ -410,11 +426,24 @@ mod tests {
         f.mask = Some(path);
         let gray = ImageU8 { width: 4, height: 1, channels: 3, data: vec![9; 12] };
         let rule = MaskRule { meaning: MaskMeaning::Object, inverted: false };
-        let (cut, mask) = apply(f, &rule, gray).unwrap();
+        let (cut, mask) = apply(f, &rule, Photo::Eight(gray)).unwrap();
         assert!(mask.is_none());
+        let Photo::Eight(cut) = cut else { panic!("8 bits stay 8 bits") };
         assert_eq!(cut.data.chunks_exact(4).map(|p| (p[0], p[3])).collect::<Vec<_>>(), [(9, 0), (9, 255), (9, 255), (9, 0)]);
         // What was transparent stays so.
-        let (cut, _) = apply(f, &rule, ImageU8 { channels: 4, data: vec![9; 16], ..cut }).unwrap();
+        let (cut, _) = apply(f, &rule, Photo::Eight(ImageU8 { channels: 4, data: vec![9; 16], ..cut })).unwrap();
+        let Photo::Eight(cut) = cut else { panic!("8 bits stay 8 bits") };
         assert_eq!((cut.pixel(0, 0)[3], cut.pixel(1, 0)[3]), (0, 9));
+        // 16 bits and light brighter than white keep their range.
+        let bright = Image { width: 4, height: 1, channels: 3, data: vec![7.5; 12] };
+        for photo in [Photo::Sixteen(bright.clone()), Photo::Linear(bright)] {
+            let (cut, _) = apply(f, &rule, photo.clone()).unwrap();
+            assert_eq!(std::mem::discriminant(&cut), std::mem::discriminant(&photo));
+            let (Photo::Sixteen(cut) | Photo::Linear(cut)) = cut else { panic!("floats stay floats") };
+            assert_eq!(
+                cut.data.chunks_exact(4).map(|p| (p[0], p[3])).collect::<Vec<_>>(),
+                [(7.5, 0.0), (7.5, 1.0), (7.5, 1.0), (7.5, 0.0)]
+            );
+        }
     }
 }

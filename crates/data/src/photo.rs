@@ -1,10 +1,14 @@
-//! Decoding photographs to 8-bit sRGB: JPEG with EXIF orientation, PNG (8, 16 bit, alpha), WebP, TIFF,
-//! EXR and HDR (linear, encoded to sRGB and clamped).
+//! Decoding photographs: JPEG with EXIF orientation, PNG (8, 16 bit, alpha), WebP, TIFF, and linear EXR and HDR. A file that ends
+//! early is refused, whatever its format.
 
 use crate::error::{DataError, Result};
-use diorama_geom::ImageU8;
-use diorama_geom::color::{srgb_from_linear, u8_from_unit};
+use crate::jpeg;
+use diorama_geom::capture::ColorSpace;
+use diorama_geom::color::{srgb_from_linear, u16_from_unit};
+use diorama_geom::{Image, ImageU8};
+use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
+use std::io::Cursor;
 use std::path::Path;
 
 /// Limits on what a photograph may claim to be.
@@ -20,26 +24,148 @@ impl Default for PhotoLimits {
     }
 }
 
-fn undecodable(path: &Path, e: impl std::fmt::Display) -> DataError {
-    DataError::input(path, format!("cannot be decoded as an image: {e}"))
+/// How finely a photograph's values are stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Depth {
+    Eight,
+    Sixteen,
+    /// Floating point, in linear light.
+    Linear,
 }
 
-fn open(path: &Path, limits: &PhotoLimits) -> Result<impl ImageDecoder> {
-    let size = std::fs::metadata(path).map_err(DataError::io(path, "read"))?.len();
-    if size == 0 {
-        return Err(DataError::input(path, "the image file is empty (0 bytes); copy it again"));
+/// What a photograph's head says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Header {
+    /// Width and height as shown, that is after EXIF orientation.
+    pub size: (u32, u32),
+    /// Whether metadata say that the picture is to be turned or mirrored.
+    pub is_turned: bool,
+    pub depth: Depth,
+}
+
+impl Header {
+    pub fn color_space(&self) -> ColorSpace {
+        if self.depth == Depth::Linear { ColorSpace::Linear } else { ColorSpace::Srgb }
     }
-    let reader = ImageReader::open(path).map_err(DataError::io(path, "read"))?;
-    let mut reader = reader.with_guessed_format().map_err(DataError::io(path, "read"))?;
+}
+
+/// A decoded photograph of 1, 3 or 4 channels, alpha straight.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Photo {
+    /// sRGB in 8 bits.
+    Eight(ImageU8),
+    /// sRGB of 16 bits, as values in [0, 1].
+    Sixteen(Image),
+    /// Linear light, 1 is white, brighter is more.
+    Linear(Image),
+}
+
+impl Photo {
+    /// Width and height.
+    pub fn size(&self) -> (usize, usize) {
+        match self {
+            Photo::Eight(im) => (im.width, im.height),
+            Photo::Sixteen(im) | Photo::Linear(im) => (im.width, im.height),
+        }
+    }
+
+    /// 1, 3 or 4.
+    pub fn channels(&self) -> usize {
+        match self {
+            Photo::Eight(im) => im.channels,
+            Photo::Sixteen(im) | Photo::Linear(im) => im.channels,
+        }
+    }
+
+    /// Area average over the exact pixel footprint, in the photograph's own space.
+    pub fn downsampled(&self, width: usize, height: usize) -> Photo {
+        match self {
+            Photo::Eight(im) => Photo::Eight(im.downsampled(width, height)),
+            Photo::Sixteen(im) => Photo::Sixteen(im.downsampled(width, height)),
+            Photo::Linear(im) => Photo::Linear(im.downsampled(width, height)),
+        }
+    }
+
+    /// sRGB in 8 bits; what is brighter than white is white.
+    pub fn into_8_bits(self) -> ImageU8 {
+        match self {
+            Photo::Eight(im) => im,
+            Photo::Sixteen(im) => im.to_u8(),
+            Photo::Linear(im) => encoded(&im).to_u8(),
+        }
+    }
+
+    /// sRGB as floats; what is brighter than white goes on along the curve.
+    pub fn into_srgb(self) -> Image {
+        match self {
+            Photo::Eight(im) => im.to_f32(),
+            Photo::Sixteen(im) => im,
+            Photo::Linear(im) => encoded(&im),
+        }
+    }
+}
+
+/// Linear colors along the sRGB curve, alpha as it is.
+fn encoded(im: &Image) -> Image {
+    let mut out = im.clone();
+    for p in out.data.chunks_exact_mut(im.channels) {
+        p.iter_mut().take(3).for_each(|v| *v = srgb_from_linear(*v));
+    }
+    out
+}
+
+/// Whether two sizes are the same picture, but for the rounding of sides.
+pub fn is_same_aspect(a: (u32, u32), b: (u32, u32)) -> bool {
+    let ([aw, ah], [bw, bh]) = ([a.0, a.1].map(f64::from), [b.0, b.1].map(f64::from));
+    // The larger picture's shape, at the smaller one's size, differs by less than a pixel.
+    let ((w, h), (large_w, large_h)) = if aw * ah <= bw * bh { ((aw, ah), (bw, bh)) } else { ((bw, bh), (aw, ah)) };
+    (large_h * w / large_w - h).abs() <= 1.0 || (large_w * h / large_h - w).abs() <= 1.0
+}
+
+/// What helps where a file is damaged.
+const CURE: &str = "copy it again, or leave such photographs out with --skip-broken";
+
+fn undecodable(path: &Path, e: impl std::fmt::Display) -> DataError {
+    DataError::input(path, format!("cannot be decoded as an image: {e}; {CURE}"))
+}
+
+fn ends_early(path: &Path) -> DataError {
+    DataError::input(path, format!("the image file ends early, as if it was cut off; {CURE}"))
+}
+
+/// The error of a decoder, in words.
+fn failed(path: &Path, limits: &PhotoLimits, e: image::ImageError) -> DataError {
+    let mut cause: Option<&dyn std::error::Error> = Some(&e);
+    while let Some(c) = cause {
+        if c.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == std::io::ErrorKind::UnexpectedEof) {
+            return ends_early(path);
+        }
+        cause = c.source();
+    }
+    // Some decoders pass the error on as text alone.
+    let text = e.to_string();
+    if ["unexpected end of file", "failed to fill whole buffer", "unexpected EOF"].iter().any(|t| text.contains(t)) {
+        return ends_early(path);
+    }
+    match e {
+        image::ImageError::Limits(_) => too_large(path, limits),
+        e => undecodable(path, e),
+    }
+}
+
+fn decoder<'a>(path: &Path, limits: &PhotoLimits, file: impl std::io::BufRead + std::io::Seek + 'a) -> Result<impl ImageDecoder + 'a> {
+    let mut reader = ImageReader::new(file).with_guessed_format().map_err(DataError::io(path, "read"))?;
     let mut l = Limits::default();
     l.max_image_width = Some(limits.max_side);
     l.max_image_height = Some(limits.max_side);
     l.max_alloc = Some(limits.max_bytes);
     reader.limits(l);
-    reader.into_decoder().map_err(|e| match e {
-        image::ImageError::Limits(_) => too_large(path, limits),
-        e => undecodable(path, e),
-    })
+    let decoder = reader.into_decoder().map_err(|e| failed(path, limits, e))?;
+    let (w, h) = decoder.dimensions();
+    if w > limits.max_side || h > limits.max_side || decoder.total_bytes() > limits.max_bytes {
+        return Err(too_large(path, limits));
+    }
+    Ok(decoder)
 }
 
 fn too_large(path: &Path, limits: &PhotoLimits) -> DataError {
@@ -49,56 +175,127 @@ fn too_large(path: &Path, limits: &PhotoLimits) -> DataError {
     )
 }
 
+fn turns_sides(o: Orientation) -> bool {
+    matches!(o, Orientation::Rotate90 | Orientation::Rotate270 | Orientation::Rotate90FlipH | Orientation::Rotate270FlipH)
+}
+
+/// Reads a photograph's head, not its pixels.
+pub fn header(path: &Path) -> Result<Header> {
+    let limits = PhotoLimits::default();
+    let file = std::fs::File::open(path).map_err(DataError::io(path, "read"))?;
+    if file.metadata().map_err(DataError::io(path, "read"))?.len() == 0 {
+        return Err(DataError::input(path, format!("the image file is empty (0 bytes); {CURE}")));
+    }
+    let mut file = std::io::BufReader::new(file);
+    let (w, h, orientation, depth) = match jpeg::header(&mut file).map_err(DataError::io(path, "read"))? {
+        Some(j) => (j.width, j.height, Orientation::from_exif(j.orientation).unwrap_or(Orientation::NoTransforms), Depth::Eight),
+        None => {
+            std::io::Seek::rewind(&mut file).map_err(DataError::io(path, "read"))?;
+            let mut d = decoder(path, &limits, file)?;
+            let (w, h) = d.dimensions();
+            (w, h, d.orientation().unwrap_or(Orientation::NoTransforms), depth_of(d.color_type()))
+        }
+    };
+    if w > limits.max_side || h > limits.max_side {
+        return Err(too_large(path, &limits));
+    }
+    if w == 0 || h == 0 {
+        return Err(undecodable(path, format!("it has {w}×{h} pixels")));
+    }
+    let size = if turns_sides(orientation) { (h, w) } else { (w, h) };
+    Ok(Header { size, is_turned: orientation != Orientation::NoTransforms, depth })
+}
+
+fn depth_of(color: image::ColorType) -> Depth {
+    use image::ColorType::*;
+    match color {
+        Rgb32F | Rgba32F => Depth::Linear,
+        L16 | La16 | Rgb16 | Rgba16 => Depth::Sixteen,
+        _ => Depth::Eight,
+    }
+}
+
 /// Whether metadata say that the picture is to be turned or mirrored.
 pub fn is_turned(path: &Path) -> Result<bool> {
-    let limits = PhotoLimits::default();
-    let mut d = open(path, &limits)?;
-    Ok(d.orientation().is_ok_and(|o| o != image::metadata::Orientation::NoTransforms))
+    Ok(header(path)?.is_turned)
 }
 
 /// Width and height as shown, that is after EXIF orientation.
 pub fn size(path: &Path) -> Result<(u32, u32)> {
-    let limits = PhotoLimits::default();
-    let mut d = open(path, &limits)?;
-    let (w, h) = d.dimensions();
-    if w > limits.max_side || h > limits.max_side {
-        return Err(too_large(path, &limits));
-    }
-    let turned = d.orientation().is_ok_and(|o| {
-        use image::metadata::Orientation::*;
-        matches!(o, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
-    });
-    Ok(if turned { (h, w) } else { (w, h) })
+    Ok(header(path)?.size)
 }
 
-/// Decodes a photograph to 1, 3 or 4 channels of 8 bits.
-pub fn load(path: &Path) -> Result<ImageU8> {
+/// Decodes a photograph with all of its range.
+///
+/// # Errors
+/// When the file is no image, ends early, or holds a value that is not a number.
+pub fn load_full(path: &Path) -> Result<Photo> {
     let limits = PhotoLimits::default();
-    let mut decoder = open(path, &limits)?;
-    let (w, h) = decoder.dimensions();
-    if w > limits.max_side || h > limits.max_side || decoder.total_bytes() > limits.max_bytes {
-        return Err(too_large(path, &limits));
+    let bytes = std::fs::read(path).map_err(DataError::io(path, "read"))?;
+    if bytes.is_empty() {
+        return Err(DataError::input(path, format!("the image file is empty (0 bytes); {CURE}")));
     }
-    let orientation = decoder.orientation().unwrap_or(image::metadata::Orientation::NoTransforms);
-    let mut im = DynamicImage::from_decoder(decoder).map_err(|e| undecodable(path, e))?;
+    // The decoder fills up with gray what a JPEG lacks.
+    if bytes.starts_with(&[0xff, 0xd8]) && !jpeg::is_whole(&bytes) {
+        return Err(ends_early(path));
+    }
+    let is_exr = bytes.starts_with(&[0x76, 0x2f, 0x31, 0x01]);
+    let mut decoder = decoder(path, &limits, Cursor::new(&bytes))?;
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let mut im = DynamicImage::from_decoder(decoder).map_err(|e| failed(path, &limits, e))?;
     im.apply_orientation(orientation);
     let (width, height) = (im.width() as usize, im.height() as usize);
-    let linear = matches!(im, DynamicImage::ImageRgb32F(_) | DynamicImage::ImageRgba32F(_));
-    let alpha = im.color().has_alpha();
-    let (channels, data) = if linear {
-        let encode = |v: f32| u8_from_unit(srgb_from_linear(v.clamp(0.0, 1.0)));
-        if alpha {
-            let encoded = im.to_rgba32f().pixels().flat_map(|p| [encode(p[0]), encode(p[1]), encode(p[2]), u8_from_unit(p[3])]).collect();
-            (4, encoded)
-        } else {
-            (3, im.to_rgb32f().into_raw().into_iter().map(encode).collect())
-        }
-    } else if alpha {
-        (4, im.to_rgba8().into_raw())
-    } else {
-        (3, im.to_rgb8().into_raw())
+    let channels = if im.color().has_alpha() { 4 } else { 3 };
+    let floats = |im: DynamicImage| {
+        let data = if channels == 4 { im.into_rgba32f().into_raw() } else { im.into_rgb32f().into_raw() };
+        Image { width, height, channels, data }
     };
-    Ok(ImageU8 { width, height, channels, data })
+    Ok(match depth_of(im.color()) {
+        Depth::Eight => {
+            let data = if channels == 4 { im.into_rgba8().into_raw() } else { im.into_rgb8().into_raw() };
+            Photo::Eight(ImageU8 { width, height, channels, data })
+        }
+        Depth::Sixteen => Photo::Sixteen(floats(im)),
+        Depth::Linear => {
+            let mut im = floats(im);
+            check_range(path, &im)?;
+            if is_exr && channels == 4 {
+                straighten(&mut im);
+            }
+            Photo::Linear(im)
+        }
+    })
+}
+
+/// The largest value of 16-bit floats.
+const LARGEST: f32 = 65504.0;
+
+fn check_range(path: &Path, im: &Image) -> Result<()> {
+    let Some(at) = im.data.iter().position(|v| v.is_nan() || v.abs() > LARGEST) else { return Ok(()) };
+    let (pixel, value) = (at / im.channels, im.data[at]);
+    let channel = ["red", "green", "blue", "alpha"][at % im.channels];
+    let (x, y) = (pixel % im.width, pixel / im.width);
+    Err(DataError::input(
+        path,
+        if value.is_nan() {
+            format!("pixel ({x}, {y}) is not a number (NaN, {channel}); mend it, or {}", "leave such photographs out with --skip-broken")
+        } else {
+            format!("pixel ({x}, {y}) is {value} ({channel}), beyond ±{LARGEST}; scale or clamp the photograph's values")
+        },
+    ))
+}
+
+/// EXR's colors are multiplied by alpha.
+fn straighten(im: &mut Image) {
+    for p in im.data.chunks_exact_mut(4).filter(|p| p[3] > 0.0) {
+        let alpha = p[3];
+        p.iter_mut().take(3).for_each(|v| *v = (*v / alpha).clamp(-LARGEST, LARGEST));
+    }
+}
+
+/// Decodes a photograph to 1, 3 or 4 channels of 8 bits, sRGB.
+pub fn load(path: &Path) -> Result<ImageU8> {
+    load_full(path).map(Photo::into_8_bits)
 }
 
 /// Decodes a photograph to RGB, its longer side at most `side`; what is clear is white.
@@ -149,6 +346,39 @@ pub fn encode_png(im: &ImageU8) -> Vec<u8> {
 /// Writes a PNG atomically.
 pub fn save_png(path: &Path, im: &ImageU8) -> Result<()> {
     crate::atomic::write(path, &encode_png(im))
+}
+
+/// Writes linear light as EXR, atomically.
+pub fn save_exr(path: &Path, im: &Image) -> Result<()> {
+    crate::atomic::write(path, &encode_float(im, image::ImageFormat::OpenExr))
+}
+
+/// Encodes floats in memory. EXR's colors are multiplied by alpha.
+pub(crate) fn encode_float(im: &Image, format: image::ImageFormat) -> Vec<u8> {
+    let (w, h) = (im.width as u32, im.height as u32);
+    let picture = if im.channels == 4 {
+        let data = im.data.chunks_exact(4).flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], p[3]]).collect();
+        DynamicImage::ImageRgba32F(image::ImageBuffer::from_raw(w, h, data).expect("as many values as pixels"))
+    } else {
+        DynamicImage::ImageRgb32F(image::ImageBuffer::from_raw(w, h, im.data.clone()).expect("as many values as pixels"))
+    };
+    let mut out = Cursor::new(Vec::new());
+    picture.write_to(&mut out, format).expect("a Vec takes any bytes");
+    out.into_inner()
+}
+
+/// Encodes a PNG of 16 bits in memory, of values in [0, 1].
+pub(crate) fn encode_png_16(im: &Image) -> Vec<u8> {
+    let (w, h) = (im.width as u32, im.height as u32);
+    let data = im.data.iter().map(|v| u16_from_unit(*v)).collect();
+    let picture = if im.channels == 4 {
+        DynamicImage::ImageRgba16(image::ImageBuffer::from_raw(w, h, data).expect("as many values as pixels"))
+    } else {
+        DynamicImage::ImageRgb16(image::ImageBuffer::from_raw(w, h, data).expect("as many values as pixels"))
+    };
+    let mut out = Cursor::new(Vec::new());
+    picture.write_to(&mut out, image::ImageFormat::Png).expect("a Vec takes any bytes");
+    out.into_inner()
 }
 
 #[cfg(test)]
@@ -224,7 +454,8 @@ mod tests {
         std::fs::write(&p, b"").unwrap();
         assert!(load(&p).unwrap_err().to_string().contains("empty"));
         std::fs::write(&p, &encode_png(&sample(3))[..40]).unwrap();
-        assert!(load(&p).unwrap_err().to_string().contains("cannot be decoded"));
+        let e = load(&p).unwrap_err().to_string();
+        assert!(e.contains("ends early") && e.contains("--skip-broken"), "{e}");
         std::fs::write(&p, b"not an image at all").unwrap();
         assert!(load(&p).unwrap_err().is_input());
     }

@@ -1,7 +1,8 @@
 //! Photographs into a data set: upright, at most so large, without metadata.
 
+use crate::atomic;
 use crate::error::{DataError, Result};
-use crate::{atomic, photo};
+use crate::photo::{self, Photo};
 use diorama_geom::ImageU8;
 use std::path::{Path, PathBuf};
 
@@ -58,36 +59,71 @@ pub fn focal_ratio(photo: &Path) -> Option<f64> {
     Some(mm / FILM * w.hypot(h) / w.max(h))
 }
 
-/// Writes a photograph as `folder/stem` with its extension. A JPEG that needs no change keeps its pixels bit for bit; its metadata
-/// goes in any case.
+/// Writes a photograph as `folder/stem` with its extension. A JPEG that needs no change keeps its pixels bit for bit, and what was
+/// stored without loss stays so, with all of its range; metadata go in any case.
 ///
 /// # Errors
 /// When it cannot be decoded, or the disk refuses.
 pub fn import(source: &Path, folder: &Path, stem: &str, max_side: u32) -> Result<PathBuf> {
-    let (w, h) = photo::size(source)?;
+    let header = photo::header(source)?;
+    let (w, h) = header.size;
     let shrink = w.max(h) > max_side;
     let bytes = std::fs::read(source).map_err(DataError::io(source, "read"))?;
-    if !shrink && bytes.starts_with(&[0xff, 0xd8]) && !photo::is_turned(source)? {
+    if !shrink && bytes.starts_with(&[0xff, 0xd8]) && !header.is_turned {
         // Decoding it shows whether it is whole.
-        photo::load(source)?;
+        photo::load_full(source)?;
         if let Some(clean) = without_metadata(&bytes) {
             let target = folder.join(format!("{stem}.jpg"));
             atomic::write(&target, &clean)?;
             return Ok(target);
         }
     }
+    let keeps_all = is_lossless(&bytes);
     drop(bytes);
-    let mut image = photo::load(source)?;
+    let mut photo = photo::load_full(source)?;
     if shrink {
         let by = max_side as f64 / w.max(h) as f64;
-        image = image.downsampled(((w as f64 * by).round() as usize).max(1), ((h as f64 * by).round() as usize).max(1));
+        photo = photo.downsampled(((w as f64 * by).round() as usize).max(1), ((h as f64 * by).round() as usize).max(1));
     }
-    write(&image, folder, stem)
+    let (target, encoded) = match photo {
+        Photo::Eight(image) => return write_as(&image, folder, stem, keeps_all),
+        Photo::Sixteen(image) => (folder.join(format!("{stem}.png")), photo::encode_png_16(&image)),
+        Photo::Linear(image) => (folder.join(format!("{stem}.exr")), photo::encode_float(&image, image::ImageFormat::OpenExr)),
+    };
+    atomic::write(&target, &encoded)?;
+    Ok(target)
+}
+
+/// Whether a photograph was stored without loss.
+fn is_lossless(file: &[u8]) -> bool {
+    if file.get(8..12) != Some(b"WEBP") {
+        return !file.starts_with(&[0xff, 0xd8]);
+    }
+    // Of the chunks, the one that holds the picture.
+    let mut at = 12;
+    while let (Some(name), Some(length)) = (file.get(at..at + 4), file.get(at + 4..at + 8)) {
+        if matches!(name, b"VP8 " | b"VP8L") {
+            return name == b"VP8L";
+        }
+        let length = u32::from_le_bytes(length.try_into().expect("four bytes")) as usize;
+        at = at.saturating_add(8 + length.next_multiple_of(2));
+    }
+    false
+}
+
+/// Writes pixels that were made of a photograph: as PNG where that was stored without loss or there is alpha, else as JPEG.
+pub fn write_like(source: &Path, image: &ImageU8, folder: &Path, stem: &str) -> Result<PathBuf> {
+    let bytes = std::fs::read(source).map_err(DataError::io(source, "read"))?;
+    write_as(image, folder, stem, is_lossless(&bytes))
 }
 
 /// Writes pixels as JPEG, or as PNG where there is alpha.
 pub fn write(image: &ImageU8, folder: &Path, stem: &str) -> Result<PathBuf> {
-    if image.channels != 3 {
+    write_as(image, folder, stem, false)
+}
+
+fn write_as(image: &ImageU8, folder: &Path, stem: &str, keeps_all: bool) -> Result<PathBuf> {
+    if keeps_all || image.channels != 3 {
         let target = folder.join(format!("{stem}.png"));
         photo::save_png(&target, image)?;
         return Ok(target);
@@ -138,8 +174,7 @@ pub fn without_metadata(jpeg: &[u8]) -> Option<Vec<u8>> {
         }
         at += 2 + length;
         if marker == 0xda {
-            // Entropy-coded data runs to the next marker that is neither a stuffed byte, nor a restart, nor a fill byte.
-            let end = (at..jpeg.len() - 1).find(|i| jpeg[*i] == 0xff && !matches!(jpeg[i + 1], 0 | 0xff | 0xd0..=0xd7))?;
+            let end = crate::jpeg::end_of_scan(jpeg, at)?;
             out.extend(&jpeg[at..end]);
             at = end;
         }
@@ -208,13 +243,63 @@ mod tests {
     }
 
     #[test]
+    fn what_was_stored_without_loss_stays_so() {
+        use diorama_geom::Image;
+        let dir = tempfile::tempdir().unwrap();
+        let out = dir.path().join("out");
+        std::fs::create_dir(&out).unwrap();
+        let values: Vec<f32> = (0..32 * 24 * 3).map(|i| (i * 40_503 % 65_536) as f32 / 65_535.0).collect();
+        let deep = Image { width: 32, height: 24, channels: 3, data: values };
+        let light = Image { data: deep.data.iter().map(|v| v * 900.0).collect(), ..deep.clone() };
+        let encode = |format| {
+            let im = image::RgbImage::from_raw(32, 24, picture().data).unwrap();
+            let mut bytes = std::io::Cursor::new(Vec::new());
+            image::DynamicImage::ImageRgb8(im).write_to(&mut bytes, format).unwrap();
+            bytes.into_inner()
+        };
+        for (name, bytes, made) in [
+            ("8.png", photo::encode_png(&picture()), "png"),
+            ("8.tiff", encode(image::ImageFormat::Tiff), "png"),
+            ("8.webp", encode(image::ImageFormat::WebP), "png"),
+            ("16.png", photo::encode_png_16(&deep), "png"),
+            ("a.exr", photo::encode_float(&light, image::ImageFormat::OpenExr), "exr"),
+            ("a.hdr", photo::encode_float(&light, image::ImageFormat::Hdr), "exr"),
+        ] {
+            let source = dir.path().join(name);
+            std::fs::write(&source, bytes).unwrap();
+            let target = import(&source, &out, "a", 100).unwrap();
+            assert_eq!(target.extension().unwrap(), made, "{name}");
+            assert!(photo::load_full(&target).unwrap() == photo::load_full(&source).unwrap(), "{name}");
+            // Reduced, it is encoded anew, and still not as JPEG.
+            assert_eq!(import(&source, &out, "b", 16).unwrap().extension().unwrap(), made, "{name}");
+            assert_eq!(write_like(&source, &picture(), &out, "c").unwrap().extension().unwrap(), "png", "{name}");
+        }
+        let jpeg = write(&picture(), dir.path(), "a").unwrap();
+        assert_eq!(import(&jpeg, &out, "d", 16).unwrap().extension().unwrap(), "jpg");
+        assert_eq!(write_like(&jpeg, &picture(), &out, "e").unwrap().extension().unwrap(), "jpg");
+    }
+
+    #[test]
     fn truncated_jpegs_are_not_copied() {
         let dir = tempfile::tempdir().unwrap();
-        let bytes = std::fs::read(with_metadata(dir.path())).unwrap();
-        let whole = bytes.len() - b"GPS again".len();
-        assert!(without_metadata(&bytes[..whole]).is_some());
-        for n in 0..whole {
-            assert_eq!(without_metadata(&bytes[..n]), None, "{n} of {whole} bytes");
+        let out = dir.path().join("out");
+        std::fs::create_dir(&out).unwrap();
+        let source = with_metadata(dir.path());
+        let bytes = std::fs::read(&source).unwrap();
+        let whole = without_metadata(&bytes).unwrap();
+        let end = bytes.len() - b"GPS again".len();
+        assert_eq!(&bytes[end - 2..end], [0xff, 0xd9]);
+        for n in 0..end {
+            // Without its end nothing is clean, and nothing is written.
+            assert_eq!(without_metadata(&bytes[..n]), None, "{n}");
+        }
+        for n in [10, 200, end / 2, end - 40] {
+            std::fs::write(&source, &bytes[..n]).unwrap();
+            assert!(import(&source, &out, "a", 100).unwrap_err().is_input(), "{n}");
+            assert!(out.read_dir().unwrap().next().is_none());
+        }
+        for n in [end, end + 3] {
+            assert_eq!(without_metadata(&bytes[..n]).as_ref(), Some(&whole));
         }
     }
 

@@ -1,12 +1,15 @@
-//! The pixels of a capture as 8-bit samples in memory: all of them while they fit a budget, else one of each square of some, drawn
-//! at random. Training draws far fewer pixels than such captures have, and memory stays bounded however large they are.
+//! The pixels of a capture in memory, in 8 bits, 16 bits or half floats by what the photographs hold: all of them while they fit a
+//! budget, else one of each square of some, drawn at random. Training draws far fewer pixels than such captures have, and memory stays
+//! bounded however large they are.
 
 use crate::error::{DataError, Result};
 use crate::masks::{self, COUNTS};
-use crate::photo;
-use diorama_geom::capture::{Frame, MaskRule};
+use crate::photo::{self, Depth, Photo};
+use diorama_geom::capture::{ColorSpace, Frame, MaskRule};
+use diorama_geom::color::u16_from_unit;
 use diorama_geom::rng::Rng;
-use diorama_geom::{ImageU8, Reduction};
+use diorama_geom::{ImageU8, PixelFormat, Reduction};
+use half::f16;
 use rayon::prelude::*;
 
 /// Bytes that pixels may take.
@@ -15,17 +18,25 @@ pub const DEFAULT_BUDGET: u64 = 4 << 30;
 /// Stream of the random numbers by which pixels are kept.
 const KEPT: u64 = 15;
 
-/// Pixels of some frames, four bytes each: RGB and alpha (255 where the photograph has none).
+/// Pixels of some frames, four values each: RGB and alpha (opaque where the photograph has none). Colors are sRGB, but for
+/// [`PixelFormat::Half`], which holds linear light.
 pub struct PixelStore {
-    bytes: Vec<u8>,
+    values: Values,
+    format: PixelFormat,
     /// One of each `stride × stride` pixels is kept.
     stride: u32,
-    /// First byte of each frame, and of the one after the last.
+    /// First value of each frame, and of the one after the last.
     offsets: Vec<usize>,
     sizes: Vec<(u32, u32)>,
     /// 0 where a kept pixel is masked away.
     masks: Vec<Option<Vec<u8>>>,
     pub has_alpha: bool,
+}
+
+/// Values of pixels, four each.
+enum Values {
+    Bytes(Vec<u8>),
+    Words(Vec<u16>),
 }
 
 /// What to decode.
@@ -45,11 +56,17 @@ impl PixelStore {
                 (c.width, c.height)
             })
             .collect();
+        let format = format_of(frames)?;
+        let pixel = format.bytes() as u64;
         let squares = |stride: u32| sizes.iter().map(move |(w, h)| w.div_ceil(stride) as usize * h.div_ceil(stride) as usize);
-        let stride = (1..).find(|s| squares(*s).sum::<usize>() as u64 * 4 <= options.budget || *s >= 64).expect("some stride");
+        let stride = (1..).find(|s| squares(*s).sum::<usize>() as u64 * pixel <= options.budget || *s >= 64).expect("some stride");
         let mut offsets = vec![0usize];
         squares(stride).for_each(|n| offsets.push(offsets[offsets.len() - 1] + n * 4));
-        let mut out = PixelStore { bytes: vec![0; offsets[frames.len()]], stride, offsets, sizes, masks: Vec::new(), has_alpha: false };
+        let values = match format {
+            PixelFormat::Unorm8 => Values::Bytes(vec![0; offsets[frames.len()]]),
+            _ => Values::Words(vec![0; offsets[frames.len()]]),
+        };
+        let mut out = PixelStore { values, format, stride, offsets, sizes, masks: Vec::new(), has_alpha: false };
         // A few photographs at a time: decoded ones are larger than what is kept.
         let batch = rayon::current_num_threads().max(1) * 2;
         for first in (0..frames.len()).step_by(batch) {
@@ -57,20 +74,43 @@ impl PixelStore {
             let decoded: Vec<Result<Kept>> = (first..last)
                 .into_par_iter()
                 .map(|i| {
-                    let (image, mask) = decode(frames[i], &options.masks, out.sizes[i])?;
+                    let (photo, mask) = decode(frames[i], &options.masks, out.sizes[i])?;
                     progress();
                     let mask = mask.map(|m| out.keep(i, |x, y| m.pixel(x, y)[0]));
-                    Ok(Kept { rgba: out.keep(i, |x, y| rgba(&image, x, y)), mask, has_alpha: image.channels == 4 })
+                    let has_alpha = photo.channels() == 4;
+                    Ok(Kept { values: out.values_of(i, photo), mask, has_alpha })
                 })
                 .collect();
             for (i, kept) in (first..last).zip(decoded) {
                 let kept = kept?;
                 out.has_alpha |= kept.has_alpha;
                 out.masks.push(kept.mask);
-                out.bytes[out.offsets[i]..out.offsets[i + 1]].copy_from_slice(kept.rgba.as_flattened());
+                let own = out.offsets[i]..out.offsets[i + 1];
+                match (&mut out.values, kept.values) {
+                    (Values::Bytes(all), Values::Bytes(v)) => all[own].copy_from_slice(&v),
+                    (Values::Words(all), Values::Words(v)) => all[own].copy_from_slice(&v),
+                    _ => unreachable!("all frames are of the store's format"),
+                }
             }
         }
         Ok(out)
+    }
+
+    /// The kept pixels of a photograph in the store's format.
+    fn values_of(&self, i: usize, photo: Photo) -> Values {
+        match (self.format, photo) {
+            (PixelFormat::Half, Photo::Linear(im)) => {
+                Values::Words(self.keep(i, |x, y| four(im.pixel(x, y), 1.0).map(|v| f16::from_f32(v).to_bits())).into_flattened())
+            }
+            (PixelFormat::Unorm8, photo) => {
+                let im = photo.into_8_bits();
+                Values::Bytes(self.keep(i, |x, y| four(im.pixel(x, y), 255)).into_flattened())
+            }
+            (_, photo) => {
+                let im = photo.into_srgb();
+                Values::Words(self.keep(i, |x, y| four(im.pixel(x, y), 1.0).map(u16_from_unit)).into_flattened())
+            }
+        }
     }
 
     /// What a frame has at the pixels that are kept of it.
@@ -99,9 +139,23 @@ impl PixelStore {
         Rng::new(i as u64, KEPT)
     }
 
-    /// RGBA of frame `i`'s kept pixels, square by square.
-    pub fn kept(&self, i: usize) -> &[[u8; 4]] {
-        self.bytes[self.offsets[i]..self.offsets[i + 1]].as_chunks().0
+    /// How values are written.
+    pub fn format(&self) -> PixelFormat {
+        self.format
+    }
+
+    /// How many pixels are kept of frame `i`.
+    pub fn kept(&self, i: usize) -> usize {
+        (self.offsets[i + 1] - self.offsets[i]) / 4
+    }
+
+    /// RGBA of frame `i`'s kept pixels, square by square: one word each of 8-bit values, two of others; the first value is lowest.
+    pub fn words(&self, i: usize) -> Vec<u32> {
+        let own = self.offsets[i]..self.offsets[i + 1];
+        match &self.values {
+            Values::Bytes(v) => v[own].as_chunks().0.iter().map(|p| u32::from_le_bytes(*p)).collect(),
+            Values::Words(v) => v[own].as_chunks().0.iter().map(|[low, high]| (*high as u32) << 16 | *low as u32).collect(),
+        }
     }
 
     /// Which of them count; none: all.
@@ -128,11 +182,14 @@ impl PixelStore {
         (y / self.stride) as usize * self.sizes[i].0.div_ceil(self.stride) as usize + (x / self.stride) as usize
     }
 
-    /// RGBA of a pixel that [`PixelStore::snap`] gave.
+    /// RGBA of a pixel that [`PixelStore::snap`] gave, as [`PixelStore::words`] has it; the second word counts where a pixel has two.
     #[inline]
-    pub fn pixel(&self, i: usize, x: u32, y: u32) -> [u8; 4] {
+    pub fn pixel(&self, i: usize, x: u32, y: u32) -> [u32; 2] {
         let at = self.offsets[i] + self.square(i, x, y) * 4;
-        self.bytes[at..at + 4].try_into().expect("four bytes")
+        match &self.values {
+            Values::Bytes(v) => [u32::from_le_bytes(v[at..at + 4].try_into().expect("four values")), 0],
+            Values::Words(v) => [0, 2].map(|k| (v[at + k + 1] as u32) << 16 | v[at + k] as u32),
+        }
     }
 
     /// Whether such a pixel counts: not masked away.
@@ -147,20 +204,33 @@ impl PixelStore {
     }
 }
 
+/// The format that holds all that frames have.
+///
+/// # Errors
+/// When a photograph's head cannot be read.
+pub fn format_of(frames: &[&Frame]) -> Result<PixelFormat> {
+    if frames.iter().all(|f| f.color_space == ColorSpace::Linear) && !frames.is_empty() {
+        return Ok(PixelFormat::Half);
+    }
+    let depths = frames.par_iter().map(|f| Ok(photo::header(&f.image)?.depth)).collect::<Result<Vec<_>>>()?;
+    Ok(if depths.contains(&Depth::Sixteen) { PixelFormat::Unorm16 } else { PixelFormat::Unorm8 })
+}
+
 /// What is kept of a frame.
 struct Kept {
-    rgba: Vec<[u8; 4]>,
+    values: Values,
     mask: Option<Vec<u8>>,
     has_alpha: bool,
 }
 
-fn decode(frame: &Frame, rule: &MaskRule, size: (u32, u32)) -> Result<(ImageU8, Option<ImageU8>)> {
-    let full = photo::load(&frame.image)?;
+fn decode(frame: &Frame, rule: &MaskRule, size: (u32, u32)) -> Result<(Photo, Option<ImageU8>)> {
+    let full = photo::load_full(&frame.image)?;
     let c = &frame.camera;
-    if (full.width as u32, full.height as u32) != (c.width, c.height) {
+    let (w, h) = full.size();
+    if (w as u32, h as u32) != (c.width, c.height) {
         let message = format!(
-            "the photograph is {}×{} but its camera says {}×{}; correct w and h (and the focal length) or use the original photographs",
-            full.width, full.height, c.width, c.height
+            "the photograph is {w}×{h} but its camera says {}×{}; it was changed since the capture was read: use the photographs as they were",
+            c.width, c.height
         );
         return Err(DataError::input(&frame.image, message));
     }
@@ -169,19 +239,20 @@ fn decode(frame: &Frame, rule: &MaskRule, size: (u32, u32)) -> Result<(ImageU8, 
     Ok((full.downsampled(w, h), mask.map(|m| m.downsampled(w, h))))
 }
 
-fn rgba(im: &ImageU8, x: usize, y: usize) -> [u8; 4] {
-    match *im.pixel(x, y) {
+/// RGBA of a pixel of any number of channels.
+fn four<T: Copy + Default>(pixel: &[T], opaque: T) -> [T; 4] {
+    match *pixel {
         [r, g, b, a] => [r, g, b, a],
-        [r, g, b] => [r, g, b, 255],
-        [v, ..] => [v, v, v, 255],
-        [] => [0; 4],
+        [r, g, b] => [r, g, b, opaque],
+        [v, ..] => [v, v, v, opaque],
+        [] => [T::default(); 4],
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use diorama_geom::{Camera, Pose};
+    use diorama_geom::{Camera, Image, Pose};
     use std::path::Path;
 
     fn frame(dir: &Path, name: &str, w: usize, h: usize, value: u8) -> Frame {
@@ -214,14 +285,14 @@ mod tests {
         assert_eq!(load(u64::MAX).stride(), 1);
         let budget = 2 * 101 * 67 * 4 / 10;
         let s = load(budget);
-        assert!(s.stride() == 4 && s.bytes.len() as u64 <= budget);
+        assert!(s.stride() == 4 && s.kept(0) as u64 * 8 <= budget);
         let (mut sum, mut kept) = ([0.0; 2], std::collections::HashSet::new());
         for i in 0..2 {
             for (x, y) in (0..67).flat_map(|y| (0..101).map(move |x| (x, y))) {
                 let (a, b) = s.snap(i, x, y);
                 assert!(a / 4 == x / 4 && b / 4 == y / 4 && a < 101 && b < 67);
                 assert_eq!(s.snap(i, a, b), (a, b), "what is kept stays");
-                assert_eq!(s.pixel(i, x, y), [a as u8, b as u8, 7, 255]);
+                assert_eq!(s.pixel(i, x, y)[0].to_le_bytes(), [a as u8, b as u8, 7, 255]);
                 assert_eq!(s.counts(i, x, y), a < 50);
                 if x < 100 && y < 64 {
                     (sum[0], sum[1]) = (sum[0] + (a % 4) as f64, sum[1] + (b % 4) as f64);
@@ -248,6 +319,45 @@ mod tests {
         assert!(PixelStore::load(&[&f], &options, &|| {}).err().unwrap().to_string().contains("mask"));
     }
 
+    fn four_words(words: [u32; 2]) -> [u16; 4] {
+        [0, 1, 2, 3].map(|k| (words[k / 2] >> (16 * (k % 2))) as u16)
+    }
+
+    #[test]
+    fn sixteen_bits_and_light_brighter_than_white_stay() {
+        let dir = tempfile::tempdir().unwrap();
+        let options = StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks: MaskRule::default() };
+        let value = |i: usize| (i * 40_503 % 65_536) as f32;
+        let im = Image { width: 5, height: 4, channels: 3, data: (0..60).map(|i| value(i) / 65535.0).collect() };
+        let mut f = frame(dir.path(), "a.png", 5, 4, 0);
+        std::fs::write(&f.image, photo::encode_png_16(&im)).unwrap();
+        // Beside a photograph of 8 bits.
+        let other = frame(dir.path(), "b.png", 5, 4, 77);
+        let s = PixelStore::load(&[&f, &other], &options, &|| {}).unwrap();
+        assert_eq!((s.format(), s.words(0).len(), s.kept(0)), (PixelFormat::Unorm16, 40, 20));
+        for (i, want) in im.data.chunks_exact(3).enumerate() {
+            let at = |photo: usize| four_words(s.pixel(photo, i as u32 % 5, i as u32 / 5));
+            assert!((0..3).all(|k| at(0)[k] as f32 == (want[k] * 65535.0).round()) && at(0)[3] == 65535);
+            assert_eq!(at(1), [77 * 257, 77 * 257, 77 * 257, 65535]);
+        }
+        let bright = Image { data: (0..60).map(|i| value(i) / 16.0).collect(), ..im };
+        f.image.set_extension("exr");
+        f.color_space = ColorSpace::Linear;
+        photo::save_exr(&f.image, &bright).unwrap();
+        let s = PixelStore::load(&[&f], &options, &|| {}).unwrap();
+        assert_eq!(s.format(), PixelFormat::Half);
+        for (i, want) in bright.data.chunks_exact(3).enumerate() {
+            let got = four_words(s.pixel(0, i as u32 % 5, i as u32 / 5)).map(|v| f16::from_bits(v).to_f32());
+            // Half floats have 11 bits.
+            assert!((0..3).all(|k| (got[k] - want[k]).abs() <= want[k] / 2048.0 + 1e-7), "{got:?} {want:?}");
+            assert_eq!(s.pixel(0, i as u32 % 5, i as u32 / 5), [s.words(0)[i * 2], s.words(0)[i * 2 + 1]]);
+            assert_eq!(got[3], 1.0);
+        }
+        // A run that was begun before stays in sRGB.
+        f.color_space = ColorSpace::Srgb;
+        assert_eq!(PixelStore::load(&[&f], &options, &|| {}).unwrap().format(), PixelFormat::Unorm8);
+    }
+
     #[test]
     fn an_objects_mask_makes_pixels_transparent() {
         let dir = tempfile::tempdir().unwrap();
@@ -258,7 +368,7 @@ mod tests {
         let masks = MaskRule { meaning: diorama_geom::capture::MaskMeaning::Object, inverted: false };
         let s = PixelStore::load(&[&f], &StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks }, &|| {}).unwrap();
         assert!(s.has_alpha && (0..4).all(|x| s.counts(0, x, 0)));
-        assert_eq!([0, 1].map(|x| s.pixel(0, x, 0)[3]), [0, 255]);
+        assert_eq!([0, 1].map(|x| s.pixel(0, x, 0)[0].to_le_bytes()[3]), [0, 255]);
     }
 
     #[test]

@@ -251,3 +251,16 @@ pub fn warnings(a: &Agreement, frames: &[Frame]) -> Vec<String> {
     }
     out
 }
+
+/// Follows frames that were left out; `kept` are the numbers of those that stay, ascending. Points that only the others see go, too.
+pub fn keep(points: &mut Vec<SparsePoint>, agreement: Option<&mut Agreement>, kept: &[usize]) {
+    let number: HashMap<u32, u32> = kept.iter().enumerate().map(|(new, old)| (*old as u32, new as u32)).collect();
+    points.retain_mut(|p| {
+        let was_told = !p.frames.is_empty();
+        p.frames = p.frames.iter().filter_map(|f| number.get(f).copied()).collect();
+        !was_told || !p.frames.is_empty()
+    });
+    if let Some(a) = agreement {
+        a.frames = kept.iter().filter_map(|i| a.frames.get(*i).copied()).collect();
+    }
+}

@@ -22,7 +22,7 @@ const BLENDER_HALF: f64 = 0.5 / 0.33;
 pub fn read(file: &Path, root: &Path) -> Result<Imported> {
     let map = json::read(file)?;
     let head = Object { path: file, place: "", map: &map };
-    let mut out = Imported { scene: ngp_scene(&head)?, ..Imported::default() };
+    let mut out = Imported { scene: ngp_scene(&head)?, frames_from_capture: applied(&head)?, ..Imported::default() };
     read_frames(&head, root, Split::Train, &mut out)?;
     out.has_own_split = apply_file_lists(&head, &mut out.frames)?;
     read_points(&head, root, &mut out)?;
@@ -70,6 +70,9 @@ pub fn read_blender(root: &Path) -> Result<Imported> {
         if out.scene.is_none() {
             out.scene = ngp_scene(&head)?;
         }
+        if out.frames_from_capture.is_none() {
+            out.frames_from_capture = applied(&head)?;
+        }
         let first = out.frames.len();
         read_frames(&head, root, split, &mut out)?;
         for f in &mut out.frames[first..] {
@@ -96,6 +99,27 @@ fn ngp_scene(head: &Object) -> Result<Option<SceneBox>> {
     };
     let center = (DVec3::splat(0.5) - DVec3::from_array(offset)) / scale;
     Ok(Some(SceneBox { center, half: 0.5 / scale, aabb_scale: aabb as u32 }))
+}
+
+/// nerfstudio's `applied_transform` and `applied_scale`: what was done to the poses after structure from motion, which is undone
+/// where things go back to the input's frame.
+fn applied(head: &Object) -> Result<Option<Similarity>> {
+    let (matrix, scale) = (head.matrix("applied_transform", 3)?, head.positive("applied_scale")?);
+    if matrix.is_none() && scale.is_none() {
+        return Ok(None);
+    }
+    let mut out = Similarity { scale: scale.unwrap_or(1.0), ..Similarity::IDENTITY };
+    if let Some(m) = matrix {
+        let column = |c: usize| DVec3::new(m[c], m[4 + c], m[8 + c]);
+        let turned = DMat3::from_cols(column(0), column(1), column(2));
+        let own = turned.determinant().abs().cbrt();
+        let pose = Pose { rotation: turned * if own > 0.0 { 1.0 / own } else { 0.0 }, translation: column(3) };
+        let pose = rigid(pose).map_err(|what| {
+            DataError::input(head.path, format!("applied_transform: {what}; correct it, or remove it to keep the poses' own frame"))
+        })?;
+        out = Similarity { scale: out.scale * own, rotation: pose.rotation, translation: out.scale * pose.translation };
+    }
+    Ok(Some(out))
 }
 
 fn read_frames(head: &Object, root: &Path, split: Split, out: &mut Imported) -> Result<()> {
@@ -169,6 +193,11 @@ fn read_camera(head: &Object, frame: &Object, image: &Path, sizes: &mut Option<(
             None => *sizes.insert(crate::photo::size(image)?),
         },
     };
+    let flag = |key: &str| -> Result<bool> { Ok(head.flag(key)?.unwrap_or(false)) };
+    let model = frame.text("camera_model")?.or(head.text("camera_model")?);
+    if model == Some("EQUIRECTANGULAR") || (model.is_none() && !flag("is_fisheye")? && flag("equirectangular")?) {
+        return Ok(Camera::equirectangular(width, height));
+    }
     let from_angle = |angle: f64, side: u32| 0.5 * side as f64 / (0.5 * angle).tan();
     let fx = match (positive("fl_x")?, positive("camera_angle_x")?) {
         (Some(f), _) => f,
@@ -184,15 +213,11 @@ fn read_camera(head: &Object, frame: &Object, image: &Path, sizes: &mut Option<(
     };
     let k = [number("k1")?, number("k2")?, number("k3")?, number("k4")?].map(|k| k.unwrap_or(0.0));
     let p = [number("p1")?, number("p2")?].map(|p| p.unwrap_or(0.0));
-    let flag = |key: &str| -> Result<bool> { Ok(head.flag(key)?.unwrap_or(false)) };
-    let model = frame.text("camera_model")?.or(head.text("camera_model")?);
     let fisheye = Lens::Fisheye { k, p: [0.0; 2], s: [0.0; 2] };
     let lens = match model {
         Some("OPENCV_FISHEYE") => fisheye,
-        Some("EQUIRECTANGULAR") => Lens::Equirectangular,
         Some("PINHOLE" | "SIMPLE_PINHOLE") => Lens::Pinhole,
         None if flag("is_fisheye")? => fisheye,
-        None if flag("equirectangular")? => Lens::Equirectangular,
         None | Some("OPENCV" | "SIMPLE_RADIAL" | "RADIAL") => {
             if k[3] != 0.0 {
                 return Err(DataError::input(head.path, "k4: only the OPENCV_FISHEYE model has it; set camera_model or remove k4"));

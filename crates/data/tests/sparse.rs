@@ -1,7 +1,7 @@
 //! Sparse points come with a capture, and a model whose poses contradict them is told.
 
 use diorama_data::import::{self, Format, ImportOptions};
-use diorama_data::{colmap, photo};
+use diorama_data::{colmap, photo, photo_check};
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::{DQuat, DVec3};
 use diorama_geom::rng::Rng;
@@ -212,4 +212,35 @@ fn points_named_by_transforms_json_come_along() {
     assert!(with.points[0].frames.is_empty() && with.agreement.is_none());
     // Points are not kept in a run's folder.
     assert!(!serde_json::to_string(&with).unwrap().contains("points"));
+}
+
+#[test]
+fn points_follow_the_photographs_when_broken_ones_are_left_out() {
+    let dir = tempfile::tempdir().unwrap();
+    write(dir.path(), &GOOD);
+    std::fs::write(dir.path().join("images/v2.png"), b"").unwrap();
+    let whole = std::fs::read(dir.path().join("images/v5.png")).unwrap();
+    std::fs::write(dir.path().join("images/v5.png"), &whole[..whole.len() - 20]).unwrap();
+    let mut c = import::import(dir.path(), &ImportOptions { skip_broken: true, ..ImportOptions::default() }).unwrap();
+    photo_check::leave_out_broken(&mut c).unwrap();
+    assert_eq!((c.frames.len(), &c.broken[..]), (VIEWS - 2, &["v2.png".to_string(), "v5.png".to_string()][..]));
+    assert_eq!(c.agreement.as_ref().unwrap().frames.len(), VIEWS - 2);
+    assert!(!c.points.is_empty());
+    for p in &c.points {
+        for f in &p.frames {
+            let f = &c.frames[*f as usize];
+            assert!(f.camera.project(f.world_from_camera.inverse().point(p.position)).is_some(), "{} sees {}", f.name, p.position);
+        }
+    }
+    // Each frame's own points are those that the whole model has for it.
+    write(dir.path(), &GOOD);
+    let all = import::import(dir.path(), &ImportOptions::default()).unwrap();
+    let seen_by = |c: &Capture, name: &str| {
+        let at = c.frames.iter().position(|f| f.name == name).unwrap() as u32;
+        c.points.iter().filter(|p| p.frames.contains(&at)).map(|p| p.position.to_array()).collect::<Vec<_>>()
+    };
+    for f in &c.frames {
+        let want = seen_by(&all, &f.name);
+        assert!(!want.is_empty() && seen_by(&c, &f.name).len() == want.len(), "{}", f.name);
+    }
 }

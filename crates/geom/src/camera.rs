@@ -66,6 +66,13 @@ impl Camera {
         Camera { width, height, fx: f, fy: f, cx: 0.5 * width as f64, cy: 0.5 * height as f64, lens: Lens::Pinhole }
     }
 
+    /// A camera that sees the full sphere. The focal lengths are pixels per radian at the horizon; nothing depends on them.
+    pub fn equirectangular(width: u32, height: u32) -> Camera {
+        let (w, h) = (width as f64, height as f64);
+        let (fx, fy) = (w / std::f64::consts::TAU, h / std::f64::consts::PI);
+        Camera { width, height, fx, fy, cx: 0.5 * w, cy: 0.5 * h, lens: Lens::Equirectangular }
+    }
+
     /// The same camera for images resized to `width × height`.
     pub fn resized(&self, width: u32, height: u32) -> Camera {
         let (sx, sy) = (width as f64 / self.width as f64, height as f64 / self.height as f64);
@@ -105,7 +112,8 @@ impl Camera {
         }
     }
 
-    /// Pixel coordinates of a point in the camera; `None` behind a perspective camera.
+    /// Pixel coordinates of a point in the camera; `None` behind a perspective camera, and where a fisheye lens does not reach: its
+    /// polynomial has turned back, or the point is straight behind.
     pub fn project(&self, x_in_camera: DVec3) -> Option<DVec2> {
         let p = x_in_camera;
         let d = match self.lens {
@@ -119,6 +127,9 @@ impl Camera {
             Lens::Fisheye { .. } => {
                 let r = DVec2::new(p.x, p.y).length();
                 let theta = r.atan2(p.z);
+                if !self.lens.reaches(theta) || (r <= 1e-12 && p.z <= 0.0) {
+                    return None;
+                }
                 let u = if r > 1e-12 { DVec2::new(p.x, p.y) * (theta / r) } else { DVec2::ZERO };
                 self.lens.distort(u)
             }
@@ -153,6 +164,17 @@ impl Lens {
                 if r < 1e-9 || *omega < 1e-9 { u } else { u * ((2.0 * r * (omega / 2.0).tan()).atan() / (omega * r)) }
             }
         }
+    }
+
+    /// Whether a fisheye's image radius grows with the angle from the axis all the way to `theta`; beyond, its polynomial says nothing.
+    fn reaches(&self, theta: f64) -> bool {
+        let Lens::Fisheye { k, .. } = self else { return true };
+        // d(θ + k1 θ³ + …)/dθ
+        let slope = |t: f64| {
+            let t2 = t * t;
+            1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])))
+        };
+        k.iter().all(|k| *k >= 0.0) || (1..=8).all(|i| slope(theta * i as f64 / 8.0) > 0.0)
     }
 
     /// Inverts [`Lens::distort`] by Newton's method with a central-difference Jacobian.
@@ -215,6 +237,62 @@ mod tests {
                 assert!((back - DVec2::new(x, y)).length() < 1e-6, "{lens:?}: {back} for {x},{y}");
             }
         }
+    }
+
+    #[test]
+    fn a_lens_of_200_degrees_sees_behind_itself() {
+        for k in [[0.0; 4], [0.02, -0.005, 0.001, -0.0001], [-0.01, 0.0, 0.0, 0.0]] {
+            let lens = Lens::Fisheye { k, p: [0.0; 2], s: [0.0; 2] };
+            // The circle of 100° from the axis touches the image's sides.
+            let theta = 100f64.to_radians();
+            let edge = lens.distort(DVec2::new(theta, 0.0)).x;
+            let f = 500.0 / edge;
+            let c = Camera { width: 1000, height: 1000, fx: f, fy: f, cx: 500.0, cy: 500.0, lens };
+            for degrees in [0.0, 30.0, 89.0, 90.0, 91.0, 99.9] {
+                for turn in 0..8 {
+                    let (t, phi) = (f64::to_radians(degrees), turn as f64 * 0.8);
+                    let d = DVec3::new(t.sin() * phi.cos(), t.sin() * phi.sin(), t.cos());
+                    let px = c.project(d * 2.5).unwrap_or_else(|| panic!("{degrees}° is seen"));
+                    assert!((0.0..=1000.0).contains(&px.x) && (0.0..=1000.0).contains(&px.y), "{px}");
+                    assert!((c.direction(px.x, px.y) - d).length() < 1e-8, "{degrees}°, {k:?}");
+                }
+            }
+            let left = c.direction(0.0, 500.0);
+            assert!((left.angle_between(DVec3::Z) - theta).abs() < 1e-9 && left.z < 0.0 && left.x < 0.0);
+            assert_eq!(c.project(-DVec3::Z), None, "straight behind is nowhere");
+        }
+    }
+
+    #[test]
+    fn a_fisheye_does_not_see_where_its_polynomial_turns_back() {
+        // θ − 0.1 θ³ grows up to 105° and falls from there: 150° would land within the image.
+        let lens = Lens::Fisheye { k: [-0.1, 0.0, 0.0, 0.0], p: [0.0; 2], s: [0.0; 2] };
+        let c = Camera { width: 1000, height: 1000, fx: 300.0, fy: 300.0, cx: 500.0, cy: 500.0, lens };
+        let at = |degrees: f64| c.project(DVec3::new(degrees.to_radians().sin(), 0.0, degrees.to_radians().cos()));
+        assert!(at(100.0).is_some());
+        assert_eq!((at(110.0), at(150.0)), (None, None));
+    }
+
+    #[test]
+    fn a_full_sphere_is_seen_once() {
+        let c = Camera::equirectangular(720, 360);
+        for (d, x, y) in [
+            (DVec3::Z, 360.0, 180.0),
+            (DVec3::X, 540.0, 180.0),
+            (-DVec3::X, 180.0, 180.0),
+            (DVec3::new(0.0, 1.0, 1e-9), 360.0, 360.0),
+            (DVec3::new(0.0, -1.0, 1e-9), 360.0, 0.0),
+        ] {
+            assert!((c.project(d * 3.0).unwrap() - DVec2::new(x, y)).length() < 1e-3, "{d}");
+        }
+        for (x, y) in (0..72).flat_map(|x| (0..36).map(move |y| (x as f64 * 10.0 + 0.5, y as f64 * 10.0 + 0.5))) {
+            let d = c.direction(x, y);
+            assert!((d.length() - 1.0).abs() < 1e-12);
+            assert!((c.project(d * 0.3).unwrap() - DVec2::new(x, y)).length() < 1e-6);
+        }
+        // Straight behind is the seam of the left and right edge.
+        let x = c.project(-DVec3::Z).unwrap().x;
+        assert!(x < 1e-6 || (x - 720.0).abs() < 1e-6);
     }
 
     #[test]

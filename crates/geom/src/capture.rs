@@ -171,6 +171,9 @@ pub struct Capture {
     /// Where the poses come from a model that tells; not kept in a run's folder.
     #[serde(skip)]
     pub agreement: Option<Agreement>,
+    /// Names of photographs that could not be decoded and were left out; not kept in a run's folder.
+    #[serde(skip)]
+    pub broken: Vec<String>,
 }
 
 impl Capture {
@@ -184,6 +187,7 @@ impl Capture {
             masks: MaskRule::default(),
             points: Vec::new(),
             agreement: None,
+            broken: Vec::new(),
         }
     }
 

@@ -15,6 +15,11 @@ pub fn u8_from_unit(value: f32) -> u8 {
     (value * 255.0 + 0.5).clamp(0.0, 255.0) as u8
 }
 
+/// Quantizes a value in [0, 1] to 16 bits, rounding to nearest and clamping.
+pub fn u16_from_unit(value: f32) -> u16 {
+    (value * 65535.0 + 0.5).clamp(0.0, 65535.0) as u16
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

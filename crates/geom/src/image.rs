@@ -2,6 +2,24 @@
 
 use crate::color::u8_from_unit;
 
+/// How the values of stored pixels are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PixelFormat {
+    /// 8 bits for 0 to 1.
+    Unorm8,
+    /// 16 bits for 0 to 1.
+    Unorm16,
+    /// Floats of 16 bits (IEEE 754 binary16).
+    Half,
+}
+
+impl PixelFormat {
+    /// Bytes of a pixel of four values.
+    pub fn bytes(self) -> usize {
+        if self == PixelFormat::Unorm8 { 4 } else { 8 }
+    }
+}
+
 /// `[H, W, C]` of f32.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image {
@@ -31,6 +49,15 @@ impl Image {
         &self.data[i..i + self.channels]
     }
 
+    /// Area average over the exact pixel footprint; color is weighted by alpha where there is one.
+    pub fn downsampled(&self, width: usize, height: usize) -> Image {
+        if (width, height) == (self.width, self.height) {
+            return self.clone();
+        }
+        let data = averages((self.width, self.height), (width, height), self.channels, |i| self.data[i]);
+        Image { width, height, channels: self.channels, data }
+    }
+
     pub fn to_u8(&self) -> ImageU8 {
         let data = self.data.iter().map(|&v| u8_from_unit(v)).collect();
         ImageU8 { width: self.width, height: self.height, channels: self.channels, data }
@@ -54,36 +81,40 @@ impl ImageU8 {
         if (width, height) == (self.width, self.height) {
             return self.clone();
         }
-        let c = self.channels;
-        let xs = footprints(self.width, width);
-        let ys = footprints(self.height, height);
-        let mut out = vec![0u8; width * height * c];
-        for (y, rows) in ys.iter().enumerate() {
-            for (x, cols) in xs.iter().enumerate() {
-                let (mut sum, mut total, mut alpha_total) = ([0.0f32; 4], 0.0f32, 0.0f32);
-                for &(sy, wy) in rows {
-                    for &(sx, wx) in cols {
-                        let p = self.pixel(sx, sy);
-                        let w = wx * wy;
-                        let a = if c == 4 { p[3] as f32 * w } else { w };
-                        total += w;
-                        alpha_total += a;
-                        for k in 0..c.min(3) {
-                            sum[k] += a * p[k] as f32;
-                        }
+        let data = averages((self.width, self.height), (width, height), self.channels, |i| self.data[i] as f32);
+        ImageU8 { width, height, channels: self.channels, data: data.into_iter().map(|v| (v + 0.5) as u8).collect() }
+    }
+}
+
+/// Averages over the footprints of a smaller image's pixels, of values that `at` tells.
+fn averages(from: (usize, usize), to: (usize, usize), channels: usize, at: impl Fn(usize) -> f32) -> Vec<f32> {
+    let (xs, ys) = (footprints(from.0, to.0), footprints(from.1, to.1));
+    let mut out = vec![0.0; to.0 * to.1 * channels];
+    for (y, rows) in ys.iter().enumerate() {
+        for (x, cols) in xs.iter().enumerate() {
+            let (mut sum, mut total, mut alpha_total) = ([0.0f32; 4], 0.0f32, 0.0f32);
+            for &(sy, wy) in rows {
+                for &(sx, wx) in cols {
+                    let p = (sy * from.0 + sx) * channels;
+                    let w = wx * wy;
+                    let a = if channels == 4 { at(p + 3) * w } else { w };
+                    total += w;
+                    alpha_total += a;
+                    for k in 0..channels.min(3) {
+                        sum[k] += a * at(p + k);
                     }
                 }
-                let o = &mut out[(y * width + x) * c..][..c];
-                for k in 0..c.min(3) {
-                    o[k] = if alpha_total > 0.0 { (sum[k] / alpha_total + 0.5) as u8 } else { 0 };
-                }
-                if c == 4 {
-                    o[3] = (alpha_total / total + 0.5) as u8;
-                }
+            }
+            let o = &mut out[(y * to.0 + x) * channels..][..channels];
+            for k in 0..channels.min(3) {
+                o[k] = if alpha_total > 0.0 { sum[k] / alpha_total } else { 0.0 };
+            }
+            if channels == 4 {
+                o[3] = alpha_total / total;
             }
         }
-        ImageU8 { width, height, channels: c, data: out }
     }
+    out
 }
 
 /// For each output pixel the input pixels that it covers and by how much.

@@ -71,6 +71,11 @@ impl Similarity {
         Similarity { scale: 1.0 / self.scale, rotation, translation: -(rotation * self.translation) / self.scale }
     }
 
+    /// This transform after another one.
+    pub fn after(&self, first: &Similarity) -> Similarity {
+        Similarity { scale: self.scale * first.scale, rotation: self.rotation * first.rotation, translation: self.point(first.translation) }
+    }
+
     /// Moves a camera: its centre as a point, its axes by the rotation alone.
     pub fn pose(&self, pose: &Pose) -> Pose {
         Pose { rotation: self.rotation * pose.rotation, translation: self.point(pose.translation) }

@@ -57,6 +57,9 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         if let fog @ [_, ..] = &report.behind_fog()[..] {
             println!("behind fog: {}", fog.join(", "));
         }
+        if model.is_linear() {
+            println!("scored in {}: the photographs hold linear light", report.scored_in);
+        }
         if let Some(p) = report.psnr_mean_image {
             println!("the mean training image in place of renders: {p:.2} dB");
         }

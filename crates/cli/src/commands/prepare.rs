@@ -56,6 +56,7 @@ pub fn run(a: &PrepareArgs) -> Result<Outcome> {
         threads: a.threads,
         resume: a.resume,
         force: a.force,
+        skip_broken: a.skip_broken,
     };
     watch_interrupts();
     let (mut last, mut stage) = (Instant::now(), String::new());
@@ -88,6 +89,9 @@ pub fn run(a: &PrepareArgs) -> Result<Outcome> {
     );
     if !made.lost.is_empty() {
         println!("without a pose: {}", made.lost.join(", "));
+    }
+    if !made.broken.is_empty() {
+        println!("broken, left out: {}", made.broken.join(", "));
     }
     let f = &made.finished;
     if f.left_out > 0 {

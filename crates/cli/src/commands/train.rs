@@ -136,6 +136,7 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
     set("background", a.background.clone())?;
     set("device", a.device.clone())?;
     set("seed", a.seed.map(|v| v.to_string()))?;
+    set("data.skip_broken", (a.skip_broken && !a.resume).then(|| "true".into()))?;
     if let Some(s) = a.seconds {
         if !(s.is_finite() && s > 0.0) {
             return Err(PipelineError::Usage(format!("--seconds {s}: must be greater than 0")));
@@ -202,7 +203,7 @@ fn same(a: &TrainArgs, before: &Config, now: &Config) -> Result<()> {
 }
 
 /// Flags and the values that they set.
-const FLAGS: [(&str, &str); 9] = [
+const FLAGS: [(&str, &str); 10] = [
     ("--method", "method"),
     ("--downscale", "data.downscale"),
     ("--preset report", "data.shortest_side"),
@@ -212,6 +213,7 @@ const FLAGS: [(&str, &str); 9] = [
     ("--format", "data.format"),
     ("--mask", "data.mask"),
     ("--mask-meaning", "data.mask_meaning"),
+    ("--skip-broken", "data.skip_broken"),
 ];
 
 fn is_given(a: &TrainArgs, flag: &str) -> bool {
@@ -224,6 +226,7 @@ fn is_given(a: &TrainArgs, flag: &str) -> bool {
         "--seed" => a.seed.is_some(),
         "--mask" => a.masks.mask.is_some(),
         "--mask-meaning" => a.masks.mask_meaning.is_some(),
+        "--skip-broken" => a.skip_broken,
         _ => a.format.is_some(),
     }
 }

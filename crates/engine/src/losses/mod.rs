@@ -1,6 +1,7 @@
 //! Losses over rays.
 
 use crate::samplers::RayBatch;
+use diorama_geom::color::srgb_from_linear;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::distortion;
 use diorama_kernels::ops::ngp_field::{RayGradient, RayLoss, RayOutput};
@@ -32,13 +33,35 @@ pub struct Photometric<'a> {
     /// Background of each ray, `[R, 3]`: what transparent pixels are composited on.
     pub background: &'a [f32],
     pub color: ColorLoss,
+    /// For linear light: differences are divided by the prediction plus this, which takes no part in the gradient, so that dark parts
+    /// count like bright ones (Mildenhall et al. 2022, equation 5); 0: they are not.
+    pub relative: f32,
     /// Weight of the distortion loss.
     pub distortion: f32,
     /// Weight of the squared difference between opacity and the photograph's alpha.
     pub alpha: f32,
 }
 
+/// What [`Photometric::relative`] is for linear light.
+pub const RELATIVE: f32 = 1e-3;
+
+/// A linear value as it is shown: within white, along the sRGB curve.
+pub fn shown(linear: f32) -> f32 {
+    srgb_from_linear(linear.clamp(0.0, 1.0))
+}
+
+/// Mean squared difference of two colors, of linear ones as they are shown.
+pub fn squared_error(a: [f32; 3], b: [f32; 3], is_linear: bool) -> f32 {
+    let of = |v: f32| if is_linear { shown(v) } else { v };
+    (0..3).map(|k| (of(a[k]) - of(b[k])).powi(2) / 3.0).sum()
+}
+
 impl Photometric<'_> {
+    /// [`squared_error`] of a ray.
+    pub fn squared_error(&self, rgb: [f32; 3], target: [f32; 3]) -> f32 {
+        squared_error(rgb, target, self.relative > 0.0)
+    }
+
     /// What the ray should come to, background included.
     pub fn target(&self, r: usize) -> [f32; 3] {
         let t = &self.batch.target[r * 4..r * 4 + 4];
@@ -55,9 +78,10 @@ impl RayLoss for Photometric<'_> {
         let scale = 1.0 / self.batch.len() as f32;
         let mut loss = 0.0f32;
         for k in 0..3 {
-            let (value, slope) = self.color.at(out.rgb[k] - target[k]);
+            let by = if self.relative > 0.0 { 1.0 / (out.rgb[k].max(0.0) + self.relative) } else { 1.0 };
+            let (value, slope) = self.color.at(by * (out.rgb[k] - target[k]));
             loss += value / 3.0;
-            g.rgb[k] = slope * scale / 3.0;
+            g.rgb[k] = by * slope * scale / 3.0;
         }
         if self.alpha > 0.0 {
             let d = out.opacity - self.batch.target[r * 4 + 3];
@@ -86,6 +110,28 @@ mod tests {
     }
 
     #[test]
+    fn relative_differences_count_alike_in_shadow_and_in_light() {
+        let mut batch = RayBatch::default();
+        batch.resize(2);
+        batch.target = vec![0.02, 0.02, 0.02, 1.0, 40.0, 40.0, 40.0, 1.0];
+        let (offsets, t, dt) = ([0u32, 1, 2], [0.0, 1.0], [0.5, 0.5]);
+        let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
+        for color in [ColorLoss::Mse, ColorLoss::Huber(0.1)] {
+            let p = Photometric { batch: &batch, samples, background: &[1.0; 6], color, relative: 1e-6, distortion: 0.0, alpha: 0.0 };
+            let run = |r: usize, v: f32| {
+                let mut w = [0.0];
+                let out = RayOutput { rgb: [v; 3], opacity: 1.0, depth: 1.0, weights: &[1.0], first: 0 };
+                let mut g = RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut w };
+                (p.ray(r, &out, &mut g), g.rgb[0])
+            };
+            let ((dark, d_dark), (light, d_light)) = (run(0, 0.022), run(1, 44.0));
+            assert!((dark - light).abs() < 1e-3 * light, "{dark} {light}");
+            // A step in proportion to the value.
+            assert!((d_dark * 0.022 - d_light * 44.0).abs() < 1e-3 * d_light * 44.0 && d_light > 0.0);
+        }
+    }
+
+    #[test]
     fn each_term_changes_the_loss_and_masked_rays_do_not_count() {
         let mut batch = RayBatch::default();
         batch.resize(1);
@@ -93,7 +139,7 @@ mod tests {
         let (offsets, t, dt) = ([0u32, 2], [0.0, 1.0], [0.5, 0.5]);
         let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
         let run = |batch: &RayBatch, distortion: f32, alpha: f32, color: ColorLoss| {
-            let p = Photometric { batch, samples, background: &[1.0; 3], color, distortion, alpha };
+            let p = Photometric { batch, samples, background: &[1.0; 3], color, relative: 0.0, distortion, alpha };
             let mut w = [0.0; 2];
             let out = RayOutput { rgb: [0.5, 0.5, 0.5], opacity: 0.9, depth: 1.0, weights: &[0.4, 0.5], first: 0 };
             p.ray(0, &out, &mut RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut w })

@@ -12,7 +12,7 @@ use crate::samplers::stratified;
 use diorama_geom::contraction::{contract, contract_backward};
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
-use diorama_geom::{Camera, Pose};
+use diorama_geom::{Camera, PixelFormat, Pose};
 use diorama_kernels::gpu::check::{Row, Table};
 use diorama_kernels::gpu::{Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
@@ -25,6 +25,7 @@ use diorama_kernels::ops::march::{MarchRays, Marched};
 use diorama_kernels::ops::ngp_field::gpu as field;
 use diorama_kernels::ops::ngp_field::gpu::loss::{self, Figures, SUMS, Target, Terms};
 use diorama_kernels::ops::ngp_field::{RayGradient, RayLoss, RayOutput};
+use diorama_kernels::ops::pixel_gather;
 use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, CELLS, GpuPhotographs};
 use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
@@ -48,6 +49,7 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
 /// not be trained on.
 struct Two {
     stride: u32,
+    format: PixelFormat,
 }
 
 impl Two {
@@ -66,6 +68,18 @@ impl Two {
     }
 }
 
+impl Two {
+    /// A pixel as it is stored; half floats of it reach up to 3.
+    fn words(&self, image: usize, x: u32, y: u32) -> [u32; 2] {
+        let v = [x * 7, y * 30, image as u32, 200 + x];
+        match self.format {
+            PixelFormat::Unorm8 => [u32::from_le_bytes(v.map(|v| v as u8)), 0],
+            PixelFormat::Unorm16 => [v[1] * 257 << 16 | v[0] * 257, v[3] * 257 << 16 | v[2] * 257],
+            PixelFormat::Half => [(0x3000 + v[1] * 21) << 16 | (0x3000 + v[0] * 21), 0x3c00 << 16 | (0x3000 + v[2])],
+        }
+    }
+}
+
 impl PixelSource for Two {
     fn images(&self) -> usize {
         2
@@ -79,8 +93,8 @@ impl PixelSource for Two {
         let random = Two::kept_by(image).bits((y0 as u64) << 32 | x0 as u64);
         (x0 + random as u32 % s.min(w - x0), y0 + (random >> 32) as u32 % s.min(h - y0))
     }
-    fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4] {
-        [x as u8 * 7, y as u8 * 30, image as u8, 200 + x as u8]
+    fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4] {
+        pixel_gather::cpu::convert(self.format, self.words(image, x, y))
     }
     fn counts(&self, image: usize, x: u32, _: u32) -> bool {
         image == 0 || x > 16
@@ -92,13 +106,15 @@ fn draws(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     let mut errors = ErrorMap::new(2);
     errors.errors.iter_mut().enumerate().for_each(|(i, e)| *e = [0.0625, 0.0, 1.0, 0.25][i * 7 % 4]);
     errors.refresh();
-    for (stride, map) in [(1, None), (3, None), (1, Some(&errors))] {
-        let two = Two { stride };
+    use PixelFormat::{Half, Unorm8, Unorm16};
+    for (stride, map, format) in [(1, None, Unorm8), (3, None, Unorm8), (1, Some(&errors), Unorm8), (3, None, Unorm16), (1, None, Half)] {
+        let two = Two { stride, format };
         let (sizes, kept) = ([two.size(0), two.size(1)], two.kept());
-        let words: Vec<u32> = kept.iter().map(|(i, x, y)| u32::from_le_bytes(two.rgba(*i, *x, *y))).collect();
-        let mut mask = vec![0u32; words.len().div_ceil(32)];
+        let own = pixel_gather::words_per_pixel(format);
+        let words: Vec<u32> = kept.iter().flat_map(|(i, x, y)| two.words(*i, *x, *y).into_iter().take(own)).collect();
+        let mut mask = vec![0u32; kept.len().div_ceil(32)];
         kept.iter().enumerate().for_each(|(at, (i, x, y))| mask[at / 32] |= (two.counts(*i, *x, *y) as u32) << (at % 32));
-        let photographs = GpuPhotographs::upload(gpu, &sizes, stride, &[0, 1].map(Two::kept_by), &words, Some(&mask));
+        let photographs = GpuPhotographs::upload(gpu, &sizes, stride, &[0, 1].map(Two::kept_by), (format, &words), Some(&mask));
         let camera = PosedCamera { camera: Camera::pinhole(8, 4, 1.0), pose: Pose::look_at(DVec3::X, DVec3::ZERO, DVec3::Z) };
         let on_gpu = map.map(|m| GpuErrorMap::upload(gpu, &m.errors, &m.drawn));
         let (rng, back) = (Rng::new(3, 1), Rng::new(3, 2));
@@ -109,10 +125,10 @@ fn draws(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let o = DrawOptions { cameras: &[camera; 2], first, rng, near: 0.1, cube: (0.0, 1.0), error_map: map };
             pixels::draw(&two, &o, &mut batch);
             let drawn = photographs.draw(gpu, n, first, &rng, on_gpu.as_ref(), Backdrop::Random(back));
-            let (shape, exact) =
-                (format!("R={n} from {first} 1 of {stride}²{}", if map.is_some() { " by error" } else { "" }), |v: &[f32]| {
-                    v.iter().map(|v| v.to_bits()).collect::<Vec<_>>()
-                });
+            let (shape, exact) = (
+                format!("R={n} from {first} 1 of {stride}² {format:?}{}", if map.is_some() { " by error" } else { "" }),
+                |v: &[f32]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>(),
+            );
             table.equal("draw", "images", &shape, &drawn.images, &batch.images)?;
             table.equal("draw", "pixels", &shape, &drawn.pixels, &exact(&batch.pixels))?;
             table.equal("draw", "jitter", &shape, &drawn.jitter, &exact(&batch.jitter))?;
@@ -394,9 +410,10 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         batch.target.chunks_exact_mut(4).skip(2).step_by(9).for_each(|t| t[0] = f32::NAN);
         let (rgb, background) = (random_unit(s * 3, 8), random_unit(rays * 3, 9));
         let out = composite::forward(&p, &scene.sigma, &rgb, 3, &background);
-        for (color, huber) in [(ColorLoss::Mse, 0.0), (ColorLoss::Huber(0.1), 0.1)] {
+        for (color, huber, relative) in [(ColorLoss::Mse, 0.0, 0.0), (ColorLoss::Huber(0.1), 0.1, 0.0), (ColorLoss::Huber(0.1), 0.1, 0.05)]
+        {
             let (distortion, alpha) = (0.3, 0.2);
-            let photometric = Photometric { batch: &batch, samples: p, background: &background, color, distortion, alpha };
+            let photometric = Photometric { batch: &batch, samples: p, background: &background, color, relative, distortion, alpha };
             let (mut value, mut error, mut counted) = (0.0f64, 0.0f64, 0usize);
             let mut of_rays = vec![0.0f64; rays];
             let (mut d_color, mut d_opacity, mut d_weights) = (vec![0.0; rays * 3], vec![0.0; rays], vec![0.0; s]);
@@ -415,7 +432,7 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                 d_opacity[r] = g.opacity;
                 let target = photometric.target(r);
                 if !target[0].is_nan() {
-                    of_rays[r] = (0..3).map(|k| (rgb[k] - target[k]).powi(2) as f64 / 3.0).sum::<f64>();
+                    of_rays[r] = photometric.squared_error(rgb, target) as f64;
                     error += of_rays[r];
                     counted += 1;
                 }
@@ -429,8 +446,8 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let (rgba, background, left_out, sums) = (up(&rgba), up(&background), gpu.upload_u32(&left_out), gpu.zeros(SUMS));
             let target = Target { rgba: &rgba, background: &background, left_out: &left_out };
             let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
-            let (d, errors) = loss::loss(gpu, Terms { huber, distortion, alpha }, &on_gpu, &results, target, figures);
-            let shape = format!("R={rays} S={s} {color:?}");
+            let (d, errors) = loss::loss(gpu, Terms { huber, relative, distortion, alpha }, &on_gpu, &results, target, figures);
+            let shape = format!("R={rays} S={s} {color:?} relative {relative}");
             table.close("loss", "errors", &shape, &errors, &of_rays)?;
             table.close("loss", "d color", &shape, &d.color, &wide(&d_color))?;
             table.close("loss", "d opacity", &shape, &d.opacity, &wide(&d_opacity))?;
@@ -442,7 +459,7 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 
             // All of it at once.
             for reach in [0.0, near] {
-                let terms = Terms { huber, distortion, alpha };
+                let terms = Terms { huber, relative, distortion, alpha };
                 let (sigma_gpu, rgb_gpu, sums) = (up(&scene.sigma), up(&rgb), gpu.zeros(SUMS));
                 let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
                 let (g, own_errors) = loss::composite_and_loss(gpu, terms, &on_gpu, &sigma_gpu, &rgb_gpu, target, reach, figures);
@@ -512,6 +529,8 @@ fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                 near: 0.1,
                 cube: (0.0, 1.0),
                 clip: None,
+                crop: None,
+                is_linear: false,
                 pruning: quality.pruning(),
                 appearance: None,
                 tolerance: 0.0,
@@ -547,6 +566,8 @@ fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             near: 0.1,
             cube: (0.0, 1.0),
             clip: None,
+            crop: None,
+            is_linear: false,
             pruning: Quality::Full.pruning(),
             appearance: None,
             tolerance: 0.0,

@@ -238,7 +238,7 @@ pub struct GpuTrainer {
     field: GpuField,
     coarse: Option<GpuField>,
     cube: (f32, f32),
-    learned: Option<GpuGroup>,
+    learned: Option<(GpuGroup, Activation)>,
     occupancy: Option<GpuOccupancyGrid>,
     photographs: GpuPhotographs,
     cameras: GpuCameras,
@@ -259,7 +259,7 @@ impl GpuTrainer {
             field: GpuField::upload(&gpu, of.field, corrections.is_some()),
             coarse: of.coarse.map(|f| GpuField::upload(&gpu, f, false)),
             cube,
-            learned: of.learned.map(|l| GpuGroup::upload(&gpu, &l.group)),
+            learned: of.learned.map(|l| (GpuGroup::upload(&gpu, &l.group), l.activation)),
             occupancy: of.occupancy.map(occupancy),
             photographs,
             cameras,
@@ -285,10 +285,10 @@ impl GpuTrainer {
         let (low, size) = self.cube;
         let near_far = ray_aabb::gpu::intersect(gpu, &origins, &dirs, [low; 3], [low + size; 3], s.near);
         let rays = GpuRays { origins, dirs, near_far, jitter: drawn.jitter.clone(), resumed: false };
-        let sky = self.learned.as_ref().map(|g| {
+        let sky = self.learned.as_ref().map(|(g, activation)| {
             let every_ray = Rows::all(gpu, s.rays);
             let codes = spherical_harmonics::gpu::forward(gpu, 4, &rays.dirs);
-            let rgb = linear::gpu::forward(gpu, &every_ray, (SKY, 3), &codes, &g.values, None, BiasKind::None, Activation::Sigmoid);
+            let rgb = linear::gpu::forward(gpu, &every_ray, (SKY, 3), &codes, &g.values, None, BiasKind::None, *activation);
             (every_ray, codes, rgb)
         });
         let background = sky.as_ref().map_or(&drawn.background, |(_, _, rgb)| rgb);
@@ -336,9 +336,9 @@ impl GpuTrainer {
         };
 
         let at = (s.t, s.rate_scale);
-        if let (Some(group), Some((every_ray, codes, rgb))) = (&self.learned, &sky) {
+        if let (Some((group, activation)), Some((every_ray, codes, rgb))) = (&self.learned, &sky) {
             let (none, d) = (BiasKind::None, &learned.background);
-            let d = linear::gpu::backward(gpu, every_ray, (SKY, 3), codes, &group.values, none, Activation::Sigmoid, rgb, d);
+            let d = linear::gpu::backward(gpu, every_ray, (SKY, 3), codes, &group.values, none, *activation, rgb, d);
             group.step(gpu, at, &d.w);
         }
         if let (Some((group, focal)), Some(d_points)) = (&self.corrections, &learned.points) {
@@ -387,7 +387,7 @@ impl GpuTrainer {
         if let (Some(own), Some(f)) = (&self.coarse, to.coarse) {
             own.download(gpu, f)?;
         }
-        if let (Some(own), Some(l)) = (&self.learned, to.learned) {
+        if let (Some((own, _)), Some(l)) = (&self.learned, to.learned) {
             own.download(gpu, &mut l.group)?;
         }
         if let (Some((own, _)), Some(g)) = (&self.corrections, to.corrections) {

@@ -152,6 +152,8 @@ mod tests {
             near: 0.0,
             cube: (0.0, 1.0),
             clip: None,
+            crop: None,
+            is_linear: false,
             pruning: Quality::Full.pruning(),
             appearance: None,
             tolerance: 0.0,

@@ -5,7 +5,9 @@ use crate::background::LearnedBackground;
 use crate::fields::{Batch, Field, FieldBuffers, Pruning};
 use crate::samplers::occupancy::Occupancy;
 use crate::samplers::{RayBatch, pixels, stratified};
-use diorama_geom::Image;
+use diorama_geom::color::srgb_from_linear;
+use diorama_geom::glam::DVec3;
+use diorama_geom::{Image, OrientedBox};
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched};
 use diorama_kernels::ops::ray_generation::PosedCamera;
@@ -84,10 +86,14 @@ pub struct Tracer<'a> {
     pub cube: (f32, f32),
     /// Only what lies in this box (lowest and highest corner, model space) is shown.
     pub clip: Option<([f32; 3], [f32; 3])>,
+    /// And only what lies in this box, which may be turned (model space).
+    pub crop: Option<OrientedBox>,
     /// Samples that are left out where an occupancy grid places them.
     pub pruning: Pruning,
     /// Training image whose appearance is worn; none: the mean.
     pub appearance: Option<u32>,
+    /// Whether colors are linear light, which [`Tracer::view`] encodes to sRGB; values above 1 go on along the curve.
+    pub is_linear: bool,
     /// Pixels are interpolated where traced neighbours differ by no more than this; 0: all are traced.
     pub tolerance: f32,
     /// Traces instead of the CPU, which goes on where it fails; rays of an abandoned device come back empty.
@@ -143,6 +149,17 @@ pub struct View {
     pub opacity: Image,
     /// Expected distance along the ray in model units, 0 where nothing is hit, `[H, W, 1]`.
     pub depth: Image,
+}
+
+/// Shortens rays to what lies in a box.
+fn cut_to(crop: &OrientedBox, batch: &mut RayBatch) {
+    let vector = |v: &[f32]| DVec3::new(v[0] as f64, v[1] as f64, v[2] as f64);
+    let rays = batch.origins.chunks_exact(3).zip(batch.dirs.chunks_exact(3));
+    for ((o, d), near_far) in rays.zip(batch.near_far.chunks_exact_mut(2)) {
+        let (near, far) = crop.intersect(vector(o), vector(d)).unwrap_or((0.0, 0.0));
+        let (near, far) = (near_far[0].max(near as f32), near_far[1].min(far as f32));
+        near_far.copy_from_slice(&if near < far { [near, far] } else { [0.0, 0.0] });
+    }
 }
 
 /// Rays per chunk of an image.
@@ -221,7 +238,10 @@ impl Tracer<'_> {
             let traced = self.trace(batch, buf);
             for (i, &p) in part.iter().enumerate() {
                 let (p, o) = (p as usize, traced.opacity[i]);
-                out.rgb.data[p * 3..p * 3 + 3].copy_from_slice(&traced.rgb[i * 3..i * 3 + 3]);
+                let rgb = &traced.rgb[i * 3..i * 3 + 3];
+                for (o, v) in out.rgb.data[p * 3..p * 3 + 3].iter_mut().zip(rgb) {
+                    *o = if self.is_linear { srgb_from_linear(*v) } else { *v };
+                }
                 out.opacity.data[p] = o;
                 out.depth.data[p] = if o > 1e-3 { traced.depth[i] / o } else { 0.0 };
             }
@@ -229,10 +249,13 @@ impl Tracer<'_> {
         }
     }
 
-    /// Traces the rays of a batch, whose origins, directions and extents are set.
+    /// Traces the rays of a batch, whose origins, directions and extents are set; colors stay as the field has them.
     pub fn trace(&self, batch: &mut RayBatch, buf: &mut FieldBuffers) -> Traced {
         if let Some((min, max)) = self.clip {
             diorama_kernels::ops::ray_aabb::cpu::intersect(&batch.origins, &batch.dirs, min, max, self.near, &mut batch.near_far);
+        }
+        if let Some(crop) = &self.crop {
+            cut_to(crop, batch);
         }
         let placement = match self.sampling {
             Sampling::Occupancy { grid, max_samples } => Placement::March(grid.march_config(max_samples)),
@@ -393,6 +416,8 @@ mod tests {
             near: 0.1,
             cube: (0.0, 1.0),
             clip: None,
+            crop: None,
+            is_linear: false,
             pruning: Pruning { stop: 0.0, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             appearance: None,
             tolerance: 0.0,
@@ -436,6 +461,8 @@ mod tests {
             near: 0.1,
             cube: (0.0, 1.0),
             clip: None,
+            crop: None,
+            is_linear: false,
             pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             appearance: None,
             tolerance: 0.0,
@@ -494,6 +521,8 @@ mod tests {
                 near: 0.1,
                 cube: (0.0, 1.0),
                 clip: None,
+                crop: None,
+                is_linear: false,
                 pruning: quality.pruning(),
                 appearance: None,
                 tolerance: quality.tolerance(),

@@ -3,7 +3,7 @@
 use super::RayBatch;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::ray_generation::PosedCamera;
-use diorama_kernels::ops::{pixel_gather, ray_aabb, ray_generation};
+use diorama_kernels::ops::{ray_aabb, ray_generation};
 use rayon::prelude::*;
 
 /// Access to training pixels, wherever they lie.
@@ -14,7 +14,8 @@ pub trait PixelSource: Sync {
     fn snap(&self, _image: usize, x: u32, y: u32) -> (u32, u32) {
         (x, y)
     }
-    fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4];
+    /// Straight RGBA in the photographs' own space: sRGB, or linear light, which may exceed 1.
+    fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4];
     /// Whether the pixel may be trained on.
     fn counts(&self, image: usize, x: u32, y: u32) -> bool;
 }
@@ -109,7 +110,7 @@ pub fn draw(source: &dyn PixelSource, o: &DrawOptions, batch: &mut RayBatch) {
             let (x, y) = source.snap(img as usize, x, y);
             *image = img as u32;
             pixel.copy_from_slice(&[x as f32 + 0.5, y as f32 + 0.5]);
-            target.copy_from_slice(&pixel_gather::cpu::convert(source.rgba(img as usize, x, y)));
+            target.copy_from_slice(&source.rgba(img as usize, x, y));
             if source.counts(img as usize, x, y) {
                 return;
             }
@@ -141,8 +142,8 @@ mod tests {
         fn size(&self, _: usize) -> (u32, u32) {
             (8, 4)
         }
-        fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4] {
-            [x as u8, y as u8, image as u8, 255]
+        fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4] {
+            [x, y, image as u32, 255].map(|v| v as f32 / 255.0)
         }
         fn counts(&self, _: usize, x: u32, _: u32) -> bool {
             x >= 4

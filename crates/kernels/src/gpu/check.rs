@@ -21,7 +21,7 @@ use crate::ops::{
 };
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
-use diorama_geom::{Camera, Lens, Pose};
+use diorama_geom::{Camera, Lens, PixelFormat, Pose};
 use diorama_testkit::{compare, random, random_unit, wide};
 
 /// Largest error allowed, relative to the value plus the root mean square of all.
@@ -560,13 +560,20 @@ fn corners(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 }
 
 fn pixels(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
-    let bytes: Vec<u8> = random_unit(400, 1).iter().map(|v| (v * 256.0) as u8).collect();
-    let words: Vec<u32> = bytes.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
-    for n in [0, 1, 67] {
-        let at: Vec<u32> = random_unit(n, 2).iter().map(|v| (v * 100.0) as u32).collect();
-        let offsets: Vec<usize> = at.iter().map(|i| *i as usize * 4).collect();
-        let got = pixel_gather::gpu::gather(gpu, &gpu.upload_u32(&words), &gpu.upload_u32(&at));
-        table.close("pixel gather", "forward", format!("R={n}"), &got, &pixel_gather::reference::gather(&bytes, &offsets))?;
+    for format in [PixelFormat::Unorm8, PixelFormat::Unorm16, PixelFormat::Half] {
+        // Half floats from 2⁻¹⁴ to 2, of both signs: larger ones would hide errors of the others.
+        let sixteen = |v: &f32| {
+            let bits = (v * 65536.0) as u32;
+            if format == PixelFormat::Half { bits & 0x8000 | (0x0400 + bits % 0x3c00) } else { bits }
+        };
+        let words: Vec<u32> = random_unit(400, 1).as_chunks().0.iter().map(|[a, b]| sixteen(b) << 16 | sixteen(a)).collect();
+        for n in [0, 1, 67] {
+            let at: Vec<u32> = random_unit(n, 2).iter().map(|v| (v * 100.0) as u32).collect();
+            let chosen: Vec<usize> = at.iter().map(|i| *i as usize).collect();
+            let got = pixel_gather::gpu::gather(gpu, format, &gpu.upload_u32(&words), &gpu.upload_u32(&at));
+            let want = pixel_gather::reference::gather(format, &words, &chosen);
+            table.close("pixel gather", "forward", format!("R={n} {format:?}"), &got, &want)?;
+        }
     }
     Ok(())
 }

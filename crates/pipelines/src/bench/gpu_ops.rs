@@ -178,6 +178,15 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let target = Target { rgba: &target, background: &background, left_out: &left_out };
     t.row("composite, loss and backward", "3 channels, 32 samples per ray", "sample", s, 0.0, 64.0, || {
         let figures = Figures { sums: &sums, marched: &p.offsets, is_main: true };
-        loss::composite_and_loss(gpu, Terms { huber: 0.0, distortion: 0.0, alpha: 0.0 }, &p, &sigma, &rgb, target, 0.0, figures);
+        loss::composite_and_loss(
+            gpu,
+            Terms { huber: 0.0, relative: 0.0, distortion: 0.0, alpha: 0.0 },
+            &p,
+            &sigma,
+            &rgb,
+            target,
+            0.0,
+            figures,
+        );
     })
 }

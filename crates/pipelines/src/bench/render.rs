@@ -44,7 +44,7 @@ pub fn run(model: &ObjectModel, repeats: usize, device: String) -> Result<Render
         for &i in &frames {
             let (tracer, camera) = (model.tracer(quality), model.posed(i));
             seconds += median_seconds(repeats, || drop(tracer.view(&camera, &mut |_| {})));
-            psnr += score_view(model, i, photo::load(&model.capture.frames[i].image)?, quality)?.scores.psnr;
+            psnr += score_view(model, i, photo::load_full(&model.capture.frames[i].image)?, quality)?.scores.psnr;
         }
         let n = frames.len() as f64;
         Ok(QualityFigure { frames_per_s: n / seconds, psnr: psnr / n })

@@ -69,6 +69,9 @@ pub struct DataConfig {
     pub mask_meaning: String,
     /// Bytes that pixels may take; beyond that one of each small square is kept.
     pub memory_budget: u64,
+    /// Leave out photographs that cannot be decoded, instead of refusing the capture.
+    #[serde(default)]
+    pub skip_broken: bool,
 }
 
 fn use_masks() -> String {
@@ -228,6 +231,7 @@ impl Config {
                 mask: use_masks(),
                 mask_meaning: auto(),
                 memory_budget: diorama_data::pixel_store::DEFAULT_BUDGET,
+                skip_broken: false,
             },
             field: FieldConfig {
                 levels: 16,

@@ -306,6 +306,7 @@ mod running {
     use crate::object::model::ObjectModel;
     use crate::object::recipe::Photographs;
     use diorama_data::pixel_store::PixelStore;
+    use diorama_engine::losses::RELATIVE;
     use diorama_engine::on_gpu::{GpuStep, GpuTrainer, Placing, Trainees, TraineesMut};
     use diorama_geom::rng::Rng;
     use diorama_kernels::gpu::{Gpu, GpuError};
@@ -346,7 +347,7 @@ mod running {
         pub fn upload(&mut self, m: &ObjectModel, photographs: &Photographs) -> Result<()> {
             let store = photographs.store();
             // Of the smallest budgets even 1 of 64 × 64 pixels may be more.
-            let bytes: u64 = (0..store.len()).map(|i| store.kept(i).len() as u64 * 4).sum();
+            let bytes: u64 = (0..store.len()).map(|i| (store.kept(i) * store.format().bytes()) as u64).sum();
             let most = self.gpu.largest_buffer();
             if bytes > most {
                 return Err(PipelineError::Usage(format!(
@@ -396,7 +397,12 @@ mod running {
                 backdrop: d.background.map_or(Backdrop::Color(m.backdrop_color()), Backdrop::Random),
                 near: s.near,
                 placing,
-                terms: Terms { huber: if c.loss.color == "huber" { 0.1 } else { 0.0 }, distortion: c.loss.distortion, alpha: c.loss.alpha },
+                terms: Terms {
+                    huber: if c.loss.color == "huber" { 0.1 } else { 0.0 },
+                    relative: if m.is_linear() { RELATIVE } else { 0.0 },
+                    distortion: c.loss.distortion,
+                    alpha: c.loss.alpha,
+                },
                 near_scaling: c.loss.near_scaling,
                 t: step as u32 + 1,
                 rate_scale: d.rate_scale,
@@ -459,17 +465,17 @@ mod running {
         let n = store.len();
         let sizes: Vec<(u32, u32)> = (0..n).map(|i| store.size(i)).collect();
         let keys: Vec<Rng> = (0..n).map(|i| store.kept_by(i)).collect();
-        let pixels: Vec<u32> = (0..n).flat_map(|i| store.kept(i).iter().map(|p| u32::from_le_bytes(*p))).collect();
-        let mut mask = vec![u32::MAX; pixels.len().div_ceil(32)];
+        let pixels: Vec<u32> = (0..n).flat_map(|i| store.words(i)).collect();
+        let mut mask = vec![u32::MAX; (0..n).map(|i| store.kept(i)).sum::<usize>().div_ceil(32)];
         let (mut all, mut first) = (true, 0);
         for i in 0..n {
             for (at, _) in store.counting(i).into_iter().flatten().enumerate().filter(|(_, counts)| !counts) {
                 mask[(first + at) / 32] &= !(1 << ((first + at) % 32));
                 all = false;
             }
-            first += store.kept(i).len();
+            first += store.kept(i);
         }
-        GpuPhotographs::upload(gpu, &sizes, store.stride(), &keys, &pixels, (!all).then_some(&mask[..]))
+        GpuPhotographs::upload(gpu, &sizes, store.stride(), &keys, (store.format(), &pixels), (!all).then_some(&mask[..]))
     }
 }
 

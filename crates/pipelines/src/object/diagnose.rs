@@ -2,7 +2,7 @@
 
 use crate::error::Result;
 use diorama_data::{masks, photo, pixel_store, sparse, video};
-use diorama_geom::capture::{Agreement, Frame, MaskRule, Split, focus_point};
+use diorama_geom::capture::{Agreement, ColorSpace, Frame, MaskRule, Split, focus_point};
 use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, Capture, Lens, Pose};
@@ -289,7 +289,8 @@ fn look(f: &Frame, rule: &MaskRule) -> Result<Look> {
     Ok(Look {
         stops: mean.max(1e-6).log2(),
         sharpness: video::laplacian_variance(&gray, small.width) / variance.max(1.0),
-        clipped: seen.iter().filter(|i| gray[**i] >= 250).count() as f32 / n,
+        // What is brighter than white is not lost in linear light.
+        clipped: if f.color_space == ColorSpace::Linear { 0.0 } else { seen.iter().filter(|i| gray[**i] >= 250).count() as f32 / n },
         clear,
         masked,
     })

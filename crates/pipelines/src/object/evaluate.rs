@@ -4,7 +4,9 @@ use super::fog::{self, Surfaces};
 use super::held_out::{self, GAP_DB, GAP_MEANS};
 use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
-use diorama_data::{masks, photo, weights};
+use diorama_data::photo::{self, Photo};
+use diorama_data::{masks, weights};
+use diorama_engine::losses;
 use diorama_engine::metrics::lpips::{self, Lpips};
 use diorama_engine::metrics::{self, Scores};
 use diorama_engine::renderers::volume::{Quality, View};
@@ -66,6 +68,8 @@ pub struct Report {
     pub training: Option<TrainingScores>,
     /// What drew the views.
     pub device: String,
+    /// The space in which views and photographs are compared.
+    pub scored_in: &'static str,
     pub per_view: Vec<ViewScore>,
 }
 
@@ -87,23 +91,30 @@ impl Report {
     }
 }
 
-/// A photograph at the run's resolution, transparent pixels on the model's backdrop.
-fn reference_photo(model: &ObjectModel, full: &ImageU8) -> Image {
-    let (width, height) = model.config.reduction().size((full.width as u32, full.height as u32));
-    let small = full.downsampled(width as usize, height as usize);
+/// A photograph at the run's resolution, transparent pixels on the model's backdrop: sRGB up to white.
+fn reference_photo(model: &ObjectModel, full: &Photo) -> Image {
+    let (w, h) = full.size();
+    let (w, h) = model.config.reduction().size((w as u32, h as u32));
+    let small = full.downsampled(w as usize, h as usize);
+    // What a field of linear light was trained on is blended there, too.
+    let (small, is_linear) = match small {
+        Photo::Linear(im) if model.is_linear() => (im, true),
+        other => (other.into_srgb(), false),
+    };
     let back = model.backdrop_color();
     let mut out = Image::zeros(small.width, small.height, 3);
     for (o, p) in out.data.chunks_exact_mut(3).zip(small.data.chunks_exact(small.channels)) {
-        let a = if small.channels == 4 { p[3] as f32 / 255.0 } else { 1.0 };
+        let a = if small.channels == 4 { p[3] } else { 1.0 };
         for k in 0..3 {
-            o[k] = p[k.min(small.channels - 1)] as f32 / 255.0 * a + back[k] * (1.0 - a);
+            let v = p[k.min(small.channels - 1)] * a + back[k] * (1.0 - a);
+            o[k] = if is_linear { losses::shown(v) } else { v.clamp(0.0, 1.0) };
         }
     }
     out
 }
 
 /// What frame `i`'s render is compared with, and the mask of the pixels that count, where there is one.
-fn reference(model: &ObjectModel, i: usize, full: ImageU8) -> Result<(Image, Option<ImageU8>)> {
+fn reference(model: &ObjectModel, i: usize, full: Photo) -> Result<(Image, Option<ImageU8>)> {
     let (full, mask) = masks::apply(&model.capture.frames[i], &model.capture.masks, full)?;
     let photo = reference_photo(model, &full);
     let counts = mask.map(|m| m.downsampled(photo.width, photo.height));
@@ -114,7 +125,7 @@ fn reference(model: &ObjectModel, i: usize, full: ImageU8) -> Result<(Image, Opt
 ///
 /// # Errors
 /// When the mask cannot be decoded, or is not that of the photograph; or when the device that was named failed.
-pub fn score_view(model: &ObjectModel, i: usize, full: ImageU8, quality: Quality) -> Result<ScoredView> {
+pub fn score_view(model: &ObjectModel, i: usize, full: Photo, quality: Quality) -> Result<ScoredView> {
     let (photo, counts) = reference(model, i, full)?;
     let view = model.tracer(quality).view(&model.posed(i), &mut |_| {});
     model.check_device()?;
@@ -157,7 +168,7 @@ pub fn evaluate_with_training(
     }
     let mut scores = Vec::new();
     for i in held_out::spread(&model.train, TRAINING_VIEWS.min(report.views)) {
-        scores.push(score_view(model, i, photo::load(&model.capture.frames[i].image)?, quality)?.scores);
+        scores.push(score_view(model, i, photo::load_full(&model.capture.frames[i].image)?, quality)?.scores);
     }
     let mean = |f: fn(&Scores) -> f64| mean_of_numbers(scores.iter().map(f));
     let training = TrainingScores { views: scores.len(), psnr: mean(|s| s.psnr), ssim: mean(|s| s.ssim) };
@@ -214,7 +225,7 @@ pub fn evaluate_with(
     let (mut per_view, mut mean_scores) = (Vec::new(), Vec::new());
     for i in frames {
         let frame = &model.capture.frames[i];
-        let full = photo::load(&frame.image)?;
+        let full = photo::load_full(&frame.image)?;
         let scored = score_view(model, i, full, quality)?;
         if let Some(mean) = mean.as_ref().filter(|m| (m.width, m.height) == (scored.photo.width, scored.photo.height)) {
             mean_scores.push(metrics::compare(mean, &scored.photo, admits(&scored.counts)).psnr);
@@ -246,6 +257,7 @@ pub fn evaluate_with(
         lpips: lpips.map(|_| mean_of_numbers(per_view.iter().filter_map(|v| v.lpips))),
         training: None,
         device: model.drew_on(),
+        scored_in: if model.is_linear() { "sRGB, of linear light up to white" } else { "sRGB" },
         per_view,
     })
 }
@@ -261,7 +273,7 @@ fn mean_image(model: &ObjectModel) -> Result<Option<Image>> {
     let mut sum: Option<Image> = None;
     let mut n = 0.0;
     for &i in model.train.iter().step_by(step) {
-        let (im, _) = reference(model, i, photo::load(&model.capture.frames[i].image)?)?;
+        let (im, _) = reference(model, i, photo::load_full(&model.capture.frames[i].image)?)?;
         n += 1.0;
         match &mut sum {
             None => sum = Some(im),

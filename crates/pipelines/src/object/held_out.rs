@@ -6,6 +6,7 @@ use super::recipe::Photographs;
 use crate::error::Result;
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_engine::fields::FieldBuffers;
+use diorama_engine::losses;
 use diorama_engine::metrics::psnr;
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::samplers::RayBatch;
@@ -91,12 +92,13 @@ impl HeldOutPixels {
     pub fn judge(&self, model: &ObjectModel) -> HeldOut {
         let mut batch = self.batch.clone();
         let seen = model.tracer(Quality::Full).trace(&mut batch, &mut FieldBuffers::default());
-        let back = model.backdrop_color();
+        let (back, is_linear) = (model.backdrop_color(), model.is_linear());
         let mut sums = vec![(0.0f64, 0usize); self.frames.len()];
         for (r, t) in batch.target.chunks_exact(4).enumerate().filter(|(_, t)| !t[0].is_nan()) {
-            let error = |k: usize| (seen.rgb[r * 3 + k].clamp(0.0, 1.0) - (t[k] * t[3] + back[k] * (1.0 - t[3]))).powi(2) as f64 / 3.0;
+            let got = [0, 1, 2].map(|k| if is_linear { seen.rgb[r * 3 + k] } else { seen.rgb[r * 3 + k].clamp(0.0, 1.0) });
+            let want = [0, 1, 2].map(|k| t[k] * t[3] + back[k] * (1.0 - t[3]));
             let sum = &mut sums[batch.images[r] as usize];
-            *sum = (sum.0 + error(0) + error(1) + error(2), sum.1 + 1);
+            *sum = (sum.0 + losses::squared_error(got, want, is_linear) as f64, sum.1 + 1);
         }
         let (error, n) = sums.iter().fold((0.0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         let mse = error / n as f64;

@@ -6,14 +6,15 @@ use super::device;
 use super::export::ExportOptions;
 use super::model::{self, ObjectModel};
 use crate::error::{PipelineError, Result};
-use diorama_data::memory;
-use diorama_geom::Capture;
+use diorama_data::{memory, pixel_store};
 use diorama_geom::capture::Split;
+use diorama_geom::{Capture, PixelFormat};
 use diorama_kernels::ops::hash_grid::HashGrid;
 use diorama_mesh::extract::Grid;
 
-/// Bytes per pixel of a photograph while it is decoded: as the file has it, as RGBA, reduced.
+/// Bytes per pixel of a photograph while it is decoded: as the file has it, as RGBA, reduced; beyond 8 bits in floats.
 const DECODED: u64 = 8;
+const DECODED_IN_FLOATS: u64 = 32;
 /// Bytes per sample of a step of `ngp`: encoded, through the network and back.
 const SAMPLE: u64 = 1024;
 /// Bytes per square cell of the grid's side, of a surface that crosses the grid a few times while it is simplified.
@@ -58,8 +59,8 @@ pub fn size(bytes: u64) -> String {
     if mib < 1024.0 { format!("{mib:.0} MiB") } else { format!("{:.1} GiB", mib / 1024.0) }
 }
 
-/// What training a configuration on a capture takes, with so many samples in a step.
-pub fn of_training(config: &Config, capture: &Capture, samples: usize) -> Needs {
+/// What training a configuration on a capture takes, whose pixels are kept in `format`, with so many samples in a step.
+pub fn of_training(config: &Config, capture: &Capture, format: PixelFormat, samples: usize) -> Needs {
     let train = capture.indices(Split::Train);
     let (mut pixels, mut masks, mut largest) = (0u64, 0u64, 0u64);
     for f in train.iter().map(|&i| &capture.frames[i]) {
@@ -68,8 +69,10 @@ pub fn of_training(config: &Config, capture: &Capture, samples: usize) -> Needs 
         masks += if f.mask.is_some() { w as u64 * h as u64 } else { 0 };
         largest = largest.max(f.camera.width as u64 * f.camera.height as u64);
     }
-    let kept = (pixels * 4).min(config.data.memory_budget);
-    let masks = (masks as f64 * kept as f64 / (pixels * 4).max(1) as f64) as u64;
+    let bytes = pixels * format.bytes() as u64;
+    let kept = bytes.min(config.data.memory_budget);
+    let masks = (masks as f64 * kept as f64 / bytes.max(1) as f64) as u64;
+    let decoded = if format == PixelFormat::Unorm8 { DECODED } else { DECODED_IN_FLOATS };
     let at_once = (2 * rayon::current_num_threads()).min(train.len()) as u64;
     // Values, gradients and two moments; a checkpoint copies all but the gradients while it is written.
     let parameters = match config.method {
@@ -80,7 +83,7 @@ pub fn of_training(config: &Config, capture: &Capture, samples: usize) -> Needs 
     let occupancy = if config.method == Method::Ngp { cells.saturating_mul(9) } else { 0 };
     let batch = if config.method == Method::Ngp { (samples as u64).saturating_mul(SAMPLE) } else { 0 };
     Needs(vec![
-        ("photographs", kept + masks + at_once * largest * DECODED),
+        ("photographs", kept + masks + at_once * largest * decoded),
         ("parameters", parameters),
         ("occupancy grid", occupancy),
         ("batch", batch),
@@ -104,11 +107,13 @@ pub fn of_export(model: &ObjectModel, o: &ExportOptions, grid: &Grid, texels: us
 /// Compares what training takes with what there is: a note where it is tight.
 ///
 /// # Errors
-/// When it does not fit.
+/// When it does not fit, or a photograph's head cannot be read.
 pub fn check_training(config: &Config, capture: &Capture) -> Result<Option<String>> {
     // A GPU that was named keeps its batches itself.
     let on_host = config.device == "cpu" || config.sampling.batch_samples == 0;
-    let needs = of_training(config, capture, if on_host { device::batch_samples(config, false) } else { 0 });
+    let train: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.frames[i]).collect();
+    let format = pixel_store::format_of(&train)?;
+    let needs = of_training(config, capture, format, if on_host { device::batch_samples(config, false) } else { 0 });
     let cure = match needs.largest() {
         "photographs" => format!("--downscale 2, or --set data.memory_budget={}", (needs.of("photographs") / 4).max(1 << 20)),
         "occupancy grid" => "--set sampling.occupancy_resolution=128".into(),
@@ -160,7 +165,7 @@ mod tests {
     fn what_is_counted_is_what_a_model_has() {
         let dir = tempfile::tempdir().unwrap();
         let (c, capture) = still_life(dir.path(), &[("field.log2_size", "14")]);
-        let needs = of_training(&c, &capture, 9 << 10);
+        let needs = of_training(&c, &capture, PixelFormat::Unorm8, 9 << 10);
         assert_eq!(needs.of("batch"), 9 << 20);
         let m = ObjectModel::new(c, capture, false).unwrap();
         let table = m.field.table.as_ref().unwrap().values.len() as f64 * 28.0;
@@ -178,13 +183,19 @@ mod tests {
         let of = |sets: &[(&str, &str)]| {
             let mut c = c.clone();
             sets.iter().for_each(|(k, v)| c.set(k, v).unwrap());
-            of_training(&c, &capture, 0).of("photographs")
+            of_training(&c, &capture, PixelFormat::Unorm8, 0).of("photographs")
         };
         let decoded = of(&[("data.memory_budget", "0")]);
         let n = capture.indices(Split::Train).len() as u64;
         assert_eq!(of(&[]) - decoded, n * 48_000_000);
         assert_eq!(of(&[("data.downscale", "4")]) - decoded, n * 3_000_000);
         assert_eq!(of(&[("data.memory_budget", "1000")]) - decoded, 1000);
+        let deep = |budget: &str| {
+            let mut c = c.clone();
+            c.set("data.memory_budget", budget).unwrap();
+            of_training(&c, &capture, PixelFormat::Unorm16, 0).of("photographs")
+        };
+        assert_eq!(deep("4294967296") - deep("0"), n * 96_000_000, "16 bits take twice as much");
     }
 
     #[test]

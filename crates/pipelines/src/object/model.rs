@@ -11,7 +11,8 @@ use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Sampling
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::pixels::ErrorMap;
 use diorama_engine::train::Origin;
-use diorama_geom::capture::Split;
+use diorama_geom::capture::{ColorSpace, Split};
+use diorama_geom::color::srgb_from_linear;
 use diorama_geom::field_query::FieldQuery;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Capture, Pose, Similarity};
@@ -19,6 +20,7 @@ use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::hash_grid::HashGridConfig;
+use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::march::OccupancyBits;
 use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
 use std::collections::HashMap;
@@ -67,6 +69,7 @@ impl ObjectModel {
     pub fn new(config: Config, capture: Capture, has_alpha: bool) -> Result<ObjectModel> {
         config.check()?;
         let train = capture.indices(Split::Train);
+        let is_linear = is_linear(&capture);
         let outer = capture.scene.aabb_scale as f32;
         let (seed, rate, images, dims) = (config.seed, config.optim.rate, train.len(), config.field.appearance);
         let f = &config.field;
@@ -77,7 +80,8 @@ impl ObjectModel {
             Method::Baseline => (fields::baseline(outer, rate, seed), None),
         };
         let occupancy = (config.method == Method::Ngp).then(|| Occupancy::new(config.sampling.occupancy_resolution, cascades(&capture)));
-        let learned = (config.background == Background::Learned).then(|| LearnedBackground::new(Adam { rate, ..Adam::default() }));
+        let learned = (config.background == Background::Learned)
+            .then(|| LearnedBackground::new(color_head(is_linear).0, Adam { rate, ..Adam::default() }));
         let corrections = config.camera.refine.then(|| {
             let adam = Adam { rate: config.camera.rate, weight_decay: config.camera.decay, ..Adam::default() };
             ParamGroup::dense("corrections", vec![0.0; images * CORRECTION], adam)
@@ -109,6 +113,7 @@ impl ObjectModel {
         for f in model.fields_mut() {
             f.weights.adam.weight_decay = decay;
             f.net.mlp.precision = precision;
+            (f.net.rgb.activation, f.net.rgb.shift) = color_head(is_linear);
         }
         Ok(model)
     }
@@ -161,6 +166,11 @@ impl ObjectModel {
         }
     }
 
+    /// Whether the photographs, and so the field's colors, are linear light.
+    pub fn is_linear(&self) -> bool {
+        is_linear(&self.capture)
+    }
+
     /// Ready to render, wearing the mean appearance.
     pub fn tracer(&self, quality: Quality) -> Tracer<'_> {
         let s = &self.config.sampling;
@@ -176,6 +186,8 @@ impl ObjectModel {
             near: s.near,
             cube: self.cube(),
             clip: None,
+            crop: None,
+            is_linear: self.is_linear(),
             pruning: quality.pruning(),
             appearance: None,
             tolerance: quality.tolerance(),
@@ -352,7 +364,10 @@ impl FieldQuery for ObjectModel {
         const CHUNK: usize = 1 << 16;
         let on_device = |a: &Supervised| a.color(&self.model_points(points_in_world), directions.as_flattened());
         match self.accelerator.as_ref().map(on_device) {
-            Some(Ok(rgb)) => return rgb_srgb.as_flattened_mut().copy_from_slice(&rgb),
+            Some(Ok(rgb)) => {
+                rgb_srgb.as_flattened_mut().copy_from_slice(&rgb);
+                return self.encode(rgb_srgb);
+            }
             Some(Err(Unserved::Abandoned)) => return rgb_srgb.fill([0.0; 3]),
             Some(Err(Unserved::Failed(_))) | None => {}
         }
@@ -373,10 +388,28 @@ impl FieldQuery for ObjectModel {
             self.field.render(&batch, &mut buf);
             out.as_flattened_mut().copy_from_slice(&buf.out.rgb);
         }
+        self.encode(rgb_srgb);
     }
 }
 
+/// Whether all photographs hold linear light.
+fn is_linear(capture: &Capture) -> bool {
+    !capture.frames.is_empty() && capture.frames.iter().all(|f| f.color_space == ColorSpace::Linear)
+}
+
+/// How the last layer becomes color: between 0 and 1, or for linear light any value above 0, at first a middle gray.
+fn color_head(is_linear: bool) -> (Activation, f32) {
+    if is_linear { (Activation::TruncatedExp, -1.6) } else { (Activation::Sigmoid, 0.0) }
+}
+
 impl ObjectModel {
+    /// The field's own colors to sRGB.
+    pub fn encode(&self, rgb: &mut [[f32; 3]]) {
+        if self.is_linear() {
+            rgb.as_flattened_mut().iter_mut().for_each(|v| *v = srgb_from_linear(*v));
+        }
+    }
+
     /// Densities per model unit `[N]` at model points `[N, 3]`.
     pub fn model_density(&self, model: &[f32], sigma: &mut [f32]) {
         match self.accelerator.as_ref().map(|a| a.density(model)) {

@@ -169,7 +169,9 @@ fn sample(model: &ObjectModel, o: &PointOptions, progress: &mut dyn FnMut(&str, 
             }
             cloud.positions.push(p_in_world);
             cloud.normals.push(n);
-            cloud.colors_srgb.push(p.rgb);
+            let mut color = [p.rgb];
+            model.encode(&mut color);
+            cloud.colors_srgb.extend(color);
         }
         progress("points", cloud.positions.len(), o.points);
     }

@@ -11,9 +11,10 @@ use crate::bench::train::{StageFigure, TrainReport};
 use crate::error::{PipelineError, Result};
 use diorama_data::checkpoint;
 use diorama_data::import::{self, ImportOptions};
+use diorama_data::photo_check;
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_engine::fields::{Batch, Field, FieldBuffers, Pruning};
-use diorama_engine::losses::{ColorLoss, Photometric};
+use diorama_engine::losses::{self, ColorLoss, Photometric};
 use diorama_engine::params::Schedule;
 use diorama_engine::samplers::pixels::{self, DrawOptions, PixelSource};
 use diorama_engine::samplers::{RayBatch, stratified};
@@ -23,7 +24,9 @@ use diorama_geom::Capture;
 use diorama_geom::capture::Split;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::composite::Packed;
+use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::march::{self, MarchRays, Marched};
+use diorama_kernels::ops::pixel_gather;
 use diorama_kernels::ops::ray_generation::{self, CORRECTION, PosedCamera};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -60,8 +63,19 @@ pub fn load_capture(config: &Config) -> Result<Capture> {
         "" => None,
         f => Some(f.parse().map_err(PipelineError::Usage)?),
     };
-    let options = ImportOptions { format, split, seed: config.seed, masks: config.data.masks()?, ..ImportOptions::default() };
-    Ok(import::import(&config.data.path, &options)?)
+    let options = ImportOptions {
+        format,
+        split,
+        seed: config.seed,
+        masks: config.data.masks()?,
+        skip_broken: config.data.skip_broken,
+        ..ImportOptions::default()
+    };
+    let mut capture = import::import(&config.data.path, &options)?;
+    if config.data.skip_broken {
+        photo_check::leave_out_broken(&mut capture)?;
+    }
+    Ok(capture)
 }
 
 /// A capture that a run has kept, with the sparse points that it has not; a note says so where they cannot be had.
@@ -303,8 +317,8 @@ impl PixelSource for Photographs {
     fn snap(&self, image: usize, x: u32, y: u32) -> (u32, u32) {
         self.0.snap(image, x, y)
     }
-    fn rgba(&self, image: usize, x: u32, y: u32) -> [u8; 4] {
-        self.0.pixel(image, x, y)
+    fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4] {
+        pixel_gather::cpu::convert(self.0.format(), self.0.pixel(image, x, y))
     }
     fn counts(&self, image: usize, x: u32, y: u32) -> bool {
         self.0.counts(image, x, y)
@@ -535,19 +549,16 @@ impl<'a> Trainer<'a> {
 
     /// Squared error of the step's colours, and what the error map learns from it.
     fn score(&mut self) -> f64 {
-        let b = &self.buffers;
+        let (b, is_linear) = (&self.buffers, self.model.is_linear());
         let (mut sum, mut n) = (0.0f64, 0usize);
         for r in 0..b.batch.len() {
             let t = &b.batch.target[r * 4..r * 4 + 4];
             if t[0].is_nan() {
                 continue;
             }
-            let e: f32 = (0..3)
-                .map(|k| {
-                    let want = t[k] * t[3] + b.background[r * 3 + k] * (1.0 - t[3]);
-                    (b.field.out.rgb[r * 3 + k] - want).powi(2) / 3.0
-                })
-                .sum();
+            let want = [0, 1, 2].map(|k| t[k] * t[3] + b.background[r * 3 + k] * (1.0 - t[3]));
+            let got = [0, 1, 2].map(|k| b.field.out.rgb[r * 3 + k]);
+            let e = losses::squared_error(got, want, is_linear);
             sum += e as f64;
             n += 1;
             if let Some(map) = &mut self.model.error_map {
@@ -604,7 +615,9 @@ fn train_field(
 ) -> f64 {
     let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
     let color = if config.loss.color == "huber" { ColorLoss::Huber(0.1) } else { ColorLoss::Mse };
-    let loss = Photometric { batch, samples, background, color, distortion: config.loss.distortion, alpha: config.loss.alpha };
+    // Linear light has a color head of its own.
+    let relative = if field.net.rgb.activation == Activation::TruncatedExp { losses::RELATIVE } else { 0.0 };
+    let loss = Photometric { batch, samples, background, color, relative, distortion: config.loss.distortion, alpha: config.loss.alpha };
     let near_scaling = config.loss.near_scaling;
     let b = Batch { samples, positions, dirs: &batch.dirs, images: Some(&batch.images), background, near_scaling };
     field.train(&b, &loss, buffers, d_positions);
@@ -625,7 +638,8 @@ impl Trainee for Trainer<'_> {
                 done => return done,
             };
             let m = &self.model;
-            let needs = memory::of_training(&m.config, &m.capture, self.device.batch_samples(&m.config)).to_string();
+            let needs =
+                memory::of_training(&m.config, &m.capture, self.photographs.0.format(), self.device.batch_samples(&m.config)).to_string();
             self.setback = Some(match device::aftermath(e, &m.config.device, self.device.halvings(), &needs) {
                 Aftermath::Fail(e) => return Err(e),
                 Aftermath::Cpu(why) => {

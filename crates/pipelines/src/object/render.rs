@@ -2,16 +2,17 @@
 
 use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
-use diorama_data::camera_path_json::{self, CameraPath};
+use diorama_data::camera_path_json::{self, CameraPath, PathCrop};
 use diorama_data::depth::{DepthFormat, DepthSequence};
 use diorama_data::film::Film;
 use diorama_data::{DataError, photo};
-use diorama_engine::renderers::volume::{Quality, View};
+use diorama_engine::renderers::volume::{Backdrop, Quality, View};
 use diorama_engine::samplers::{RayBatch, pixels};
 use diorama_geom::camera_path::{self, PathView};
 use diorama_geom::capture::focus_point;
+use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::DVec3;
-use diorama_geom::{Camera, Image, ImageU8, Pose};
+use diorama_geom::{Camera, Image, ImageU8, Lens, OrientedBox, Pose};
 use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use std::path::PathBuf;
@@ -122,14 +123,16 @@ pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> 
     let views = |poses: Vec<Pose>| poses.into_iter().map(|p| PathView { camera, world_from_camera: p }).collect();
     let (up, fps) = (DVec3::Z, o.fps.unwrap_or(FPS) as f64);
     Ok(match &o.path {
-        PathKind::Orbit => CameraPath { views: views(camera_path::orbit(&poses, center, up, n)), fps },
-        PathKind::Spiral => CameraPath { views: views(camera_path::spiral(&poses, center, up, n)), fps },
-        PathKind::Interpolate => CameraPath { views: views(camera_path::interpolate(&poses, n)), fps },
+        PathKind::Orbit => CameraPath { views: views(camera_path::orbit(&poses, center, up, n)), fps, crop: None },
+        PathKind::Spiral => CameraPath { views: views(camera_path::spiral(&poses, center, up, n)), fps, crop: None },
+        PathKind::Interpolate => CameraPath { views: views(camera_path::interpolate(&poses, n)), fps, crop: None },
         PathKind::File(f) => {
             let mut path = camera_path_json::read(f, &model.capture.world_from_capture)?;
             path.fps = o.fps.map_or(path.fps, f64::from);
             if o.size.is_some() || o.fov.is_some() {
-                path.views.iter_mut().for_each(|v| v.camera = other_size(&v.camera, o.size, o.fov));
+                for v in &mut path.views {
+                    v.camera = other_size(&v.camera, o.size, o.fov)?;
+                }
             }
             path
         }
@@ -140,7 +143,7 @@ pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> 
             }
             let views =
                 held.iter().map(|&i| PathView { camera: model.posed(i).camera, world_from_camera: frames[i].world_from_camera }).collect();
-            CameraPath { views, fps }
+            CameraPath { views, fps, crop: None }
         }
     })
 }
@@ -148,15 +151,34 @@ pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> 
 /// The capture's camera without distortion, at another size and field of view.
 fn view_camera(base: &Camera, size: Option<(u32, u32)>, fov: Option<f64>) -> Camera {
     let (w, h) = size.unwrap_or((base.width, base.height));
-    let fov = fov.unwrap_or(2.0 * (0.5 * base.width as f64 / base.fx).atan());
-    Camera::pinhole(w, h, fov)
+    // What sees a hemisphere or more gives no flat picture.
+    let own = match base.lens {
+        Lens::Equirectangular => WIDEST,
+        _ => (2.0 * (0.5 * base.width as f64 / base.fx).atan()).min(WIDEST),
+    };
+    Camera::pinhole(w, h, fov.unwrap_or(own))
 }
 
+/// Widest field of view of pictures where nobody asks for more, in radians.
+const WIDEST: f64 = 1.75;
+
 /// A path's camera at another size, where its vertical field of view stays, or with another horizontal one.
-fn other_size(c: &Camera, size: Option<(u32, u32)>, fov: Option<f64>) -> Camera {
+fn other_size(c: &Camera, size: Option<(u32, u32)>, fov: Option<f64>) -> Result<Camera> {
     let (w, h) = size.unwrap_or((c.width, c.height));
-    let same_height = 2.0 * (0.5 * w as f64 / (c.fy * h as f64 / c.height as f64)).atan();
-    Camera::pinhole(w, h, fov.unwrap_or(same_height))
+    if fov.is_some() && c.lens != Lens::Pinhole {
+        return Err(PipelineError::Usage("--fov: the path's camera_type is not perspective; set fov in its file".into()));
+    }
+    Ok(match c.lens {
+        Lens::Pinhole => {
+            let same_height = 2.0 * (0.5 * w as f64 / (c.fy * h as f64 / c.height as f64)).atan();
+            Camera::pinhole(w, h, fov.unwrap_or(same_height))
+        }
+        Lens::Equirectangular => Camera::equirectangular(w, h),
+        lens => {
+            let f = c.fy * h as f64 / c.height as f64;
+            Camera { width: w, height: h, fx: f, fy: f, cx: 0.5 * w as f64, cy: 0.5 * h as f64, lens }
+        }
+    })
 }
 
 /// Renders a path; returns the number of frames and whether it was interrupted: then the film has the frames until there,
@@ -185,12 +207,18 @@ pub fn render(
             break;
         }
         let posed = model.to_model(v.camera, &v.world_from_camera);
-        let view = trace(model, &posed, o.clip, o.quality);
+        let view = trace(model, &posed, o.clip, path.crop.as_ref(), o.quality);
         for (k, layer) in o.layers.iter().enumerate() {
             let image = draw_layer(model, &posed, &view, *layer);
             model.check_device()?;
             if let Some(folder) = &o.images {
                 photo::save_png(&folder.join(layer.file(i)), &image)?;
+                if model.is_linear() && *layer == Layer::Rgb {
+                    // Beside the picture, all of its light.
+                    let mut light = view.rgb.clone();
+                    light.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
+                    photo::save_exr(&folder.join(layer.file(i)).with_extension("exr"), &light)?;
+                }
             }
             if let (Layer::Depth, Some(distances)) = (layer, &mut distances) {
                 distances.push(&distance_map(model, &view, o.scale))?;
@@ -208,8 +236,16 @@ pub fn render(
     Ok((done, done < total))
 }
 
-fn trace(model: &ObjectModel, camera: &PosedCamera, clip: Option<([f32; 3], [f32; 3])>, quality: Quality) -> View {
+fn trace(model: &ObjectModel, camera: &PosedCamera, clip: Option<([f32; 3], [f32; 3])>, crop: Option<&PathCrop>, quality: Quality) -> View {
     let mut tracer = model.tracer(quality);
+    if let Some(c) = crop {
+        let place = model.model_from_world.pose(&c.within.place);
+        tracer.crop = Some(OrientedBox { place, sides: c.within.sides * model.model_from_world.scale });
+        if let Some(color) = c.background_srgb {
+            let own = |v: f32| if model.is_linear() { linear_from_srgb(v) } else { v };
+            tracer.backdrop = Backdrop::Color(color.map(own));
+        }
+    }
     tracer.clip = clip.map(|(lo, hi)| {
         let to = |p: [f32; 3]| model.model_from_world.point(DVec3::new(p[0] as f64, p[1] as f64, p[2] as f64)).as_vec3().to_array();
         (to(lo), to(hi))
@@ -219,7 +255,7 @@ fn trace(model: &ObjectModel, camera: &PosedCamera, clip: Option<([f32; 3], [f32
 
 /// Distance along the ray of a view's first pixel (in the model's space) at which it meets matter; none where it meets hardly any.
 pub fn depth_of_pixel(model: &ObjectModel, camera: &PosedCamera, clip: Option<([f32; 3], [f32; 3])>) -> Option<f32> {
-    let view = trace(model, camera, clip, Quality::Full);
+    let view = trace(model, camera, clip, None, Quality::Full);
     (view.opacity.data[0] > 0.3).then_some(view.depth.data[0])
 }
 
@@ -231,7 +267,7 @@ pub fn picture(model: &ObjectModel, camera: &PosedCamera, layer: Layer, clip: Op
         let none = View { rgb: Image::zeros(w, h, 3), opacity: Image::zeros(w, h, 1), depth: Image::zeros(w, h, 1) };
         return draw_layer(model, camera, &none, layer);
     }
-    draw_layer(model, camera, &trace(model, camera, clip, quality), layer)
+    draw_layer(model, camera, &trace(model, camera, clip, None, quality), layer)
 }
 
 /// Steps of each pixel's ray that lie in occupied cells, as a share of the most that any ray has.

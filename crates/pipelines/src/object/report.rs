@@ -77,6 +77,7 @@ mod tests {
             lpips: None,
             training: Some(TrainingScores { views: 2, psnr: 30.0, ssim: 0.9 }),
             device: "cpu".into(),
+            scored_in: "sRGB",
             per_view: vec![view("clear", 29.0, false), view("foggy", 20.0, true)],
         };
         let mesh = Exported {

@@ -141,6 +141,11 @@ fn trace(
             }
             r += 1;
         }
-        rgb[texel as usize] = if total > 0.0 { sum.map(|v| v / total) } else { [-1.0; 3] };
+        rgb[texel as usize] = [-1.0; 3];
+        if total > 0.0 {
+            let mut mean = [sum.map(|v| v / total)];
+            model.encode(&mut mean);
+            [rgb[texel as usize]] = mean;
+        }
     }
 }

@@ -33,8 +33,7 @@ impl PointsView {
     /// # Errors
     /// When the points cannot be read.
     pub fn of_capture(data: &Path, capture: &Capture) -> Result<PointsView> {
-        let mut splats = points(data)?.unwrap_or_default();
-        splats.transform(&capture.world_from_capture);
+        let splats = points(data, &capture.world_from_capture)?.unwrap_or_default();
         let photos = capture.frames.iter().map(|f| f.image.clone()).collect();
         let s = capture.scene;
         let corner = |sign: f64| (s.center + DVec3::splat(sign * s.half * s.aabb_scale as f64)).to_array();
@@ -110,8 +109,8 @@ impl PointsView {
     }
 }
 
-/// Points of a data set in its own frame, where it has any.
-fn points(data: &Path) -> Result<Option<Splats>> {
+/// Points of a data set in the world, where it has any. Those that `transforms.json` names stand in the frame of its poses.
+fn points(data: &Path, world_from_capture: &Similarity) -> Result<Option<Splats>> {
     let file = data.join("transforms.json");
     if file.exists() {
         let map = json::read(&file)?;
@@ -125,7 +124,9 @@ fn points(data: &Path) -> Result<Option<Splats>> {
         Some(model) => {
             let found = colmap::points(&model)?;
             let point = |p: &colmap::Point| (p.position.as_vec3().to_array(), p.rgb.map(|v| v as f32 / 255.0));
-            Ok(Some(Splats::of_points(found.iter().map(point))))
+            let mut splats = Splats::of_points(found.iter().map(point));
+            splats.transform(world_from_capture);
+            Ok(Some(splats))
         }
         None => Ok(None),
     }

@@ -3,13 +3,15 @@
 pub mod error_map;
 
 use self::error_map::GpuErrorMap;
+use super::words_per_pixel;
 use crate::gpu::random::{Wide, below, bits, halves, key, product, sum, uniform, widened};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use cubecl::prelude::*;
+use diorama_geom::PixelFormat;
 use diorama_geom::rng::Rng;
 
-/// `[R, 4]` for the pixels `at` `[R]` of packed RGBA `[P]`, red in the lowest byte.
-pub fn gather(gpu: &Gpu, pixels: &Buffer, at: &Buffer) -> Buffer {
+/// `[R, 4]` for the pixels `at` `[R]` of packed RGBA.
+pub fn gather(gpu: &Gpu, format: PixelFormat, pixels: &Buffer, at: &Buffer) -> Buffer {
     let out = gpu.empty(at.len() * 4);
     if !at.is_empty() {
         // SAFETY: units past the length stop; `at` indexes the pixels.
@@ -22,8 +24,39 @@ pub fn gather(gpu: &Gpu, pixels: &Buffer, at: &Buffer) -> Buffer {
                 at.arg(),
                 out.arg(),
                 at.len() as u32,
+                code(format),
             );
         }
+    }
+    out
+}
+
+/// A format as kernels know it.
+fn code(format: PixelFormat) -> u32 {
+    match format {
+        PixelFormat::Unorm8 => 0,
+        PixelFormat::Unorm16 => 1,
+        PixelFormat::Half => 2,
+    }
+}
+
+/// Channel `k` of a pixel.
+#[cube]
+fn channel(pixels: &[u32], at: usize, #[comptime] k: usize, #[comptime] format: u32) -> f32 {
+    if comptime!(format == 0) {
+        f32::cast_from((pixels[at] >> comptime!(8 * k as u32)) & 255) / 255.0
+    } else {
+        let bits = (pixels[at * 2 + comptime!(k / 2)] >> comptime!(16 * (k % 2) as u32)) & 0xffff;
+        if comptime!(format == 1) { f32::cast_from(bits) / 65535.0 } else { half(bits) }
+    }
+}
+
+/// A finite half float: the bits of a float whose exponent is 112 too low. Devices may take the smallest ones for 0.
+#[cube]
+fn half(bits: u32) -> f32 {
+    let mut out = f32::reinterpret((bits & 0x7fff) << 13) * comptime!(2.0f32.powi(112));
+    if bits >= 0x8000 {
+        out = -out;
     }
     out
 }
@@ -47,6 +80,7 @@ pub struct GpuPhotographs {
     /// [`PHOTOGRAPH`] numbers of each: width, height, first pixel, and the key by which pixels were kept.
     sizes: Buffer,
     pixels: Buffer,
+    format: PixelFormat,
     /// One bit per pixel that may be trained on; none: all may.
     mask: Option<Buffer>,
 }
@@ -76,13 +110,20 @@ pub enum Backdrop {
 }
 
 impl GpuPhotographs {
-    /// Packed RGBA of all photographs, red in the lowest byte, of the given widths and heights. Of each `stride ×
+    /// Packed RGBA of all photographs, of the given widths and heights. Of each `stride ×
     /// stride` pixels one is there, which the photograph's random numbers name (the x of the square by the lower half
     /// of number `y << 32 | x` of its corner, the y by the upper).
     ///
     /// # Panics
     /// When the sizes do not add up to the pixels.
-    pub fn upload(gpu: &Gpu, sizes: &[(u32, u32)], stride: u32, keys: &[Rng], pixels: &[u32], mask: Option<&[u32]>) -> Self {
+    pub fn upload(
+        gpu: &Gpu,
+        sizes: &[(u32, u32)],
+        stride: u32,
+        keys: &[Rng],
+        (format, pixels): (PixelFormat, &[u32]),
+        mask: Option<&[u32]>,
+    ) -> Self {
         let mut first = 0;
         let mut rows = Vec::with_capacity(sizes.len() * PHOTOGRAPH);
         for ((w, h), rng) in sizes.iter().zip(keys) {
@@ -90,9 +131,9 @@ impl GpuPhotographs {
             rows.extend([*w, *h, first, high, low]);
             first += w.div_ceil(stride) * h.div_ceil(stride);
         }
-        assert_eq!(first as usize, pixels.len(), "photographs: pixels");
+        assert_eq!(first as usize * words_per_pixel(format), pixels.len(), "photographs: pixels");
         let mask = mask.map(|m| gpu.upload_u32(m));
-        GpuPhotographs { count: sizes.len(), stride, sizes: gpu.upload_u32(&rows), pixels: gpu.upload_u32(pixels), mask }
+        GpuPhotographs { count: sizes.len(), stride, sizes: gpu.upload_u32(&rows), pixels: gpu.upload_u32(pixels), format, mask }
     }
 
     /// `n` random training pixels, half of them where `errors` are high; `first` counts those drawn before.
@@ -140,6 +181,7 @@ impl GpuPhotographs {
                     self.stride,
                     self.mask.is_some(),
                     errors.is_some(),
+                    code(self.format),
                 );
                 back::launch_unchecked(
                     &gpu.client,
@@ -183,6 +225,7 @@ fn choose(
     stride: u32,
     #[comptime] is_masked: bool,
     #[comptime] by_error: bool,
+    #[comptime] format: u32,
 ) {
     let r = ABSOLUTE_POS;
     if r >= n as usize {
@@ -249,11 +292,10 @@ fn choose(
     centres[r * 2] = f32::cast_from(x) + 0.5;
     centres[r * 2 + 1] = f32::cast_from(y) + 0.5;
     left_out[r] = refused;
-    let pixel = pixels[at as usize];
-    #[unroll]
-    for k in 0..4u32 {
-        target[r * 4 + k as usize] = f32::cast_from((pixel >> (k * 8)) & 255) / 255.0;
-    }
+    target[r * 4] = channel(pixels, at as usize, 0usize, format);
+    target[r * 4 + 1] = channel(pixels, at as usize, 1usize, format);
+    target[r * 4 + 2] = channel(pixels, at as usize, 2usize, format);
+    target[r * 4 + 3] = channel(pixels, at as usize, 3usize, format);
 }
 
 #[cube(launch_unchecked)]
@@ -289,14 +331,13 @@ fn back(
 }
 
 #[cube(launch_unchecked)]
-fn unpack(pixels: &[u32], at: &[u32], out: &mut [f32], n: u32) {
+fn unpack(pixels: &[u32], at: &[u32], out: &mut [f32], n: u32, #[comptime] format: u32) {
     let i = ABSOLUTE_POS;
     if i >= n as usize {
         terminate!();
     }
-    let pixel = pixels[at[i] as usize];
-    #[unroll]
-    for k in 0..4u32 {
-        out[i * 4 + k as usize] = f32::cast_from((pixel >> (k * 8)) & 255) / 255.0;
-    }
+    out[i * 4] = channel(pixels, at[i] as usize, 0usize, format);
+    out[i * 4 + 1] = channel(pixels, at[i] as usize, 1usize, format);
+    out[i * 4 + 2] = channel(pixels, at[i] as usize, 2usize, format);
+    out[i * 4 + 3] = channel(pixels, at[i] as usize, 3usize, format);
 }

@@ -1,4 +1,6 @@
-//! Colours of chosen pixels: bytes of packed RGBA frames to floats in [0, 1], alpha straight.
+//! Colors of chosen pixels: packed RGBA frames to floats, alpha straight.
+//!
+//! A pixel is one word of 8-bit values, or two words of 16-bit values or half floats; red is lowest.
 
 pub mod cpu;
 #[cfg(feature = "gpu")]
@@ -6,3 +8,10 @@ pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;
+
+use diorama_geom::PixelFormat;
+
+/// Words of 32 bits that a pixel takes.
+pub fn words_per_pixel(format: PixelFormat) -> usize {
+    format.bytes() / 4
+}

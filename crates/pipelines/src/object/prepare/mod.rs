@@ -75,6 +75,8 @@ pub struct PrepareOptions {
     /// Go on from what an earlier call left.
     pub resume: bool,
     pub force: bool,
+    /// Leave out photographs that cannot be decoded.
+    pub skip_broken: bool,
 }
 
 /// What was made.
@@ -85,6 +87,8 @@ pub struct Prepared {
     pub registered: usize,
     /// Photographs without a pose.
     pub lost: Vec<String>,
+    /// Photographs that could not be decoded and were left out.
+    pub broken: Vec<String>,
     pub points: usize,
     /// Mean angle between the cameras' own up directions and the world's, in degrees.
     pub tilt: f64,
@@ -104,6 +108,10 @@ const POSED: &str = "posed";
 const MASKS: &str = "masks";
 const POINTS: &str = "points.ply";
 const IMAGES_DONE: &str = "images.done";
+/// Within [`WORK`]: photographs of linear light as COLMAP can read them, PNGs of 8 bits under the same names.
+const SEEN: &str = "seen";
+/// Within [`WORK`]: names of the broken photographs that were left out, a line each.
+const BROKEN: &str = "images.broken";
 
 /// Photographs with poses, before they are finished.
 struct Posed {
@@ -117,6 +125,7 @@ struct Posed {
     points: Vec<(DVec3, [u8; 3])>,
     images: usize,
     lost: Vec<String>,
+    broken: Vec<String>,
     tilt: f64,
     floor: bool,
     /// Whether frames carry the capture's own division.
@@ -190,6 +199,7 @@ fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut d
         points: placed.points,
         images: names.len(),
         lost,
+        broken: std::fs::read_to_string(work.join(BROKEN)).unwrap_or_default().lines().map(String::from).collect(),
         tilt: placed.tilt,
         floor: placed.floor,
         is_divided: false,
@@ -235,6 +245,7 @@ fn complete(mut p: Posed, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut
         images: p.images,
         registered,
         lost: p.lost,
+        broken: p.broken,
         points: p.points.len(),
         tilt: p.tilt,
         floor: p.floor,
@@ -325,6 +336,7 @@ fn common_focal_ratio(all: &[PathBuf]) -> Option<f64> {
 fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<bool> {
     let folder = o.out.join(IMAGES);
     let mut focal_ratio = None;
+    let mut broken = Vec::new();
     if o.input.is_dir() {
         let all = photo_import::list(&o.input).map_err(|e| match import::detect(&o.input) {
             Ok(_) => DataError::input(&o.input, "has poses already: train on it as it is, or finish its photographs with --sfm none"),
@@ -337,7 +349,14 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
             if interrupt.load(Ordering::Relaxed) {
                 return Ok(false);
             }
-            photo_import::import(source, &folder, stem, o.max_side)?;
+            match photo_import::import(source, &folder, stem, o.max_side) {
+                Ok(taken) => see(&taken, work)?,
+                Err(e) if o.skip_broken && e.is_input() => {
+                    note(&format!("left out: {e}"));
+                    broken.push(source.file_name().unwrap_or_default().to_string_lossy().into_owned());
+                }
+                Err(e) => return Err(e.into()),
+            }
             note(&format!("photographs: {} of {}", i + 1, all.len()));
         }
     } else {
@@ -356,6 +375,7 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
             }
         }
     }
+    atomic::write(&work.join(BROKEN), broken.join("\n").as_bytes())?;
     let kept = focal_ratio.map(|f| f.to_string()).unwrap_or_default();
     atomic::write(&work.join(IMAGES_DONE), kept.as_bytes())?;
     Ok(true)
@@ -371,6 +391,16 @@ fn stems(files: &[PathBuf]) -> Vec<String> {
         stem
     };
     files.iter().enumerate().map(stem).collect()
+}
+
+/// Makes a picture that COLMAP can read of a photograph of linear light.
+fn see(taken: &Path, work: &Path) -> Result<()> {
+    if photo::header(taken)?.depth == photo::Depth::Linear {
+        let folder = work.join(SEEN);
+        std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
+        photo::save_png(&folder.join(taken.file_name().unwrap_or_default()), &photo::load(taken)?)?;
+    }
+    Ok(())
 }
 
 fn enough(o: &PrepareOptions, names: &[String], lost: &[String]) -> Result<()> {

@@ -5,7 +5,7 @@ use crate::error::{PipelineError, Result};
 use diorama_data::colmap::Observed;
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::split::{self, SplitRule};
-use diorama_data::{DataError, atomic, photo, photo_import};
+use diorama_data::{DataError, atomic, photo, photo_check, photo_import};
 use diorama_geom::capture::{Frame, focus_point};
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Capture, ImageU8, Lens, Pose, Similarity};
@@ -21,8 +21,11 @@ const UNTOLD: usize = 3;
 /// # Errors
 /// When it cannot be read, has a lens that `transforms.json` has no words for, or lacks what is asked of it.
 pub fn read(o: &PrepareOptions) -> Result<Capture> {
-    let options = ImportOptions { format: o.format, seed: o.seed, masks: o.masks, ..ImportOptions::default() };
-    let capture = import::import(&o.input, &options)?;
+    let options = ImportOptions { format: o.format, seed: o.seed, masks: o.masks, skip_broken: o.skip_broken, ..ImportOptions::default() };
+    let mut capture = import::import(&o.input, &options)?;
+    if o.skip_broken {
+        photo_check::leave_out_broken(&mut capture)?;
+    }
     let has_words = |l: &Lens| match l {
         Lens::Pinhole | Lens::Equirectangular => true,
         Lens::Brown { k, .. } => k[3..] == [0.0; 3],
@@ -92,6 +95,7 @@ pub fn take(capture: Capture, o: &PrepareOptions, interrupt: &AtomicBool, note: 
         points: capture.points.iter().map(|p| (p.position, p.color)).collect(),
         frames,
         lost: Vec::new(),
+        broken: capture.broken,
         tilt,
         floor: false,
         is_divided,

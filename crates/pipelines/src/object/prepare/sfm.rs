@@ -1,6 +1,6 @@
 //! COLMAP, driven step by step; each finished step is marked, so that an interrupted run goes on.
 
-use super::{IMAGES, PrepareOptions, WORK};
+use super::{IMAGES, PrepareOptions, SEEN, WORK};
 use crate::error::{PipelineError, Result};
 use diorama_data::process::{self, Ended};
 use diorama_data::{DataError, atomic, colmap};
@@ -34,6 +34,12 @@ impl std::str::FromStr for Matcher {
 const EXHAUSTIVE: usize = 400;
 /// A model with less than this share of the photographs is tried again with all pairs.
 const FEW: f64 = 0.9;
+/// The photographs as COLMAP reads them.
+fn seen_images(o: &PrepareOptions) -> std::path::PathBuf {
+    let own = o.out.join(WORK).join(SEEN);
+    if own.is_dir() { own } else { o.out.join(IMAGES) }
+}
+
 /// COLMAP's names of lenses that are understood here.
 pub const LENSES: [&str; 6] = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"];
 
@@ -72,7 +78,7 @@ pub fn reconstruct(
     if !LENSES.contains(&&*o.lens) {
         return Err(PipelineError::Usage(format!("--lens {}: expected one of {}", o.lens, LENSES.join(", "))));
     }
-    let sfm = Sfm { program, images: o.out.join(IMAGES), work: o.out.join(WORK), threads: o.threads, interrupt };
+    let sfm = Sfm { program, images: seen_images(o), work: o.out.join(WORK), threads: o.threads, interrupt };
     let (names, is_video) = (photos.names, photos.is_video);
     if !sfm.features(o, photos, note)? {
         return Ok(None);

@@ -16,6 +16,8 @@ const PARTS: usize = 256;
 pub struct Terms {
     /// Width of the Huber loss's quadratic part; 0: squared error.
     pub huber: f32,
+    /// For linear light: what is added to a prediction that its difference is divided by; 0: differences count as they are.
+    pub relative: f32,
     /// Weight of the distortion loss.
     pub distortion: f32,
     /// Weight of the squared difference between opacity and the photograph's alpha.
@@ -86,6 +88,7 @@ pub fn composite_and_loss(
             r as u32,
             1.0 / r as f32,
             terms.huber,
+            terms.relative,
             terms.alpha,
             terms.distortion,
             near_scaling,
@@ -121,6 +124,7 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
             r as u32,
             1.0 / r as f32,
             terms.huber,
+            terms.relative,
             terms.alpha,
             terms.distortion,
         );
@@ -181,8 +185,26 @@ struct Error {
     squared: f32,
 }
 
+/// A linear value as it is shown: within white, along the sRGB curve.
 #[cube]
-fn color_error(d: f32, huber: f32) -> Error {
+fn shown(linear: f32) -> f32 {
+    let v = min(max(linear, 0.0), 1.0);
+    let mut out = v * 12.92;
+    if v > 0.0031308 {
+        out = 1.055 * v.powf(1.0 / 2.4) - 0.055;
+    }
+    out
+}
+
+#[cube]
+fn color_error(got: f32, wanted: f32, huber: f32, relative: f32) -> Error {
+    let mut by = 1.0f32;
+    let mut off = got - wanted;
+    if relative > 0.0 {
+        by = 1.0 / (max(got, 0.0) + relative);
+        off = shown(got) - shown(wanted);
+    }
+    let d = by * (got - wanted);
     let mut value = d * d;
     let mut slope = 2.0 * d;
     if huber > 0.0 {
@@ -197,7 +219,7 @@ fn color_error(d: f32, huber: f32) -> Error {
             }
         }
     }
-    Error { value, slope, squared: d * d }
+    Error { value, slope: by * slope, squared: off * off }
 }
 
 #[cube(launch_unchecked)]
@@ -218,6 +240,7 @@ fn blend_and_compare(
     rays: u32,
     scale: f32,
     huber: f32,
+    relative: f32,
     alpha: f32,
     distortion: f32,
     near: f32,
@@ -265,7 +288,7 @@ fn blend_and_compare(
     #[unroll]
     for k in 0..3usize {
         let behind = background[r * 3 + k];
-        let e = color_error(color[k] + light * behind - (rgba[r * 4 + k] * a + behind * (1.0 - a)), huber);
+        let e = color_error(color[k] + light * behind, rgba[r * 4 + k] * a + behind * (1.0 - a), huber, relative);
         value += e.value / 3.0;
         error += e.squared / 3.0;
         let d = counts * e.slope / 3.0;
@@ -327,6 +350,7 @@ fn compare(
     rays: u32,
     scale: f32,
     huber: f32,
+    relative: f32,
     alpha: f32,
     distortion: f32,
 ) {
@@ -343,8 +367,8 @@ fn compare(
     let mut error = 0.0f32;
     #[unroll]
     for k in 0..3usize {
-        let d = color[r * 3 + k] - (rgba[r * 4 + k] * a + background[r * 3 + k] * (1.0 - a));
-        let e = color_error(d, huber);
+        let wanted = rgba[r * 4 + k] * a + background[r * 3 + k] * (1.0 - a);
+        let e = color_error(color[r * 3 + k], wanted, huber, relative);
         error += e.squared;
         value += e.value / 3.0;
         d_color[r * 3 + k] = counts * e.slope * scale / 3.0;

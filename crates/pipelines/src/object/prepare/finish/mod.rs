@@ -148,6 +148,9 @@ pub fn finish(
         let masks = folder.join(MASKS);
         std::fs::create_dir_all(&masks).map_err(DataError::io(&masks, "create"))?;
     }
+    if frames.iter().any(|f| photo::header(&f.image).is_ok_and(|h| h.depth > photo::Depth::Eight)) {
+        note("photographs of more than 8 bits are finished in 8 bits");
+    }
     let name = |f: &Frame| f.image.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let gains = o.normalize_exposure.then(|| {
         note("comparing exposures");
@@ -189,7 +192,7 @@ pub fn finish(
             }
             image = crop_to(crop, image, &mut f)?;
         }
-        let written = photo_import::write(&image, &folder, &stem)?;
+        let written = photo_import::write_like(&f.image, &image, &folder, &stem)?;
         f.image = root.join(FINISHED).join(written.file_name().unwrap_or_default());
         Ok((f, sigma, share))
     };
