@@ -3,7 +3,7 @@
 use super::config::{Background, Config, Method};
 use super::device::{self, Drawing, Opened};
 use super::evaluate;
-use super::model::ObjectModel;
+use super::model::{ObjectModel, is_linear};
 use super::run_folder::RunFolder;
 use super::viewing::RunView;
 use crate::bench::train::{StageFigure, TrainReport};
@@ -102,6 +102,11 @@ pub fn train(
     }
     for note in &capture.notes {
         events(&Event::Note(note.clone()));
+    }
+    let config = &with_white(config, &capture)?;
+    if config.data.white > 0.0 {
+        let white = config.data.white;
+        events(&Event::Note(format!("the photographs hold linear light: {white} is shown as white (--set data.white={white})")));
     }
     let (store, budget) = load_pixels(config, &capture, &opened)?;
     if let n @ 2.. = store.stride() {
@@ -209,6 +214,7 @@ const WRONG: f32 = 0.01;
 /// A trainer whose run is not kept.
 fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'static>> {
     let capture = load_capture(config)?;
+    let config = &with_white(config, &capture)?;
     let device = device::open(config)?;
     let (store, _) = load_pixels(config, &capture, &device)?;
     let has_alpha = store.has_alpha;
@@ -223,12 +229,24 @@ fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'stat
     Trainer::new(model, Photographs(store), Path::new(""), device)
 }
 
+/// The configuration with [`super::config::DataConfig::white`] as the training photographs have it.
+fn with_white(config: &Config, capture: &Capture) -> Result<Config> {
+    let mut config = config.clone();
+    if !is_linear(capture) {
+        config.data.white = 0.0;
+    } else if config.data.white == 0.0 {
+        let train: Vec<_> = capture.frames.iter().filter(|f| f.split == Split::Train).collect();
+        config.data.white = photo_check::white(&train)?;
+    }
+    Ok(config)
+}
+
 /// The training pixels, and the bytes that they might take.
 fn load_pixels(config: &Config, capture: &Capture, device: &Opened) -> Result<(PixelStore, u64)> {
     let train = capture.indices(Split::Train);
     let frames: Vec<_> = train.iter().map(|&i| &capture.frames[i]).collect();
     let budget = config.data.memory_budget.min(device.most_bytes());
-    let options = StoreOptions { downscale: config.data.downscale, budget };
+    let options = StoreOptions { downscale: config.data.downscale, budget, white: config.data.white };
     Ok((PixelStore::load(&frames, &options, &|| {})?, budget))
 }
 

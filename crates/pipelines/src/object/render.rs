@@ -321,7 +321,7 @@ fn save_layer(folder: &Path, i: usize, layer: Layer, image: &ImageU8, view: &Vie
             if model.is_linear() {
                 // Beside the picture, all of its light.
                 let mut light = view.rgb.clone();
-                light.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
+                light.data.iter_mut().for_each(|v| *v = model.config.data.white * linear_from_srgb(*v));
                 photo::save_exr(&folder.join(format!("{i:04}.exr")), &light)?;
             }
             format!("{i:04}.png")
