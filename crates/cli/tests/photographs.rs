@@ -117,11 +117,11 @@ fn resized_photographs_train_and_are_scored() {
     }
 }
 
-/// Light of a photograph of the still life as if a lamp of 8 times white stood before it.
+/// Light of a photograph of the still life, a thousand times as much as a screen shows.
 fn lit(im: &ImageU8) -> Image {
-    let light = |p: &[u8]| [0, 1, 2].map(|k| 8.0 * linear_from_srgb(p[k] as f32 / 255.0).powi(2));
-    let im = opaque(im);
-    Image { width: im.width, height: im.height, channels: 3, data: im.data.chunks_exact(3).flat_map(light).collect() }
+    let light = |p: &[u8]| [0, 1, 2].map(|k| 1000.0 * linear_from_srgb(p[k] as f32 / 255.0).powi(2) + 2.0);
+    let data = im.data.chunks_exact(4).flat_map(|p| [&light(p)[..], &[p[3] as f32 / 255.0]].concat()).collect();
+    Image { width: im.width, height: im.height, channels: 4, data }
 }
 
 #[test]
@@ -130,7 +130,7 @@ fn linear_light_is_learned_beyond_white_and_rendered_with_it() {
     let (data, run, out) = (dir.path().join("data"), dir.path().join("run"), dir.path().join("out"));
     write_capture(&data, 24, 48).unwrap();
     convert(&data, "exr", |im, to| photo::save_exr(to, &lit(im)).unwrap());
-    let (code, said, _) = train(&data, &run, &["--steps", "600"]);
+    let (code, said, _) = train(&data, &run, &["--steps", "1000"]);
     assert_eq!(code, Some(0), "{said}");
     let report = eval(&run);
     assert!(report["scored_in"].as_str().unwrap().contains("linear light"), "{report}");
@@ -139,15 +139,19 @@ fn linear_light_is_learned_beyond_white_and_rendered_with_it() {
     assert_eq!(code, Some(0), "{said}");
     let Photo::Linear(got) = photo::load_full(&out.join("0000.exr")).unwrap() else { panic!("linear light") };
     let Photo::Linear(want) = photo::load_full(&photographs(&data)[0]).unwrap() else { panic!("linear light") };
-    // Where the photograph is brighter than white the render is as bright.
-    let bright: Vec<usize> = (0..want.data.len()).filter(|i| want.data[*i] > 3.0).collect();
-    assert!(bright.len() > 100, "{}", bright.len());
-    let mean = |im: &Image| bright.iter().map(|i| im.data[*i] as f64).sum::<f64>() / bright.len() as f64;
-    assert!((mean(&got) / mean(&want) - 1.0).abs() < 0.2, "{} for {}", mean(&got), mean(&want));
+    let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
+    let white: f32 = config.lines().find_map(|l| l.strip_prefix("white = ")).unwrap().parse().unwrap();
+    assert!((50.0..1003.0).contains(&white), "{white}");
+    // Where the photograph is bright, far beyond 1, the render is as bright.
+    let both = want.data.chunks_exact(4).zip(got.data.chunks_exact(3)).filter(|(p, _)| p[3] == 1.0);
+    let bright: Vec<(f32, f32)> = both.flat_map(|(p, q)| [0, 1, 2].map(|k| (p[k], q[k]))).filter(|(want, _)| *want > 0.2 * white).collect();
+    assert!(bright.len() > 50, "{}", bright.len());
+    let ratio = bright.iter().map(|v| v.1).sum::<f32>() / bright.iter().map(|v| v.0).sum::<f32>();
+    assert!((ratio - 1.0).abs() < 0.2, "{ratio}");
     // The PNG is the same light along the sRGB curve, up to white.
     let png = photo::load(&out.join("0000.png")).unwrap();
     for (p, v) in png.data.iter().zip(&got.data) {
-        assert!((*p as f32 - 255.0 * srgb_from_linear(v.clamp(0.0, 1.0))).abs() <= 0.51, "{p} {v}");
+        assert!((*p as f32 - 255.0 * srgb_from_linear((v / white).clamp(0.0, 1.0))).abs() <= 0.51, "{p} {v}");
     }
 }
 
@@ -159,7 +163,7 @@ fn a_nan_is_told_with_file_and_pixel_before_anything_is_written() {
     convert(&data, "exr", |im, to| {
         let mut light = lit(im);
         if to.file_stem().unwrap().to_str().unwrap().ends_with('5') {
-            light.data[(7 * 32 + 9) * 3] = f32::NAN;
+            light.data[(7 * 32 + 9) * 4] = f32::NAN;
         }
         photo::save_exr(to, &light).unwrap();
     });

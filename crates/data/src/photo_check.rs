@@ -1,7 +1,7 @@
 //! Photographs against the cameras that were found for them: sizes, color spaces, depth maps, and whether the files are whole.
 
 use crate::error::{DataError, Result};
-use crate::photo::{self, Depth, Header};
+use crate::photo::{self, Depth, Header, Photo};
 use crate::{llff, photo_import, sparse};
 use diorama_geom::Capture;
 use diorama_geom::capture::{ColorSpace, Frame};
@@ -99,6 +99,35 @@ pub fn left_out(broken: &[DataError]) -> Option<String> {
     let names = names(broken);
     let some = if names.len() == 1 { "broken photograph is" } else { "broken photographs are" };
     (!names.is_empty()).then(|| format!("{} {some} left out: {}", names.len(), names.join(", ")))
+}
+
+/// Photographs that [`white`] looks at.
+const LOOKED_AT: usize = 12;
+/// Share of the values that are darker than white.
+const DARKER: f32 = 0.97;
+
+/// The linear light of some photographs that is fit to be shown as white: nearly all of them is darker.
+///
+/// # Errors
+/// When one cannot be decoded, or all are black.
+pub fn white(frames: &[&Frame]) -> Result<f32> {
+    let n = frames.len().min(LOOKED_AT);
+    let looks = (0..n).into_par_iter().map(|i| {
+        let photo = photo::load_full(&frames[i * frames.len() / n].image)?;
+        let (w, h) = photo.size();
+        let by = (200.0 / w.max(h) as f64).min(1.0);
+        let small = photo.downsampled(((w as f64 * by) as usize).max(1), ((h as f64 * by) as usize).max(1));
+        let Photo::Linear(im) = small else { return Ok(Vec::new()) };
+        let seen = im.data.chunks_exact(im.channels).filter(|p| p.get(3).is_none_or(|a| *a > 0.5));
+        Ok(seen.map(|p| p[0].max(p[1]).max(p[2])).collect::<Vec<f32>>())
+    });
+    let mut values = looks.collect::<Result<Vec<_>>>()?.concat();
+    values.sort_by(f32::total_cmp);
+    let found = values.get(((values.len() as f32 * DARKER) as usize).min(values.len().saturating_sub(1))).copied().unwrap_or(0.0);
+    match (found > 0.0, frames.first()) {
+        (false, Some(f)) => Err(DataError::input(&f.image, "is black, like the other photographs; give some that show something")),
+        _ => Ok(found),
+    }
 }
 
 /// Gives cameras their photographs' sizes.

@@ -18,6 +18,9 @@ pub const DEFAULT_BUDGET: u64 = 4 << 30;
 /// Stream of the random numbers by which pixels are kept.
 const KEPT: u64 = 15;
 
+/// The largest half float.
+const LARGEST: f32 = 65504.0;
+
 /// Pixels of some frames, four values each: RGB and alpha (opaque where the photograph has none). Colors are sRGB, but for
 /// [`PixelFormat::Half`], which holds linear light.
 pub struct PixelStore {
@@ -44,6 +47,8 @@ pub struct StoreOptions {
     pub reduction: Reduction,
     pub budget: u64,
     pub masks: MaskRule,
+    /// Linear light that is stored as 1.
+    pub white: f32,
 }
 
 impl PixelStore {
@@ -78,7 +83,7 @@ impl PixelStore {
                     progress();
                     let mask = mask.map(|m| out.keep(i, |x, y| m.pixel(x, y)[0]));
                     let has_alpha = photo.channels() == 4;
-                    Ok(Kept { values: out.values_of(i, photo), mask, has_alpha })
+                    Ok(Kept { values: out.values_of(i, photo, options.white), mask, has_alpha })
                 })
                 .collect();
             for (i, kept) in (first..last).zip(decoded) {
@@ -97,10 +102,13 @@ impl PixelStore {
     }
 
     /// The kept pixels of a photograph in the store's format.
-    fn values_of(&self, i: usize, photo: Photo) -> Values {
+    fn values_of(&self, i: usize, photo: Photo, white: f32) -> Values {
         match (self.format, photo) {
             (PixelFormat::Half, Photo::Linear(im)) => {
-                Values::Words(self.keep(i, |x, y| four(im.pixel(x, y), 1.0).map(|v| f16::from_f32(v).to_bits())).into_flattened())
+                let stored = |[r, g, b, a]: [f32; 4]| {
+                    [r / white, g / white, b / white, a].map(|v| f16::from_f32(v.clamp(-LARGEST, LARGEST)).to_bits())
+                };
+                Values::Words(self.keep(i, |x, y| stored(four(im.pixel(x, y), 1.0))).into_flattened())
             }
             (PixelFormat::Unorm8, photo) => {
                 let im = photo.into_8_bits();
@@ -279,8 +287,12 @@ mod tests {
         photo::save_png(&mask, &half).unwrap();
         f.mask = Some(mask);
         let load = |budget| {
-            PixelStore::load(&[&f, &f], &StoreOptions { reduction: Reduction::Times(1), budget, masks: MaskRule::default() }, &|| {})
-                .unwrap()
+            PixelStore::load(
+                &[&f, &f],
+                &StoreOptions { reduction: Reduction::Times(1), budget, masks: MaskRule::default(), white: 1.0 },
+                &|| {},
+            )
+            .unwrap()
         };
         assert_eq!(load(u64::MAX).stride(), 1);
         let budget = 2 * 101 * 67 * 4 / 10;
@@ -309,7 +321,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let mut f = frame(dir.path(), "a.png", 8, 6, 0);
         f.camera.width = 9;
-        let options = StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks: MaskRule::default() };
+        let options = StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks: MaskRule::default(), white: 1.0 };
         let e = PixelStore::load(&[&f], &options, &|| {}).err().unwrap();
         assert!(e.is_input() && e.to_string().contains("8×6"), "{e}");
         f.camera.width = 8;
@@ -326,7 +338,7 @@ mod tests {
     #[test]
     fn sixteen_bits_and_light_brighter_than_white_stay() {
         let dir = tempfile::tempdir().unwrap();
-        let options = StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks: MaskRule::default() };
+        let options = StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks: MaskRule::default(), white: 1.0 };
         let value = |i: usize| (i * 40_503 % 65_536) as f32;
         let im = Image { width: 5, height: 4, channels: 3, data: (0..60).map(|i| value(i) / 65535.0).collect() };
         let mut f = frame(dir.path(), "a.png", 5, 4, 0);
@@ -366,7 +378,8 @@ mod tests {
         photo::save_png(&mask, &ImageU8 { width: 4, height: 1, channels: 1, data: vec![0, 255, 0, 255] }).unwrap();
         f.mask = Some(mask);
         let masks = MaskRule { meaning: diorama_geom::capture::MaskMeaning::Object, inverted: false };
-        let s = PixelStore::load(&[&f], &StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks }, &|| {}).unwrap();
+        let s =
+            PixelStore::load(&[&f], &StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks, white: 1.0 }, &|| {}).unwrap();
         assert!(s.has_alpha && (0..4).all(|x| s.counts(0, x, 0)));
         assert_eq!([0, 1].map(|x| s.pixel(0, x, 0)[0].to_le_bytes()[3]), [0, 255]);
     }
@@ -378,9 +391,12 @@ mod tests {
         let mask = dir.path().join("m.png");
         photo::save_png(&mask, &ImageU8 { width: 4, height: 1, channels: 1, data: vec![0, 255, 0, 255] }).unwrap();
         f.mask = Some(mask);
-        let s =
-            PixelStore::load(&[&f], &StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks: MaskRule::default() }, &|| {})
-                .unwrap();
+        let s = PixelStore::load(
+            &[&f],
+            &StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks: MaskRule::default(), white: 1.0 },
+            &|| {},
+        )
+        .unwrap();
         assert_eq!([0, 1, 2, 3].map(|x| s.counts(0, x, 0)), [false, true, false, true]);
     }
 }

@@ -8,13 +8,14 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 /// Switches that leave the parameters alone.
-const NEUTRAL: [(&str, &str); 12] = [
+const NEUTRAL: [(&str, &str); 13] = [
     ("device", "this build has one"),
     ("data.path", "names the capture"),
     ("data.format", "tested with the importers"),
     ("data.mask", "this capture has none: tested in masks"),
     ("data.mask_meaning", "this capture has none: tested in masks"),
     ("data.memory_budget", "must not change the result: tested in pixel_store"),
+    ("data.white", "of linear light alone: tested in cli/tests/photographs.rs"),
     ("data.skip_broken", "tested with broken photographs in cli/tests/photographs.rs"),
     ("run.seconds", "the other budget: tested in train::run"),
     ("run.log_every", "tested in train::run"),

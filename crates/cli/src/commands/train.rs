@@ -196,7 +196,9 @@ fn same(a: &TrainArgs, before: &Config, now: &Config) -> Result<()> {
         let set = a.overrides.iter().any(|o| o.split('=').next().is_some_and(|k| k.trim() == key));
         set || FLAGS.iter().any(|f| f.1 == key && is_given(a, f.0)) || key.starts_with("run.") || ["device", "data.path"].contains(&key)
     };
-    match run.iter().zip(&given).find(|((key, run), (_, given))| run != given && !flagged(key)) {
+    // Light of 0 stands for what the photographs say.
+    let unsaid = |key: &str, given: &str| key == "data.white" && given.parse::<f64>() == Ok(0.0);
+    match run.iter().zip(&given).find(|((key, run), (_, given))| run != given && !flagged(key) && !unsaid(key, given)) {
         Some(((key, run), (_, given))) => changed(&format!("--config {}: {key}", file.display()), run, given),
         None => Ok(()),
     }

@@ -69,6 +69,9 @@ pub struct DataConfig {
     pub mask_meaning: String,
     /// Bytes that pixels may take; beyond that one of each small square is kept.
     pub memory_budget: u64,
+    /// Of photographs of linear light: what is shown as white, and is 1 to the field; 0: what few of their pixels exceed.
+    #[serde(default)]
+    pub white: f32,
     /// Leave out photographs that cannot be decoded, instead of refusing the capture.
     #[serde(default)]
     pub skip_broken: bool,
@@ -231,6 +234,7 @@ impl Config {
                 mask: use_masks(),
                 mask_meaning: auto(),
                 memory_budget: diorama_data::pixel_store::DEFAULT_BUDGET,
+                white: 0.0,
                 skip_broken: false,
             },
             field: FieldConfig {
@@ -364,6 +368,9 @@ impl Config {
         }
         if s.occupancy_resolution == 0 || !s.occupancy_resolution.is_multiple_of(16) {
             return fail("sampling.occupancy_resolution: must be a multiple of 16");
+        }
+        if !(0.0..=1e9).contains(&self.data.white) {
+            return fail("data.white: 0, or light above 0");
         }
         if self.data.downscale == 0 || self.run.log_every == 0 {
             return fail("data.downscale and run.log_every: at least 1");

@@ -98,7 +98,11 @@ fn reference_photo(model: &ObjectModel, full: &Photo) -> Image {
     let small = full.downsampled(w as usize, h as usize);
     // What a field of linear light was trained on is blended there, too.
     let (small, is_linear) = match small {
-        Photo::Linear(im) if model.is_linear() => (im, true),
+        Photo::Linear(mut im) if model.is_linear() => {
+            let white = model.config.data.white;
+            im.data.chunks_exact_mut(im.channels).for_each(|p| p.iter_mut().take(3).for_each(|v| *v /= white));
+            (im, true)
+        }
         other => (other.into_srgb(), false),
     };
     let back = model.backdrop_color();

@@ -71,7 +71,12 @@ impl HeldOutPixels {
             return Ok(None);
         }
         let listed: Vec<_> = frames.iter().map(|&i| &model.capture.frames[i]).collect();
-        let options = StoreOptions { reduction: model.config.reduction(), budget: BUDGET, masks: model.capture.masks };
+        let options = StoreOptions {
+            reduction: model.config.reduction(),
+            budget: BUDGET,
+            masks: model.capture.masks,
+            white: model.config.data.white,
+        };
         let photographs = Photographs::new(PixelStore::load(&listed, &options, &|| {})?);
         let cameras: Vec<_> = frames.iter().map(|&i| model.posed(i)).collect();
         let mut batch = RayBatch::default();

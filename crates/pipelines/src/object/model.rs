@@ -393,7 +393,7 @@ impl FieldQuery for ObjectModel {
 }
 
 /// Whether all photographs hold linear light.
-fn is_linear(capture: &Capture) -> bool {
+pub fn is_linear(capture: &Capture) -> bool {
     !capture.frames.is_empty() && capture.frames.iter().all(|f| f.color_space == ColorSpace::Linear)
 }
 

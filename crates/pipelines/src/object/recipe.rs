@@ -4,7 +4,7 @@ use super::config::{Background, Config, Method};
 use super::device::{self, Aftermath, Drawing, Opened};
 use super::held_out::{self, HeldOutPixels};
 use super::memory;
-use super::model::ObjectModel;
+use super::model::{ObjectModel, is_linear};
 use super::run_folder::{RunFolder, RunSummary};
 use super::viewing::RunView;
 use crate::bench::train::{StageFigure, TrainReport};
@@ -125,6 +125,11 @@ pub fn train(
     let capture = if resume { with_points(folder, config)? } else { load_capture(config)? };
     for note in &capture.notes {
         events(&Event::Note(note.clone()));
+    }
+    let config = &with_white(config, &capture)?;
+    if config.data.white > 0.0 {
+        let white = config.data.white;
+        events(&Event::Note(format!("the photographs hold linear light: {white} is shown as white (--set data.white={white})")));
     }
     memory::check_training(config, &capture)?.into_iter().for_each(|n| events(&Event::Note(n)));
     let (store, budget) = load_pixels(config, &capture, &opened)?;
@@ -256,6 +261,7 @@ const WRONG: f32 = 0.01;
 /// A trainer whose run is not kept.
 fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'static>> {
     let capture = load_capture(config)?;
+    let config = &with_white(config, &capture)?;
     let device = device::open(config)?;
     let (store, _) = load_pixels(config, &capture, &device)?;
     let has_alpha = store.has_alpha;
@@ -270,12 +276,24 @@ fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'stat
     Trainer::new(model, Photographs(store), Path::new(""), device)
 }
 
+/// The configuration with [`super::config::DataConfig::white`] as the training photographs have it.
+fn with_white(config: &Config, capture: &Capture) -> Result<Config> {
+    let mut config = config.clone();
+    if !is_linear(capture) {
+        config.data.white = 0.0;
+    } else if config.data.white == 0.0 {
+        let train: Vec<_> = capture.frames.iter().filter(|f| f.split == Split::Train).collect();
+        config.data.white = photo_check::white(&train)?;
+    }
+    Ok(config)
+}
+
 /// The training pixels, and the bytes that they might take.
 fn load_pixels(config: &Config, capture: &Capture, device: &Opened) -> Result<(PixelStore, u64)> {
     let train = capture.indices(Split::Train);
     let frames: Vec<_> = train.iter().map(|&i| &capture.frames[i]).collect();
     let budget = config.data.memory_budget.min(device.most_bytes());
-    let options = StoreOptions { reduction: config.reduction(), budget, masks: capture.masks };
+    let options = StoreOptions { reduction: config.reduction(), budget, masks: capture.masks, white: config.data.white };
     Ok((PixelStore::load(&frames, &options, &|| {})?, budget))
 }
 

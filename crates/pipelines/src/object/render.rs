@@ -216,7 +216,7 @@ pub fn render(
                 if model.is_linear() && *layer == Layer::Rgb {
                     // Beside the picture, all of its light.
                     let mut light = view.rgb.clone();
-                    light.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
+                    light.data.iter_mut().for_each(|v| *v = model.config.data.white * linear_from_srgb(*v));
                     photo::save_exr(&folder.join(layer.file(i)).with_extension("exr"), &light)?;
                 }
             }
