@@ -6,13 +6,13 @@ use diorama_pipelines::object::quickstart::write_capture;
 use diorama_pipelines::object::run_folder;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::sync::{Mutex, OnceLock};
+use std::sync::{OnceLock, RwLock};
 
-/// A short run, made once; tests that leave files in it hold the lock.
+/// A short run, made once; tests that leave files in it hold the lock alone, those that such files would change hold it with others.
 struct Good {
     _folder: tempfile::TempDir,
     run: PathBuf,
-    lock: Mutex<()>,
+    lock: RwLock<()>,
 }
 
 fn good() -> &'static Good {
@@ -23,7 +23,7 @@ fn good() -> &'static Good {
         write_capture(&capture, 24, 64).unwrap();
         let small = ["--set", "field.log2_size=14", "--set", "field.finest=256"];
         works(&[&["train", s(&capture), "-o", s(&run), "--steps", "250", "--device", "cpu"], &small[..]].concat());
-        Good { _folder: folder, run, lock: Mutex::new(()) }
+        Good { _folder: folder, run, lock: RwLock::new(()) }
     })
 }
 
@@ -80,6 +80,7 @@ fn bounds(points: &[Corner]) -> (Corner, Corner) {
 
 #[test]
 fn points_lie_where_the_mesh_does() {
+    let _held = good().lock.read().unwrap();
     let dir = tempfile::tempdir().unwrap();
     let (mesh, cloud) = (dir.path().join("mesh.ply"), dir.path().join("cloud.ply"));
     export(&mesh, &["--resolution", "96", "--scale", "2"]);
@@ -111,6 +112,7 @@ fn points_lie_where_the_mesh_does() {
 
 #[test]
 fn points_are_written_as_las_and_e57_too() {
+    let _held = good().lock.read().unwrap();
     let dir = tempfile::tempdir().unwrap();
     let las = dir.path().join("a.las");
     export(&las, &["--points", "3000"]);
@@ -134,7 +136,7 @@ fn points_are_written_as_las_and_e57_too() {
 
 #[test]
 fn the_mesh_lies_inside_the_crop_box_of_the_viewer() {
-    let _held = good().lock.lock().unwrap();
+    let _held = good().lock.write().unwrap();
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("a.ply");
     let (model, _) = run_folder::load_model(&good().run).unwrap();
@@ -162,6 +164,7 @@ fn the_mesh_lies_inside_the_crop_box_of_the_viewer() {
 
 #[test]
 fn the_summary_says_how_many_faces_went() {
+    let _held = good().lock.read().unwrap();
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("a.stl");
     let run = s(&good().run);
@@ -173,6 +176,7 @@ fn the_summary_says_how_many_faces_went() {
 
 #[test]
 fn no_more_faces_than_asked_also_where_the_mesh_is_closed() {
+    let _held = good().lock.read().unwrap();
     let dir = tempfile::tempdir().unwrap();
     for faces in ["400", "60"] {
         let made =
@@ -193,7 +197,7 @@ fn npy(file: &Path) -> Vec<f32> {
 
 #[test]
 fn distances_follow_the_measured_length_and_are_not_cut_off() {
-    let _held = good().lock.lock().unwrap();
+    let _held = good().lock.write().unwrap();
     let dir = tempfile::tempdir().unwrap();
     let run = &good().run;
     let render = |name: &str, more: &[&str]| {
