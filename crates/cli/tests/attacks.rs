@@ -394,11 +394,11 @@ fn fault_15_a_ply_that_claims_too_many_vertices() {
     std::fs::write(&file, claim).unwrap();
     fails(&diorama(&["view", file.to_str().unwrap(), "--port", "0"]), 2, &["claim.ply", "room"]);
     std::fs::remove_file(&file).unwrap();
-    // Named by a capture it is left alone, too.
+    // Named by a capture it is refused, too.
     let (dir, capture) = copy(&good().capture);
     std::fs::write(capture.join("x.ply"), b"ply\nformat ascii 1.0\nelement vertex 4000000000000\nend_header\n").unwrap();
     edit(&capture, |j| j["ply_file_path"] = "x.ply".into());
-    assert!(train(&capture, &dir.path().join("run"), &["--steps", "1"]).status.success());
+    fails(&train(&capture, &dir.path().join("run"), &["--steps", "1"]), 2, &["x.ply", "room"]);
 }
 
 #[test]
