@@ -1,5 +1,33 @@
 //! Scene contraction for unbounded captures (Barron et al. 2022, mip-NeRF 360, eq. 10).
 
+/// How model space, whose inner cube is `[0, 1]³`, becomes the finite domain of an encoding.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Space {
+    /// A cube of this edge around the inner cube's center; nothing lies outside.
+    Cube(f32),
+    /// All of space: as it is within a cube of this edge around the inner cube's center, contracted beyond.
+    Contracted(f32),
+}
+
+impl Space {
+    /// Coordinates in `[−½, ½]³` of a point given relative to the inner cube's center.
+    #[inline(always)]
+    pub fn normalize(self, centered: [f32; 3]) -> [f32; 3] {
+        match self {
+            Space::Cube(edge) => centered.map(|v| v / edge),
+            Space::Contracted(edge) => contract(centered.map(|v| 2.0 / edge * v)).map(|v| 0.25 * v),
+        }
+    }
+
+    /// Gradient of [`Space::normalize`]'s input at `centered`, given that of its output.
+    pub fn normalize_backward(self, centered: [f32; 3], d: [f32; 3]) -> [f32; 3] {
+        match self {
+            Space::Cube(edge) => d.map(|d| d / edge),
+            Space::Contracted(edge) => contract_backward(centered.map(|v| 2.0 / edge * v), d).map(|g| 0.5 / edge * g),
+        }
+    }
+}
+
 /// Maps all of space into the ball of radius 2: identity inside the unit ball, else
 /// `(2 − 1/‖x‖) x/‖x‖`, with the norm of largest magnitude (`‖·‖∞`) so that the image is a cube.
 pub fn contract(x: [f32; 3]) -> [f32; 3] {

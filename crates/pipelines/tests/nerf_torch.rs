@@ -2,6 +2,7 @@
 //! that has torch and numpy.
 
 use diorama_engine::fields::{self, Batch, FieldBuffers};
+use diorama_geom::contraction::Space;
 use diorama_kernels::ops::composite::Packed;
 use diorama_testkit::random;
 use std::path::Path;
@@ -20,7 +21,7 @@ fn nerf_forward_equals_pytorch() {
     };
     let n = 4096;
     // An outer cube of edge 1: model points are [0, 1]³, field coordinates [−1, 1]³.
-    let mut field = fields::nerf(1.0, 5e-4, 0, 0, 7, 1);
+    let mut field = fields::nerf(Space::Cube(1.0), 5e-4, 0, 0, 7, 1);
     for (w, noise) in field.weights.values.iter_mut().zip(random(field.net.mlp.params_len(), 5)) {
         *w += 0.01 * noise;
     }

@@ -8,7 +8,7 @@ pub use visible::{Pruning, VisibleBuffers};
 
 use crate::params::ParamGroup;
 use crate::stages::Stages;
-use diorama_geom::contraction::contract;
+use diorama_geom::contraction::Space;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::fused_mlp;
@@ -20,9 +20,9 @@ use rayon::prelude::*;
 /// How positions are encoded.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Encoding {
-    /// Over the outer cube as `[0, 1]³`.
+    /// Over the field's space as `[0, 1]³`.
     Hash(HashGrid),
-    /// Over the outer cube as `[−1, 1]³`.
+    /// Over the field's space as `[−1, 1]³`.
     Frequency(frequency::Frequency),
 }
 
@@ -61,15 +61,13 @@ pub struct Appearance {
     pub group: ParamGroup,
 }
 
-/// A field in model space, where the inner cube is `[0, 1]³` and the outer one `outer` times as wide.
+/// A field in model space, where the inner cube is `[0, 1]³`.
 #[derive(Clone, Debug)]
 pub struct Field {
     pub encoding: Encoding,
     pub directions: DirectionCode,
     pub net: FieldNet,
-    pub outer: f32,
-    /// Contract space around the inner cube instead of scaling it down.
-    pub contraction: bool,
+    pub space: Space,
     pub table: Option<ParamGroup>,
     pub weights: ParamGroup,
     pub appearance: Option<Appearance>,
@@ -111,12 +109,11 @@ impl Field {
     /// Field coordinates of model points: `[0, 1]³` for a hash grid, `[−1, 1]³` for frequencies.
     fn unit(&self, model: &[f32], out: &mut Vec<f32>) {
         out.resize(model.len(), 0.0);
-        let (outer, contraction) = (self.outer, self.contraction);
+        let space = self.space;
         let frequency = matches!(self.encoding, Encoding::Frequency(_));
         out.par_chunks_mut(3 * 4096).zip(model.par_chunks(3 * 4096)).for_each(|(out, model)| {
             for (o, m) in out.chunks_exact_mut(3).zip(model.chunks_exact(3)) {
-                let centred = [m[0] - 0.5, m[1] - 0.5, m[2] - 0.5];
-                let u = if contraction { contract(centred.map(|v| 2.0 * v)).map(|v| 0.25 * v) } else { centred.map(|v| v / outer) };
+                let u = space.normalize([m[0] - 0.5, m[1] - 0.5, m[2] - 0.5]);
                 for k in 0..3 {
                     o[k] = if frequency { 2.0 * u[k] } else { u[k] + 0.5 };
                 }
@@ -128,14 +125,14 @@ impl Field {
     fn unit_backward(&self, model: &[f32], d: &mut [f32]) {
         let factor = if matches!(self.encoding, Encoding::Frequency(_)) { 2.0 } else { 1.0 };
         for (d, m) in d.chunks_exact_mut(3).zip(model.chunks_exact(3)) {
-            if !self.contraction {
-                d.iter_mut().for_each(|d| *d *= factor / self.outer);
-                continue;
-            }
-            let x = [0, 1, 2].map(|k: usize| 2.0 * (m[k] - 0.5));
-            let g = diorama_geom::contraction::contract_backward(x, [d[0], d[1], d[2]]);
-            d.copy_from_slice(&g.map(|g| g * 0.5 * factor));
+            let g = self.space.normalize_backward([m[0] - 0.5, m[1] - 0.5, m[2] - 0.5], [d[0], d[1], d[2]]);
+            d.copy_from_slice(&g.map(|g| g * factor));
         }
+    }
+
+    /// Whether space has no bound.
+    pub fn is_unbounded(&self) -> bool {
+        matches!(self.space, Space::Contracted(_))
     }
 
     fn codes(&self, batch: &Batch, buf: &mut FieldBuffers) {
@@ -302,8 +299,7 @@ impl Field {
             encoding: self.encoding.clone(),
             directions: self.directions,
             net: self.net.clone(),
-            outer: self.outer,
-            contraction: self.contraction,
+            space: self.space,
             table: self.table.as_ref().map(ParamGroup::values_only),
             weights: self.weights.values_only(),
             appearance: self.appearance.as_ref().map(|a| Appearance { dims: a.dims, group: a.group.values_only() }),

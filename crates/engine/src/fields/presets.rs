@@ -2,6 +2,7 @@
 
 use super::{Appearance, DirectionCode, Encoding, Field};
 use crate::params::ParamGroup;
+use diorama_geom::contraction::Space;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::frequency::Frequency;
@@ -36,7 +37,7 @@ fn ray_inputs(first: usize, count: usize) -> impl Iterator<Item = Source> {
 
 /// Hash grid 32 → 64 → 16 with truncated exponential density, then 16 + 16 (+ appearance) → 64 → 64 → 3
 /// (Müller et al. 2022, section 5.4).
-pub fn ngp(grid: HashGridConfig, outer: f32, contraction: bool, rate: f32, images: usize, dims: usize, seed: u64) -> Field {
+pub fn ngp(grid: HashGridConfig, space: Space, rate: f32, images: usize, dims: usize, seed: u64) -> Field {
     use Source::{Input, Layer as L};
     let grid = HashGrid::new(grid);
     let appearance = appearance(images, dims, seed);
@@ -64,15 +65,14 @@ pub fn ngp(grid: HashGridConfig, outer: f32, contraction: bool, rate: f32, image
         encoding: Encoding::Hash(grid),
         directions: DirectionCode::SphericalHarmonics(4),
         net,
-        outer,
-        contraction,
+        space,
         appearance,
     }
 }
 
 /// γ with 10 and 4 bands, 8 × 256 with a skip to the fifth layer, 128-wide view branch
 /// (Mildenhall et al. 2020, figure 7). `stream` tells the coarse from the fine network.
-pub fn nerf(outer: f32, rate: f32, images: usize, dims: usize, seed: u64, stream: u64) -> Field {
+pub fn nerf(space: Space, rate: f32, images: usize, dims: usize, seed: u64, stream: u64) -> Field {
     use Source::{Input, Layer as L};
     let encoding = Frequency { dims: 3, bands: 10, include_input: true, pi: true, window: None };
     let view = Frequency { bands: 4, pi: false, ..encoding };
@@ -94,37 +94,37 @@ pub fn nerf(outer: f32, rate: f32, images: usize, dims: usize, seed: u64, stream
         sigma: Head { layer: 8, channel: 0, activation: Activation::Softplus, shift: 0.0 },
         rgb: Head { layer: 11, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
     };
-    frequency_field(net, encoding, DirectionCode::Frequency(view), outer, rate, appearance, seed.wrapping_add(stream << 32))
+    frequency_field(net, encoding, DirectionCode::Frequency(view), space, rate, appearance, seed.wrapping_add(stream << 32))
 }
 
 /// The report's primary network: sin and cos of position to 60 values, 4 fully connected layers of 256,
 /// ReLU; density and colour.
-pub fn mlp(outer: f32, rate: f32, seed: u64) -> Field {
+pub fn mlp(space: Space, rate: f32, seed: u64) -> Field {
     let encoding = Frequency { dims: 3, bands: 10, include_input: false, pi: true, window: None };
-    plain(encoding, &[256, 256, 256, 256, PADDED], outer, rate, seed)
+    plain(encoding, &[256, 256, 256, 256, PADDED], space, rate, seed)
 }
 
 /// The report's baseline: raw input, 2 fully connected layers of 256; density and colour.
-pub fn baseline(outer: f32, rate: f32, seed: u64) -> Field {
+pub fn baseline(space: Space, rate: f32, seed: u64) -> Field {
     let encoding = Frequency { dims: 3, bands: 0, include_input: true, pi: true, window: None };
-    plain(encoding, &[256, 256, PADDED], outer, rate, seed)
+    plain(encoding, &[256, 256, PADDED], space, rate, seed)
 }
 
-fn plain(encoding: Frequency, widths: &[usize], outer: f32, rate: f32, seed: u64) -> Field {
+fn plain(encoding: Frequency, widths: &[usize], space: Space, rate: f32, seed: u64) -> Field {
     let last = widths.len() - 1;
     let net = FieldNet {
         mlp: Mlp::chain(vec![encoding.output_dims()], widths, true),
         sigma: Head { layer: last, channel: 3, activation: Activation::Softplus, shift: 0.0 },
         rgb: Head { layer: last, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
     };
-    frequency_field(net, encoding, DirectionCode::None, outer, rate, None, seed)
+    frequency_field(net, encoding, DirectionCode::None, space, rate, None, seed)
 }
 
 fn frequency_field(
     net: FieldNet,
     encoding: Frequency,
     directions: DirectionCode,
-    outer: f32,
+    space: Space,
     rate: f32,
     appearance: Option<Appearance>,
     seed: u64,
@@ -136,8 +136,7 @@ fn frequency_field(
         encoding: Encoding::Frequency(encoding),
         directions,
         net,
-        outer,
-        contraction: false,
+        space,
         appearance,
     }
 }

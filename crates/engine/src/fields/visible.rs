@@ -340,6 +340,7 @@ fn gather(waves: &[Wave], width: usize, total: usize, out: &mut Vec<f32>, of: im
 mod tests {
     use super::*;
     use crate::fields;
+    use diorama_geom::contraction::Space;
     use diorama_geom::rng::Rng;
     use diorama_kernels::ops::hash_grid::HashGridConfig;
 
@@ -357,7 +358,7 @@ mod tests {
     /// Rays through a field of varying density, some of which miss it.
     fn scene() -> Scene {
         let config = HashGridConfig { levels: 4, features: 2, log2_size: 10, base: 4, finest: 32 };
-        let mut field = fields::ngp(config, 1.0, false, 1e-2, 0, 0, 1);
+        let mut field = fields::ngp(config, Space::Cube(1.0), 1e-2, 0, 0, 1);
         let rng = Rng::new(3, 3);
         let table = &mut field.table.as_mut().expect("a hash field").values;
         table.iter_mut().enumerate().for_each(|(i, v)| *v = rng.normal(i as u64) * 2.0);
@@ -384,7 +385,7 @@ mod tests {
         }
 
         fn config(&self) -> MarchConfig {
-            MarchConfig { cone: 1.0 / 256.0, dt_min: 0.004, dt_max: 0.1, max_samples: 1000 }
+            MarchConfig { cone: 1.0 / 256.0, dt_min: 0.004, dt_max: 0.1, max_samples: 1000, ..MarchConfig::default() }
         }
 
         fn visible(&self, pruning: Pruning) -> (Marched, Vec<f32>, FieldBuffers) {
@@ -449,8 +450,9 @@ mod tests {
     #[test]
     fn a_field_that_knows_nothing_keeps_its_samples_however_short_the_steps() {
         let mut s = scene();
-        s.field = fields::ngp(HashGridConfig { levels: 4, features: 2, log2_size: 10, base: 4, finest: 32 }, 1.0, false, 1e-2, 0, 0, 1);
-        let config = MarchConfig { cone: 0.0, dt_min: 0.0005, dt_max: 0.0005, max_samples: 1000 };
+        s.field =
+            fields::ngp(HashGridConfig { levels: 4, features: 2, log2_size: 10, base: 4, finest: 32 }, Space::Cube(1.0), 1e-2, 0, 0, 1);
+        let config = MarchConfig { cone: 0.0, dt_min: 0.0005, dt_max: 0.0005, max_samples: 1000, ..MarchConfig::default() };
         let pruning = Pruning { stop: 1e-4, min_alpha: 0.003, thin: 0.7, min_weight: 0.0 };
         let (mut samples, mut positions, mut buf) = (Marched::default(), Vec::new(), FieldBuffers::default());
         s.field.visible(&s.grid, &s.rays(), &config, pruning, &mut samples, &mut positions, &mut buf);

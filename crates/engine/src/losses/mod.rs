@@ -29,6 +29,7 @@ impl ColorLoss {
 /// Colour, distortion and opacity terms of a batch, each a mean over its rays.
 pub struct Photometric<'a> {
     pub batch: &'a RayBatch,
+    /// In the distance that the distortion loss measures; not read without it.
     pub samples: Packed<'a>,
     /// Background of each ray, `[R, 3]`: what transparent pixels are composited on.
     pub background: &'a [f32],

@@ -6,10 +6,10 @@ use crate::losses::{ColorLoss, Photometric};
 use crate::renderers::supervised::Supervised;
 use crate::renderers::volume::{self, Accelerator, Quality, Sampling, Tracer, View};
 use crate::samplers::RayBatch;
-use crate::samplers::occupancy::{OCCUPIED, Occupancy};
+use crate::samplers::occupancy::Occupancy;
 use crate::samplers::pixels::{self, DrawOptions, ErrorMap, PixelSource};
 use crate::samplers::stratified;
-use diorama_geom::contraction::{contract, contract_backward};
+use diorama_geom::contraction;
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, PixelFormat, Pose};
@@ -17,6 +17,7 @@ use diorama_kernels::gpu::check::{Row, Table};
 use diorama_kernels::gpu::{Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::composite::{Composited, Packed, cpu as composite, reference};
+use diorama_kernels::ops::distortion;
 use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
@@ -234,18 +235,19 @@ fn corrections(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let (near_far, jitter) = (vec![0.0; rays * 2], vec![0.5; rays]);
         let r = MarchRays { origins: &origins, dirs: &dirs, near_far: &near_far, jitter: &jitter, resumed: false };
         let (on_gpu, p) = (GpuRays::upload(gpu, &r), GpuPacked::upload(gpu, &scene.packed()));
-        for space in [Space::Model, Space::Cube(4.0), Space::Centred(4.0), Space::Contracted] {
+        for space in [Space::Model, Space::Cube(4.0), Space::Centred(4.0), Space::Contracted(1.5), Space::ContractedCentred(1.5)] {
             let (mut d_origins, mut d_dirs) = (vec![0.0f64; rays * 3], vec![0.0f64; rays * 3]);
             for r in 0..rays {
                 for i in scene.packed().range(r) {
                     let mid = scene.t[i] + 0.5 * scene.dt[i];
                     let g = [0, 1, 2].map(|k: usize| d[i * 3 + k]);
-                    let x = [0, 1, 2].map(|k: usize| 2.0 * (origins[r * 3 + k] + mid * dirs[r * 3 + k] - 0.5));
+                    let x = [0, 1, 2].map(|k: usize| origins[r * 3 + k] + mid * dirs[r * 3 + k] - 0.5);
                     let g = match space {
                         Space::Model => g,
                         Space::Cube(w) => g.map(|v| v / w),
                         Space::Centred(w) => g.map(|v| 2.0 * v / w),
-                        Space::Contracted => contract_backward(x, g).map(|v| 0.5 * v),
+                        Space::Contracted(w) => contraction::Space::Contracted(w).normalize_backward(x, g),
+                        Space::ContractedCentred(w) => contraction::Space::Contracted(w).normalize_backward(x, g).map(|v| 2.0 * v),
                     };
                     for k in 0..3 {
                         d_origins[r * 3 + k] += g[k] as f64;
@@ -301,14 +303,17 @@ fn spaces(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             }
         }
         let cube = model.iter().map(|v| ((v - 0.5) / 4.0 + 0.5) as f64).collect::<Vec<_>>();
-        let contracted =
-            model.chunks_exact(3).flat_map(|m| contract([m[0], m[1], m[2]].map(|v| 2.0 * (v - 0.5))).map(|v| 0.25 * v as f64 + 0.5));
+        let contracted: Vec<f64> = model
+            .chunks_exact(3)
+            .flat_map(|m| contraction::Space::Contracted(1.5).normalize([m[0], m[1], m[2]].map(|v| v - 0.5)).map(f64::from))
+            .collect();
         let centred = model.iter().map(|v| (2.0 * (v - 0.5) / 4.0) as f64).collect();
         let all = [
             (Space::Model, wide(&model)),
             (Space::Cube(4.0), cube),
-            (Space::Contracted, contracted.collect()),
+            (Space::Contracted(1.5), contracted.iter().map(|v| v + 0.5).collect()),
             (Space::Centred(4.0), centred),
+            (Space::ContractedCentred(1.5), contracted.iter().map(|v| 2.0 * v).collect()),
         ];
         for (space, want) in all {
             let shape = format!("R={rays} {space:?}");
@@ -367,15 +372,16 @@ fn prunings(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 
 fn grids(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     let rng = Rng::new(5, 6);
-    for cascades in [1, 3] {
-        let mut grid = Occupancy::new(16, cascades);
+    for (cascades, unbounded) in [(1, false), (3, false), (3, true)] {
+        let mut grid = Occupancy::new(16, cascades, unbounded);
         // A corner that no camera sees.
         grid.density[..40].fill(-1.0);
         grid.refresh();
         let g = &grid;
-        let on_gpu = GpuOccupancyGrid::upload(gpu, &g.bits, &g.density, &g.fresh, &g.live, g.decay, OCCUPIED);
+        let thresholds: Vec<f32> = (0..cascades).map(|c| g.most(c)).collect();
+        let on_gpu = GpuOccupancyGrid::upload(gpu, &g.bits, &g.density, &g.fresh, &g.live, g.decay, &thresholds);
         for (step, block) in [(0u64, 2), (16, 2), (1 << 30, 1)] {
-            let shape = format!("cascades={cascades} step {step} block {block}");
+            let shape = format!("cascades={cascades} unbounded={unbounded} step {step} block {block}");
             let (points, cells) = grid.probe(&rng, step, 3000, block);
             let (points_gpu, cells_gpu) = on_gpu.probe(gpu, &rng, step, 3000, block, Space::Model);
             table.close("occupancy", "points", &shape, &points_gpu, &wide(&points))?;
@@ -410,10 +416,13 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         batch.target.chunks_exact_mut(4).skip(2).step_by(9).for_each(|t| t[0] = f32::NAN);
         let (rgb, background) = (random_unit(s * 3, 8), random_unit(rays * 3, 9));
         let out = composite::forward(&p, &scene.sigma, &rgb, 3, &background);
+        let (mut starts, mut lengths) = (Vec::new(), Vec::new());
+        distortion::cpu::normalize(&p, &mut starts, &mut lengths);
+        let spread = Packed { t: &starts, dt: &lengths, ..p };
         for (color, huber, relative) in [(ColorLoss::Mse, 0.0, 0.0), (ColorLoss::Huber(0.1), 0.1, 0.0), (ColorLoss::Huber(0.1), 0.1, 0.05)]
         {
             let (distortion, alpha) = (0.3, 0.2);
-            let photometric = Photometric { batch: &batch, samples: p, background: &background, color, relative, distortion, alpha };
+            let photometric = Photometric { batch: &batch, samples: spread, background: &background, color, relative, distortion, alpha };
             let (mut value, mut error, mut counted) = (0.0f64, 0.0f64, 0usize);
             let mut of_rays = vec![0.0f64; rays];
             let (mut d_color, mut d_opacity, mut d_weights) = (vec![0.0; rays * 3], vec![0.0; rays], vec![0.0; s]);
@@ -516,11 +525,11 @@ fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     let grid = HashGridConfig { levels: 3, features: 2, log2_size: 10, base: 4, finest: 16 };
     let camera =
         PosedCamera { camera: Camera::pinhole(12, 10, 0.6), pose: Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z) };
-    for (images, contraction) in [(0, false), (3, true)] {
-        let mut f = fields::ngp(grid, 1.0, contraction, 1e-2, images, if images > 0 { 4 } else { 0 }, 1);
+    for (images, space) in [(0, contraction::Space::Cube(1.0)), (3, contraction::Space::Contracted(1.0))] {
+        let mut f = fields::ngp(grid, space, 1e-2, images, if images > 0 { 4 } else { 0 }, 1);
         f.net.sigma.shift = 1.2;
         f.table.iter_mut().for_each(|t| t.values.iter_mut().for_each(|v| *v *= 2e4));
-        let occupancy = Occupancy::new(16, 1);
+        let occupancy = Occupancy::new(16, 1, false);
         for (quality, room) in [(Quality::Full, 1 << 17), (Quality::Full, 4096), (Quality::Fast, 1 << 17)] {
             let on_cpu = Tracer {
                 field: &f,
@@ -552,8 +561,9 @@ fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     let camera =
         PosedCamera { camera: Camera::pinhole(6, 5, 0.6), pose: Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z) };
-    let (fine, coarse) = (fields::nerf(1.0, 1e-3, 2, 4, 1, 1), fields::nerf(1.0, 1e-3, 2, 4, 1, 0));
-    let plain = fields::baseline(2.0, 1e-3, 3);
+    let (fine, coarse) =
+        (fields::nerf(contraction::Space::Cube(1.0), 1e-3, 2, 4, 1, 1), fields::nerf(contraction::Space::Cube(1.0), 1e-3, 2, 4, 1, 0));
+    let plain = fields::baseline(contraction::Space::Cube(2.0), 1e-3, 3);
     for (name, field, guide) in [("nerf", &fine, Some(&coarse)), ("baseline", &plain, None)] {
         let sampling = match guide {
             Some(coarse) => Sampling::Hierarchical { coarse, samples: 8, more: 8 },

@@ -1,6 +1,7 @@
 //! What a field is on the device besides its parameters.
 
 use crate::fields::{DirectionCode, Encoding, Field};
+use diorama_geom::contraction as geom;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::gpu::{Buffer, Gpu, Rows};
 use diorama_kernels::ops::frequency::Frequency;
@@ -35,10 +36,11 @@ impl Shape {
         let mut wanted = vec![per_level > 0 || moves];
         wanted.extend((field.directions.dims() > 0).then_some(false));
         wanted.extend(field.appearance.as_ref().map(|_| true));
-        let space = match (&encoder, field.contraction) {
-            (Encoder::Hash(_), true) => Space::Contracted,
-            (Encoder::Hash(_), false) => Space::Cube(field.outer),
-            (Encoder::Frequency(_), _) => Space::Centred(field.outer),
+        let space = match (&encoder, field.space) {
+            (Encoder::Hash(_), geom::Space::Contracted(edge)) => Space::Contracted(edge),
+            (Encoder::Hash(_), geom::Space::Cube(edge)) => Space::Cube(edge),
+            (Encoder::Frequency(_), geom::Space::Contracted(edge)) => Space::ContractedCentred(edge),
+            (Encoder::Frequency(_), geom::Space::Cube(edge)) => Space::Centred(edge),
         };
         let net = GpuNet::new(gpu, &field.net, &field.density_net(Precision::F32), per_level, &wanted, arithmetic);
         Shape { encoder, directions: field.directions, net, space }

@@ -4,7 +4,7 @@ use super::shape::Shape;
 use crate::background::LearnedBackground;
 use crate::fields::Field;
 use crate::params::ParamGroup;
-use crate::samplers::occupancy::{OCCUPIED, Occupancy};
+use crate::samplers::occupancy::Occupancy;
 use crate::samplers::pixels::ErrorMap;
 use diorama_geom::rng::Rng;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
@@ -251,7 +251,10 @@ impl GpuTrainer {
     /// Uploads all that training needs; `cameras` as they were given, `cube` the scene's outer cube: lowest corner
     /// and edge.
     pub fn new(gpu: Gpu, of: &Trainees, photographs: GpuPhotographs, cameras: &[PosedCamera], cube: (f32, f32)) -> Self {
-        let occupancy = |o: &Occupancy| GpuOccupancyGrid::upload(&gpu, &o.bits, &o.density, &o.fresh, &o.live, o.decay, OCCUPIED);
+        let occupancy = |o: &Occupancy| {
+            let thresholds: Vec<f32> = (0..o.bits.cascades).map(|c| o.most(c)).collect();
+            GpuOccupancyGrid::upload(&gpu, &o.bits, &o.density, &o.fresh, &o.live, o.decay, &thresholds)
+        };
         let cameras = GpuCameras::upload(&gpu, cameras);
         let corrections = of.corrections.map(|(g, focal)| (GpuGroup::upload(&gpu, g), focal));
         corrections.iter().for_each(|(g, focal)| cameras.correct(&gpu, &g.values, *focal));

@@ -109,6 +109,7 @@ mod tests {
     use super::*;
     use crate::fields::{self, FieldBuffers};
     use crate::renderers::volume::{Backdrop, Quality, Sampling, Tracer};
+    use diorama_geom::contraction::Space;
     use std::sync::Arc;
 
     /// Serves so many calls with what no CPU would compute, then fails.
@@ -144,7 +145,7 @@ mod tests {
     }
 
     fn traced(by: Option<&dyn Accelerator>) -> Traced {
-        let field = fields::baseline(1.0, 1e-3, 3);
+        let field = fields::baseline(Space::Cube(1.0), 1e-3, 3);
         let tracer = Tracer {
             field: &field,
             sampling: Sampling::Stratified { samples: 8 },

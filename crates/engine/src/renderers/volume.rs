@@ -397,6 +397,7 @@ fn taken(buf: &mut FieldBuffers) -> Traced {
 mod tests {
     use super::*;
     use crate::fields;
+    use diorama_geom::contraction::Space;
     use diorama_geom::glam::DVec3;
     use diorama_geom::{Camera, Pose};
     use diorama_kernels::ops::hash_grid::HashGridConfig;
@@ -404,9 +405,9 @@ mod tests {
     #[test]
     fn waves_equal_one_long_march() {
         let grid = HashGridConfig { levels: 3, features: 2, log2_size: 10, base: 4, finest: 16 };
-        let mut field = fields::ngp(grid, 1.0, false, 1e-2, 0, 0, 1);
+        let mut field = fields::ngp(grid, Space::Cube(1.0), 1e-2, 0, 0, 1);
         field.net.sigma.shift = 1.2;
-        let occupancy = Occupancy::new(16, 1);
+        let occupancy = Occupancy::new(16, 1, false);
         let pose = Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z);
         let camera = PosedCamera { camera: Camera::pinhole(12, 10, 0.6), pose };
         let tracer = Tracer {
@@ -449,9 +450,9 @@ mod tests {
     #[test]
     fn the_clip_box_hides_what_lies_outside() {
         let grid = HashGridConfig { levels: 2, features: 2, log2_size: 8, base: 4, finest: 8 };
-        let mut field = fields::ngp(grid, 1.0, false, 1e-2, 0, 0, 1);
+        let mut field = fields::ngp(grid, Space::Cube(1.0), 1e-2, 0, 0, 1);
         field.net.sigma.shift = 6.0;
-        let occupancy = Occupancy::new(16, 1);
+        let occupancy = Occupancy::new(16, 1, false);
         let pose = Pose::look_at(DVec3::new(0.5, -1.5, 0.5), DVec3::splat(0.5), DVec3::Z);
         let camera = PosedCamera { camera: Camera::pinhole(9, 9, 0.8), pose };
         let mut tracer = Tracer {
@@ -508,9 +509,9 @@ mod tests {
     #[test]
     fn a_fast_view_is_close_to_a_full_one() {
         let grid = HashGridConfig { levels: 3, features: 2, log2_size: 10, base: 4, finest: 16 };
-        let mut field = fields::ngp(grid, 1.0, false, 1e-2, 0, 0, 1);
+        let mut field = fields::ngp(grid, Space::Cube(1.0), 1e-2, 0, 0, 1);
         field.net.sigma.shift = 3.0;
-        let occupancy = Occupancy::new(16, 1);
+        let occupancy = Occupancy::new(16, 1, false);
         let pose = Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z);
         let camera = PosedCamera { camera: Camera::pinhole(40, 32, 0.6), pose };
         let draw = |quality: Quality| {

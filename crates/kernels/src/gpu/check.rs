@@ -480,14 +480,19 @@ fn boxes(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 /// A sample whose midpoint lies on a cell wall may fall to either side: rays that differ are counted, and
 /// no more than one in fifty may.
 fn marches(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
-    for (cascades, cone) in [(1, 0.0), (3, 1.0 / 256.0)] {
+    let bounded = MarchConfig { dt_min: 0.005, dt_max: 0.08, max_samples: 200, ..MarchConfig::default() };
+    let growing = MarchConfig { cone: 1.0 / 256.0, ..bounded };
+    let unbounded = MarchConfig { dt_max: 1e6, disparity_from: 0.7, unbounded: true, max_samples: 600, ..growing };
+    for (cascades, config) in [(1, bounded), (3, growing), (3, unbounded)] {
         for n in [0, 1, 300] {
             let mut grid = OccupancyBits::full(16, cascades);
             let u = random_unit(grid.cells(), 9);
             grid.fill_with(|i| u[i] < 0.3 && i / 64 % 3 != 0);
-            let [origins, dirs, near_far, jitter] = rays(n);
+            let [origins, dirs, mut near_far, jitter] = rays(n);
+            if config.unbounded {
+                near_far.iter_mut().skip(1).step_by(2).for_each(|far| *far = 1000.0);
+            }
             let r = MarchRays { origins: &origins, dirs: &dirs, near_far: &near_far, jitter: &jitter, resumed: false };
-            let config = MarchConfig { cone, dt_min: 0.005, dt_max: 0.08, max_samples: 200 };
             let want = march::reference::march(&grid, &r, &config);
             let on_gpu = march::gpu::GpuRays::upload(gpu, &r);
             let capacity = want.t.len() + 500;
@@ -504,25 +509,32 @@ fn marches(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                     && a.len() == b.len()
                     && a.clone().zip(b).all(|(a, b)| {
                         let mid = want.t[b] + 0.5 * want.dt[b];
-                        let at = (0..3).all(|k| (places[a * 3 + k] - (origins[i * 3 + k] + mid * dirs[i * 3 + k])).abs() < 1e-4);
-                        (t[a] - want.t[b]).abs() < 1e-4 && cells[a] == want.cells[b] && at
+                        let at =
+                            (0..3).all(|k| (places[a * 3 + k] - (origins[i * 3 + k] + mid * dirs[i * 3 + k])).abs() < 1e-4 * mid.max(1.0));
+                        (t[a] - want.t[b]).abs() < 1e-4 * want.t[b].max(1.0) && cells[a] == want.cells[b] && at
                     });
                 ties += !same as usize;
             }
             let outcome = if ties * 50 <= n { Ok(0.0) } else { Err(format!("{ties} of {n} rays differ")) };
-            table.row("march", "samples", format!("R={n} cascades={cascades}"), outcome);
+            table.row("march", "samples", format!("R={n} cascades={cascades} unbounded={}", config.unbounded), outcome);
             // With room for half of them, offsets must stop there and what fits must be the same.
             let half = capacity / 2;
             let marched = march::gpu::march(gpu, &occupancy, &on_gpu, &config, half);
             let packed = &marched.packed;
             let cut: Vec<u32> = offsets.iter().skip(1).map(|o| (*o > half as u32) as u32).collect();
-            table.equal("march", "rays cut", format!("R={n} cascades={cascades}"), &marched.cut, &cut)?;
+            table.equal("march", "rays cut", format!("R={n} cascades={cascades} unbounded={}", config.unbounded), &marched.cut, &cut)?;
             let bounded: Vec<u32> = offsets.iter().map(|o| (*o).min(half as u32)).collect();
-            table.equal("march", "bounded offsets", format!("R={n} cascades={cascades}"), &packed.offsets, &bounded)?;
+            table.equal(
+                "march",
+                "bounded offsets",
+                format!("R={n} cascades={cascades} unbounded={}", config.unbounded),
+                &packed.offsets,
+                &bounded,
+            )?;
             let kept = *bounded.last().expect("R + 1 offsets") as usize;
             let same = gpu.read(&packed.t)?[..kept] == t[..kept];
             let outcome = if same { Ok(0.0) } else { Err("other samples than with room for all".into()) };
-            table.row("march", "bounded samples", format!("R={n} cascades={cascades}"), outcome);
+            table.row("march", "bounded samples", format!("R={n} cascades={cascades} unbounded={}", config.unbounded), outcome);
         }
     }
     Ok(())

@@ -4,6 +4,7 @@ use super::median_seconds;
 use super::ops::OpFigure;
 use crate::{PipelineError, Result};
 use diorama_engine::fields;
+use diorama_geom::contraction::Space;
 use diorama_geom::rng::Rng;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
@@ -132,7 +133,7 @@ fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     })?;
     // The standard field's network: layer by layer, in one launch, and on tensor cores.
     let grid = HashGridConfig { levels: 16, features: 2, log2_size: 4, base: 4, finest: 16 };
-    let field = fields::ngp(grid, 1.0, false, 1e-2, 0, 0, 1);
+    let field = fields::ngp(grid, Space::Cube(1.0), 1e-2, 0, 0, 1);
     let (net, density) = (&field.net, field.density_net(Precision::F32));
     let (params, features, flops) = (gpu.upload(&field.weights.values), random(gpu, s * 32, 4), 2.0 * net.mlp.macs() as f64);
     let p = evenly(gpu, s);

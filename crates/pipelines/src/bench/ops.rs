@@ -201,7 +201,7 @@ fn rays(t: &mut Table) {
     let near_far: Vec<f32> = (0..n).flat_map(|_| [0.1, 3.0]).collect();
     let jitter = vec![0.5; n];
     let rays = MarchRays { origins: &origins, dirs: &dirs, near_far: &near_far, jitter: &jitter, resumed: false };
-    let config = MarchConfig { cone: 0.0, dt_min: 1.732 / 1024.0, dt_max: 1.0, max_samples: 1024 };
+    let config = MarchConfig { cone: 0.0, dt_min: 1.732 / 1024.0, dt_max: 1.0, max_samples: 1024, ..MarchConfig::default() };
     let (mut scratch, mut marched) = (march::cpu::MarchScratch::default(), Marched::default());
     t.row("march", "128^3, a shell", "ray", n, Work::Unknown, || {
         march::cpu::march(&grid, &rays, &config, &mut scratch, &mut marched);

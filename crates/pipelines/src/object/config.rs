@@ -101,13 +101,15 @@ impl DataConfig {
 pub struct FieldConfig {
     pub levels: usize,
     pub features: usize,
+    /// `log2` of the most rows per level; 0: by the number of training pixels.
     pub log2_size: u32,
     pub base: u32,
-    /// Cells per axis at the finest level; 0: 2048 per inner cube.
+    /// Cells per axis at the finest level; 0: half as wide as a pixel where cameras look, 512 to 2048 per inner cube.
     pub finest: u32,
     /// Length of the per-image appearance code; 0: none.
     pub appearance: usize,
-    pub contraction: bool,
+    /// `auto`: unbounded for opaque photographs, else the capture's box; `box`; `unbounded`.
+    pub space: String,
     /// `auto`: networks multiply in bf16 where the CPU has tiles for it; `f32`.
     pub precision: String,
 }
@@ -118,6 +120,7 @@ pub struct FieldConfig {
 pub struct LossConfig {
     /// `mse` or `huber`.
     pub color: String,
+    /// Weight of the distortion loss, in normalized distance `t / (1 + t)`.
     pub distortion: f32,
     pub alpha: f32,
     /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.
@@ -240,16 +243,16 @@ impl Config {
             field: FieldConfig {
                 levels: 16,
                 features: 2,
-                log2_size: 19,
+                log2_size: 0,
                 base: 16,
                 finest: 0,
                 appearance: 0,
-                contraction: false,
+                space: "auto".into(),
                 precision: "auto".into(),
             },
             loss: LossConfig {
                 color: if ngp { "huber" } else { "mse" }.into(),
-                distortion: if ngp { 1e-2 } else { 0.0 },
+                distortion: if ngp { 3e-2 } else { 0.0 },
                 alpha: 0.0,
                 near_scaling: if ngp { 1.0 } else { 0.0 },
             },
@@ -350,8 +353,12 @@ impl Config {
     pub fn check(&self) -> Result<()> {
         let fail = |m: &str| Err(PipelineError::Usage(m.to_string()));
         let f = &self.field;
-        if ![1, 2, 4, 8].contains(&f.features) || !(1..=64).contains(&f.levels) || f.base == 0 || !(4..=24).contains(&f.log2_size) {
-            return fail("field: features must be 1, 2, 4 or 8, levels 1 to 64, base at least 1, log2_size 4 to 24");
+        let rows = f.log2_size == 0 || (4..=24).contains(&f.log2_size);
+        if ![1, 2, 4, 8].contains(&f.features) || !(1..=64).contains(&f.levels) || f.base == 0 || !rows {
+            return fail("field: features must be 1, 2, 4 or 8, levels 1 to 64, base at least 1, log2_size 0 or 4 to 24");
+        }
+        if !["auto", "box", "unbounded"].contains(&&f.space[..]) {
+            return fail("field.space: expected auto, box or unbounded");
         }
         if !["auto", "f32"].contains(&&f.precision[..]) {
             return fail("field.precision: expected auto or f32");

@@ -74,12 +74,14 @@ pub fn of_training(config: &Config, capture: &Capture, format: PixelFormat, samp
     let masks = (masks as f64 * kept as f64 / bytes.max(1) as f64) as u64;
     let decoded = if format == PixelFormat::Unorm8 { DECODED } else { DECODED_IN_FLOATS };
     let at_once = (2 * rayon::current_num_threads()).min(train.len()) as u64;
+    // Whether photographs are opaque is not known yet; what they need most for is.
+    let space = model::space(config, capture, false);
     // Values, gradients and two moments; a checkpoint copies all but the gradients while it is written.
     let parameters = match config.method {
-        Method::Ngp => HashGrid::new(model::hash_grid(config, capture)).params_len() as u64 * (4 * 4 + 3 * 4),
+        Method::Ngp => HashGrid::new(model::hash_grid(config, capture, space)).params_len() as u64 * (4 * 4 + 3 * 4),
         _ => 0,
     };
-    let cells = (config.sampling.occupancy_resolution as u64).saturating_pow(3).saturating_mul(model::cascades(capture) as u64);
+    let cells = (config.sampling.occupancy_resolution as u64).saturating_pow(3).saturating_mul(model::cascades(space) as u64);
     let occupancy = if config.method == Method::Ngp { cells.saturating_mul(9) } else { 0 };
     let batch = if config.method == Method::Ngp { (samples as u64).saturating_mul(SAMPLE) } else { 0 };
     Needs(vec![

@@ -11,8 +11,9 @@ use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Sampling
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::pixels::ErrorMap;
 use diorama_engine::train::Origin;
-use diorama_geom::capture::{ColorSpace, Split};
+use diorama_geom::capture::{ColorSpace, Split, focus_point};
 use diorama_geom::color::srgb_from_linear;
+use diorama_geom::contraction::Space;
 use diorama_geom::field_query::FieldQuery;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Capture, Pose, Similarity};
@@ -21,9 +22,11 @@ use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::linear::Activation;
-use diorama_kernels::ops::march::OccupancyBits;
 use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
 use std::collections::HashMap;
+
+/// Where rays end in space without a bound, in inner cubes: a camera that moves by one sees it move by 0.001 radians.
+const FAR: f32 = 1024.0;
 
 /// Fields, occupancy and corrections of one run, with the capture they belong to.
 pub struct ObjectModel {
@@ -51,17 +54,73 @@ pub struct ObjectModel {
     pub accelerator: Option<Supervised>,
 }
 
+/// Density per inner cube at the start of unbounded fields: light passes most of the inner cube, so that what stands
+/// there is found before what would stand in front of each camera.
+const INITIAL_DENSITY: f32 = 0.1;
+
+/// Cascades of the occupancy grid of unbounded space: they reach 64 inner cubes far, beyond which a ray has a few samples left.
+const CASCADES: usize = 8;
+
+/// Least and most cells of the finest level, per inner cube.
+const FINEST: (f64, f64) = (512.0, 2048.0);
+
+/// `log2` of training pixels per row of the hash grid's largest levels, and of the fewest and most rows.
+const PIXELS_PER_ROW: f64 = 5.0;
+const ROWS: (f64, f64) = (14.0, 19.0);
+
+/// How far cameras stand from what they look at, in inner cubes.
+fn viewing_distance(capture: &Capture) -> f64 {
+    let poses: Vec<Pose> = capture.frames.iter().map(|f| f.world_from_camera).collect();
+    focus_point(&poses).1 * capture.scene.model_from_world().scale
+}
+
+/// The space that a configuration gives a capture: opaque photographs show the world to its end.
+pub(super) fn space(config: &Config, capture: &Capture, has_alpha: bool) -> Space {
+    let unbounded = match &config.field.space[..] {
+        "auto" => !has_alpha,
+        s => s == "unbounded",
+    };
+    match unbounded {
+        // What lies around the cameras keeps its shape.
+        true => Space::Contracted((2.0 * viewing_distance(capture)).clamp(1.0, 8.0) as f32),
+        false => Space::Cube(capture.scene.aabb_scale.max(1) as f32),
+    }
+}
+
 /// Shape of the hash grid of `ngp`.
-pub(super) fn hash_grid(config: &Config, capture: &Capture) -> HashGridConfig {
+pub(super) fn hash_grid(config: &Config, capture: &Capture, space: Space) -> HashGridConfig {
     let f = &config.field;
-    let widest = if f.contraction { 2.0 } else { capture.scene.aabb_scale as f32 };
-    let finest = if f.finest > 0 { f.finest } else { (2048.0 * widest) as u32 };
-    HashGridConfig { levels: f.levels, features: f.features, log2_size: f.log2_size, base: f.base, finest }
+    let train: Vec<_> =
+        capture.frames.iter().filter(|f| f.split == Split::Train).map(|f| f.camera.downscaled(config.data.downscale)).collect();
+    let finest = match f.finest {
+        0 => {
+            let mut focal: Vec<f64> = train.iter().map(|c| c.fx.max(c.fy)).collect();
+            focal.sort_by(f64::total_cmp);
+            let per_cube = (2.0 * focal[focal.len() / 2] / viewing_distance(capture)).clamp(FINEST.0, FINEST.1);
+            let cubes = match space {
+                Space::Contracted(edge) => 2.0 * edge,
+                Space::Cube(edge) => edge,
+            };
+            (per_cube * cubes as f64) as u32
+        }
+        n => n,
+    };
+    let log2_size = match f.log2_size {
+        0 => {
+            let pixels: f64 = train.iter().map(|c| c.width as f64 * c.height as f64).sum();
+            (pixels.log2() - PIXELS_PER_ROW).round().clamp(ROWS.0, ROWS.1) as u32
+        }
+        n => n,
+    };
+    HashGridConfig { levels: f.levels, features: f.features, log2_size, base: f.base, finest: finest.max(f.base) }
 }
 
 /// Cascades of the occupancy grid, each twice as wide as the one inside it.
-pub(super) fn cascades(capture: &Capture) -> usize {
-    capture.scene.aabb_scale.max(1).ilog2() as usize + 1
+pub(super) fn cascades(space: Space) -> usize {
+    match space {
+        Space::Contracted(_) => CASCADES,
+        Space::Cube(edge) => (edge as u32).ilog2() as usize + 1,
+    }
 }
 
 impl ObjectModel {
@@ -70,16 +129,16 @@ impl ObjectModel {
         config.check()?;
         let train = capture.indices(Split::Train);
         let is_linear = is_linear(&capture);
-        let outer = capture.scene.aabb_scale as f32;
+        let space = space(&config, &capture, has_alpha);
         let (seed, rate, images, dims) = (config.seed, config.optim.rate, train.len(), config.field.appearance);
-        let f = &config.field;
         let (field, coarse) = match config.method {
-            Method::Ngp => (fields::ngp(hash_grid(&config, &capture), outer, f.contraction, rate, images, dims, seed), None),
-            Method::Nerf => (fields::nerf(outer, rate, images, dims, seed, 1), Some(fields::nerf(outer, rate, images, dims, seed, 0))),
-            Method::Mlp => (fields::mlp(outer, rate, seed), None),
-            Method::Baseline => (fields::baseline(outer, rate, seed), None),
+            Method::Ngp => (fields::ngp(hash_grid(&config, &capture, space), space, rate, images, dims, seed), None),
+            Method::Nerf => (fields::nerf(space, rate, images, dims, seed, 1), Some(fields::nerf(space, rate, images, dims, seed, 0))),
+            Method::Mlp => (fields::mlp(space, rate, seed), None),
+            Method::Baseline => (fields::baseline(space, rate, seed), None),
         };
-        let occupancy = (config.method == Method::Ngp).then(|| Occupancy::new(config.sampling.occupancy_resolution, cascades(&capture)));
+        let occupancy = (config.method == Method::Ngp)
+            .then(|| Occupancy::new(config.sampling.occupancy_resolution, cascades(space), matches!(space, Space::Contracted(_))));
         let learned = (config.background == Background::Learned)
             .then(|| LearnedBackground::new(color_head(is_linear).0, Adam { rate, ..Adam::default() }));
         let corrections = config.camera.refine.then(|| {
@@ -109,6 +168,9 @@ impl ObjectModel {
             o.keep_visible(&cameras, model.config.sampling.min_cell_views);
         }
         let decay = model.config.optim.weight_decay;
+        if model.config.method == Method::Ngp && model.field.is_unbounded() {
+            model.field.net.sigma.shift = INITIAL_DENSITY.ln();
+        }
         let precision = if model.config.field.precision == "auto" { Precision::Bf16 } else { Precision::F32 };
         for f in model.fields_mut() {
             f.weights.adam.weight_decay = decay;
@@ -151,9 +213,18 @@ impl ObjectModel {
         }
     }
 
+    /// Density per inner cube, a little below what the field starts from: what is denser is trained on however short its
+    /// step, else a field could lose all of its samples before it has learned anything.
+    pub fn thin(&self) -> f32 {
+        0.7 * self.field.net.sigma.shift.exp()
+    }
+
     /// The scene's outer cube in model space: lowest corner and edge.
     pub fn cube(&self) -> (f32, f32) {
-        OccupancyBits::cube(self.capture.scene.aabb_scale.max(1).ilog2() as usize)
+        match self.field.space {
+            Space::Contracted(_) => (0.5 - FAR, 2.0 * FAR),
+            Space::Cube(edge) => (0.5 - 0.5 * edge, edge),
+        }
     }
 
     /// The colour that renders and scores are composited on, unless it is learned.

@@ -24,6 +24,7 @@ use diorama_geom::Capture;
 use diorama_geom::capture::Split;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::composite::Packed;
+use diorama_kernels::ops::distortion;
 use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::march::{self, MarchRays, Marched};
 use diorama_kernels::ops::pixel_gather;
@@ -51,10 +52,6 @@ const BATCH_RAMP: (u64, u64) = (256, 1024);
 /// How much longer the steps of a march are at first, and the training step from which they have their own length:
 /// what a scene is roughly like is learned from few samples per ray and so from many rays.
 const MARCH_RAMP: (f32, u64) = (16.0, 1024);
-
-/// Density per inner cube, a little below what fields start from: what is denser is trained on however short its
-/// step, else a field could lose all of its samples before it has learned anything.
-const THIN: f32 = 0.7;
 
 /// Reads the capture that a configuration names.
 pub fn load_capture(config: &Config) -> Result<Capture> {
@@ -478,7 +475,7 @@ impl<'a> Trainer<'a> {
     fn step_ngp(&mut self, step: u64) -> (f64, u64) {
         let b = &mut self.buffers;
         let m = &mut self.model;
-        let s = &m.config.sampling;
+        let (s, thin) = (&m.config.sampling, m.thin());
         let grid = m.occupancy.as_mut().expect("ngp has an occupancy grid");
         if step > 0 && step.is_multiple_of(s.occupancy_every) {
             let (until, block) = OCCUPANCY_WARMUP;
@@ -493,7 +490,7 @@ impl<'a> Trainer<'a> {
             jitter: &b.batch.jitter,
             resumed: false,
         };
-        let pruning = Pruning { stop: s.stop, min_alpha: s.min_alpha, thin: THIN, min_weight: 0.0 };
+        let pruning = Pruning { stop: s.stop, min_alpha: s.min_alpha, thin, min_weight: 0.0 };
         let march = grid.march_config(s.max_samples).stretched(stretch(step));
         m.field.visible(&grid.bits, &rays, &march, pruning, &mut b.marched, &mut b.positions, &mut b.field);
         b.field.visible.seen().for_each(|(cells, sigma)| grid.record(cells, sigma));
@@ -529,7 +526,7 @@ impl<'a> Trainer<'a> {
             fine: Rng::new(seed, FINE),
             refresh_errors: step.is_multiple_of(ERROR_REFRESH),
             stretch: stretch(step),
-            thin: THIN,
+            thin: m.thin(),
             rate_scale: self.schedule.scale(progress as f32) * m.rate_scale,
         };
         let figures = self.device.step(&mut self.model, step, &drawing)?;
@@ -633,9 +630,15 @@ fn train_field(
 ) -> f64 {
     let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
     let color = if config.loss.color == "huber" { ColorLoss::Huber(0.1) } else { ColorLoss::Mse };
+    let (mut starts, mut lengths) = (Vec::new(), Vec::new());
+    if config.loss.distortion > 0.0 {
+        distortion::cpu::normalize(&samples, &mut starts, &mut lengths);
+    }
+    let spread = Packed { offsets: &marched.offsets, t: &starts, dt: &lengths };
     // Linear light has a color head of its own.
     let relative = if field.net.rgb.activation == Activation::TruncatedExp { losses::RELATIVE } else { 0.0 };
-    let loss = Photometric { batch, samples, background, color, relative, distortion: config.loss.distortion, alpha: config.loss.alpha };
+    let (distortion, alpha) = (config.loss.distortion, config.loss.alpha);
+    let loss = Photometric { batch, samples: spread, background, color, relative, distortion, alpha };
     let near_scaling = config.loss.near_scaling;
     let b = Batch { samples, positions, dirs: &batch.dirs, images: Some(&batch.images), background, near_scaling };
     field.train(&b, &loss, buffers, d_positions);

@@ -283,7 +283,8 @@ fn occupied(model: &ObjectModel, camera: &PosedCamera) -> Vec<f32> {
     }
     pixels::rays(std::slice::from_ref(camera), model.config.sampling.near, model.cube(), &mut batch);
     let rays = MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
-    let config = MarchConfig { cone: 0.0, dt_min: 1.0 / STEPS, dt_max: 1.0 / STEPS, max_samples: 4 * STEPS as usize };
+    let config =
+        MarchConfig { cone: 0.0, dt_min: 1.0 / STEPS, dt_max: 1.0 / STEPS, max_samples: 4 * STEPS as usize, ..MarchConfig::default() };
     let mut marched = Marched::default();
     march::cpu::march(&grid.bits, &rays, &config, &mut march::cpu::MarchScratch::default(), &mut marched);
     let counts: Vec<u32> = marched.offsets.windows(2).map(|o| o[1] - o[0]).collect();

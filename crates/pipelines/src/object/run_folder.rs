@@ -309,12 +309,14 @@ pub fn load_model(path: &Path) -> Result<(ObjectModel, Vec<String>)> {
 pub fn load_model_of(path: &Path, data: Option<&Path>) -> Result<(ObjectModel, Vec<String>)> {
     let config = read_config(path)?;
     let capture = kept_capture::read(path, data, &config.data.path)?;
-    let mut model = ObjectModel::new(config, capture, false)?;
     let folder = path.join("checkpoints");
     if !checkpoint::exists(&folder) {
         return Err(DataError::input(path, "holds no checkpoint yet; train it first").into());
     }
     let (c, note) = checkpoint::load(&folder)?;
+    // The field's space depends on it.
+    let has_alpha = c.metadata.get("has_alpha").is_some_and(|v| v == "true");
+    let mut model = ObjectModel::new(config, capture, has_alpha)?;
     model.restore(c, &checkpoint::latest(&folder))?;
     Ok((model, note.into_iter().collect()))
 }

@@ -1,7 +1,26 @@
 //! Linear time through prefix sums: for sorted midpoints
 //! `Σ_j w_j |m_i − m_j| = m_i (2 W_i − W) − (2 M_i − M)` with running sums `W_i = Σ_{j≤i} w_j`, `M_i = Σ_{j≤i} w_j m_j`.
 
+use super::normalized_distance;
 use crate::ops::composite::Packed;
+use rayon::prelude::*;
+
+/// Samples per task.
+const TASK: usize = 1 << 12;
+
+/// Starts `[S]` and lengths `[S]` of samples in [`normalized_distance`].
+pub fn normalize(p: &Packed, s: &mut Vec<f32>, ds: &mut Vec<f32>) {
+    s.resize(p.samples(), 0.0);
+    ds.resize(p.samples(), 0.0);
+    let out = s.par_chunks_mut(TASK).zip(ds.par_chunks_mut(TASK));
+    out.zip(p.t.par_chunks(TASK).zip(p.dt.par_chunks(TASK))).for_each(|((s, ds), (t, dt))| {
+        for i in 0..s.len() {
+            s[i] = normalized_distance(t[i]);
+            // s(t + δ) − s(t) without a difference of close numbers.
+            ds[i] = dt[i] / ((1.0 + t[i]) * (1.0 + t[i] + dt[i]));
+        }
+    });
+}
 
 /// Loss of ray `r`, whose samples have weights `w`; adds `scale · ∂loss/∂w` to `g` unless it is empty.
 pub fn ray(p: &Packed, r: usize, w: &[f32], scale: f32, g: &mut [f32]) -> f32 {

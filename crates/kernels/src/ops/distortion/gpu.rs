@@ -23,6 +23,29 @@ pub fn both(gpu: &Gpu, p: &GpuPacked, weights: &Buffer, d_loss: &Buffer) -> (Buf
     (loss, g)
 }
 
+/// Samples in [`super::normalized_distance`].
+pub fn normalized(gpu: &Gpu, p: &GpuPacked) -> GpuPacked {
+    let (s, ds) = (gpu.empty(p.t.len()), gpu.empty(p.t.len()));
+    let r = p.rays();
+    if r > 0 {
+        // SAFETY: units past the rays stop; offsets bound the samples.
+        unsafe {
+            normalize::launch_unchecked(
+                &gpu.client,
+                units(r),
+                CubeDim::new_1d(CUBE),
+                p.offsets.arg(),
+                p.t.arg(),
+                p.dt.arg(),
+                s.arg(),
+                ds.arg(),
+                r as u32,
+            );
+        }
+    }
+    GpuPacked { offsets: p.offsets.clone(), t: s, dt: ds }
+}
+
 fn run(gpu: &Gpu, p: &GpuPacked, weights: &Buffer, d_loss: &Buffer, loss: &Buffer, g: &Buffer) {
     let r = p.rays();
     if r > 0 {
@@ -55,6 +78,18 @@ impl DeviceOp for super::DistortionOp {
     fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let p = GpuPacked { offsets: kept[0].clone(), t: kept[1].clone(), dt: kept[2].clone() };
         vec![d[0].as_ref().map(|d| backward(gpu, &p, &i[0].data, d))]
+    }
+}
+
+#[cube(launch_unchecked)]
+fn normalize(offsets: &[u32], t: &[f32], dt: &[f32], s: &mut [f32], ds: &mut [f32], rays: u32) {
+    let r = ABSOLUTE_POS;
+    if r >= rays as usize {
+        terminate!();
+    }
+    for i in offsets[r] as usize..offsets[r + 1] as usize {
+        s[i] = t[i] / (1.0 + t[i]);
+        ds[i] = dt[i] / ((1.0 + t[i]) * (1.0 + t[i] + dt[i]));
     }
 }
 

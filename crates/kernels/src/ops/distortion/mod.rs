@@ -13,6 +13,13 @@ use crate::burn_op::{self, In, Out, SliceOp};
 use burn::tensor::Tensor;
 use std::sync::Arc;
 
+/// Distance `t` as a coordinate in which all of space is finite, `s = t / (1 + t)`: distance close by, disparity
+/// beyond. Unbounded rays are judged in it, as mip-NeRF 360 does with its normalized distance.
+#[inline(always)]
+pub fn normalized_distance(t: f32) -> f32 {
+    t / (1.0 + t)
+}
+
 #[derive(Debug)]
 struct DistortionOp {
     offsets: Arc<[u32]>,

@@ -18,6 +18,19 @@ fn matches_the_reference_both_ways() {
 }
 
 #[test]
+fn normalized_distance_is_finite_and_keeps_order() {
+    let (offsets, t, dt) = ([0u32, 3], [0.1f32, 3.0, 500.0], [0.4f32, 2.0, 1e6]);
+    let p = Packed { offsets: &offsets, t: &t, dt: &dt };
+    let (mut s, mut ds) = (Vec::new(), Vec::new());
+    cpu::normalize(&p, &mut s, &mut ds);
+    for i in 0..3 {
+        let (from, to) = (t[i] as f64 / (1.0 + t[i] as f64), (t[i] as f64 + dt[i] as f64) / (1.0 + t[i] as f64 + dt[i] as f64));
+        assert!((s[i] as f64 - from).abs() < 1e-6 && (ds[i] as f64 - (to - from)).abs() < 1e-6);
+        assert!(s[i] + ds[i] <= 1.0);
+    }
+}
+
+#[test]
 fn reference_gradient_matches_central_differences() {
     let s = scene(4, 6);
     let p = s.packed();

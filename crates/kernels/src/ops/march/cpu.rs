@@ -67,7 +67,7 @@ fn march_ray(grid: &OccupancyBits, rays: &MarchRays, r: usize, config: &MarchCon
     let inv = d.map(|v| if v == 0.0 { f32::INFINITY } else { 1.0 / v });
     let (near, far, jitter) = (rays.near_far[r * 2], rays.near_far[r * 2 + 1], rays.jitter[r]);
     let n = grid.resolution;
-    let step = |t: f32| (t * config.cone).clamp(config.dt_min, config.dt_max);
+    let step = |t: f32| config.step(t);
     let mut t = if rays.resumed { near } else { (near + (jitter - 0.5) * step(near)).max(near) };
     let mut count = 0;
     while t < far && count < config.max_samples {
@@ -80,14 +80,14 @@ fn march_ray(grid: &OccupancyBits, rays: &MarchRays, r: usize, config: &MarchCon
             c += 1;
         }
         let (low, size) = OccupancyBits::cube(c);
-        if reach >= 0.5 * size {
+        if reach >= 0.5 * size && !config.unbounded {
             t += dt;
             continue;
         }
         let scale = n as f32 / size;
         let cell = x.map(|v| (((v - low) * scale) as usize).min(n - 1));
         let index = ((c * n + cell[2]) * n + cell[1]) * n + cell[0];
-        if grid.get(index) {
+        if reach >= 0.5 * size || grid.get(index) {
             piece.cells.push(index as u32);
             piece.t.push(t);
             piece.dt.push(dt);

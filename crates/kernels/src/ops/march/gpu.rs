@@ -80,10 +80,12 @@ pub enum Space {
     Model,
     /// The cube of this width around the model cube's centre as `[0, 1]³`.
     Cube(f32),
-    /// All of space, contracted around the model cube, as `[0, 1]³`.
-    Contracted,
+    /// All of space, contracted beyond the cube of this width, as `[0, 1]³`.
+    Contracted(f32),
     /// As [`Space::Cube`], but as `[−1, 1]³`.
     Centred(f32),
+    /// As [`Space::Contracted`], but as `[−1, 1]³`.
+    ContractedCentred(f32),
 }
 
 impl Space {
@@ -92,8 +94,9 @@ impl Space {
         match self {
             Space::Model => (0, 1.0),
             Space::Cube(width) => (1, width),
-            Space::Contracted => (2, 1.0),
+            Space::Contracted(width) => (2, width),
             Space::Centred(width) => (3, width),
+            Space::ContractedCentred(width) => (4, width),
         }
     }
 }
@@ -128,6 +131,8 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
             config.cone,
             config.dt_min,
             config.dt_max,
+            config.disparity_from,
+            config.unbounded as u32,
             rays.resumed,
             write,
         );
@@ -211,6 +216,8 @@ fn walk(
     cone: f32,
     dt_min: f32,
     dt_max: f32,
+    disparity_from: f32,
+    unbounded: u32,
     #[comptime] resumed: bool,
     #[comptime] write: bool,
 ) {
@@ -231,13 +238,13 @@ fn walk(
     let n = f32::cast_from(resolution);
     let mut t = near;
     if comptime!(!resumed) {
-        t = max(near + (jitter - 0.5) * clamp(near * cone, dt_min, dt_max), near);
+        t = max(near + (jitter - 0.5) * step(near, cone, dt_min, dt_max, disparity_from), near);
     }
     let mut count = 0u32;
     let mut x = Array::<f32>::new(3usize);
     let mut cell = Array::<u32>::new(3usize);
     while t < far && count < max_samples {
-        let dt = clamp(t * cone, dt_min, dt_max);
+        let dt = step(t, cone, dt_min, dt_max, disparity_from);
         let mid = t + 0.5 * dt;
         let mut reach = 0.0f32;
         #[unroll]
@@ -251,17 +258,19 @@ fn walk(
             cascade += 1;
             size *= 2.0;
         }
-        if reach >= 0.5 * size {
+        let beyond = reach >= 0.5 * size;
+        if beyond && unbounded == 0 {
             t += dt;
         } else {
             let low = 0.5 - 0.5 * size;
             let scale = n / size;
             #[unroll]
             for k in 0..3usize {
-                cell[k] = min(u32::cast_from((x[k] - low) * scale), resolution - 1);
+                // What lies beyond the outermost cascade counts to the cells at its walls.
+                cell[k] = min(u32::cast_from(max((x[k] - low) * scale, 0.0)), resolution - 1);
             }
             let index = ((cascade * resolution + cell[2]) * resolution + cell[1]) * resolution + cell[0];
-            if (bits[(index >> 5) as usize] >> (index & 31)) & 1 == 1 {
+            if beyond || (bits[(index >> 5) as usize] >> (index & 31)) & 1 == 1 {
                 if comptime!(write) {
                     let to = offsets[r] + count;
                     if to < capacity {
@@ -303,6 +312,12 @@ fn walk(
     if comptime!(!write) {
         counts[r] = count;
     }
+}
+
+/// [`MarchConfig::step`].
+#[cube]
+fn step(t: f32, cone: f32, dt_min: f32, dt_max: f32, disparity_from: f32) -> f32 {
+    clamp(t * cone * max(t / disparity_from, 1.0), dt_min, dt_max)
 }
 
 #[cube(launch_unchecked)]
@@ -372,18 +387,23 @@ fn put(out: &mut [f32], at: usize, x: f32, y: f32, z: f32, width: f32, #[comptim
         out[at + 1] = (y - 0.5) / width + 0.5;
         out[at + 2] = (z - 0.5) / width + 0.5;
     }
-    if comptime!(kind == 2) {
-        let cx = 2.0 * (x - 0.5);
-        let cy = 2.0 * (y - 0.5);
-        let cz = 2.0 * (z - 0.5);
+    if comptime!(kind == 2 || kind == 4) {
+        let cx = 2.0 / width * (x - 0.5);
+        let cy = 2.0 / width * (y - 0.5);
+        let cz = 2.0 / width * (z - 0.5);
         let m = max(max(cx.abs(), cy.abs()), cz.abs());
         let mut s = 0.25f32;
-        if m > 1.0 {
-            s = 0.25 * (2.0 - 1.0 / m) / m;
+        let mut middle = 0.5f32;
+        if comptime!(kind == 4) {
+            s = 0.5f32;
+            middle = 0.0f32;
         }
-        out[at] = cx * s + 0.5;
-        out[at + 1] = cy * s + 0.5;
-        out[at + 2] = cz * s + 0.5;
+        if m > 1.0 {
+            s *= (2.0 - 1.0 / m) / m;
+        }
+        out[at] = cx * s + middle;
+        out[at + 1] = cy * s + middle;
+        out[at + 2] = cz * s + middle;
     }
     if comptime!(kind == 3) {
         out[at] = 2.0 * (x - 0.5) / width;
@@ -440,13 +460,13 @@ fn pull(
         if comptime!(kind == 3) {
             scale = 2.0 / width;
         }
-        if comptime!(kind == 2) {
+        if comptime!(kind == 2 || kind == 4) {
             // Contracted: c = s(m) x with m the greatest coordinate's size, which has a slope of its own.
             let mut m = 0.0f32;
             let mut along = 0.0f32;
             #[unroll]
             for k in 0..3usize {
-                let x = 2.0 * (origins[r * 3 + k] + mid * dirs[r * 3 + k] - 0.5);
+                let x = 2.0 / width * (origins[r * 3 + k] + mid * dirs[r * 3 + k] - 0.5);
                 point[k] = x;
                 along += d[i * 3 + k] * x;
                 if x.abs() >= m {
@@ -454,10 +474,13 @@ fn pull(
                     greatest = k;
                 }
             }
-            scale = 0.5f32;
+            scale = 0.5 / width;
+            if comptime!(kind == 4) {
+                scale = 1.0 / width;
+            }
             if m > 1.0 {
-                scale = 0.5 * (2.0 - 1.0 / m) / m;
-                pulled = 0.5 * (2.0 / m - 2.0) / (m * m) * along;
+                pulled = scale * (2.0 / m - 2.0) / (m * m) * along;
+                scale *= (2.0 - 1.0 / m) / m;
                 if point[greatest] < 0.0 {
                     pulled = -pulled;
                 }
@@ -466,7 +489,7 @@ fn pull(
         #[unroll]
         for k in 0..3usize {
             let mut g = scale * d[i * 3 + k];
-            if comptime!(kind == 2) {
+            if comptime!(kind == 2 || kind == 4) {
                 if greatest == k {
                     g += pulled;
                 }

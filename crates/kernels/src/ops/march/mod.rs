@@ -119,13 +119,30 @@ pub struct MarchConfig {
     pub cone: f32,
     pub dt_min: f32,
     pub dt_max: f32,
+    /// Distance beyond which samples are spaced evenly in disparity instead: steps are `t / disparity_from` times as long.
+    pub disparity_from: f32,
+    /// Whether space beyond the outermost cascade is occupied, instead of empty.
+    pub unbounded: bool,
     pub max_samples: usize,
+}
+
+impl Default for MarchConfig {
+    /// Steps that grow with distance at no point, inside of the cascades alone.
+    fn default() -> Self {
+        MarchConfig { cone: 0.0, dt_min: 1.0 / 1024.0, dt_max: 1.0, disparity_from: f32::MAX, unbounded: false, max_samples: 1024 }
+    }
 }
 
 impl MarchConfig {
     /// The same marching with steps `by` times as long.
     pub fn stretched(self, by: f32) -> Self {
         MarchConfig { cone: self.cone * by, dt_min: self.dt_min * by, dt_max: self.dt_max * by, ..self }
+    }
+
+    /// Length of the step that begins at `t`.
+    #[inline(always)]
+    pub fn step(&self, t: f32) -> f32 {
+        (t * self.cone * (t / self.disparity_from).max(1.0)).clamp(self.dt_min, self.dt_max)
     }
 }
 

@@ -39,10 +39,15 @@ fn run(g: &OccupancyBits, r: &Rays, c: &MarchConfig) -> Marched {
 
 #[test]
 fn matches_the_reference_up_to_ties() {
-    for (cascades, cone) in [(1, 0.0), (3, 1.0 / 256.0)] {
+    let bounded = MarchConfig { dt_min: 0.005, dt_max: 0.08, max_samples: 200, ..MarchConfig::default() };
+    let growing = MarchConfig { cone: 1.0 / 256.0, ..bounded };
+    let unbounded = MarchConfig { dt_max: 1e6, disparity_from: 0.7, unbounded: true, max_samples: 600, ..growing };
+    for (cascades, c) in [(1, bounded), (3, growing), (3, unbounded)] {
         for n in [0, 1, 300] {
-            let (g, r) = (sparse_grid(cascades), rays(n, 1.0));
-            let c = MarchConfig { cone, dt_min: 0.005, dt_max: 0.08, max_samples: 200 };
+            let (g, mut r) = (sparse_grid(cascades), rays(n, 1.0));
+            if c.unbounded {
+                r.near_far.iter_mut().skip(1).step_by(2).for_each(|far| *far = 1000.0);
+            }
             let (got, want) = (run(&g, &r, &c), reference::march(&g, &r.view(), &c));
             assert_eq!(got.offsets.len(), n + 1);
             // A sample whose midpoint lies on a cell wall may fall to either side: such rays are
@@ -51,7 +56,7 @@ fn matches_the_reference_up_to_ties() {
             for i in 0..n {
                 let a = got.offsets[i] as usize..got.offsets[i + 1] as usize;
                 let b = want.offsets[i] as usize..want.offsets[i + 1] as usize;
-                let same = a.len() == b.len() && got.t[a].iter().zip(&want.t[b]).all(|(a, b)| (a - b).abs() < 1e-4);
+                let same = a.len() == b.len() && got.t[a].iter().zip(&want.t[b]).all(|(a, b)| (a - b).abs() < 1e-4 * b.max(1.0));
                 ties += !same as usize;
             }
             assert!(ties * 50 <= n, "{ties} of {n} rays differ");
@@ -62,7 +67,7 @@ fn matches_the_reference_up_to_ties() {
 #[test]
 fn a_full_grid_covers_the_ray_without_gaps_and_an_empty_one_not_at_all() {
     let r = rays(50, 0.5);
-    let c = MarchConfig { cone: 0.0, dt_min: 0.01, dt_max: 0.01, max_samples: 10_000 };
+    let c = MarchConfig { cone: 0.0, dt_min: 0.01, dt_max: 0.01, max_samples: 10_000, ..MarchConfig::default() };
     let mut g = OccupancyBits::full(16, 3);
     let out = run(&g, &r, &c);
     for i in 0..50 {
@@ -78,7 +83,7 @@ fn a_full_grid_covers_the_ray_without_gaps_and_an_empty_one_not_at_all() {
 #[test]
 fn samples_lie_in_occupied_cells_and_respect_the_limit() {
     let (g, r) = (sparse_grid(1), rays(100, 0.9));
-    let c = MarchConfig { cone: 0.0, dt_min: 0.004, dt_max: 0.004, max_samples: 7 };
+    let c = MarchConfig { cone: 0.0, dt_min: 0.004, dt_max: 0.004, max_samples: 7, ..MarchConfig::default() };
     let out = run(&g, &r, &c);
     let mut x = Vec::new();
     cpu::positions(&r.view(), &out, &mut x);
@@ -90,10 +95,33 @@ fn samples_lie_in_occupied_cells_and_respect_the_limit() {
 }
 
 #[test]
+fn unbounded_rays_are_sampled_to_their_end_evenly_in_disparity() {
+    let mut r = rays(40, 0.5);
+    r.near_far.iter_mut().skip(1).step_by(2).for_each(|far| *far = 1000.0);
+    let c = MarchConfig { cone: 1.0 / 128.0, dt_min: 0.001, dt_max: 1e6, disparity_from: 1.0, unbounded: true, max_samples: 10_000 };
+    let mut g = OccupancyBits::full(16, 3);
+    g.fill_with(|_| false);
+    let out = run(&g, &r, &c);
+    for w in out.offsets.windows(2) {
+        let last = w[1] as usize - 1;
+        let (first, end) = (out.t[w[0] as usize], out.t[last] + out.dt[last]);
+        assert!(first > 1.0 && first < 8.0, "the cascades are empty, what lies beyond is not: {first}");
+        assert!(end >= 1000.0, "{end}");
+        for i in w[0] as usize..last {
+            // 1/t − 1/(t + δ) = cone / (1 + cone t), next to constant.
+            let step = 1.0 / out.t[i] - 1.0 / out.t[i + 1];
+            let want = c.cone / (1.0 + c.cone * out.t[i]);
+            assert!((step - want).abs() < 1e-3 * want, "{step} {want}");
+        }
+        assert!(w[1] - w[0] < 128, "{} samples", w[1] - w[0]);
+    }
+}
+
+#[test]
 fn missing_rays_get_no_samples() {
     let mut r = rays(3, 0.5);
     r.near_far = vec![1.0, 0.5, 0.0, 1.0, 2.0, 2.0];
-    let c = MarchConfig { cone: 0.0, dt_min: 0.01, dt_max: 0.01, max_samples: 100 };
+    let c = MarchConfig { cone: 0.0, dt_min: 0.01, dt_max: 0.01, max_samples: 100, ..MarchConfig::default() };
     let out = run(&OccupancyBits::full(16, 1), &r, &c);
     assert!(out.offsets[1] == 0 && out.offsets[2] > 0 && out.offsets[3] == out.offsets[2]);
 }
@@ -105,7 +133,7 @@ fn empty_blocks_are_crossed_at_once_and_nothing_behind_them_is_missed() {
     g.fill_with(|i| i % 32 == 29 || i / 32 % 32 == 2);
     assert!((0..4).any(|x| g.is_block_empty(0, [x * 8, 16, 16])) && !g.is_block_empty(0, [29, 16, 16]));
     let r = rays(400, 1.0);
-    let c = MarchConfig { cone: 0.0, dt_min: 0.003, dt_max: 0.003, max_samples: 1000 };
+    let c = MarchConfig { cone: 0.0, dt_min: 0.003, dt_max: 0.003, max_samples: 1000, ..MarchConfig::default() };
     let (got, want) = (run(&g, &r, &c), reference::march(&g, &r.view(), &c));
     let length = |m: &Marched, i: usize| m.dt[m.offsets[i] as usize..m.offsets[i + 1] as usize].iter().sum::<f32>();
     let mut met = 0;

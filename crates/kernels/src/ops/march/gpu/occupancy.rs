@@ -25,12 +25,13 @@ pub struct GpuOccupancyGrid {
     /// Cells that are sampled.
     live: Buffer,
     decay: f32,
-    /// Density above which a cell is occupied, unless the mean is lower.
-    threshold: f32,
+    /// Density above which a cell of each cascade is occupied, unless the cascade's mean is lower.
+    thresholds: Buffer,
 }
 
 impl GpuOccupancyGrid {
-    pub fn upload(gpu: &Gpu, bits: &OccupancyBits, density: &[f32], fresh: &[f32], live: &[u32], decay: f32, threshold: f32) -> Self {
+    pub fn upload(gpu: &Gpu, bits: &OccupancyBits, density: &[f32], fresh: &[f32], live: &[u32], decay: f32, thresholds: &[f32]) -> Self {
+        assert!(thresholds.len() == bits.cascades, "occupancy: a threshold for each cascade");
         assert!(density.len() == bits.cells() && fresh.len() == bits.cells(), "occupancy: {} cells", bits.cells());
         GpuOccupancyGrid {
             bits: GpuOccupancy::upload(gpu, bits),
@@ -38,7 +39,7 @@ impl GpuOccupancyGrid {
             fresh: gpu.upload(fresh),
             live: gpu.upload_u32(live),
             decay,
-            threshold,
+            thresholds: gpu.upload(thresholds),
         }
     }
 
@@ -118,20 +119,21 @@ impl GpuOccupancyGrid {
         }
         self.note(gpu, &Rows::all(gpu, cells.len()), cells, sigma, block);
         let (n, cascades, cells) = (self.bits.resolution, self.bits.cascades, self.density.len());
-        let (sums, counts, limit) = (gpu.empty(PARTS), gpu.empty(PARTS), gpu.empty(1));
+        let (sums, counts, limits) = (gpu.empty(PARTS * cascades), gpu.empty(PARTS * cascades), gpu.empty(cascades));
         let cube = CubeDim::new_1d(CUBE);
         // SAFETY: units past the parts, words and blocks stop.
         unsafe {
             fold::launch_unchecked(
                 &gpu.client,
-                units(PARTS),
+                units(PARTS * cascades),
                 cube,
                 self.density.arg(),
                 self.fresh.arg(),
                 sums.arg(),
                 counts.arg(),
                 PARTS as u32,
-                cells as u32,
+                (PARTS * cascades) as u32,
+                (cells / cascades) as u32,
                 self.decay,
             );
             decide::launch_unchecked(
@@ -140,18 +142,20 @@ impl GpuOccupancyGrid {
                 CubeDim::new_1d(1),
                 sums.arg(),
                 counts.arg(),
-                limit.arg(),
+                self.thresholds.arg(),
+                limits.arg(),
                 PARTS as u32,
-                self.threshold,
+                cascades as u32,
             );
             occupy::launch_unchecked(
                 &gpu.client,
                 units(cells / 32),
                 cube,
                 self.density.arg(),
-                limit.arg(),
+                limits.arg(),
                 self.bits.bits.arg(),
                 (cells / 32) as u32,
+                (cells / cascades / 32) as u32,
             );
             for c in 1..cascades {
                 pool::launch_unchecked(&gpu.client, units(n.pow(3) / 32), cube, self.bits.bits.arg(), c as u32, n as u32);
@@ -229,16 +233,17 @@ fn probe(
 }
 
 #[cube(launch_unchecked)]
-fn fold(density: &mut [f32], fresh: &mut [u32], sums: &mut [f32], counts: &mut [u32], parts: u32, cells: u32, decay: f32) {
+fn fold(density: &mut [f32], fresh: &mut [u32], sums: &mut [f32], counts: &mut [u32], parts: u32, all_parts: u32, cells: u32, decay: f32) {
     let unit = ABSOLUTE_POS;
-    if unit >= parts as usize {
+    if unit >= all_parts as usize {
         terminate!();
     }
     let mut total = 0.0f32;
     let mut known = 0u32;
     // Neighbouring units read neighbouring cells.
-    let mut i = unit;
-    while i < cells as usize {
+    let first = unit / parts as usize * cells as usize;
+    let mut i = first + unit % parts as usize;
+    while i < first + cells as usize {
         let mut d = density[i];
         let f = f32::reinterpret(fresh[i]);
         if f > 0.0 && d >= 0.0 {
@@ -260,27 +265,30 @@ fn fold(density: &mut [f32], fresh: &mut [u32], sums: &mut [f32], counts: &mut [
     counts[unit] = known;
 }
 
-/// The threshold: the mean of the known densities, but no more than `most`.
+/// The threshold of each cascade: the mean of its known densities, but no more than `most`.
 #[cube(launch_unchecked)]
-fn decide(sums: &[f32], counts: &[u32], limit: &mut [f32], parts: u32, most: f32) {
-    let mut total = 0.0f32;
-    let mut known = 0u32;
-    for i in 0..parts as usize {
-        total += sums[i];
-        known += counts[i];
+fn decide(sums: &[f32], counts: &[u32], most: &[f32], limits: &mut [f32], parts: u32, cascades: u32) {
+    for c in 0..cascades as usize {
+        let mut total = 0.0f32;
+        let mut known = 0u32;
+        for i in 0..parts as usize {
+            total += sums[c * parts as usize + i];
+            known += counts[c * parts as usize + i];
+        }
+        limits[c] = min(most[c], total / f32::cast_from(max(known, 1u32)));
     }
-    limit[0] = min(most, total / f32::cast_from(max(known, 1u32)));
 }
 
 #[cube(launch_unchecked)]
-fn occupy(density: &[f32], limit: &[f32], bits: &mut [u32], words: u32) {
+fn occupy(density: &[f32], limits: &[f32], bits: &mut [u32], words: u32, words_per_cascade: u32) {
     let w = ABSOLUTE_POS;
     if w >= words as usize {
         terminate!();
     }
+    let limit = limits[w / words_per_cascade as usize];
     let mut word = 0u32;
     for i in 0..32usize {
-        if density[w * 32 + i] > limit[0] {
+        if density[w * 32 + i] > limit {
             word |= 1u32 << u32::cast_from(i);
         }
     }

@@ -18,7 +18,7 @@ pub struct Terms {
     pub huber: f32,
     /// For linear light: what is added to a prediction that its difference is divided by; 0: differences count as they are.
     pub relative: f32,
-    /// Weight of the distortion loss.
+    /// Weight of the distortion loss, in normalized distance ([`distortion::normalized_distance`]).
     pub distortion: f32,
     /// Weight of the squared difference between opacity and the photograph's alpha.
     pub alpha: f32,
@@ -129,7 +129,7 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
             terms.distortion,
         );
     }
-    let (spread, weights) = distortion::gpu::both(gpu, p, &out.weights, &d_spread);
+    let (spread, weights) = distortion::gpu::both(gpu, &distortion::gpu::normalized(gpu, p), &out.weights, &d_spread);
     add_up(gpu, p, target.left_out, &values, &errors, &spread, terms.distortion, figures);
     (GpuComposited { weights, ..d }, errors)
 }
@@ -222,6 +222,18 @@ fn color_error(got: f32, wanted: f32, huber: f32, relative: f32) -> Error {
     Error { value, slope: by * slope, squared: off * off }
 }
 
+/// Length of a sample as the distortion loss takes it.
+#[cube]
+fn length(t: f32, dt: f32) -> f32 {
+    dt / ((1.0 + t) * (1.0 + t + dt))
+}
+
+/// Middle of a sample as the distortion loss takes it, from the beginning of its ray's first sample on.
+#[cube]
+fn middle(t: f32, dt: f32, first: f32) -> f32 {
+    (t - first) / ((1.0 + t) * (1.0 + first)) + 0.5 * length(t, dt)
+}
+
 #[cube(launch_unchecked)]
 fn blend_and_compare(
     offsets: &[u32],
@@ -266,7 +278,7 @@ fn blend_and_compare(
         light *= through;
         all_w += w;
         // Midpoints relative to the first keep the distortion's differences exact in f32.
-        all_m += w * ((t[i] - t[first]) + 0.5 * dt[i]);
+        all_m += w * middle(t[i], dt[i], t[first]);
         // Kept where the gradient will be.
         d_sigma[i] = w;
         #[unroll]
@@ -306,17 +318,18 @@ fn blend_and_compare(
         let i = first + count - 1 - j;
         let w = d_sigma[i];
         // As in the distortion's own kernel, with the sums up to here.
-        let mid = (t[i] - t[first]) + 0.5 * dt[i];
+        let mid = middle(t[i], dt[i], t[first]);
+        let length = length(t[i], dt[i]);
         let pairs = mid * (2.0 * sum_w - all_w) - (2.0 * sum_m - all_m);
         sum_w -= w;
         sum_m -= w * mid;
-        spread += w * (pairs + w * dt[i] / 3.0);
+        spread += w * (pairs + w * length / 3.0);
         let mut kept = 1.0f32;
         if near > 0.0 {
             let share = min((t[i] + 0.5 * dt[i]) / near, 1.0);
             kept = share * share;
         }
-        let mut g = counts * distortion * (2.0 * pairs + w * dt[i] * 2.0 / 3.0);
+        let mut g = counts * distortion * (2.0 * pairs + w * length * 2.0 / 3.0);
         #[unroll]
         for k in 0..3usize {
             g += d_color[k] * rgb[i * 3 + k];
