@@ -38,7 +38,7 @@ const SWITCHES: [(&str, &str, &[(&str, &str)]); 44] = [
     ("field.base", "8", &[]),
     ("field.finest", "64", &[]),
     ("field.appearance", "4", &[]),
-    ("field.space", "box", &[]),
+    ("field.space", "unbounded", &[]),
     ("field.precision", "f32", &[]),
     ("loss.color", "mse", &[]),
     ("loss.distortion", "0.1", &[]),

@@ -75,7 +75,7 @@ impl Two {
         let v = [x * 7, y * 30, image as u32, 200 + x];
         match self.format {
             PixelFormat::Unorm8 => [u32::from_le_bytes(v.map(|v| v as u8)), 0],
-            PixelFormat::Unorm16 => [v[1] * 257 << 16 | v[0] * 257, v[3] * 257 << 16 | v[2] * 257],
+            PixelFormat::Unorm16 => [((v[1] * 257) << 16) | (v[0] * 257), ((v[3] * 257) << 16) | (v[2] * 257)],
             PixelFormat::Half => [(0x3000 + v[1] * 21) << 16 | (0x3000 + v[0] * 21), 0x3c00 << 16 | (0x3000 + v[2])],
         }
     }
@@ -418,10 +418,13 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let out = composite::forward(&p, &scene.sigma, &rgb, 3, &background);
         let (mut starts, mut lengths) = (Vec::new(), Vec::new());
         distortion::cpu::normalize(&p, &mut starts, &mut lengths);
-        let spread = Packed { t: &starts, dt: &lengths, ..p };
-        for (color, huber, relative) in [(ColorLoss::Mse, 0.0, 0.0), (ColorLoss::Huber(0.1), 0.1, 0.0), (ColorLoss::Huber(0.1), 0.1, 0.05)]
+        let in_distance = Packed { t: &starts, dt: &lengths, ..p };
+        let wide_huber = ColorLoss::Huber(0.1);
+        for (color, huber, relative, normalized) in
+            [(ColorLoss::Mse, 0.0, 0.0, true), (wide_huber, 0.1, 0.0, false), (wide_huber, 0.1, 0.05, false)]
         {
             let (distortion, alpha) = (0.3, 0.2);
+            let spread = if normalized { in_distance } else { p };
             let photometric = Photometric { batch: &batch, samples: spread, background: &background, color, relative, distortion, alpha };
             let (mut value, mut error, mut counted) = (0.0f64, 0.0f64, 0usize);
             let mut of_rays = vec![0.0f64; rays];
@@ -455,8 +458,8 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let (rgba, background, left_out, sums) = (up(&rgba), up(&background), gpu.upload_u32(&left_out), gpu.zeros(SUMS));
             let target = Target { rgba: &rgba, background: &background, left_out: &left_out };
             let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
-            let (d, errors) = loss::loss(gpu, Terms { huber, relative, distortion, alpha }, &on_gpu, &results, target, figures);
-            let shape = format!("R={rays} S={s} {color:?} relative {relative}");
+            let (d, errors) = loss::loss(gpu, Terms { huber, relative, distortion, normalized, alpha }, &on_gpu, &results, target, figures);
+            let shape = format!("R={rays} S={s} {color:?} relative {relative} normalized={normalized}");
             table.close("loss", "errors", &shape, &errors, &of_rays)?;
             table.close("loss", "d color", &shape, &d.color, &wide(&d_color))?;
             table.close("loss", "d opacity", &shape, &d.opacity, &wide(&d_opacity))?;
@@ -468,7 +471,7 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 
             // All of it at once.
             for reach in [0.0, near] {
-                let terms = Terms { huber, relative, distortion, alpha };
+                let terms = Terms { huber, relative, distortion, normalized, alpha };
                 let (sigma_gpu, rgb_gpu, sums) = (up(&scene.sigma), up(&rgb), gpu.zeros(SUMS));
                 let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
                 let (g, own_errors) = loss::composite_and_loss(gpu, terms, &on_gpu, &sigma_gpu, &rgb_gpu, target, reach, figures);

@@ -181,7 +181,7 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
         let figures = Figures { sums: &sums, marched: &p.offsets, is_main: true };
         loss::composite_and_loss(
             gpu,
-            Terms { huber: 0.0, relative: 0.0, distortion: 0.0, alpha: 0.0 },
+            Terms { huber: 0.0, relative: 0.0, distortion: 0.0, normalized: false, alpha: 0.0 },
             &p,
             &sigma,
             &rgb,

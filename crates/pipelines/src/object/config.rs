@@ -120,7 +120,7 @@ pub struct FieldConfig {
 pub struct LossConfig {
     /// `mse` or `huber`.
     pub color: String,
-    /// Weight of the distortion loss, in normalized distance `t / (1 + t)`.
+    /// Weight of the distortion loss; in unbounded space it is taken in `4 t / (1 + t)`.
     pub distortion: f32,
     pub alpha: f32,
     /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.
@@ -252,7 +252,7 @@ impl Config {
             },
             loss: LossConfig {
                 color: if ngp { "huber" } else { "mse" }.into(),
-                distortion: if ngp { 3e-2 } else { 0.0 },
+                distortion: if ngp { 1e-2 } else { 0.0 },
                 alpha: 0.0,
                 near_scaling: if ngp { 1.0 } else { 0.0 },
             },

@@ -401,6 +401,7 @@ mod running {
                     huber: if c.loss.color == "huber" { 0.1 } else { 0.0 },
                     relative: if m.is_linear() { RELATIVE } else { 0.0 },
                     distortion: c.loss.distortion,
+                    normalized: m.field.is_unbounded(),
                     alpha: c.loss.alpha,
                 },
                 near_scaling: c.loss.near_scaling,

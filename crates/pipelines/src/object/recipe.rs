@@ -631,10 +631,12 @@ fn train_field(
     let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
     let color = if config.loss.color == "huber" { ColorLoss::Huber(0.1) } else { ColorLoss::Mse };
     let (mut starts, mut lengths) = (Vec::new(), Vec::new());
-    if config.loss.distortion > 0.0 {
+    let spread = if config.loss.distortion > 0.0 && field.is_unbounded() {
         distortion::cpu::normalize(&samples, &mut starts, &mut lengths);
-    }
-    let spread = Packed { offsets: &marched.offsets, t: &starts, dt: &lengths };
+        Packed { offsets: &marched.offsets, t: &starts, dt: &lengths }
+    } else {
+        samples
+    };
     // Linear light has a color head of its own.
     let relative = if field.net.rgb.activation == Activation::TruncatedExp { losses::RELATIVE } else { 0.0 };
     let (distortion, alpha) = (config.loss.distortion, config.loss.alpha);

@@ -17,7 +17,7 @@ pub fn normalize(p: &Packed, s: &mut Vec<f32>, ds: &mut Vec<f32>) {
         for i in 0..s.len() {
             s[i] = normalized_distance(t[i]);
             // s(t + δ) − s(t) without a difference of close numbers.
-            ds[i] = dt[i] / ((1.0 + t[i]) * (1.0 + t[i] + dt[i]));
+            ds[i] = 4.0 * dt[i] / ((1.0 + t[i]) * (1.0 + t[i] + dt[i]));
         }
     });
 }

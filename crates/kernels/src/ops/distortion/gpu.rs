@@ -88,8 +88,8 @@ fn normalize(offsets: &[u32], t: &[f32], dt: &[f32], s: &mut [f32], ds: &mut [f3
         terminate!();
     }
     for i in offsets[r] as usize..offsets[r + 1] as usize {
-        s[i] = t[i] / (1.0 + t[i]);
-        ds[i] = dt[i] / ((1.0 + t[i]) * (1.0 + t[i] + dt[i]));
+        s[i] = 4.0 * t[i] / (1.0 + t[i]);
+        ds[i] = 4.0 * dt[i] / ((1.0 + t[i]) * (1.0 + t[i] + dt[i]));
     }
 }
 

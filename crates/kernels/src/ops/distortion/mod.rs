@@ -13,11 +13,11 @@ use crate::burn_op::{self, In, Out, SliceOp};
 use burn::tensor::Tensor;
 use std::sync::Arc;
 
-/// Distance `t` as a coordinate in which all of space is finite, `s = t / (1 + t)`: distance close by, disparity
-/// beyond. Unbounded rays are judged in it, as mip-NeRF 360 does with its normalized distance.
+/// Distance `t` as a coordinate in which all of space is finite, `s = 4 t / (1 + t)`: distance around 1, where its slope
+/// is 1, and disparity beyond. Unbounded rays are judged in it, as mip-NeRF 360 does with its normalized distance.
 #[inline(always)]
 pub fn normalized_distance(t: f32) -> f32 {
-    t / (1.0 + t)
+    4.0 * t / (1.0 + t)
 }
 
 #[derive(Debug)]

@@ -24,9 +24,10 @@ fn normalized_distance_is_finite_and_keeps_order() {
     let (mut s, mut ds) = (Vec::new(), Vec::new());
     cpu::normalize(&p, &mut s, &mut ds);
     for i in 0..3 {
-        let (from, to) = (t[i] as f64 / (1.0 + t[i] as f64), (t[i] as f64 + dt[i] as f64) / (1.0 + t[i] as f64 + dt[i] as f64));
-        assert!((s[i] as f64 - from).abs() < 1e-6 && (ds[i] as f64 - (to - from)).abs() < 1e-6);
-        assert!(s[i] + ds[i] <= 1.0);
+        let at = |t: f64| 4.0 * t / (1.0 + t);
+        let (from, to) = (at(t[i] as f64), at(t[i] as f64 + dt[i] as f64));
+        assert!((s[i] as f64 - from).abs() < 4e-6 && (ds[i] as f64 - (to - from)).abs() < 4e-6);
+        assert!(s[i] + ds[i] <= 4.0);
     }
 }
 

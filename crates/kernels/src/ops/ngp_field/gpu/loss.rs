@@ -18,8 +18,10 @@ pub struct Terms {
     pub huber: f32,
     /// For linear light: what is added to a prediction that its difference is divided by; 0: differences count as they are.
     pub relative: f32,
-    /// Weight of the distortion loss, in normalized distance ([`distortion::normalized_distance`]).
+    /// Weight of the distortion loss.
     pub distortion: f32,
+    /// Whether the distortion loss is taken in normalized distance ([`distortion::normalized_distance`]).
+    pub normalized: bool,
     /// Weight of the squared difference between opacity and the photograph's alpha.
     pub alpha: f32,
 }
@@ -92,6 +94,7 @@ pub fn composite_and_loss(
             terms.alpha,
             terms.distortion,
             near_scaling,
+            terms.normalized,
         );
     }
     // The values hold the distortion already.
@@ -129,7 +132,11 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
             terms.distortion,
         );
     }
-    let (spread, weights) = distortion::gpu::both(gpu, &distortion::gpu::normalized(gpu, p), &out.weights, &d_spread);
+    let (spread, weights) = if terms.normalized {
+        distortion::gpu::both(gpu, &distortion::gpu::normalized(gpu, p), &out.weights, &d_spread)
+    } else {
+        distortion::gpu::both(gpu, p, &out.weights, &d_spread)
+    };
     add_up(gpu, p, target.left_out, &values, &errors, &spread, terms.distortion, figures);
     (GpuComposited { weights, ..d }, errors)
 }
@@ -224,14 +231,22 @@ fn color_error(got: f32, wanted: f32, huber: f32, relative: f32) -> Error {
 
 /// Length of a sample as the distortion loss takes it.
 #[cube]
-fn length(t: f32, dt: f32) -> f32 {
-    dt / ((1.0 + t) * (1.0 + t + dt))
+fn length(t: f32, dt: f32, #[comptime] normalized: bool) -> f32 {
+    let mut share = 1.0f32;
+    if comptime!(normalized) {
+        share = 0.25 * (1.0 + t) * (1.0 + t + dt);
+    }
+    dt / share
 }
 
 /// Middle of a sample as the distortion loss takes it, from the beginning of its ray's first sample on.
 #[cube]
-fn middle(t: f32, dt: f32, first: f32) -> f32 {
-    (t - first) / ((1.0 + t) * (1.0 + first)) + 0.5 * length(t, dt)
+fn middle(t: f32, dt: f32, first: f32, #[comptime] normalized: bool) -> f32 {
+    let mut share = 1.0f32;
+    if comptime!(normalized) {
+        share = 0.25 * (1.0 + t) * (1.0 + first);
+    }
+    (t - first) / share + 0.5 * length(t, dt, normalized)
 }
 
 #[cube(launch_unchecked)]
@@ -256,6 +271,7 @@ fn blend_and_compare(
     alpha: f32,
     distortion: f32,
     near: f32,
+    #[comptime] normalized: bool,
 ) {
     let r = ABSOLUTE_POS;
     if r >= rays as usize {
@@ -278,7 +294,7 @@ fn blend_and_compare(
         light *= through;
         all_w += w;
         // Midpoints relative to the first keep the distortion's differences exact in f32.
-        all_m += w * middle(t[i], dt[i], t[first]);
+        all_m += w * middle(t[i], dt[i], t[first], normalized);
         // Kept where the gradient will be.
         d_sigma[i] = w;
         #[unroll]
@@ -318,8 +334,8 @@ fn blend_and_compare(
         let i = first + count - 1 - j;
         let w = d_sigma[i];
         // As in the distortion's own kernel, with the sums up to here.
-        let mid = middle(t[i], dt[i], t[first]);
-        let length = length(t[i], dt[i]);
+        let mid = middle(t[i], dt[i], t[first], normalized);
+        let length = length(t[i], dt[i], normalized);
         let pairs = mid * (2.0 * sum_w - all_w) - (2.0 * sum_m - all_m);
         sum_w -= w;
         sum_m -= w * mid;
