@@ -172,7 +172,7 @@ fn cut_photo(data: &[u8]) {
         n => FILES[n as usize - 3].to_vec(),
     };
     let want = photo::load_full(&file("cut", &whole)).expect("a whole photograph");
-    let length = u16::from_le_bytes([*low, *high]) as usize * whole.len() >> 16;
+    let length = (u16::from_le_bytes([*low, *high]) as usize * whole.len()) >> 16;
     if let Ok(got) = photo::load_full(&file("cut", &whole[..length])) {
         assert!(got == want, "{length} of {} bytes decode to something else", whole.len());
     }
