@@ -213,7 +213,8 @@ impl<'a> Sight<'a> {
         Sight { posed, widest: if matches!(c.lens, Lens::Equirectangular) { PI } else { widest } }
     }
 
-    /// Whether a ball may be seen: where its point nearest to the axis projects, widened by the ball's angular radius.
+    /// Whether a ball may be seen: where its center projects (or, for one beyond the image's rim, its point nearest to the
+    /// axis), widened by the ball's angular radius.
     fn sees(&self, center: DVec3, radius: f64) -> bool {
         let c = &self.posed.camera;
         let p = self.posed.pose.inverse().point(center);
@@ -228,11 +229,13 @@ impl<'a> Sight<'a> {
             return false;
         }
         let across = DVec3::new(p.x, p.y, 0.0).normalize_or_zero();
-        let Some(x) = c.project(across * nearest.sin() + DVec3::Z * nearest.cos()) else { return false };
+        let angle = p.angle_between(DVec3::Z);
+        let angle = if angle <= self.widest { angle } else { nearest };
+        let Some(x) = c.project(across * angle.sin() + DVec3::Z * angle.cos()) else { return false };
         let (w, h) = (c.width as f64, c.height as f64);
         // A perspective image stretches towards its rim.
-        let stretch = if matches!(c.lens, Lens::Fisheye { .. }) { 1.0 } else { nearest.cos().max(0.05).powi(-2) };
-        let margin = 1.2 * size * c.fx.max(c.fy) * stretch + 0.05 * w.max(h);
+        let stretch = if matches!(c.lens, Lens::Fisheye { .. }) { 1.0 } else { angle.cos().max(0.05).powi(-2) };
+        let margin = size * c.fx.max(c.fy) * stretch + 0.05 * w.max(h);
         x.x > -margin && x.x < w + margin && x.y > -margin && x.y < h + margin
     }
 }
