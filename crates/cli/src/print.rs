@@ -19,7 +19,7 @@ pub fn line(text: Arguments) {
     finish(out.write_fmt(text).and_then(|()| out.write_all(b"\n")));
 }
 
-/// Writes bytes to stdout, as [`line`].
+/// Writes bytes to stdout, as `line`.
 pub fn bytes(text: &[u8]) {
     let mut out = std::io::stdout().lock();
     finish(out.write_all(text).and_then(|()| out.flush()));

@@ -26,7 +26,7 @@ const FRONT: f64 = 0.25;
 pub struct Surfaces(Vec<DVec3>);
 
 impl Surfaces {
-    /// Of up to [`VIEWS`] training views, at [`VIEW_PX`].
+    /// Of up to `VIEWS` training views, at `VIEW_PX`.
     pub fn of(model: &ObjectModel) -> Surfaces {
         let frames = spread(&model.train, VIEWS);
         let tracer = model.tracer(Quality::Fast);

@@ -61,7 +61,7 @@ pub struct HeldOutPixels {
 }
 
 impl HeldOutPixels {
-    /// Draws from up to [`VIEWS`] held-out photographs; `None` where none is held out.
+    /// Draws from up to `VIEWS` held-out photographs; `None` where none is held out.
     ///
     /// # Errors
     /// When a photograph or its mask cannot be read.
