@@ -338,3 +338,29 @@ fn train_refuses_a_model_that_contradicts_itself_and_doctor_says_why() {
     let model = told["findings"].as_array().unwrap().iter().find(|f| f["subject"] == "model").unwrap().clone();
     assert!(model["grade"] == "trouble" && model["cure"].as_str().unwrap().contains("prepare"), "{model}");
 }
+
+#[test]
+fn broken_photographs_are_named_or_left_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let (photos, model, out, colmap) =
+        (dir.path().join("photos"), dir.path().join("model"), dir.path().join("data"), dir.path().join("colmap"));
+    capture(&photos, &model);
+    stand_in(&colmap, &model);
+    let whole = std::fs::read(photos.join("view_00.jpg")).unwrap();
+    std::fs::write(photos.join("view_99.jpg"), &whole[..whole.len() * 9 / 10]).unwrap();
+    let prepare = |more: &[&str]| {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
+        c.env("DIORAMA_COLMAP", &colmap).arg("prepare").arg(&photos).arg("-o").arg(&out).args(more).arg("--json");
+        let o = c.output().unwrap();
+        (o.status.code(), String::from_utf8_lossy(&o.stderr).into_owned(), o.stdout)
+    };
+    let (code, said, _) = prepare(&[]);
+    assert_eq!(code, Some(2), "{said}");
+    assert!(said.contains("view_99.jpg") && said.contains("ends early") && said.contains("--skip-broken"), "{said}");
+    let (code, said, made) = prepare(&["--force", "--skip-broken"]);
+    assert_eq!(code, Some(0), "{said}");
+    let made: serde_json::Value = serde_json::from_slice(&made).unwrap();
+    assert_eq!(made["broken"], serde_json::json!(["view_99.jpg"]));
+    assert_eq!((&made["images"], &made["registered"]), (&(VIEWS as u64).into(), &(VIEWS as u64).into()));
+    assert!(!out.join("images/view_99.jpg").exists());
+}

@@ -1,5 +1,6 @@
 //! JPEG files without decoding them (ITU T.81): size and orientation from their head, and whether their data are all there.
 
+use std::borrow::Cow;
 use std::io::{self, BufRead, Read, Seek, SeekFrom};
 
 /// What a file's head says.
@@ -64,9 +65,13 @@ fn markers(reader: &mut (impl BufRead + Seek)) -> io::Result<Option<Header>> {
     }
 }
 
-/// Whether a file holds all data of its picture. Most end with a marker; where it is missing, the coded data are counted.
-pub fn is_whole(file: &[u8]) -> bool {
-    walk(file).unwrap_or(false)
+/// A file that holds all data of its picture, with its end marker; none where it ends early. Where the marker is missing, the coded
+/// data are counted.
+pub fn whole(file: &[u8]) -> Option<Cow<'_, [u8]>> {
+    if walk(file)? {
+        return Some(file.into());
+    }
+    Some([file.strip_suffix(&[0xff]).unwrap_or(file), &[0xff, 0xd9]].concat().into())
 }
 
 /// Where the coded data of a scan end: at the next marker that is neither a stuffed byte, nor a restart, nor a fill byte.
@@ -113,7 +118,7 @@ const MOST_SCANS: usize = 1000;
 /// Most bytes behind the last data of a scan.
 const PADDING: usize = 16;
 
-/// True at the end marker, or where the file ends after the last of the data.
+/// True at the end marker, false where the file ends after the last of the data, none where it ends before.
 fn walk(file: &[u8]) -> Option<bool> {
     let mut frame = Frame::default();
     let (mut tables, mut restart) = (Tables::default(), 0usize);
@@ -123,7 +128,8 @@ fn walk(file: &[u8]) -> Option<bool> {
     let mut scans = Vec::new();
     loop {
         let Some(marker) = next_marker(file, &mut at) else {
-            return Some(count && frame.components.iter().all(|c| c.done == u64::MAX) && !frame.components.is_empty());
+            let all = count && frame.components.iter().all(|c| c.done == u64::MAX) && !frame.components.is_empty();
+            return all.then_some(false);
         };
         if marker == 0xd9 {
             return Some(true);

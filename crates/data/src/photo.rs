@@ -236,11 +236,9 @@ pub fn load_full(path: &Path) -> Result<Photo> {
         return Err(DataError::input(path, format!("the image file is empty (0 bytes); {CURE}")));
     }
     // The decoder fills up with gray what a JPEG lacks.
-    if bytes.starts_with(&[0xff, 0xd8]) && !jpeg::is_whole(&bytes) {
-        return Err(ends_early(path));
-    }
+    let bytes = if bytes.starts_with(&[0xff, 0xd8]) { jpeg::whole(&bytes).ok_or_else(|| ends_early(path))? } else { (&bytes[..]).into() };
     let is_exr = bytes.starts_with(&[0x76, 0x2f, 0x31, 0x01]);
-    let mut decoder = decoder(path, &limits, Cursor::new(&bytes))?;
+    let mut decoder = decoder(path, &limits, Cursor::new(&*bytes))?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut im = DynamicImage::from_decoder(decoder).map_err(|e| failed(path, &limits, e))?;
     im.apply_orientation(orientation);

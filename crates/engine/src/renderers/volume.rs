@@ -473,6 +473,40 @@ mod tests {
         tracer.clip = Some(([0.45, 0.0, 0.45], [0.55, 1.0, 0.55]));
         let v = tracer.view(&camera, &mut |_| {});
         assert!(v.opacity.data[40] > 0.9 && v.opacity.data[42] == 0.0);
+        // A turned box hides the rest of it: standing on its edge it is seen through its corner.
+        tracer.clip = None;
+        let turned = diorama_geom::glam::DMat3::from_rotation_y(std::f64::consts::FRAC_PI_4);
+        let place = Pose { rotation: turned, translation: DVec3::splat(0.5) };
+        tracer.crop = Some(OrientedBox { place, sides: DVec3::new(0.4, 0.9, 0.4) });
+        let v = tracer.view(&camera, &mut |_| {});
+        let at = |x: usize, y: usize| v.opacity.data[y * 9 + x];
+        assert!(at(4, 4) > 0.9 && at(3, 4) > 0.5 && at(4, 3) > 0.5, "within");
+        assert!([(0, 0), (8, 8), (0, 4), (2, 2)].iter().all(|(x, y)| at(*x, *y) == 0.0), "beside");
+    }
+
+    #[test]
+    fn linear_light_is_seen_along_the_srgb_curve() {
+        let grid = HashGridConfig { levels: 2, features: 2, log2_size: 8, base: 4, finest: 8 };
+        let field = fields::ngp(grid, 1.0, false, 1e-2, 0, 0, 1);
+        let pose = Pose::look_at(DVec3::new(0.5, -1.5, 0.5), DVec3::new(0.5, -9.0, 0.5), DVec3::Z);
+        let camera = PosedCamera { camera: Camera::pinhole(2, 2, 0.8), pose };
+        let tracer = Tracer {
+            field: &field,
+            sampling: Sampling::Stratified { samples: 2 },
+            backdrop: Backdrop::Color([0.214_041, 1.0, 7.0]),
+            near: 0.1,
+            cube: (0.0, 1.0),
+            clip: None,
+            crop: None,
+            is_linear: true,
+            pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
+            appearance: None,
+            tolerance: 0.0,
+            accelerator: None,
+        };
+        let v = tracer.view(&camera, &mut |_| {});
+        let want = [0.5, 1.0, srgb_from_linear(7.0)];
+        assert!((0..3).all(|k| (v.rgb.data[k] - want[k]).abs() < 1e-3), "{:?}", &v.rgb.data[..3]);
     }
 
     fn picture(w: usize, h: usize, f: impl Fn(usize, usize) -> f32) -> View {
