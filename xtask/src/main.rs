@@ -46,15 +46,16 @@ fn fuzz(runs: &str) -> bool {
     built && Command::new("target/release/diorama-fuzz").arg(runs).status().is_ok_and(|s| s.success())
 }
 
-/// Builds once for devices, separated by commas, and compares every op on each with its reference.
+/// Builds once for devices, separated by commas, and compares every op on each with its reference. Where the build is not the default one,
+/// which holds nothing of burn, ops in burn's graph are compared as well.
 fn gpu_check(devices: &str) -> bool {
     // Vulkan, or Metal on macOS, is what the default build holds, so that nothing is built anew for it.
     let features: Vec<&str> = devices.split(',').map(|d| if ["vulkan", "metal"].contains(&d) { "native" } else { d }).collect();
-    let mut features = features.join(",");
-    let mut build = vec!["build", "--release", "--package", "diorama"];
-    if features != "native" {
-        features += ",burn-gpu";
-        build.extend(["--no-default-features", "--features", &features]);
+    let features = features.join(",");
+    let with_graph = features != "native";
+    let mut build = vec!["build", "--release", "--package", "diorama", "--bin", "diorama"];
+    if with_graph {
+        build.extend(["--package", "diorama-graph", "--example", "graph-check", "--no-default-features", "--features", &features]);
     }
     if !step("build", cargo(&build)) {
         return false;
@@ -67,13 +68,21 @@ fn gpu_check(devices: &str) -> bool {
         if std::path::Path::new(&fox).is_dir() {
             args.extend(["--data", &fox]);
         }
-        println!("\n$ diorama {}", args.join(" "));
-        let mut check = Command::new("target/release/diorama");
-        check.args(args);
-        let ready = device != "cuda" || has_nvidia() || play_cuda(&mut check);
-        ok &= step(device, ready && check.status().is_ok_and(|s| s.success()));
+        ok &= step(device, on_device(device, "target/release/diorama", &args));
+        if with_graph {
+            ok &= step(&format!("{device}, burn's graph"), on_device(device, "target/release/examples/graph-check", &[device]));
+        }
     }
     ok
+}
+
+/// Runs a check, with the CPU playing CUDA where there is no such device.
+fn on_device(device: &str, program: &str, args: &[&str]) -> bool {
+    println!("\n$ {program} {}", args.join(" "));
+    let mut check = Command::new(program);
+    check.args(args);
+    let ready = device != "cuda" || has_nvidia() || play_cuda(&mut check);
+    ready && check.status().is_ok_and(|s| s.success())
 }
 
 fn has_nvidia() -> bool {

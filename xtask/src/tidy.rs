@@ -4,9 +4,10 @@
 use std::path::{Path, PathBuf};
 
 /// Which crates each crate may import (ARCHITECTURE.md).
-const IMPORTS: [(&str, &[&str]); 10] = [
+const IMPORTS: [(&str, &[&str]); 11] = [
     ("geom", &[]),
     ("kernels", &["geom"]),
+    ("graph", &["geom", "kernels"]),
     ("engine", &["geom", "kernels"]),
     ("mesh", &["geom", "kernels"]),
     ("data", &["geom"]),
@@ -21,7 +22,10 @@ const MAX_LINES: usize = 800;
 const MAX_BYTES: u64 = 2 << 20;
 const BANNED: [&str; 6] = ["utils", "common", "helpers", "misc", "manager", "legacy"];
 const UNSAFE: [&str; 2] = ["crates/kernels/", "crates/data/"];
-const BURN: [&str; 4] = ["kernels", "engine", "nets", "pipelines"];
+/// The room that burn is for. The program is built without it, because it takes a minute to compile.
+const BURN: &str = "graph";
+/// Dependencies under another name in the sources, and those that are listed for their features alone.
+const NAMED_ELSE: [(&str, &str); 2] = [("kamadak-exif", "exif"), ("cubecl-native", "")];
 
 /// Prints every breach; true when there are none.
 pub fn run() -> bool {
@@ -32,6 +36,7 @@ pub fn run() -> bool {
     for f in &files {
         check_file(root, f, &mut breaches);
     }
+    check_manifests(root, &files, &mut breaches);
     check_architecture(root, &mut breaches);
     breaches.iter().for_each(|b| println!("tidy: {b}"));
     breaches.is_empty()
@@ -91,7 +96,7 @@ fn check_file(root: &Path, path: &Path, breaches: &mut Vec<String>) {
         if is_tidy || !name.starts_with("crates/") {
             continue;
         }
-        if (code.contains("use burn::") || code.contains(" burn::")) && !BURN.contains(&&*this) {
+        if (code.contains("use burn::") || code.contains(" burn::")) && this != BURN {
             breaches.push(format!("{at}: burn is not for {this}"));
         }
         let Some((_, allowed)) = IMPORTS.iter().find(|(c, _)| *c == this) else { continue };
@@ -103,6 +108,54 @@ fn check_file(root: &Path, path: &Path, breaches: &mut Vec<String>) {
             }
         }
     }
+}
+
+/// Every dependency must be used by its crate, and burn stays in its room.
+fn check_manifests(root: &Path, files: &[PathBuf], breaches: &mut Vec<String>) {
+    for manifest in files.iter().filter(|f| f.ends_with("Cargo.toml")) {
+        let folder = manifest.parent().unwrap_or(root);
+        let name = manifest.strip_prefix(root).unwrap_or(manifest).to_string_lossy().replace('\\', "/");
+        if !name.starts_with("crates/") && !name.starts_with("fuzz/") {
+            continue;
+        }
+        let Ok(text) = std::fs::read_to_string(manifest) else { continue };
+        let sources = files.iter().filter(|f| f.starts_with(folder) && f.extension().is_some_and(|e| e == "rs"));
+        let code: String = sources.filter_map(|f| std::fs::read_to_string(f).ok()).collect();
+        for dependency in dependencies(&text) {
+            if ["burn", "burn-cubecl", "diorama-graph"].contains(&dependency) && !name.starts_with(&format!("crates/{BURN}/")) {
+                breaches.push(format!("{name}: {dependency} is for {BURN} only"));
+            }
+            let known = NAMED_ELSE.iter().find(|(d, _)| *d == dependency).map(|(_, n)| n.to_string());
+            let used = known.unwrap_or_else(|| dependency.replace('-', "_"));
+            if !mentions(&code, &used) {
+                breaches.push(format!("{name}: {dependency} is not used"));
+            }
+        }
+    }
+}
+
+/// Names in a manifest's tables of dependencies.
+fn dependencies(manifest: &str) -> impl Iterator<Item = &str> {
+    let mut within = false;
+    manifest.lines().filter_map(move |line| {
+        if line.starts_with('[') {
+            within = line.ends_with("dependencies]");
+        }
+        let name = line.split(['=', '.', ' ']).next()?;
+        (within && !name.is_empty() && !name.starts_with(['[', '#'])).then_some(name)
+    })
+}
+
+/// Whether code names a crate as a whole word, outside of comments.
+fn mentions(code: &str, name: &str) -> bool {
+    let part = |c: char| c.is_alphanumeric() || c == '_';
+    code.lines().map(|l| l.split("//").next().unwrap_or_default()).any(|line| {
+        line.match_indices(name).any(|(at, _)| {
+            let after = &line[at + name.len()..];
+            let is_path = after.starts_with("::") || (line.trim_start().starts_with("use ") && !after.starts_with(part));
+            is_path && !line[..at].ends_with(part)
+        })
+    })
 }
 
 /// Every `crates/…` path in backticks must exist.
@@ -146,6 +199,20 @@ mod tests {
         ] {
             assert!(b.iter().any(|l| l.contains(what)), "{what}: {b:?}");
         }
+    }
+
+    #[test]
+    fn idle_and_misplaced_dependencies_are_found() {
+        let dir = std::env::temp_dir().join(format!("tidy-manifests-{}", std::process::id()));
+        let (manifest, source) = (dir.join("crates/mesh/Cargo.toml"), dir.join("crates/mesh/src/lib.rs"));
+        std::fs::create_dir_all(source.parent().unwrap()).unwrap();
+        let lists = "[package]\nname = \"x\"\n[dependencies]\nburn.workspace = true\nserde = \"1\"\nrayon = \"1\"\n# none\n[dev-dependencies]\nlas = \"0\"\n";
+        std::fs::write(&manifest, lists).unwrap();
+        std::fs::write(&source, "use burn::tensor;\nuse rayon::prelude;\n// serde::de\nfn f() { las::read(); my_serde::g() }\n").unwrap();
+        let mut b = Vec::new();
+        check_manifests(&dir, &[manifest, source], &mut b);
+        std::fs::remove_dir_all(&dir).unwrap();
+        assert_eq!(b, ["crates/mesh/Cargo.toml: burn is for graph only", "crates/mesh/Cargo.toml: serde is not used"]);
     }
 
     #[test]

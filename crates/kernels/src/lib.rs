@@ -5,7 +5,6 @@
 
 #[cfg(target_arch = "x86_64")]
 mod amx;
-pub mod burn_op;
 pub mod device;
 pub mod gemm;
 #[cfg(feature = "gpu")]

@@ -44,7 +44,6 @@ pub struct Gpu {
     pub name: String,
     /// Whether the CPU plays the device.
     pub software: bool,
-    #[cfg_attr(not(feature = "burn-gpu"), expect(dead_code, reason = "burn asks for it"))]
     device: cubecl::Device,
     pub(crate) client: Client,
     /// Whether f32 can be added atomically; else exchanges serve.
@@ -63,13 +62,16 @@ pub struct Buffer {
 
 impl Buffer {
     /// `len` numbers in memory that is there already.
-    #[cfg(feature = "burn-gpu")]
-    pub(crate) fn of(handle: Handle, len: usize) -> Buffer {
+    ///
+    /// # Panics
+    /// When the memory holds fewer.
+    pub fn of(handle: Handle, len: usize) -> Buffer {
+        assert!(handle.size_in_used() >= 4 * len as u64, "{len} numbers in {} bytes", handle.size_in_used());
         Buffer { handle, len }
     }
 
-    #[cfg(feature = "burn-gpu")]
-    pub(crate) fn handle(self) -> Handle {
+    /// The memory, for another library on the same device.
+    pub fn handle(self) -> Handle {
         self.handle
     }
 
@@ -160,9 +162,11 @@ impl Gpu {
         Gpu { shared: !(software && spirv), api, name, software, device, client, native_atomics }
     }
 
-    /// A device that burn has opened.
-    #[cfg(feature = "burn-gpu")]
-    pub(crate) fn of(device: cubecl::Device, client: Client) -> Gpu {
+    /// A device that another library has opened.
+    ///
+    /// # Panics
+    /// When ops cannot run on such a device.
+    pub fn of(device: cubecl::Device, client: Client) -> Gpu {
         let (api, software) = match &device {
             cubecl::Device::Cuda(_) => (Api::Cuda, false),
             cubecl::Device::Wgpu(d) => {
@@ -178,10 +182,14 @@ impl Gpu {
         Gpu::with(api, device, software, client)
     }
 
-    /// The device for burn's tensors; ops in burn's graph run on it without copies.
-    #[cfg(feature = "burn-gpu")]
-    pub fn tensors(&self) -> burn::tensor::Device {
-        burn::tensor::Device::new(self.device.clone())
+    /// The device as CubeCL names it, for another library that shares it.
+    pub fn device(&self) -> &cubecl::Device {
+        &self.device
+    }
+
+    /// Whether kernels may use memory shared by a cube.
+    pub fn shares_memory(&self) -> bool {
+        self.shared
     }
 
     /// The same device adding without native f32 atomics.

@@ -1,7 +1,5 @@
 //! One unit per ray for weights and densities, one per ray and channel for colours.
 
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
 use cubecl::prelude::*;
 
@@ -133,33 +131,6 @@ pub fn backward(
         );
     }
     g
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::CompositeOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        let (r, c) = (self.offsets.len() - 1, i[1].shape[1]);
-        let p = GpuPacked::upload(gpu, &self.packed());
-        let out = forward(gpu, &p, &i[0].data, &i[1].data, c, &i[2].data);
-        let GpuComposited { color, depth, opacity, weights } = out;
-        let kept = vec![p.offsets, p.t, p.dt, color.clone(), depth.clone(), opacity.clone(), weights.clone()];
-        Ahead { outputs: vec![(color, vec![r, c]), (depth, vec![r]), (opacity, vec![r]), (weights, vec![self.t.len()])], kept }
-    }
-
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        let at = |k: usize| kept[k].clone();
-        let p = GpuPacked { offsets: at(0), t: at(1), dt: at(2) };
-        let out = GpuComposited { color: at(3), depth: at(4), opacity: at(5), weights: at(6) };
-        let of = |k: usize, like: &Buffer| d[k].clone().unwrap_or_else(|| gpu.zeros(like.len()));
-        let d = GpuComposited {
-            color: of(0, &out.color),
-            depth: of(1, &out.depth),
-            opacity: of(2, &out.opacity),
-            weights: of(3, &out.weights),
-        };
-        let g = backward(gpu, &p, &i[1].data, i[1].shape[1], &i[2].data, &out, &d);
-        vec![Some(g.sigma), Some(g.features), Some(g.background)]
-    }
 }
 
 #[cube(launch_unchecked)]

@@ -1,6 +1,4 @@
 use super::*;
-use crate::burn_op::values;
-use burn::tensor::{Device, TensorData};
 use diorama_testkit::{assert_close, assert_gradient, random, random_unit, wide};
 
 pub(crate) struct Scene {
@@ -116,21 +114,4 @@ fn transmittance_and_split_match_the_reference_and_each_other() {
     let whole = cpu::forward(&p, &s.sigma, &f, 3, &vec![0.0; 120]);
     let joined: Vec<f64> = (0..120).map(|i| (front[i] + between[i / 3] * back[i]) as f64).collect();
     assert_close("front + T back", &whole.color, &joined, 1e-4);
-}
-
-#[test]
-fn burn_sees_the_same_gradients() {
-    let s = scene(5, 4);
-    let n = s.t.len();
-    let device = Device::flex().autodiff();
-    let f = random(n * 3, 1);
-    let st = Tensor::<1>::from_data(TensorData::new(s.sigma.clone(), [n]), &device).require_grad();
-    let ft = Tensor::<2>::from_data(TensorData::new(f.clone(), [n, 3]), &device).require_grad();
-    let bt = Tensor::<2>::zeros([5, 3], &device);
-    let (color, _, _, weights) = composite(s.packed(), st.clone(), ft.clone(), bt);
-    let grads = (color.sum() + weights.sum() * 0.5).backward();
-    let d = Composited { color: vec![1.0; 15], depth: vec![0.0; 5], opacity: vec![0.0; 5], weights: vec![0.5; n] };
-    let (ds, df, _) = reference::backward(&s.packed(), &wide(&s.sigma), &wide(&f), 3, &[0.0; 15], &d);
-    assert_close("sigma", &values(st.grad(&grads).unwrap()), &ds, 1e-4);
-    assert_close("features", &values(ft.grad(&grads).unwrap()), &df, 1e-4);
 }

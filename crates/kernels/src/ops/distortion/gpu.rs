@@ -1,7 +1,5 @@
 //! One unit per ray, by running sums as on the CPU.
 
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use crate::ops::composite::gpu::GpuPacked;
 use cubecl::prelude::*;
@@ -65,19 +63,6 @@ fn run(gpu: &Gpu, p: &GpuPacked, weights: &Buffer, d_loss: &Buffer, loss: &Buffe
                 r as u32,
             );
         }
-    }
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::DistortionOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        let p = GpuPacked::upload(gpu, &super::Packed { offsets: &self.offsets, t: &self.t, dt: &self.dt });
-        Ahead { outputs: vec![(forward(gpu, &p, &i[0].data), vec![p.rays()])], kept: vec![p.offsets, p.t, p.dt] }
-    }
-
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        let p = GpuPacked { offsets: kept[0].clone(), t: kept[1].clone(), dt: kept[2].clone() };
-        vec![d[0].as_ref().map(|d| backward(gpu, &p, &i[0].data, d))]
     }
 }
 

@@ -1,8 +1,6 @@
 //! One unit per number of the input.
 
 use super::Frequency;
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use cubecl::prelude::*;
 
@@ -62,17 +60,6 @@ pub fn backward(gpu: &Gpu, f: &Frequency, x: &Buffer, d_out: &Buffer) -> Buffer 
         }
     }
     out
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::FrequencyOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        Ahead { outputs: vec![(forward(gpu, &self.0, &i[0].data), vec![i[0].shape[0], self.0.output_dims()])], kept: vec![] }
-    }
-
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], _: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        vec![d[0].as_ref().map(|d| backward(gpu, &self.0, &i[0].data, d))]
-    }
 }
 
 #[cube(launch_unchecked)]

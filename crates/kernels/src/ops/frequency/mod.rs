@@ -9,9 +9,6 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
-use crate::burn_op::{self, In, Out, SliceOp};
-use burn::tensor::Tensor;
-
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Frequency {
     pub dims: usize,
@@ -36,31 +33,4 @@ impl Frequency {
             Some(a) => 0.5 * (1.0 - (std::f64::consts::PI * (a as f64 - k as f64).clamp(0.0, 1.0)).cos()),
         }
     }
-}
-
-#[derive(Debug)]
-struct FrequencyOp(Frequency);
-
-impl SliceOp for FrequencyOp {
-    fn forward(&self, i: &[In]) -> Vec<Out> {
-        let n = i[0].shape[0];
-        let mut out = vec![0.0; n * self.0.output_dims()];
-        cpu::forward(&self.0, i[0].data, &mut out);
-        vec![(out, vec![n, self.0.output_dims()])]
-    }
-    fn backward(&self, i: &[In], d: &[Option<&[f32]>]) -> Vec<Option<Vec<f32>>> {
-        vec![d[0].map(|d| {
-            let mut dx = vec![0.0; i[0].data.len()];
-            cpu::backward(&self.0, i[0].data, d, &mut dx);
-            dx
-        })]
-    }
-}
-
-/// Encodes rows, differentiable in `x`.
-///
-/// # Shapes
-/// x: `[N, dims]`; result: `[N, output_dims]`, per band all sines then all cosines.
-pub fn frequency(f: &Frequency, x: Tensor<2>) -> Tensor<2> {
-    burn_op::apply_one(FrequencyOp(*f), vec![x.into_dispatch()])
 }

@@ -1,6 +1,4 @@
 use super::*;
-use crate::burn_op::values;
-use burn::tensor::{Device, TensorData};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
 fn variants() -> Vec<Frequency> {
@@ -46,14 +44,4 @@ fn the_window_changes_the_encoding() {
     let none = reference::forward(&Frequency { window: Some(0.0), ..full }, &x);
     assert!(none.iter().all(|v| *v == 0.0));
     assert_eq!(reference::forward(&Frequency { window: Some(4.0), ..full }, &x), reference::forward(&full, &x));
-}
-
-#[test]
-fn burn_sees_the_same_gradient() {
-    let f = variants()[0];
-    let x = random(6, 1);
-    let xt = Tensor::<2>::from_data(TensorData::new(x.clone(), [2, 3]), &Device::flex().autodiff()).require_grad();
-    let grads = frequency(&f, xt.clone()).sum().backward();
-    let want = reference::backward(&f, &wide(&x), &vec![1.0; 120]);
-    assert_close("x", &values(xt.grad(&grads).unwrap()), &want, 1e-4);
 }

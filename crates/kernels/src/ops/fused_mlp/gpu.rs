@@ -3,8 +3,6 @@
 pub mod fused;
 
 use super::{Mlp, Source};
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
 use crate::ops::linear::gpu::{self as linear, Part};
 use crate::ops::linear::{Activation, BiasKind};
@@ -115,31 +113,6 @@ pub(crate) fn columns(gpu: &Gpu, rows: &Rows, width: usize, from: (&Buffer, usiz
             to.2 as u32,
             add,
         );
-    }
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::MlpOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        let (n, width) = (i[0].shape[0], self.0.layers.last().map_or(0, |l| l.width));
-        let (params, inputs) = i.split_last().expect("the parameters come last");
-        let inputs: Vec<&Buffer> = inputs.iter().map(|i| &i.data).collect();
-        let values = forward(gpu, &self.0, &params.data, &inputs, &Rows::all(gpu, n));
-        let out = values.last().cloned().unwrap_or_else(|| gpu.empty(0));
-        Ahead { outputs: vec![(out, vec![n, width])], kept: values }
-    }
-
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        let Some(d) = &d[0] else { return vec![None; i.len()] };
-        let (params, inputs) = i.split_last().expect("the parameters come last");
-        let inputs: Vec<&Buffer> = inputs.iter().map(|i| &i.data).collect();
-        let mut d_layers = vec![None; kept.len()];
-        if let Some(last) = d_layers.last_mut() {
-            *last = Some(d.clone());
-        }
-        let rows = Rows::all(gpu, i[0].shape[0]);
-        let (d_params, d_inputs) = backward(gpu, &self.0, &params.data, &inputs, kept, &rows, d_layers);
-        d_inputs.into_iter().chain([d_params]).map(Some).collect()
     }
 }
 

@@ -9,9 +9,7 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
-use crate::burn_op::{self, In, Out, SliceOp};
 use crate::gemm::Precision;
-use burn::tensor::Tensor;
 use diorama_geom::rng::Rng;
 
 /// What a layer reads.
@@ -112,38 +110,4 @@ impl Mlp {
         }
         params
     }
-}
-
-#[derive(Debug)]
-struct MlpOp(Mlp);
-
-impl SliceOp for MlpOp {
-    fn forward(&self, i: &[In]) -> Vec<Out> {
-        let n = i[0].shape[0];
-        let (params, inputs) = i.split_last().expect("the parameters come last");
-        let inputs: Vec<&[f32]> = inputs.iter().map(|i| i.data).collect();
-        let width = self.0.layers.last().map_or(0, |l| l.width);
-        let mut out = vec![0.0; n * width];
-        cpu::forward(&self.0, params.data, &inputs, n, &mut out);
-        vec![(out, vec![n, width])]
-    }
-    fn backward(&self, i: &[In], d: &[Option<&[f32]>]) -> Vec<Option<Vec<f32>>> {
-        let Some(d) = d[0] else { return vec![None; i.len()] };
-        let n = i[0].shape[0];
-        let (params, inputs) = i.split_last().expect("the parameters come last");
-        let inputs: Vec<&[f32]> = inputs.iter().map(|i| i.data).collect();
-        let mut d_inputs: Vec<Vec<f32>> = inputs.iter().map(|i| vec![0.0; i.len()]).collect();
-        let mut d_params = vec![0.0; params.data.len()];
-        cpu::backward(&self.0, params.data, &inputs, n, d, &mut d_params, &mut d_inputs);
-        d_inputs.into_iter().map(Some).chain([Some(d_params)]).collect()
-    }
-}
-
-/// The network's last layer as a burn op, differentiable in its inputs and parameters.
-///
-/// # Shapes
-/// inputs: up to three `[N, K_i]`; params: `[params_len]`; result: `[N, width]`.
-pub fn fused_mlp(mlp: &Mlp, inputs: Vec<Tensor<2>>, params: Tensor<1>) -> Tensor<2> {
-    let all = inputs.into_iter().map(|t| t.into_dispatch()).chain([params.into_dispatch()]).collect();
-    burn_op::apply_one(MlpOp(mlp.clone()), all)
 }

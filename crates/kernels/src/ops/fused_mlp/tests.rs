@@ -1,6 +1,4 @@
 use super::*;
-use crate::burn_op::values;
-use burn::tensor::{Device, TensorData};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
 /// A chain, and a network with two inputs, a skip connection and a split head.
@@ -70,22 +68,4 @@ fn reference_gradients_match_central_differences() {
 #[should_panic(expected = "does not come before")]
 fn a_layer_cannot_read_ahead() {
     Mlp::new(vec![1], vec![Layer { inputs: vec![Source::Layer(0)], width: 1, relu: false, bias: false }]);
-}
-
-#[test]
-fn burn_sees_the_same_gradients() {
-    let mlp = &nets()[1];
-    let device = Device::flex().autodiff();
-    let params = mlp.init(&Rng::new(1, 2));
-    let (a, b) = (random(15, 1), random(9, 2));
-    let at = Tensor::<2>::from_data(TensorData::new(a.clone(), [3, 5]), &device).require_grad();
-    let bt = Tensor::<2>::from_data(TensorData::new(b.clone(), [3, 3]), &device).require_grad();
-    let pt = Tensor::<1>::from_data(TensorData::new(params.clone(), [params.len()]), &device).require_grad();
-    let grads = fused_mlp(mlp, vec![at.clone(), bt.clone()], pt.clone()).sum().backward();
-    let mut seeds: Vec<Vec<f64>> = mlp.layers.iter().map(|l| vec![0.0; 3 * l.width]).collect();
-    seeds[3].fill(1.0);
-    let (dp, di) = reference::backward(mlp, &wide(&params), &[&wide(&a), &wide(&b)], 3, &seeds);
-    assert_close("params", &values(pt.grad(&grads).unwrap()), &dp, 1e-4);
-    assert_close("input", &values(at.grad(&grads).unwrap()), &di[0], 1e-4);
-    assert_close("input", &values(bt.grad(&grads).unwrap()), &di[1], 1e-4);
 }

@@ -1,8 +1,6 @@
 //! One unit per level and point; the table's gradient is added atomically.
 
 use super::HashGrid;
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Rows, Swap, units};
 use cubecl::prelude::*;
 
@@ -12,7 +10,8 @@ const LEVEL: usize = 4;
 /// A grid whose description lies on the device.
 pub struct GpuHashGrid {
     pub grid: HashGrid,
-    levels: Buffer,
+    /// What the kernels know of each level.
+    pub levels: Buffer,
 }
 
 impl GpuHashGrid {
@@ -134,24 +133,6 @@ struct Corner {
     dx: f32,
     dy: f32,
     dz: f32,
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::HashGridOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        let (g, s) = (GpuHashGrid::new(gpu, &self.0), i[0].shape[0]);
-        let out = g.forward(gpu, &Rows::all(gpu, s), &i[0].data, &i[1].data);
-        Ahead { outputs: vec![(out, vec![self.0.levels.len(), s, self.0.config.features])], kept: vec![g.levels] }
-    }
-
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        let Some(d) = &d[0] else { return vec![None, None] };
-        let g = GpuHashGrid { grid: self.0.clone(), levels: kept[0].clone() };
-        let rows = Rows::all(gpu, i[0].shape[0]);
-        let d_table = gpu.zeros(self.0.params_len());
-        g.backward(gpu, &rows, &i[0].data, d, &d_table);
-        vec![Some(g.backward_positions(gpu, &rows, &i[0].data, &i[1].data, d)), Some(d_table)]
-    }
 }
 
 #[cube]

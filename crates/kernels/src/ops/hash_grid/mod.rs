@@ -14,9 +14,6 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
-use crate::burn_op::{self, In, Out, SliceOp};
-use burn::tensor::Tensor;
-
 /// Shape of the table.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HashGridConfig {
@@ -103,33 +100,4 @@ impl Level {
             h as usize & (self.rows - 1)
         }
     }
-}
-
-#[derive(Debug)]
-struct HashGridOp(HashGrid);
-
-impl SliceOp for HashGridOp {
-    fn forward(&self, i: &[In]) -> Vec<Out> {
-        let g = &self.0;
-        let s = i[0].shape[0];
-        let mut out = vec![0.0; s * g.output_dims()];
-        cpu::forward(g, i[0].data, i[1].data, &mut out);
-        vec![(out, vec![g.levels.len(), s, g.config.features])]
-    }
-    fn backward(&self, i: &[In], d: &[Option<&[f32]>]) -> Vec<Option<Vec<f32>>> {
-        let Some(d) = d[0] else { return vec![None, None] };
-        let mut d_points = vec![0.0; i[0].data.len()];
-        let mut d_table = vec![0.0; self.0.params_len()];
-        cpu::backward(&self.0, i[0].data, d, &mut d_table, None);
-        cpu::backward_positions(&self.0, i[0].data, i[1].data, d, &mut d_points);
-        vec![Some(d_points), Some(d_table)]
-    }
-}
-
-/// Encodes points, differentiable in the points and in the table.
-///
-/// # Shapes
-/// points: `[S, 3]` in `[0, 1]³`; table: `[rows, F]`; result: `[L, S, F]`.
-pub fn hash_grid(grid: &HashGrid, points: Tensor<2>, table: Tensor<2>) -> Tensor<3> {
-    burn_op::apply_one(HashGridOp(grid.clone()), vec![points.into_dispatch(), table.into_dispatch()])
 }

@@ -1,6 +1,4 @@
 use super::*;
-use crate::burn_op::values;
-use burn::tensor::{Device, TensorData};
 use diorama_testkit::{assert_close, assert_gradient, random, random_unit, wide};
 
 fn grids() -> Vec<HashGrid> {
@@ -77,18 +75,4 @@ fn reference_gradients_match_central_differences() {
     let dj = wide(&random(6 * grid.output_dims(), 4));
     let g = reference::jacobian_backward(&grid, &p, &dj);
     assert_gradient("jacobian", &g, &t, 1e-6, |x| reference::jacobian(&grid, &p, x).iter().zip(&dj).map(|(a, b)| a * b).sum());
-}
-
-#[test]
-fn burn_sees_the_same_gradients() {
-    let grid = grids().swap_remove(1);
-    let (p, t) = (points(9), random(grid.params_len(), 2));
-    let device = Device::flex().autodiff();
-    let pt = Tensor::<2>::from_data(TensorData::new(p.clone(), [9, 3]), &device).require_grad();
-    let tt = Tensor::<2>::from_data(TensorData::new(t.clone(), [grid.rows(), 2]), &device).require_grad();
-    let grads = hash_grid(&grid, pt.clone(), tt.clone()).sum().backward();
-    let ones = vec![1.0; 9 * grid.output_dims()];
-    let (dp, dt) = reference::backward(&grid, &wide(&p), &wide(&t), &ones);
-    assert_close("points", &values(pt.grad(&grads).unwrap()), &dp, 1e-4);
-    assert_close("table", &values(tt.grad(&grads).unwrap()), &dt, 1e-4);
 }

@@ -2,8 +2,6 @@
 //! formed by slices of rows and then added up.
 
 use super::{Activation, BiasKind};
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
 use cubecl::prelude::*;
 
@@ -313,23 +311,6 @@ pub(crate) fn sum_rows_part(gpu: &Gpu, rows: &Rows, n: usize, g: &Buffer, out: P
         );
     }
     add_up(gpu, &parts, slices, n, out);
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::LinearOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        let (m, size) = (i[0].shape[0], (i[1].shape[0], i[1].shape[1]));
-        let (rows, bias) = (Rows::all(gpu, m), i.get(2).map(|b| &b.data));
-        let out = forward(gpu, &rows, size, &i[0].data, &i[1].data, bias, self.bias, self.activation);
-        Ahead { outputs: vec![(out.clone(), vec![m, size.1])], kept: vec![out] }
-    }
-
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        let Some(d) = &d[0] else { return vec![None; i.len()] };
-        let (rows, size) = (Rows::all(gpu, i[0].shape[0]), (i[1].shape[0], i[1].shape[1]));
-        let g = backward(gpu, &rows, size, &i[0].data, &i[1].data, self.bias, self.activation, &kept[0], d);
-        vec![Some(g.x), Some(g.w), g.bias]
-    }
 }
 
 #[cube(launch_unchecked)]

@@ -1,6 +1,4 @@
 use super::*;
-use crate::burn_op::values;
-use burn::tensor::{Device, TensorData};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
 const ALL: [Activation; 5] = [Activation::None, Activation::Relu, Activation::Sigmoid, Activation::Softplus, Activation::TruncatedExp];
@@ -51,17 +49,4 @@ fn reference_gradients_match_central_differences() {
         assert_gradient("w", &dw, &w, 1e-6, |w| loss(&x, w, &b));
         assert_gradient("b", &db, &b, 1e-6, |b| loss(&x, &w, b));
     }
-}
-
-#[test]
-fn burn_sees_the_same_gradients() {
-    let device = Device::flex().autodiff();
-    let t = |v: &[f32], r: usize, c: usize| Tensor::<2>::from_data(TensorData::new(v.to_vec(), [r, c]), &device).require_grad();
-    let (x, w, b) = (random(20, 1), random(12, 2), random(3, 3));
-    let (xt, wt, bt) = (t(&x, 5, 4), t(&w, 4, 3), t(&b, 1, 3));
-    let grads = linear(xt.clone(), wt.clone(), Some(bt.clone()), Activation::Sigmoid).sum().backward();
-    let (dx, dw, db) = reference::backward(5, 4, 3, &wide(&x), &wide(&w), &wide(&b), BiasKind::Shared, Activation::Sigmoid, &[1.0; 15]);
-    assert_close("x", &values(xt.grad(&grads).unwrap()), &dx, 1e-4);
-    assert_close("w", &values(wt.grad(&grads).unwrap()), &dw, 1e-4);
-    assert_close("b", &values(bt.grad(&grads).unwrap()), &db, 1e-4);
 }

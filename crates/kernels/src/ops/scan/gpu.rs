@@ -1,7 +1,5 @@
 //! Sums over all rays in one cube, sums within rays by one unit each.
 
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use cubecl::prelude::*;
 
@@ -45,18 +43,6 @@ fn within(gpu: &Gpu, offsets: &Buffer, x: &Buffer, from_the_end: bool) -> Buffer
         }
     }
     out
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::ScanOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        let offsets = gpu.upload_u32(&self.0);
-        Ahead { outputs: vec![(inclusive(gpu, &offsets, &i[0].data), i[0].shape.clone())], kept: vec![offsets] }
-    }
-
-    fn back(&self, gpu: &Gpu, _: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        vec![d[0].as_ref().map(|d| inclusive_backward(gpu, &kept[0], d))]
-    }
 }
 
 #[cube(launch_unchecked)]

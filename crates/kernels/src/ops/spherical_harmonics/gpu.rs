@@ -1,8 +1,6 @@
 //! One unit per direction, the CPU's polynomials.
 
 use super::cpu::{C1, C2, C3, C20, C22, C30, C31, C32, C33};
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use cubecl::prelude::*;
 
@@ -28,17 +26,6 @@ pub fn backward(gpu: &Gpu, degree: usize, dirs: &Buffer, d_out: &Buffer) -> Buff
         }
     }
     out
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::ShOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        Ahead { outputs: vec![(forward(gpu, self.0, &i[0].data), vec![i[0].shape[0], self.0 * self.0])], kept: vec![] }
-    }
-
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], _: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        vec![d[0].as_ref().map(|d| backward(gpu, self.0, &i[0].data, d))]
-    }
 }
 
 #[cube(launch_unchecked)]

@@ -1,6 +1,4 @@
 use super::*;
-use crate::burn_op::values;
-use burn::tensor::{Device, TensorData};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
 #[test]
@@ -46,12 +44,4 @@ fn the_basis_is_orthonormal_over_the_sphere() {
             assert!((v - (p == q) as u8 as f64).abs() < 1e-3, "{p} {q} {v}");
         }
     }
-}
-
-#[test]
-fn burn_sees_the_same_gradient() {
-    let x = random(6, 1);
-    let xt = Tensor::<2>::from_data(TensorData::new(x.clone(), [2, 3]), &Device::flex().autodiff()).require_grad();
-    let grads = spherical_harmonics(4, xt.clone()).sum().backward();
-    assert_close("x", &values(xt.grad(&grads).unwrap()), &reference::backward(4, &wide(&x), &vec![1.0; 32]), 1e-4);
 }

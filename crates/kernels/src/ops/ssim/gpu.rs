@@ -1,11 +1,9 @@
 //! One unit per window and channel for the factors, one per pixel for the gradient.
 
 use super::{C1, C2, WINDOW, gaussian};
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
+use crate::gpu::Rows;
 use crate::gpu::{Buffer, CUBE, Gpu, units};
-#[cfg(feature = "burn-gpu")]
-use crate::{gpu::Rows, ops::linear::gpu as linear};
+use crate::ops::linear::gpu as linear;
 use cubecl::prelude::*;
 
 /// SSIM of every window `[windows, C]` and, of its slope `α + β x + γ y`, the three factors `[windows, C, 3]`.
@@ -47,6 +45,19 @@ pub fn backward(gpu: &Gpu, size: (usize, usize, usize), x: &Buffer, y: &Buffer) 
     gathered(gpu, size, x, y, &slopes, &g)
 }
 
+/// The image's SSIM `[1]`, and what [`mean_backward`] takes besides the images.
+pub fn mean(gpu: &Gpu, size: (usize, usize, usize), x: &Buffer, y: &Buffer) -> (Buffer, [Buffer; 2]) {
+    let (values, slopes, g) = windows(gpu, size, x, y);
+    let sum = gpu.empty(1);
+    linear::sum_rows_part(gpu, &Rows::all(gpu, values.len()), 1, &values, (&sum).into());
+    (times(gpu, &sum, &gpu.upload(&[1.0 / values.len() as f32])), [slopes, g])
+}
+
+/// Gradient with respect to x, `[h, w, c]`, given that of [`mean`].
+pub fn mean_backward(gpu: &Gpu, size: (usize, usize, usize), x: &Buffer, y: &Buffer, kept: [&Buffer; 2], d_mean: &Buffer) -> Buffer {
+    times(gpu, &gathered(gpu, size, x, y, kept[0], kept[1]), d_mean)
+}
+
 /// The gradient from the windows' factors.
 fn gathered(gpu: &Gpu, (w, h, c): (usize, usize, usize), x: &Buffer, y: &Buffer, slopes: &Buffer, g: &Buffer) -> Buffer {
     if slopes.is_empty() {
@@ -75,7 +86,6 @@ fn gathered(gpu: &Gpu, (w, h, c): (usize, usize, usize), x: &Buffer, y: &Buffer,
 }
 
 /// `x · factor[0]`.
-#[cfg(feature = "burn-gpu")]
 fn times(gpu: &Gpu, x: &Buffer, factor: &Buffer) -> Buffer {
     let out = gpu.empty(x.len());
     // SAFETY: units past the length stop.
@@ -85,29 +95,10 @@ fn times(gpu: &Gpu, x: &Buffer, factor: &Buffer) -> Buffer {
     out
 }
 
-#[cfg(feature = "burn-gpu")]
 #[cube(launch_unchecked)]
 fn scale(x: &[f32], factor: &[f32], out: &mut [f32], len: u32) {
     if ABSOLUTE_POS < len as usize {
         out[ABSOLUTE_POS] = x[ABSOLUTE_POS] * factor[0];
-    }
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::SsimOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        let [h, w, c] = [i[0].shape[0], i[0].shape[1], i[0].shape[2]];
-        let (values, slopes, g) = windows(gpu, (w, h, c), &i[0].data, &i[1].data);
-        let sum = gpu.empty(1);
-        linear::sum_rows_part(gpu, &Rows::all(gpu, values.len()), 1, &values, (&sum).into());
-        let mean = times(gpu, &sum, &gpu.upload(&[1.0 / values.len() as f32]));
-        Ahead { outputs: vec![(mean, vec![1])], kept: vec![slopes, g] }
-    }
-
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        let Some(d) = &d[0] else { return vec![None, None] };
-        let [h, w, c] = [i[0].shape[0], i[0].shape[1], i[0].shape[2]];
-        vec![Some(times(gpu, &gathered(gpu, (w, h, c), &i[0].data, &i[1].data, &kept[0], &kept[1]), d)), None]
     }
 }
 

@@ -1,7 +1,5 @@
 //! One unit per number of the input.
 
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use cubecl::prelude::*;
 
@@ -36,18 +34,6 @@ pub fn backward(gpu: &Gpu, bands: usize, x: &Buffer, d_out: &Buffer) -> Buffer {
         }
     }
     out
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::WaveOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        let [n, dims] = [i[0].shape[0], i[0].shape[1]];
-        Ahead { outputs: vec![(forward(gpu, self.0, &i[0].data), vec![n, dims * self.0])], kept: vec![] }
-    }
-
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], _: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        vec![d[0].as_ref().map(|d| backward(gpu, self.0, &i[0].data, d))]
-    }
 }
 
 /// `(v + ½) mod 2` in [0, 2).

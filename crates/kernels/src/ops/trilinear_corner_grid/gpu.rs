@@ -1,15 +1,15 @@
 //! One unit per sample and channel; the table's gradient is added atomically.
 
 use super::Corners;
-#[cfg(feature = "burn-gpu")]
-use crate::burn_op::{Ahead, DeviceOp, OnDevice};
 use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Swap, units};
 use cubecl::prelude::*;
 
 /// Which rows the samples mix, on the device.
 pub struct GpuCorners {
-    rows: Buffer,
-    voxel: Buffer,
+    /// `[voxels, 8]`
+    pub rows: Buffer,
+    /// `[S]`
+    pub voxel: Buffer,
 }
 
 impl GpuCorners {
@@ -78,24 +78,6 @@ impl GpuCorners {
             );
         }
         d_local
-    }
-}
-
-#[cfg(feature = "burn-gpu")]
-impl DeviceOp for super::CornerOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
-        let c = i[1].shape[1];
-        let corners = GpuCorners::upload(gpu, &self.corners());
-        let out = corners.forward(gpu, &i[0].data, &i[1].data, c);
-        Ahead { outputs: vec![(out, vec![i[0].shape[0], c])], kept: vec![corners.rows, corners.voxel] }
-    }
-
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        let Some(d) = &d[0] else { return vec![None, None] };
-        let corners = GpuCorners { rows: kept[0].clone(), voxel: kept[1].clone() };
-        let d_table = gpu.zeros(i[1].data.len());
-        let d_local = corners.backward(gpu, &i[0].data, &i[1].data, i[1].shape[1], d, &d_table);
-        vec![Some(d_local), Some(d_table)]
     }
 }
 

@@ -1,6 +1,4 @@
 use super::*;
-use crate::burn_op::values;
-use burn::tensor::{Device, TensorData};
 use diorama_testkit::{assert_close, assert_gradient, random, random_unit, wide};
 
 /// Two voxels that share a face: twelve corners.
@@ -47,18 +45,4 @@ fn features_are_continuous_across_a_shared_face() {
         out[0]
     };
     assert!((at(0, [1.0, 0.3, 0.6]) - at(1, [0.0, 0.3, 0.6])).abs() < 1e-6);
-}
-
-#[test]
-fn burn_sees_the_same_gradients() {
-    let voxel = voxels(4);
-    let k = Corners { rows: &ROWS, voxel: &voxel };
-    let (u, t) = (random_unit(12, 1), random(36, 2));
-    let device = Device::flex().autodiff();
-    let ut = Tensor::<2>::from_data(TensorData::new(u.clone(), [4, 3]), &device).require_grad();
-    let tt = Tensor::<2>::from_data(TensorData::new(t.clone(), [12, 3]), &device).require_grad();
-    let grads = trilinear_corner_grid(k, ut.clone(), tt.clone()).sum().backward();
-    let (du, dt) = reference::backward(&k, &wide(&u), &wide(&t), 3, &[1.0; 12]);
-    assert_close("positions", &values(ut.grad(&grads).unwrap()), &du, 1e-4);
-    assert_close("table", &values(tt.grad(&grads).unwrap()), &dt, 1e-4);
 }

@@ -1,13 +1,13 @@
 //! The same bridge on burn's Cube backend: its tensors and our [`Buffer`]s are the same memory of the same device,
 //! so nothing is copied and nothing waits.
 
-use super::{Four, OpRef, SliceBackend, SliceKernels, four};
-use crate::gpu::{Buffer, Gpu};
+use crate::bridge::{Four, OpRef, SliceBackend, SliceKernels, four};
 use burn::backend::TensorMetadata;
 use burn::tensor::{DType, Shape};
 use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
+use diorama_kernels::gpu::{Buffer, Gpu};
 
 /// A tensor as an op sees it on a device: row-major values and their shape.
 pub struct OnDevice {
@@ -23,7 +23,7 @@ pub struct Ahead {
     pub kept: Vec<Buffer>,
 }
 
-/// An op's kernels, forward and backward as in [`super::SliceOp`].
+/// An op's kernels, forward and backward as in [`crate::SliceOp`].
 pub trait DeviceOp {
     fn ahead(&self, gpu: &Gpu, inputs: &[OnDevice]) -> Ahead;
     /// Gradients for the inputs given those of the outputs (`None` where an output was not used).
@@ -42,6 +42,11 @@ fn on_device(t: &CubeTensor) -> OnDevice {
 fn tensor(like: &CubeTensor, data: Buffer, shape: Vec<usize>) -> CubeTensor {
     assert_eq!(data.len(), shape.iter().product::<usize>(), "a result has as many numbers as its shape says");
     CubeTensor::new_contiguous(like.client.clone(), like.device.clone(), Shape::from(shape), data.handle(), DType::F32)
+}
+
+/// The device for burn's tensors; ops in burn's graph run on it without copies.
+pub fn tensors(gpu: &Gpu) -> burn::tensor::Device {
+    burn::tensor::Device::new(gpu.device().clone())
 }
 
 fn gpu_of(t: &CubeTensor) -> Gpu {

@@ -14,17 +14,13 @@ use burn::tensor::{Shape, Tensor, TensorData};
 use std::fmt::Debug;
 use std::sync::{Arc, Mutex};
 
-#[cfg(feature = "burn-gpu")]
-pub mod check;
-#[cfg(feature = "burn-gpu")]
-mod on_gpu;
-#[cfg(feature = "burn-gpu")]
-pub use on_gpu::{Ahead, DeviceOp, OnDevice};
+#[cfg(feature = "gpu")]
+pub use crate::on_gpu::DeviceOp;
 
 /// Without burn on GPUs an op needs no kernels here.
-#[cfg(not(feature = "burn-gpu"))]
+#[cfg(not(feature = "gpu"))]
 pub trait DeviceOp {}
-#[cfg(not(feature = "burn-gpu"))]
+#[cfg(not(feature = "gpu"))]
 impl<T> DeviceOp for T {}
 
 /// Most inputs and outputs that an op may have.
@@ -51,7 +47,7 @@ pub trait SliceOp: DeviceOp + Debug + Send + Sync + 'static {
 
 /// A shared op, cheap to clone into a graph.
 #[derive(Clone, Debug)]
-pub struct OpRef(Arc<dyn SliceOp>);
+pub struct OpRef(pub(crate) Arc<dyn SliceOp>);
 
 /// Runs `op` on up to [`ARITY`] tensors of any rank; gradients flow where the device has autodiff.
 ///
@@ -124,10 +120,10 @@ impl SliceKernels for Flex {
     }
 }
 
-type Four<B> = (FloatTensor<B>, FloatTensor<B>, FloatTensor<B>, FloatTensor<B>);
+pub(crate) type Four<B> = (FloatTensor<B>, FloatTensor<B>, FloatTensor<B>, FloatTensor<B>);
 
 /// The extension that burn's dispatch learns.
-#[backend_extension(Autodiff, Flex, Cube: cfg(feature = "burn-gpu"))]
+#[backend_extension(Autodiff, Flex, Cube: cfg(feature = "gpu"))]
 pub trait SliceBackend: burn::backend::Backend {
     fn slice_op(
         a: FloatTensor<Self>,
@@ -139,7 +135,7 @@ pub trait SliceBackend: burn::backend::Backend {
     ) -> (FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>, FloatTensor<Self>);
 }
 
-fn four<B: SliceKernels>(mut outputs: Vec<FloatTensor<B>>, unit: &FloatTensor<B>) -> Four<B> {
+pub(crate) fn four<B: SliceKernels>(mut outputs: Vec<FloatTensor<B>>, unit: &FloatTensor<B>) -> Four<B> {
     outputs.resize_with(ARITY, || unit.clone());
     let mut it = outputs.into_iter();
     let mut next = || it.next().expect("resized to ARITY");

@@ -1,24 +1,26 @@
 //! Every op in burn's graph on a device against the same graph on the CPU, whose ops their own tests hold to the
 //! f64 references: values of all outputs, and gradients of all inputs through burn's autodiff.
 
-use super::values;
-use crate::gpu::Gpu;
-use crate::gpu::check::{TOLERANCE, Table};
-use crate::ops::composite::{self, Packed};
-use crate::ops::fused_mlp::{self, Mlp};
-use crate::ops::hash_grid::{self, HashGrid, HashGridConfig};
-use crate::ops::linear::{self, Activation};
-use crate::ops::trilinear_corner_grid::{self, Corners};
-use crate::ops::{distortion, frequency, scan, spherical_harmonics, ssim, triangle_wave};
+use crate::{composite, distortion, frequency, fused_mlp, hash_grid, linear, scan, spherical_harmonics, ssim, triangle_wave};
+use crate::{tensors, trilinear_corner_grid, values};
 use burn::tensor::{Device, Tensor, TensorData};
+use diorama_kernels::gpu::Gpu;
+use diorama_kernels::gpu::check::{Row, TOLERANCE, Table};
+use diorama_kernels::ops::composite::Packed;
+use diorama_kernels::ops::frequency::Frequency;
+use diorama_kernels::ops::fused_mlp::Mlp;
+use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
+use diorama_kernels::ops::linear::Activation;
+use diorama_kernels::ops::trilinear_corner_grid::Corners;
 use diorama_testkit::{compare, random, random_unit, wide};
 
 /// What a case gives: results by name.
 type Results = Vec<(&'static str, Vec<f32>)>;
 
-/// Adds a line for every result of every op.
-pub fn run(gpu: &Gpu, table: &mut Table) {
-    let (here, there) = (Device::flex().autodiff(), gpu.tensors().autodiff());
+/// A line for every result of every op. The device must let units share memory, as burn's own kernels do wherever they run.
+pub fn run(gpu: &Gpu) -> Vec<Row> {
+    let mut table = Table::new(gpu);
+    let (here, there) = (Device::flex().autodiff(), tensors(gpu).autodiff());
     let cases: [(&str, &str, fn(&Device) -> Results); 13] = [
         ("frequency", "N=67", frequencies),
         ("triangle wave", "N=67", waves),
@@ -39,6 +41,7 @@ pub fn run(gpu: &Gpu, table: &mut Table) {
             table.row("in burn's graph", result, format!("{op} {shape}"), compare(&got, &wide(&want), TOLERANCE));
         }
     }
+    table.rows
 }
 
 /// Random numbers that gradients are wanted of.
@@ -65,18 +68,18 @@ fn simple(x: Tensor<2>, out: Tensor<2>) -> Results {
 
 fn frequencies(device: &Device) -> Results {
     let x = leaf(device, [67, 3], 1);
-    let f = frequency::Frequency { dims: 3, bands: 4, include_input: true, pi: false, window: Some(2.5) };
-    simple(x.clone(), frequency::frequency(&f, x))
+    let f = Frequency { dims: 3, bands: 4, include_input: true, pi: false, window: Some(2.5) };
+    simple(x.clone(), frequency(&f, x))
 }
 
 fn waves(device: &Device) -> Results {
     let x = leaf(device, [67, 3], 2);
-    simple(x.clone(), triangle_wave::triangle_wave(5, x))
+    simple(x.clone(), triangle_wave(5, x))
 }
 
 fn harmonics(device: &Device) -> Results {
     let x = leaf(device, [67, 3], 3);
-    simple(x.clone(), spherical_harmonics::spherical_harmonics(4, x))
+    simple(x.clone(), spherical_harmonics(4, x))
 }
 
 fn grid() -> HashGrid {
@@ -85,7 +88,7 @@ fn grid() -> HashGrid {
 
 fn grids(device: &Device) -> Results {
     let (points, table) = (given(device, [67, 3], random_unit(67 * 3, 4)), leaf(device, [grid().rows(), 2], 5));
-    let out = hash_grid::hash_grid(&grid(), points.clone(), table.clone());
+    let out = hash_grid(&grid(), points.clone(), table.clone());
     let g = weighed(&out, 51).backward();
     let d_points = values(points.grad(&g).expect("it reaches the points"));
     vec![("forward", values(out)), ("d points", d_points), ("d table", values(table.grad(&g).expect("it reaches the table")))]
@@ -96,7 +99,7 @@ fn layers(device: &Device) -> Results {
     for bias in [None, Some(1), Some(67)] {
         let (x, w) = (leaf(device, [67, 9], 6), leaf(device, [9, 5], 7));
         let b = bias.map(|rows| leaf(device, [rows, 5], 8));
-        let out = linear::linear(x.clone(), w.clone(), b.clone(), Activation::Softplus);
+        let out = linear(x.clone(), w.clone(), b.clone(), Activation::Softplus);
         let g = weighed(&out, 52).backward();
         all.push(("forward", values(out)));
         all.push(("d x", values(x.grad(&g).expect("it reaches x"))));
@@ -109,7 +112,7 @@ fn layers(device: &Device) -> Results {
 fn networks(device: &Device) -> Results {
     let mlp = Mlp::chain(vec![5, 7], &[16, 16, 3], true);
     let (a, b, params) = (leaf(device, [67, 5], 9), leaf(device, [67, 7], 10), leaf(device, [mlp.params_len()], 11));
-    let out = fused_mlp::fused_mlp(&mlp, vec![a.clone(), b.clone()], params.clone());
+    let out = fused_mlp(&mlp, vec![a.clone(), b.clone()], params.clone());
     let g = weighed(&out, 53).backward();
     let d = |t: Tensor<2>| values(t.grad(&g).expect("it reaches the inputs"));
     let d_params = values(params.grad(&g).expect("it reaches the parameters"));
@@ -124,7 +127,7 @@ fn composite_with(device: &Device, colour_alone: bool) -> Results {
     let samples = Packed { offsets: &OFFSETS, t: &t, dt: &dt };
     let sigma = given(device, [67], random_unit(67, 14));
     let (features, background) = (leaf(device, [67, 3], 15), leaf(device, [4, 3], 16));
-    let (color, depth, opacity, weights) = composite::composite(samples, sigma.clone(), features.clone(), background.clone());
+    let (color, depth, opacity, weights) = composite(samples, sigma.clone(), features.clone(), background.clone());
     let mut loss = weighed(&color, 54);
     if !colour_alone {
         loss = loss + weighed(&depth, 55) + weighed(&opacity, 56) + weighed(&weights, 57);
@@ -152,14 +155,14 @@ fn coloured(device: &Device) -> Results {
 fn distortions(device: &Device) -> Results {
     let (t, dt) = (random_unit(67, 17), random_unit(67, 18));
     let weights = given(device, [67], random_unit(67, 19));
-    let out = distortion::distortion(Packed { offsets: &OFFSETS, t: &t, dt: &dt }, weights.clone());
+    let out = distortion(Packed { offsets: &OFFSETS, t: &t, dt: &dt }, weights.clone());
     let g = weighed(&out, 58).backward();
     vec![("forward", values(out)), ("d weights", values(weights.grad(&g).expect("it reaches the weights")))]
 }
 
 fn sums(device: &Device) -> Results {
     let x = leaf(device, [67], 20);
-    let out = scan::scan(&OFFSETS, x.clone());
+    let out = scan(&OFFSETS, x.clone());
     let g = weighed(&out, 59).backward();
     vec![("forward", values(out)), ("d values", values(x.grad(&g).expect("it reaches the values")))]
 }
@@ -168,7 +171,7 @@ fn corners(device: &Device) -> Results {
     let rows: Vec<u32> = (0..6 * 8).map(|i| i * 7 % 29).collect();
     let voxel: Vec<u32> = (0..67).map(|i| i % 6).collect();
     let (local, table) = (given(device, [67, 3], random_unit(67 * 3, 21)), leaf(device, [29, 4], 22));
-    let out = trilinear_corner_grid::trilinear_corner_grid(Corners { rows: &rows, voxel: &voxel }, local.clone(), table.clone());
+    let out = trilinear_corner_grid(Corners { rows: &rows, voxel: &voxel }, local.clone(), table.clone());
     let g = weighed(&out, 60).backward();
     let d_local = values(local.grad(&g).expect("it reaches the places"));
     vec![("forward", values(out)), ("d local", d_local), ("d table", values(table.grad(&g).expect("it reaches the table")))]
@@ -177,7 +180,7 @@ fn corners(device: &Device) -> Results {
 fn images(device: &Device) -> Results {
     let image = |seed| given(device, [17, 20, 3], random_unit(17 * 20 * 3, seed));
     let (x, y) = (image(23), image(24));
-    let out = ssim::ssim(x.clone(), y);
+    let out = ssim(x.clone(), y);
     let g = weighed(&out, 61).backward();
     vec![("forward", values(out)), ("d x", values(x.grad(&g).expect("it reaches the image")))]
 }
@@ -187,13 +190,13 @@ fn images(device: &Device) -> Results {
 fn mixed(device: &Device) -> Results {
     let (points, table) = (given(device, [67, 3], random_unit(67 * 3, 25)), leaf(device, [grid().rows(), 2], 26));
     let weight = leaf(device, [1, 8, 4], 27);
-    let features = hash_grid::hash_grid(&grid(), points.clone(), table.clone()).swap_dims(0, 1).reshape([67, 8, 1]);
+    let features = hash_grid(&grid(), points.clone(), table.clone()).swap_dims(0, 1).reshape([67, 8, 1]);
     let out = (features * weight.clone()).sum_dim(1).reshape([67, 4]);
     let sigma = out.clone().slice([0..67, 0..1]).exp().reshape([67]);
     let color = burn::tensor::activation::sigmoid(out.slice([0..67, 1..4]));
     let (t, dt) = (random_unit(67, 28), random_unit(67, 29));
     let background = leaf(device, [4, 3], 30);
-    let (color, ..) = composite::composite(Packed { offsets: &OFFSETS, t: &t, dt: &dt }, sigma, color, background);
+    let (color, ..) = composite(Packed { offsets: &OFFSETS, t: &t, dt: &dt }, sigma, color, background);
     let g = (color.clone() - 0.5).powf_scalar(2.0).mean().backward();
     vec![
         ("colour", values(color)),
