@@ -226,7 +226,11 @@ pub fn values<const D: usize>(t: Tensor<D>) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    #[cfg(feature = "gpu")]
+    use crate::on_gpu::{Ahead, OnDevice};
     use burn::tensor::Device;
+    #[cfg(feature = "gpu")]
+    use diorama_kernels::gpu::{Buffer, Gpu};
 
     /// `(x·y, x + y)` elementwise.
     #[derive(Debug)]
@@ -241,6 +245,16 @@ mod tests {
             let n = i[0].data.len();
             let g = |other: &[f32]| (0..n).map(|e| at(0, e) * other[e] + at(1, e)).collect::<Vec<f32>>();
             vec![Some(g(i[1].data)), Some(g(i[0].data))]
+        }
+    }
+
+    #[cfg(feature = "gpu")]
+    impl DeviceOp for ProductAndSum {
+        fn ahead(&self, _: &Gpu, _: &[OnDevice]) -> Ahead {
+            unreachable!("the test runs on the CPU")
+        }
+        fn back(&self, _: &Gpu, _: &[OnDevice], _: &[Buffer], _: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
+            unreachable!("the test runs on the CPU")
         }
     }
 
