@@ -173,8 +173,9 @@ fn cut_to(crop: &OrientedBox, batch: &mut RayBatch) {
     }
 }
 
-/// Rays per chunk of an image.
-const CHUNK: usize = 1 << 14;
+/// Rays per chunk of an image, and where blocks of them need no memory of their own.
+const CHUNK: usize = 1 << 12;
+const CHUNK_OF_BLOCKS: usize = 1 << 14;
 /// Pixels between those that are traced first where pixels may be interpolated.
 const COARSEST: usize = 4;
 
@@ -243,7 +244,9 @@ impl Tracer<'_> {
         progress: &mut dyn FnMut(usize),
     ) {
         let (w, mut done) = (out.rgb.width, 0);
-        for part in wanted.chunks(self.accelerator.map_or(CHUNK, |a| a.rays())) {
+        let in_blocks = self.shared_weight > 0.0 && matches!(self.sampling, Sampling::Occupancy { .. });
+        let on_cpu = if in_blocks { CHUNK_OF_BLOCKS } else { CHUNK };
+        for part in wanted.chunks(self.accelerator.map_or(on_cpu, |a| a.rays())) {
             batch.resize(part.len());
             for (i, &p) in part.iter().enumerate() {
                 batch.pixels[i * 2] = (p as usize % w) as f32 + 0.5;
