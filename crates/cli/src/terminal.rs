@@ -4,7 +4,12 @@ use diorama_engine::train::Event;
 use diorama_pipelines::PipelineError;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::IsTerminal;
-use std::time::Instant;
+use std::time::{Duration, Instant};
+
+/// Seconds between progress lines where there is no terminal.
+const LINE_EVERY: Duration = Duration::from_secs(5);
+/// Share of the work before which the time left is not guessed.
+const TOO_EARLY: f64 = 0.01;
 
 /// Exit codes (DESIGN: 0 done, 1 the work failed, 2 bad input or usage, 130 interrupted).
 pub const FAILED: u8 = 1;
@@ -57,7 +62,7 @@ impl Progress {
                 if let Some(b) = &self.bar {
                     b.set_position((progress * 1000.0) as u64);
                     b.set_message(text);
-                } else if self.last_line.is_none_or(|t| t.elapsed().as_secs() >= 5) {
+                } else if self.last_line.is_none_or(|t| t.elapsed() >= LINE_EVERY) {
                     self.last_line = Some(Instant::now());
                     eprintln!("{text}");
                 }
@@ -73,5 +78,92 @@ impl Progress {
                 eprintln!("{how} after {step} steps, {seconds:.1} s");
             }
         }
+    }
+}
+
+/// Shows work whose done share is known: a bar on a terminal, a line every few seconds elsewhere, both with the time left.
+pub struct ShareShown {
+    bar: Option<ProgressBar>,
+    begin: Instant,
+    last_line: Instant,
+}
+
+impl ShareShown {
+    pub fn new() -> Self {
+        let bar = std::io::stderr().is_terminal().then(|| {
+            let bar = ProgressBar::with_draw_target(Some(1000), ProgressDrawTarget::stderr());
+            bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").expect("a valid template"));
+            bar
+        });
+        ShareShown { bar, begin: Instant::now(), last_line: Instant::now() }
+    }
+
+    /// Tells that `share` of the work is done and what is being done.
+    pub fn show(&mut self, share: f64, text: &str) {
+        let now = Instant::now();
+        let text = match time_left(now - self.begin, share) {
+            Some(left) => format!("{text}; {left} left"),
+            None => text.to_string(),
+        };
+        if let Some(b) = &self.bar {
+            b.set_position((share * 1000.0) as u64);
+            b.set_message(text);
+        } else if self.is_line_due(now) {
+            eprintln!("{text}");
+        }
+    }
+
+    /// Whether the last line is old enough for another, which then counts as the last.
+    fn is_line_due(&mut self, now: Instant) -> bool {
+        let due = now.duration_since(self.last_line) >= LINE_EVERY;
+        if due {
+            self.last_line = now;
+        }
+        due
+    }
+
+    /// A line that stays, above the bar.
+    pub fn line(&self, text: &str) {
+        match &self.bar {
+            Some(b) => b.suspend(|| eprintln!("{text}")),
+            None => eprintln!("{text}"),
+        }
+    }
+
+    pub fn finish(&self) {
+        if let Some(b) = &self.bar {
+            b.finish_and_clear();
+        }
+    }
+}
+
+/// Time left in words, if the rest goes on as fast; none where too little is done to tell.
+fn time_left(elapsed: Duration, share: f64) -> Option<String> {
+    if share < TOO_EARLY {
+        return None;
+    }
+    let seconds = elapsed.as_secs_f64() * (1.0 - share.min(1.0)) / share;
+    Some(if seconds < 100.0 { format!("{seconds:.0} s") } else { format!("{:.0} min", seconds / 60.0) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_time_left_follows_from_the_share_that_is_done() {
+        let after = |seconds: u64, share: f64| time_left(Duration::from_secs(seconds), share);
+        assert_eq!(after(10, 0.0), None);
+        assert_eq!(after(10, 0.25).unwrap(), "30 s");
+        assert_eq!(after(60, 0.1).unwrap(), "9 min");
+        assert_eq!(after(60, 1.0).unwrap(), "0 s");
+    }
+
+    #[test]
+    fn lines_come_every_five_seconds() {
+        let mut s = ShareShown::new();
+        let begin = s.last_line;
+        let due: Vec<u64> = (0..12).filter(|i| s.is_line_due(begin + Duration::from_secs(*i))).collect();
+        assert_eq!(due, [5, 10]);
     }
 }

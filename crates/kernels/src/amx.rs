@@ -4,21 +4,25 @@
 //! rows, B's lines hold pairs of rows interleaved. Operands are rounded to bf16 (nearest even) while they
 //! are packed into tiles; sums run over `k` in a fixed order.
 
-use crate::gemm::{Gemm, Init};
+use crate::gemm::{Gemm, Init, View};
 use std::arch::asm;
 use std::arch::x86_64::*;
 use std::cell::RefCell;
 use std::sync::OnceLock;
 
 /// Elements of `k` per tile.
-const K: usize = 32;
+pub const K: usize = 32;
 /// Rows and columns of a block of 2 × 2 tiles.
-const BLOCK: usize = 32;
+pub const BLOCK: usize = 32;
 
-/// One line of a tile.
-#[derive(Clone, Copy)]
+/// One line of a tile: 32 bf16 numbers.
+#[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
-struct Line([u16; 32]);
+pub struct Line([u16; K]);
+
+impl Line {
+    pub const ZERO: Line = Line([0; K]);
+}
 
 #[derive(Default)]
 struct Scratch {
@@ -83,7 +87,7 @@ pub unsafe fn run(g: &Gemm, c: &mut [f32]) {
         let (mt, nt, kt) = (g.m.div_ceil(BLOCK) * 2, g.n.div_ceil(BLOCK) * 2, g.k.div_ceil(K));
         for (v, tiles) in [(&mut s.a, mt * kt), (&mut s.b, nt * kt)] {
             if v.len() < tiles * 16 {
-                v.resize(tiles * 16, Line([0; 32]));
+                v.resize(tiles * 16, Line::ZERO);
             }
         }
         // SAFETY: the scratch holds mt·kt and nt·kt tiles; the CPU has the instructions.
@@ -94,11 +98,45 @@ pub unsafe fn run(g: &Gemm, c: &mut [f32]) {
                 pack_columns(g, &mut s.a, kt);
             }
             pack_pairs(g, &mut s.b, kt);
-            asm!("ldtilecfg [{}]", in(reg) &CONFIG, options(nostack, readonly));
-            multiply(g, &s.a, &s.b, kt, c.as_mut_ptr());
-            asm!("tilerelease", options(nostack, nomem));
+            with_tiles(|| multiply(g, &s.a, &s.b, kt, c.as_mut_ptr()));
         }
     });
+}
+
+/// Runs `work` with the tile registers configured.
+///
+/// # Safety
+/// [`is_available`] holds.
+pub unsafe fn with_tiles(work: impl FnOnce()) {
+    // SAFETY: the CPU has the instructions and the process the permission.
+    unsafe { asm!("ldtilecfg [{}]", in(reg) &CONFIG, options(nostack, readonly)) };
+    work();
+    // SAFETY: as above.
+    unsafe { asm!("tilerelease", options(nostack, nomem)) };
+}
+
+/// Weights `[k, n]` as tiles.
+///
+/// # Safety
+/// [`is_available`] holds; `weights` holds `k · n` numbers and `out` the tiles of `n` columns.
+#[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+pub unsafe fn pack_weights(k: usize, n: usize, weights: &[f32], out: &mut [Line]) {
+    let (a, init) = (View::rows(&[], 0), Init::Zero);
+    let g = Gemm { m: 0, n, k, a, b: weights, ldb: n, ldc: n, init, relu: false };
+    // SAFETY: see the caller.
+    unsafe { pack_pairs(&g, out, k.div_ceil(K)) };
+}
+
+/// Rows `[m, k]` as tiles, `kt` of them per row.
+///
+/// # Safety
+/// [`is_available`] holds; `rows` holds `m · k` numbers and `out` the tiles of `m` rows.
+#[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
+pub unsafe fn pack_lines(rows: &[f32], k: usize, m: usize, kt: usize, out: &mut [Line]) {
+    let (a, init) = (View::rows(rows, k), Init::Zero);
+    let g = Gemm { m, n: 0, k, a, b: &[], ldb: 0, ldc: 0, init, relu: false };
+    // SAFETY: see the caller.
+    unsafe { pack_rows(&g, out, kt) };
 }
 
 /// The first `n` of 16 lanes.
@@ -200,7 +238,7 @@ unsafe fn store(out: &mut [Line], at: usize, v: __m512bh) {
 /// Transpose of 16 × 16 words of 32 bits.
 #[inline]
 #[target_feature(enable = "avx512f")]
-fn transpose16(r: [__m512i; 16]) -> [__m512i; 16] {
+pub fn transpose16(r: [__m512i; 16]) -> [__m512i; 16] {
     let mut t = r;
     for i in (0..16).step_by(2) {
         t[i] = _mm512_unpacklo_epi32(r[i], r[i + 1]);
@@ -228,6 +266,46 @@ fn transpose16(r: [__m512i; 16]) -> [__m512i; 16] {
     out
 }
 
+/// `sum[32, 32] = A · B` for 2 × 2 tiles, `kt` tiles deep.
+///
+/// # Safety
+/// Within [`with_tiles`]; `a0` and `b0` hold `2 · kt` tiles each.
+#[inline(always)]
+pub unsafe fn sum_tiles(a0: *const Line, b0: *const Line, kt: usize, sum: *mut f32) {
+    // SAFETY: the caller vouches for 2 · kt tiles of each operand and the room for the sum.
+    unsafe {
+        asm!("tilezero tmm0", "tilezero tmm1", "tilezero tmm2", "tilezero tmm3", options(nostack, nomem));
+        for q in 0..kt {
+            asm!(
+                "tileloadd tmm4, [{a0} + {line}]",
+                "tileloadd tmm6, [{b0} + {line}]",
+                "tileloadd tmm7, [{b1} + {line}]",
+                "tileloadd tmm5, [{a1} + {line}]",
+                "tdpbf16ps tmm0, tmm4, tmm6",
+                "tdpbf16ps tmm1, tmm4, tmm7",
+                "tdpbf16ps tmm2, tmm5, tmm6",
+                "tdpbf16ps tmm3, tmm5, tmm7",
+                a0 = in(reg) a0.add(q * 16),
+                a1 = in(reg) a0.add((kt + q) * 16),
+                b0 = in(reg) b0.add(q * 16),
+                b1 = in(reg) b0.add((kt + q) * 16),
+                line = in(reg) 64usize,
+                options(nostack, readonly),
+            );
+        }
+        asm!(
+            "tilestored [{c} + {row}], tmm0",
+            "tilestored [{c} + {row} + 64], tmm1",
+            "tilestored [{d} + {row}], tmm2",
+            "tilestored [{d} + {row} + 64], tmm3",
+            c = in(reg) sum,
+            d = in(reg) sum.add(16 * BLOCK),
+            row = in(reg) BLOCK * 4,
+            options(nostack),
+        );
+    }
+}
+
 /// All blocks of 2 × 2 tiles, each summed in tiles and then finished in vectors.
 #[target_feature(enable = "avx512f")]
 unsafe fn multiply(g: &Gemm, a: &[Line], b: &[Line], kt: usize, c: *mut f32) {
@@ -241,35 +319,7 @@ unsafe fn multiply(g: &Gemm, a: &[Line], b: &[Line], kt: usize, c: *mut f32) {
                 let a0 = a.as_ptr().add(i / 16 * kt * 16);
                 let sum = sums[turn].as_mut_ptr();
                 turn ^= 1;
-                asm!("tilezero tmm0", "tilezero tmm1", "tilezero tmm2", "tilezero tmm3", options(nostack, nomem));
-                for q in 0..kt {
-                    asm!(
-                        "tileloadd tmm4, [{a0} + {line}]",
-                        "tileloadd tmm6, [{b0} + {line}]",
-                        "tileloadd tmm7, [{b1} + {line}]",
-                        "tileloadd tmm5, [{a1} + {line}]",
-                        "tdpbf16ps tmm0, tmm4, tmm6",
-                        "tdpbf16ps tmm1, tmm4, tmm7",
-                        "tdpbf16ps tmm2, tmm5, tmm6",
-                        "tdpbf16ps tmm3, tmm5, tmm7",
-                        a0 = in(reg) a0.add(q * 16),
-                        a1 = in(reg) a0.add((kt + q) * 16),
-                        b0 = in(reg) b0.add(q * 16),
-                        b1 = in(reg) b0.add((kt + q) * 16),
-                        line = in(reg) 64usize,
-                        options(nostack, readonly),
-                    );
-                }
-                asm!(
-                    "tilestored [{c} + {row}], tmm0",
-                    "tilestored [{c} + {row} + 64], tmm1",
-                    "tilestored [{d} + {row}], tmm2",
-                    "tilestored [{d} + {row} + 64], tmm3",
-                    c = in(reg) sum,
-                    d = in(reg) sum.add(16 * BLOCK),
-                    row = in(reg) BLOCK * 4,
-                    options(nostack),
-                );
+                sum_tiles(a0, b0, kt, sum);
                 finish(g, sum, i, j, c);
             }
         }

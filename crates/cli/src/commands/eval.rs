@@ -2,11 +2,14 @@
 
 use super::{Outcome, note, use_threads};
 use crate::arguments::EvalArgs;
+use crate::terminal::ShareShown;
 use diorama_data::{DataError, photo};
 use diorama_geom::ImageU8;
 use diorama_geom::capture::Split;
+use diorama_pipelines::object::evaluate::{EvaluationProgress, ScoredView};
 use diorama_pipelines::object::{device, evaluate, kept_capture, run_folder};
 use diorama_pipelines::{PipelineError, Result};
+use std::cell::RefCell;
 
 pub fn run(a: &EvalArgs) -> Result<Outcome> {
     use_threads(a.threads)?;
@@ -26,8 +29,9 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
     if a.save_images {
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
-    let report = evaluate::evaluate_with_training(&model, split, quality, lpips.as_ref(), &mut |name, v| {
-        eprintln!("{name}: psnr {:.2} ssim {:.3}", v.scores.psnr, v.scores.ssim);
+    let shown = RefCell::new(ShareShown::new());
+    let mut each = |name: &str, v: &ScoredView| -> Result<()> {
+        shown.borrow().line(&format!("{name}: psnr {:.2} ssim {:.3}", v.scores.psnr, v.scores.ssim));
         if a.save_images {
             let (r, p) = (v.view.rgb.to_u8(), v.photo.to_u8());
             let rows = r.data.chunks_exact(r.width * 3).zip(p.data.chunks_exact(p.width * 3));
@@ -36,7 +40,14 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
             photo::save_png(&folder.join(format!("{}.png", name.replace(['/', '\\'], "_"))), &both)?;
         }
         Ok(())
-    })?;
+    };
+    let mut progress = |p: EvaluationProgress<'_>| {
+        let (done, all) = p.views;
+        shown.borrow_mut().show(p.share, &format!("view {} of {all} ({}): {}", done + 1, p.view, p.doing.name()));
+    };
+    let report = evaluate::evaluate_with_training(&model, split, quality, lpips.as_ref(), &mut each, &mut progress);
+    shown.borrow().finish();
+    let report = report?;
     if a.json {
         let mut object = serde_json::to_value(&report).expect("a report is JSON");
         object["gap"] = serde_json::json!(report.gap());

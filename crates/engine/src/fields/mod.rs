@@ -109,16 +109,18 @@ impl Field {
     /// Field coordinates of model points: `[0, 1]³` for a hash grid, `[−1, 1]³` for frequencies.
     fn unit(&self, model: &[f32], out: &mut Vec<f32>) {
         out.resize(model.len(), 0.0);
-        let space = self.space;
-        let frequency = matches!(self.encoding, Encoding::Frequency(_));
         out.par_chunks_mut(3 * 4096).zip(model.par_chunks(3 * 4096)).for_each(|(out, model)| {
             for (o, m) in out.chunks_exact_mut(3).zip(model.chunks_exact(3)) {
-                let u = space.normalize([m[0] - 0.5, m[1] - 0.5, m[2] - 0.5]);
-                for k in 0..3 {
-                    o[k] = if frequency { 2.0 * u[k] } else { u[k] + 0.5 };
-                }
+                o.copy_from_slice(&self.unit_point([m[0], m[1], m[2]]));
             }
         });
+    }
+
+    /// [`Field::unit`] of one point.
+    #[inline(always)]
+    pub(crate) fn unit_point(&self, model: [f32; 3]) -> [f32; 3] {
+        let u = self.space.normalize(model.map(|v| v - 0.5));
+        if matches!(self.encoding, Encoding::Frequency(_)) { u.map(|v| 2.0 * v) } else { u.map(|v| v + 0.5) }
     }
 
     /// Turns gradients of field coordinates into gradients of model points, in place.
@@ -135,14 +137,14 @@ impl Field {
         matches!(self.space, Space::Contracted(_))
     }
 
-    fn codes(&self, batch: &Batch, buf: &mut FieldBuffers) {
-        self.directions.encode(batch.dirs, &mut buf.direction);
+    /// Codes of rays for the color layers: of their directions, and of the appearance of `images`, or of all in the mean.
+    pub(crate) fn ray_codes(&self, dirs: &[f32], images: Option<&[u32]>, direction: &mut Vec<f32>, appearance: &mut Vec<f32>) {
+        self.directions.encode(dirs, direction);
         let Some(a) = &self.appearance else { return };
-        let rays = batch.samples.rays();
-        buf.appearance.resize(rays * a.dims, 0.0);
-        let mean = if batch.images.is_none() { a.mean() } else { Vec::new() };
-        for (r, row) in buf.appearance.chunks_exact_mut(a.dims).enumerate() {
-            match batch.images {
+        appearance.resize(dirs.len() / 3 * a.dims, 0.0);
+        let mean = if images.is_none() { a.mean() } else { Vec::new() };
+        for (r, row) in appearance.chunks_exact_mut(a.dims).enumerate() {
+            match images {
                 Some(images) => {
                     let i = images[r] as usize * a.dims;
                     row.copy_from_slice(&a.group.values[i..i + a.dims]);
@@ -158,8 +160,8 @@ impl Field {
         if !encoded {
             self.unit(batch.positions, &mut buf.unit);
         }
-        self.codes(batch, buf);
-        let (direction, appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
+        let (mut direction, mut appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
+        self.ray_codes(batch.dirs, batch.images, &mut direction, &mut appearance);
         let mut codes = Vec::new();
         if self.directions.dims() > 0 {
             codes.push(RayCode { values: &direction, width: self.directions.dims(), gradient: None });
@@ -196,8 +198,8 @@ impl Field {
         if !encoded {
             self.unit(batch.positions, &mut buf.unit);
         }
-        self.codes(batch, buf);
-        let (direction, appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
+        let (mut direction, mut appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
+        self.ray_codes(batch.dirs, batch.images, &mut direction, &mut appearance);
         let mut d_appearance = std::mem::take(&mut buf.d_appearance);
         d_appearance.resize(appearance.len(), 0.0);
         let mut codes = Vec::new();

@@ -1,5 +1,6 @@
 //! From fields to images.
 
+mod blocks;
 pub mod splat;
 pub mod supervised;
 pub mod volume;

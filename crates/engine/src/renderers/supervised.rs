@@ -156,6 +156,7 @@ mod tests {
             crop: None,
             is_linear: false,
             pruning: Quality::Full.pruning(),
+            shared_weight: Quality::Full.shared_weight(),
             appearance: None,
             tolerance: 0.0,
             accelerator: by,

@@ -1,5 +1,6 @@
 //! Volume rendering of whole images.
 
+use super::blocks::{self, Blocks};
 use super::supervised::Unserved;
 use crate::background::LearnedBackground;
 use crate::fields::{Batch, Field, FieldBuffers, Pruning};
@@ -94,6 +95,8 @@ pub struct Tracer<'a> {
     pub appearance: Option<u32>,
     /// Whether colors are linear light, which [`Tracer::view`] encodes to sRGB; values above 1 go on along the curve.
     pub is_linear: bool,
+    /// Weight up to which neighbouring samples of a ray share one color on the CPU; 0: each has its own.
+    pub shared_weight: f32,
     /// Pixels are interpolated where traced neighbours differ by no more than this; 0: all are traced.
     pub tolerance: f32,
     /// Traces instead of the CPU, which goes on where it fails; rays of an abandoned device come back empty.
@@ -103,7 +106,7 @@ pub struct Tracer<'a> {
 /// How much care a view gets.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Quality {
-    /// Every pixel is traced, no sample that light reaches is left out.
+    /// Every pixel is traced until a thousandth of the light is left, no sample that light reaches is left out.
     #[default]
     Full,
     /// For previews: rays end earlier, faint samples and pixels between like neighbours are left out.
@@ -114,8 +117,16 @@ impl Quality {
     /// What is left out of a view.
     pub fn pruning(self) -> Pruning {
         match self {
-            Quality::Full => Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
+            Quality::Full => Pruning { stop: 1e-3, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             Quality::Fast => Pruning { stop: 3e-2, min_alpha: 1e-2, thin: f32::INFINITY, min_weight: 1e-2 },
+        }
+    }
+
+    /// The [`Tracer::shared_weight`].
+    pub fn shared_weight(self) -> f32 {
+        match self {
+            Quality::Full => 1.0 / 16.0,
+            Quality::Fast => 1.0 / 8.0,
         }
     }
 
@@ -162,8 +173,9 @@ fn cut_to(crop: &OrientedBox, batch: &mut RayBatch) {
     }
 }
 
-/// Rays per chunk of an image.
+/// Rays per chunk of an image, and where blocks of them need no memory of their own.
 const CHUNK: usize = 1 << 12;
+const CHUNK_OF_BLOCKS: usize = 1 << 14;
 /// Pixels between those that are traced first where pixels may be interpolated.
 const COARSEST: usize = 4;
 
@@ -203,12 +215,18 @@ impl Tracer<'_> {
         let (mut batch, mut buf) = (RayBatch::default(), FieldBuffers::default());
         let mut wanted = Vec::with_capacity(w * h);
         let coarsest = if self.tolerance > 0.0 { COARSEST } else { 1 };
-        wanted.extend((0..w * h).filter(|i| (i % w).is_multiple_of(coarsest) && (i / w).is_multiple_of(coarsest)).map(|i| i as u32));
+        let tile = blocks::EDGE * coarsest;
+        for (top, left) in (0..h).step_by(tile).flat_map(|y| (0..w).step_by(tile).map(move |x| (y, x))) {
+            for y in (top..h.min(top + tile)).step_by(coarsest) {
+                wanted.extend((left..w.min(left + tile)).step_by(coarsest).map(|x| (y * w + x) as u32));
+            }
+        }
         self.pixels(camera, &wanted, &mut batch, &mut buf, &mut out, progress);
         let mut stride = coarsest;
         while stride > 1 {
             wanted.clear();
             between(&mut out, stride, self.tolerance, &mut wanted);
+            in_tiles(&mut wanted, w, blocks::EDGE * stride / 2);
             self.pixels(camera, &wanted, &mut batch, &mut buf, &mut out, progress);
             stride /= 2;
         }
@@ -225,8 +243,10 @@ impl Tracer<'_> {
         out: &mut View,
         progress: &mut dyn FnMut(usize),
     ) {
-        let w = out.rgb.width;
-        for part in wanted.chunks(self.accelerator.map_or(CHUNK, |a| a.rays())) {
+        let (w, mut done) = (out.rgb.width, 0);
+        let in_blocks = self.shared_weight > 0.0 && matches!(self.sampling, Sampling::Occupancy { .. });
+        let on_cpu = if in_blocks { CHUNK_OF_BLOCKS } else { CHUNK };
+        for part in wanted.chunks(self.accelerator.map_or(on_cpu, |a| a.rays())) {
             batch.resize(part.len());
             for (i, &p) in part.iter().enumerate() {
                 batch.pixels[i * 2] = (p as usize % w) as f32 + 0.5;
@@ -245,7 +265,8 @@ impl Tracer<'_> {
                 out.opacity.data[p] = o;
                 out.depth.data[p] = if o > 1e-3 { traced.depth[i] / o } else { 0.0 };
             }
-            progress(part.len() / w);
+            progress((done + part.len()) / w - done / w);
+            done += part.len();
         }
     }
 
@@ -284,6 +305,14 @@ impl Tracer<'_> {
                     resumed: false,
                 };
                 let march = grid.march_config(max_samples);
+                if self.shared_weight > 0.0 {
+                    let images = self.appearance.map(|i| vec![i; batch.len()]);
+                    let (field, pruning, shared_weight) = (self.field, self.pruning, self.shared_weight);
+                    let blocks = Blocks { field, grid: &grid.bits, march, pruning, shared_weight };
+                    if let Some(out) = blocks.trace(&rays, images.as_deref()) {
+                        return self.before_backdrop(batch, out);
+                    }
+                }
                 let (mut marched, mut positions) = (Marched::default(), Vec::new());
                 self.field.visible(&grid.bits, &rays, &march, self.pruning, &mut marched, &mut positions, buf);
                 self.composite(self.field, batch, &marched, &positions, buf);
@@ -341,6 +370,12 @@ impl Tracer<'_> {
         let b = Batch { samples, positions, dirs: &batch.dirs, images: images.as_deref(), background: &background, near_scaling: 0.0 };
         field.render(&b, buf);
     }
+}
+
+/// Orders pixels by square tiles of the given edge, so that neighbours are traced together.
+fn in_tiles(pixels: &mut [u32], width: usize, edge: usize) {
+    let (width, edge) = (width as u32, edge as u32);
+    pixels.sort_by_cached_key(|p| (p / width / edge, p % width / edge, *p));
 }
 
 /// Fills pixels half way between those `stride` apart: interpolated where the corners around them are alike,
@@ -419,6 +454,7 @@ mod tests {
             clip: None,
             crop: None,
             is_linear: false,
+            shared_weight: 0.0,
             pruning: Pruning { stop: 0.0, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             appearance: None,
             tolerance: 0.0,
@@ -464,6 +500,7 @@ mod tests {
             clip: None,
             crop: None,
             is_linear: false,
+            shared_weight: 0.0,
             pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             appearance: None,
             tolerance: 0.0,
@@ -487,7 +524,7 @@ mod tests {
     #[test]
     fn linear_light_is_seen_along_the_srgb_curve() {
         let grid = HashGridConfig { levels: 2, features: 2, log2_size: 8, base: 4, finest: 8 };
-        let field = fields::ngp(grid, 1.0, false, 1e-2, 0, 0, 1);
+        let field = fields::ngp(grid, Space::Cube(1.0), 1e-2, 0, 0, 1);
         let pose = Pose::look_at(DVec3::new(0.5, -1.5, 0.5), DVec3::new(0.5, -9.0, 0.5), DVec3::Z);
         let camera = PosedCamera { camera: Camera::pinhole(2, 2, 0.8), pose };
         let tracer = Tracer {
@@ -499,6 +536,7 @@ mod tests {
             clip: None,
             crop: None,
             is_linear: true,
+            shared_weight: 0.0,
             pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             appearance: None,
             tolerance: 0.0,
@@ -559,6 +597,7 @@ mod tests {
                 crop: None,
                 is_linear: false,
                 pruning: quality.pruning(),
+                shared_weight: quality.shared_weight(),
                 appearance: None,
                 tolerance: quality.tolerance(),
                 accelerator: None,

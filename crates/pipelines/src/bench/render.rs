@@ -2,23 +2,30 @@
 
 use super::median_seconds;
 use crate::error::{PipelineError, Result};
-use crate::object::evaluate::score_view;
+use crate::object::evaluate;
 use crate::object::held_out;
 use crate::object::model::ObjectModel;
 use diorama_data::photo;
-use diorama_engine::renderers::volume::Quality;
+use diorama_engine::fields::Pruning;
+use diorama_engine::metrics;
+use diorama_engine::renderers::volume::{Quality, Tracer, View};
 use diorama_geom::capture::Split;
 use serde::Serialize;
+
+/// Nothing but what next to no light reaches is left out.
+const EXHAUSTIVE: Pruning = Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 };
 
 /// What one quality reaches over all views.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct QualityFigure {
     pub frames_per_s: f64,
-    /// Mean over the held-out views.
+    /// Mean over the held-out views, against their photographs.
     pub psnr: f64,
+    /// Mean over the held-out views, against the exhaustive ones; at most 120.
+    pub psnr_against_exhaustive: f64,
 }
 
-/// Held-out views at both qualities.
+/// Held-out views at every quality.
 #[derive(Clone, Debug, Serialize)]
 pub struct RenderReport {
     pub threads: usize,
@@ -28,26 +35,47 @@ pub struct RenderReport {
     pub views: usize,
     pub width: u32,
     pub height: u32,
+    /// Every sample that light reaches is evaluated on its own.
+    pub exhaustive: QualityFigure,
     pub full: QualityFigure,
     pub fast: QualityFigure,
 }
 
-/// Draws every held-out view `repeats` times at each quality, on what [`super::super::object::device::accelerate`] named.
+/// Draws every held-out view `repeats` times at each quality, one quality after the other view by view, on what
+/// [`super::super::object::device::accelerate`] named.
 pub fn run(model: &ObjectModel, repeats: usize, device: String) -> Result<RenderReport> {
     let frames = held_out::frames(&model.capture, Split::Test);
     let Some(&first) = frames.first() else {
         return Err(PipelineError::Usage("the run holds no views out; train with --split every:8".into()));
     };
     let camera = model.posed(first).camera;
-    let figure = |quality: Quality| -> Result<QualityFigure> {
-        let (mut seconds, mut psnr) = (0.0, 0.0);
-        for &i in &frames {
-            let (tracer, camera) = (model.tracer(quality), model.posed(i));
-            seconds += median_seconds(repeats, || drop(tracer.view(&camera, &mut |_| {})));
-            psnr += score_view(model, i, photo::load_full(&model.capture.frames[i].image)?, quality)?.scores.psnr;
+    let tracers = [
+        Tracer { shared_weight: 0.0, pruning: EXHAUSTIVE, ..model.tracer(Quality::Full) },
+        model.tracer(Quality::Full),
+        model.tracer(Quality::Fast),
+    ];
+    let mut sums = [QualityFigure::default(); 3];
+    let mut seconds = [0.0; 3];
+    for &i in &frames {
+        let (photo, counts) = evaluate::reference(model, i, photo::load_full(&model.capture.frames[i].image)?)?;
+        let posed = model.posed(i);
+        let mut exhaustive: Option<View> = None;
+        for ((tracer, sum), seconds) in tracers.iter().zip(&mut sums).zip(&mut seconds) {
+            let mut view = None;
+            *seconds += median_seconds(repeats, || view = Some(tracer.view(&posed, &mut |_| {})));
+            let view = view.expect("a view was drawn");
+            sum.psnr += evaluate::scores(&view, &photo, &counts).psnr;
+            let to = exhaustive.get_or_insert_with(|| view.clone());
+            let squares: f64 = view.rgb.data.iter().zip(&to.rgb.data).map(|(a, b)| ((a - b) as f64).powi(2)).sum();
+            sum.psnr_against_exhaustive += metrics::psnr(squares / view.rgb.data.len() as f64);
         }
-        let n = frames.len() as f64;
-        Ok(QualityFigure { frames_per_s: n / seconds, psnr: psnr / n })
+    }
+    model.check_device()?;
+    let n = frames.len() as f64;
+    let mean = |k: usize| QualityFigure {
+        frames_per_s: n / seconds[k],
+        psnr: sums[k].psnr / n,
+        psnr_against_exhaustive: sums[k].psnr_against_exhaustive / n,
     };
     Ok(RenderReport {
         threads: rayon::current_num_threads(),
@@ -56,7 +84,8 @@ pub fn run(model: &ObjectModel, repeats: usize, device: String) -> Result<Render
         views: frames.len(),
         width: camera.width,
         height: camera.height,
-        full: figure(Quality::Full)?,
-        fast: figure(Quality::Fast)?,
+        exhaustive: mean(0),
+        full: mean(1),
+        fast: mean(2),
     })
 }

@@ -118,25 +118,72 @@ fn reference_photo(model: &ObjectModel, full: &Photo) -> Image {
 }
 
 /// What frame `i`'s render is compared with, and the mask of the pixels that count, where there is one.
-fn reference(model: &ObjectModel, i: usize, full: Photo) -> Result<(Image, Option<ImageU8>)> {
+pub(crate) fn reference(model: &ObjectModel, i: usize, full: Photo) -> Result<(Image, Option<ImageU8>)> {
     let (full, mask) = masks::apply(&model.capture.frames[i], &model.capture.masks, full)?;
     let photo = reference_photo(model, &full);
     let counts = mask.map(|m| m.downsampled(photo.width, photo.height));
     Ok((photo, counts))
 }
 
+/// What an evaluation does to a view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Doing {
+    Drawing,
+    Scoring,
+    PerceptualDistance,
+}
+
+impl Doing {
+    pub fn name(self) -> &'static str {
+        match self {
+            Doing::Drawing => "drawing",
+            Doing::Scoring => "scoring",
+            Doing::PerceptualDistance => "perceptual distance",
+        }
+    }
+}
+
+/// How far an evaluation is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EvaluationProgress<'a> {
+    /// Share of the work that is done, in [0, 1].
+    pub share: f64,
+    /// Views that are done, and all of them, training views included.
+    pub views: (usize, usize),
+    pub view: &'a str,
+    pub doing: Doing,
+}
+
 /// Renders frame `i` and scores it against `full`, its photograph at full size, where its mask says that pixels count.
+/// `progress` is told the share that is drawn, and when scoring begins.
 ///
 /// # Errors
 /// When the mask cannot be decoded, or is not that of the photograph; or when the device that was named failed.
-pub fn score_view(model: &ObjectModel, i: usize, full: Photo, quality: Quality) -> Result<ScoredView> {
+pub fn score_view(
+    model: &ObjectModel,
+    i: usize,
+    full: Photo,
+    quality: Quality,
+    progress: &mut dyn FnMut(f64, Doing),
+) -> Result<ScoredView> {
     let (photo, counts) = reference(model, i, full)?;
-    let view = model.tracer(quality).view(&model.posed(i), &mut |_| {});
+    let (mut rows, all) = (0, photo.height.max(1));
+    progress(0.0, Doing::Drawing);
+    let view = model.tracer(quality).view(&model.posed(i), &mut |more| {
+        rows = (rows + more).min(all);
+        progress(rows as f64 / all as f64, Doing::Drawing);
+    });
     model.check_device()?;
+    progress(1.0, Doing::Scoring);
+    let scores = scores(&view, &photo, &counts);
+    Ok(ScoredView { view, photo, counts, scores })
+}
+
+/// Scores of a view against its reference.
+pub(crate) fn scores(view: &View, photo: &Image, counts: &Option<ImageU8>) -> Scores {
     let mut shown = view.rgb.clone();
     shown.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
-    let scores = metrics::compare(&shown, &photo, admits(&counts));
-    Ok(ScoredView { view, photo, counts, scores })
+    metrics::compare(&shown, photo, admits(counts))
 }
 
 /// Whether a pixel counts.
@@ -157,22 +204,58 @@ fn where_it_counts(scored: &ScoredView) -> Image {
     out
 }
 
+/// Share of a view's time that drawing takes, and that scores take, where a perceptual distance follows and where not.
+const SHARES: [(f64, f64); 2] = [(0.5, 0.1), (0.9, 0.1)];
+
+/// Views that are done, and all of them.
+struct Count<'a> {
+    done: usize,
+    all: usize,
+    told: &'a mut dyn FnMut(EvaluationProgress),
+}
+
+impl Count<'_> {
+    /// Tells how far the view in hand is; without a perceptual distance it is done after its scores.
+    fn tell(&mut self, view: &str, part: f64, doing: Doing, with_distance: bool) {
+        let (drawing, scoring) = SHARES[!with_distance as usize];
+        let within = match doing {
+            Doing::Drawing => part * drawing,
+            Doing::Scoring => drawing,
+            Doing::PerceptualDistance => drawing + scoring,
+        };
+        let share = (self.done as f64 + within) / self.all.max(1) as f64;
+        (self.told)(EvaluationProgress { share, views: (self.done, self.all), view, doing });
+    }
+}
+
+/// Training views that are judged beside so many held-out ones.
+fn training_views(model: &ObjectModel, split: Split, held_out: usize) -> Vec<usize> {
+    if split == Split::Train { Vec::new() } else { held_out::spread(&model.train, TRAINING_VIEWS.min(held_out)) }
+}
+
 /// Scores all views of a split, and some training views beside them; tells which lie behind fog. `each` sees every view of
-/// the split as it is done.
+/// the split as it is done, and `progress` how far all is.
 pub fn evaluate_with_training(
     model: &ObjectModel,
     split: Split,
     quality: Quality,
     lpips: Option<&Lpips>,
     each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
+    progress: &mut dyn FnMut(EvaluationProgress),
 ) -> Result<Report> {
-    let mut report = evaluate_with(model, split, quality, lpips, each)?;
+    let held_out = held_out::frames(&model.capture, split).len();
+    let beside = training_views(model, split, held_out);
+    let mut count = Count { done: 0, all: held_out + beside.len(), told: progress };
+    let mut report = evaluate_counted(model, split, quality, lpips, each, &mut count)?;
     if split == Split::Train {
         return Ok(report);
     }
     let mut scores = Vec::new();
-    for i in held_out::spread(&model.train, TRAINING_VIEWS.min(report.views)) {
-        scores.push(score_view(model, i, photo::load_full(&model.capture.frames[i].image)?, quality)?.scores);
+    for i in beside {
+        let frame = &model.capture.frames[i];
+        let full = photo::load_full(&frame.image)?;
+        scores.push(score_view(model, i, full, quality, &mut |part, doing| count.tell(&frame.name, part, doing, false))?.scores);
+        count.done += 1;
     }
     let mean = |f: fn(&Scores) -> f64| mean_of_numbers(scores.iter().map(f));
     let training = TrainingScores { views: scores.len(), psnr: mean(|s| s.psnr), ssim: mean(|s| s.ssim) };
@@ -197,7 +280,8 @@ pub fn evaluate(
     quality: Quality,
     each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
 ) -> Result<Report> {
-    evaluate_with(model, split, quality, None, each)
+    let all = held_out::frames(&model.capture, split).len();
+    evaluate_counted(model, split, quality, None, each, &mut Count { done: 0, all, told: &mut |_| {} })
 }
 
 /// Reads the network and the heads of LPIPS, which may be one file or several.
@@ -213,13 +297,14 @@ pub fn load_lpips(files: &[PathBuf]) -> Result<Lpips> {
     Lpips::new(tensors).map_err(|e| PipelineError::Usage(format!("{}: {e}", names.join(","))))
 }
 
-/// [`evaluate`] with the perceptual distance, too.
-pub fn evaluate_with(
+/// [`evaluate`], with the perceptual distance where `lpips` is given.
+fn evaluate_counted(
     model: &ObjectModel,
     split: Split,
     quality: Quality,
     lpips: Option<&Lpips>,
     each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
+    count: &mut Count,
 ) -> Result<Report> {
     let frames = held_out::frames(&model.capture, split);
     if frames.is_empty() {
@@ -230,13 +315,16 @@ pub fn evaluate_with(
     for i in frames {
         let frame = &model.capture.frames[i];
         let full = photo::load_full(&frame.image)?;
-        let scored = score_view(model, i, full, quality)?;
+        let scored = score_view(model, i, full, quality, &mut |part, doing| count.tell(&frame.name, part, doing, lpips.is_some()))?;
         if let Some(mean) = mean.as_ref().filter(|m| (m.width, m.height) == (scored.photo.width, scored.photo.height)) {
             mean_scores.push(metrics::compare(mean, &scored.photo, admits(&scored.counts)).psnr);
         }
         each(&frame.name, &scored)?;
         let s = scored.scores;
         let too_small = |e: String| PipelineError::Usage(format!("{}: {e}", frame.name));
+        if lpips.is_some() {
+            count.tell(&frame.name, 1.0, Doing::PerceptualDistance, true);
+        }
         let distance = lpips.map(|l| l.distance(&where_it_counts(&scored), &scored.photo)).transpose().map_err(too_small)?;
         per_view.push(ViewScore {
             name: frame.name.clone(),
@@ -247,6 +335,7 @@ pub fn evaluate_with(
             lpips: distance.filter(|_| !s.psnr.is_nan()),
             behind_fog: false,
         });
+        count.done += 1;
     }
     // Views in which no pixel counts say nothing.
     let average = |f: fn(&ViewScore) -> f64| mean_of_numbers(per_view.iter().map(f));

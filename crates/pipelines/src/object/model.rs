@@ -260,6 +260,7 @@ impl ObjectModel {
             crop: None,
             is_linear: self.is_linear(),
             pruning: quality.pruning(),
+            shared_weight: quality.shared_weight(),
             appearance: None,
             tolerance: quality.tolerance(),
             accelerator: self.accelerator.as_ref().map(|a| a as &dyn Accelerator),

@@ -1,7 +1,7 @@
 //! Everything at once on a capture that the project generates itself.
 
 use super::config::{Config, Method};
-use super::evaluate::{self, Report};
+use super::evaluate::{self, Report, ScoredView};
 use super::export::{self, ExportOptions, Exported, Format, Size};
 use super::recipe::{self, Trained};
 use super::render::{self, Layer, PathKind, RenderOptions};
@@ -71,13 +71,14 @@ pub fn quickstart(
     let Trained { model, summary, device } = recipe::train(&config, &mut run, false, None, interrupt, events)?;
     note("scoring held-out views");
     let mut pairs: Vec<Vec<ImageU8>> = vec![Vec::new(), Vec::new()];
-    let scores = evaluate::evaluate_with_training(&model, Split::Test, Quality::Full, None, &mut |_, v| {
+    let mut keep = |_: &str, v: &ScoredView| -> Result<()> {
         if pairs[0].len() < 4 {
             pairs[0].push(v.photo.to_u8());
             pairs[1].push(v.view.rgb.to_u8());
         }
         Ok(())
-    })?;
+    };
+    let scores = evaluate::evaluate_with_training(&model, Split::Test, Quality::Full, None, &mut keep, &mut |_| {})?;
     photo::save_png(&folder.join("held_out.png"), &super::compare::tile(&pairs))?;
     note("filming a turntable");
     let video = folder.join("turntable.mp4");

@@ -70,6 +70,43 @@ pub fn forward(grid: &HashGrid, points: &[f32], table: &[f32], out: &mut [f32]) 
     });
 }
 
+/// [`forward`] on the calling thread alone, for callers that are parallel themselves.
+///
+/// # Shapes
+/// As for [`forward`].
+pub fn forward_serial(grid: &HashGrid, points: &[f32], table: &[f32], out: &mut [f32]) {
+    let (s, width) = (points.len() / 3, grid.config.features);
+    assert!(table.len() == grid.params_len() && out.len() == s * grid.output_dims(), "hash grid: shapes");
+    for (level, out) in grid.levels.iter().zip(out.chunks_exact_mut((s * width).max(1))) {
+        let rows = &table[level.offset * width..(level.offset + level.rows) * width];
+        match width {
+            1 => forward_level::<1>(level, points, rows, out),
+            2 => forward_level2(level, points, rows, out),
+            4 => forward_level::<4>(level, points, rows, out),
+            _ => forward_level::<8>(level, points, rows, out),
+        }
+    }
+}
+
+/// Whether [`forward_lines`] serves this grid here: rows of two features that fit one line.
+#[cfg(target_arch = "x86_64")]
+pub(crate) fn has_lines(grid: &HashGrid) -> bool {
+    crate::gemm::has_bf16() && grid.config.features == 2 && grid.levels.len() <= 16
+}
+
+/// Encodes points, given by coordinate, to rows of bf16, zeros beyond the levels: one line `[L · 2]` per point.
+///
+/// # Panics
+/// When the points are not a multiple of 16, or a slice does not fit.
+#[cfg(target_arch = "x86_64")]
+pub(crate) fn forward_lines(grid: &HashGrid, points: [&[f32]; 3], table: &[f32], out: &mut [crate::amx::Line]) {
+    let n = points[0].len();
+    assert!(has_lines(grid) && n.is_multiple_of(16) && points.iter().all(|p| p.len() == n), "hash grid: lines");
+    assert!(table.len() == grid.params_len() && out.len() >= n, "hash grid: shapes");
+    // SAFETY: the CPU has AVX-512 with bf16; shapes were asserted.
+    unsafe { x86::forward_lines(&grid.levels, points, table, out) };
+}
+
 fn forward_level<const F: usize>(level: &Level, points: &[f32], rows: &[f32], out: &mut [f32]) {
     for (p, o) in points.chunks_exact(3).zip(out.chunks_exact_mut(F)) {
         let (idx, f, _) = cell(level, p);
@@ -270,6 +307,7 @@ pub fn jacobian_backward(grid: &HashGrid, points: &[f32], d_jacobian: &[f32], d_
 #[cfg(target_arch = "x86_64")]
 mod x86 {
     use super::Level;
+    use crate::amx::{Line, transpose16};
     use std::arch::x86_64::*;
 
     /// Indices and weights of the eight corners of sixteen points.
@@ -280,14 +318,28 @@ mod x86 {
     }
 
     /// Constants of a level.
+    #[derive(Clone, Copy)]
     struct Hash {
         n: __m512,
         last: __m512i,
-        lane3: __m512i,
         v1: __m512i,
         v2: __m512i,
         mask: __m512i,
         xor: bool,
+    }
+
+    /// The coordinates of the sixteen points `[16, 3]` at `src`.
+    #[inline]
+    #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+    unsafe fn by_coordinate(src: *const f32) -> [__m512; 3] {
+        let lane3 = _mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 33, 36, 39, 42, 45);
+        // SAFETY: the caller vouches for 48 floats.
+        unsafe {
+            let x = _mm512_i32gather_ps::<4>(lane3, src);
+            let y = _mm512_i32gather_ps::<4>(lane3, src.add(1));
+            let z = _mm512_i32gather_ps::<4>(lane3, src.add(2));
+            [x, y, z]
+        }
     }
 
     impl Hash {
@@ -303,7 +355,6 @@ mod x86 {
             Hash {
                 n: _mm512_set1_ps(level.cells as f32),
                 last: _mm512_set1_epi32(level.cells as i32 - 1),
-                lane3: _mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 33, 36, 39, 42, 45),
                 v1: _mm512_set1_epi32(p1),
                 v2: _mm512_set1_epi32(p2),
                 mask: _mm512_set1_epi32(mask),
@@ -311,19 +362,17 @@ mod x86 {
             }
         }
 
-        /// Corners of the sixteen points at `src`.
+        /// Corners of sixteen points, given by coordinate.
         #[inline]
         #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
-        unsafe fn corners(&self, src: *const f32) -> [(__m512i, __m512); 8] {
+        fn corners(&self, points: [__m512; 3]) -> [(__m512i, __m512); 8] {
             let (zero, one, unit) = (_mm512_setzero_ps(), _mm512_set1_ps(1.0), _mm512_set1_epi32(1));
-            let axis = |k: i32| {
-                // SAFETY: the caller vouches for 48 floats.
-                let x = unsafe { _mm512_i32gather_ps::<4>(_mm512_add_epi32(self.lane3, _mm512_set1_epi32(k)), src) };
+            let axis = |x: __m512| {
                 let x = _mm512_mul_ps(_mm512_min_ps(_mm512_max_ps(x, zero), one), self.n);
                 let i = _mm512_min_epi32(_mm512_cvttps_epi32(x), self.last);
                 (i, _mm512_sub_ps(x, _mm512_cvtepi32_ps(i)))
             };
-            let ((ix, fx), (iy, fy), (iz, fz)) = (axis(0), axis(1), axis(2));
+            let ((ix, fx), (iy, fy), (iz, fz)) = (axis(points[0]), axis(points[1]), axis(points[2]));
             let y0 = _mm512_mullo_epi32(iy, self.v1);
             let z0 = _mm512_mullo_epi32(iz, self.v2);
             let xs = [ix, _mm512_add_epi32(ix, unit)];
@@ -344,6 +393,55 @@ mod x86 {
             }
             out
         }
+
+        /// Features of sixteen points, two of each: the first eight points' and the others'.
+        #[inline]
+        #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+        unsafe fn mix(&self, points: [__m512; 3], base: *const i64) -> (__m512, __m512) {
+            let low = _mm512_setr_epi32(0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
+            let high = _mm512_setr_epi32(8, 8, 9, 9, 10, 10, 11, 11, 12, 12, 13, 13, 14, 14, 15, 15);
+            let (mut lo, mut hi) = (_mm512_setzero_ps(), _mm512_setzero_ps());
+            // SAFETY: the caller vouches for the level's rows.
+            unsafe {
+                for (row, w) in self.corners(points) {
+                    let first = _mm512_i32gather_epi64::<8>(_mm512_castsi512_si256(row), base);
+                    let second = _mm512_i32gather_epi64::<8>(_mm512_extracti64x4_epi64::<1>(row), base);
+                    lo = _mm512_fmadd_ps(_mm512_permutexvar_ps(low, w), _mm512_castsi512_ps(first), lo);
+                    hi = _mm512_fmadd_ps(_mm512_permutexvar_ps(high, w), _mm512_castsi512_ps(second), hi);
+                }
+            }
+            (lo, hi)
+        }
+    }
+
+    /// Sixteen points at a time through all levels.
+    ///
+    /// # Safety
+    /// AVX-512F, DQ, BW and BF16; a multiple of 16 points, one line each; `table` holds the rows of `levels`, 16 at most.
+    #[target_feature(enable = "avx512f,avx512dq,avx512bw,avx512bf16,avx2,fma")]
+    pub unsafe fn forward_lines(levels: &[Level], points: [&[f32]; 3], table: &[f32], out: &mut [Line]) {
+        let empty = Hash::new(&levels[0]);
+        let mut hashes = [empty; 16];
+        for (h, level) in hashes.iter_mut().zip(levels) {
+            *h = Hash::new(level);
+        }
+        for g in 0..points[0].len() / 16 {
+            let mut words = [_mm512_setzero_si512(); 16];
+            // SAFETY: all loads and stores lie inside the slices, see the caller.
+            unsafe {
+                let [x, y, z] = &points;
+                let at = g * 16;
+                let points =
+                    [_mm512_loadu_ps(x.as_ptr().add(at)), _mm512_loadu_ps(y.as_ptr().add(at)), _mm512_loadu_ps(z.as_ptr().add(at))];
+                for ((word, hash), level) in words.iter_mut().zip(&hashes).zip(levels) {
+                    let (lo, hi) = hash.mix(points, table.as_ptr().add(level.offset * 2).cast());
+                    *word = std::mem::transmute::<__m512bh, __m512i>(_mm512_cvtne2ps_pbh(hi, lo));
+                }
+                for (p, line) in transpose16(words).into_iter().enumerate() {
+                    _mm512_store_si512(out.as_mut_ptr().add(g * 16 + p).cast(), line);
+                }
+            }
+        }
     }
 
     /// Sixteen points at a time, two features per row.
@@ -353,19 +451,11 @@ mod x86 {
     #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
     pub unsafe fn forward16(level: &Level, points: &[f32], rows: &[f32], out: &mut [f32]) {
         let hash = Hash::new(level);
-        let low = _mm512_setr_epi32(0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
-        let high = _mm512_setr_epi32(8, 8, 9, 9, 10, 10, 11, 11, 12, 12, 13, 13, 14, 14, 15, 15);
         let base = rows.as_ptr().cast::<i64>();
         for g in 0..points.len() / 48 {
-            let (mut lo, mut hi) = (_mm512_setzero_ps(), _mm512_setzero_ps());
             // SAFETY: all loads and stores lie inside the slices, see the caller.
             unsafe {
-                for (row, w) in hash.corners(points.as_ptr().add(g * 48)) {
-                    let first = _mm512_i32gather_epi64::<8>(_mm512_castsi512_si256(row), base);
-                    let second = _mm512_i32gather_epi64::<8>(_mm512_extracti64x4_epi64::<1>(row), base);
-                    lo = _mm512_fmadd_ps(_mm512_permutexvar_ps(low, w), _mm512_castsi512_ps(first), lo);
-                    hi = _mm512_fmadd_ps(_mm512_permutexvar_ps(high, w), _mm512_castsi512_ps(second), hi);
-                }
+                let (lo, hi) = hash.mix(by_coordinate(points.as_ptr().add(g * 48)), base);
                 _mm512_storeu_ps(out.as_mut_ptr().add(g * 32), lo);
                 _mm512_storeu_ps(out.as_mut_ptr().add(g * 32 + 16), hi);
             }
@@ -388,7 +478,7 @@ mod x86 {
             unsafe {
                 if g < groups {
                     let next = &mut buffers[g % 2];
-                    for (c, (row, w)) in hash.corners(points.as_ptr().add(g * 48)).into_iter().enumerate() {
+                    for (c, (row, w)) in hash.corners(by_coordinate(points.as_ptr().add(g * 48))).into_iter().enumerate() {
                         _mm512_store_si512(next.rows[c].as_mut_ptr().cast(), row);
                         _mm512_store_ps(next.weights[c].as_mut_ptr(), w);
                         for row in &next.rows[c] {

@@ -1,4 +1,5 @@
 use super::*;
+use diorama_geom::contraction::Space;
 use diorama_testkit::{random, random_unit};
 
 struct Rays {
@@ -153,4 +154,44 @@ fn a_coarser_cascade_holds_what_the_finer_one_holds() {
     g.fill_with(|i| i == at(0, 5, 8, 15));
     let occupied: Vec<usize> = (0..g.cells()).filter(|i| g.get(*i)).collect();
     assert_eq!(occupied, [at(0, 5, 8, 15), at(1, 4 + 2, 4 + 4, 4 + 7)]);
+}
+
+#[test]
+fn rays_that_go_on_take_the_samples_of_one_march() {
+    let c = MarchConfig { cone: 1.0 / 256.0, dt_min: 0.005, dt_max: 0.08, max_samples: 200, ..MarchConfig::default() };
+    let (g, r) = (sparse_grid(2), rays(60, 1.0));
+    let whole = run(&g, &r, &c);
+    let mut near_far = r.near_far.clone();
+    let mut most = 0;
+    for i in 0..60 {
+        let mut parts = Marched::default();
+        loop {
+            let before = parts.t.len();
+            let own = MarchRays { near_far: &near_far, resumed: before > 0, ..r.view() };
+            cpu::march_ray(&g, &own, i, &MarchConfig { max_samples: 7, ..c }, &mut parts);
+            if parts.t.len() < before + 7 || parts.t.len() >= c.max_samples {
+                break;
+            }
+            near_far[i * 2] = parts.t[parts.t.len() - 1] + parts.dt[parts.dt.len() - 1];
+        }
+        most = most.max(parts.t.len());
+        let own = whole.offsets[i] as usize..whole.offsets[i + 1] as usize;
+        assert_eq!((&parts.t[..own.len()], parts.t.len() - own.len() < 7), (&whole.t[own.clone()], true), "ray {i}");
+    }
+    assert!(most > 30, "{most}");
+}
+
+#[test]
+fn points_are_normalized_as_space_says() {
+    let far: Vec<f32> = random(3 * 50, 4).iter().map(|v| 0.5 + 3.0 * v * v * v).collect();
+    for space in [Space::Cube(2.0), Space::Contracted(1.0), Space::Contracted(2.0)] {
+        let mut points = [0, 1, 2].map(|k| far.iter().skip(k).step_by(3).copied().collect::<Vec<f32>>());
+        cpu::normalize(space, &mut points);
+        for (i, p) in far.chunks_exact(3).enumerate() {
+            let want = space.normalize([p[0] - 0.5, p[1] - 0.5, p[2] - 0.5]);
+            for k in 0..3 {
+                assert!((points[k][i] - 0.5 - want[k]).abs() < 1e-6, "{space:?} {p:?}");
+            }
+        }
+    }
 }

@@ -11,6 +11,7 @@
 mod disjoint;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+pub mod infer;
 pub mod reference;
 pub mod step;
 #[cfg(test)]

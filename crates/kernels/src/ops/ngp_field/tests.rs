@@ -177,3 +177,61 @@ fn near_samples_learn_with_the_square_of_their_distance() {
     let want: Vec<f64> = (0..n * 3).map(|e| plain[e] as f64 * ((reach(e / 3) / near).min(1.0) as f64).powi(2)).collect();
     assert_close("d points", &gradient(near), &want, 1e-4);
 }
+
+#[test]
+fn inference_in_two_parts_equals_the_whole_network() {
+    use crate::gemm::Precision;
+    use crate::ops::fused_mlp::cpu::{Activations, forward_block};
+    use infer::{InferBuffers, Inference};
+    for (levels, codes) in [(4, 2), (16, 1)] {
+        let grid = HashGrid::new(HashGridConfig { levels, features: 2, log2_size: 9, base: 4, finest: 64 });
+        for precision in [Precision::F32, Precision::Bf16] {
+            let mut net = ngp_net(grid.output_dims());
+            if codes == 1 {
+                let mut layers = net.mlp.layers.clone();
+                layers[2].inputs.pop();
+                net.mlp = Mlp::new(vec![grid.output_dims(), 16], layers);
+            }
+            net.mlp.precision = precision;
+            let params = net.mlp.init(&Rng::new(1, 1));
+            let table = random(grid.params_len(), 6);
+            for n in [0, 1, 16, 77, 600] {
+                let points = random_unit(n * 3, 5);
+                let mut features = vec![0.0; n * grid.output_dims()];
+                hash::forward(&grid, &points, &table, &mut features);
+                let rows: Vec<f32> = (0..n)
+                    .flat_map(|i| (0..levels).map(move |l| (l * n + i) * 2))
+                    .flat_map(|at| [features[at], features[at + 1]])
+                    .collect();
+                // Three rays.
+                let rays: Vec<u32> = (0..n as u32).map(|i| i % 3).collect();
+                let (sh, emb) = (random(3 * 16, 7), random(3 * 5, 8));
+                let spread = |v: &[f32], w: usize| -> Vec<f32> { rays.iter().flat_map(|&r| v[r as usize * w..][..w].to_vec()).collect() };
+                let inputs = [rows, spread(&sh, 16), spread(&emb, 5)];
+                let inputs: Vec<&[f32]> = inputs[..1 + codes].iter().map(|v| &v[..]).collect();
+                let mut acts = Activations::default();
+                forward_block(&net.mlp, &params, &inputs, n, &mut acts);
+                let want_sigma: Vec<f64> = (0..n).map(|i| (acts.values[1][i * 16] as f64 + 0.5).exp()).collect();
+                let want_rgb: Vec<f64> = (0..n * 3).map(|e| 1.0 / (1.0 + (-acts.values[3][e / 3 * 16 + e % 3] as f64).exp())).collect();
+                let by_axis = [0, 1, 2].map(|k| points.iter().skip(k).step_by(3).copied().collect::<Vec<f32>>());
+                let whole = Inference::new(&grid, &table, &net, &params).expect("a network that splits");
+                let (mut sigma, mut geometry, mut rgb, mut buf) = (Vec::new(), Vec::new(), Vec::new(), InferBuffers::default());
+                whole.density(&by_axis, &mut sigma, &mut geometry, &mut buf);
+                let all: [infer::Codes; 2] = [(&sh, 16), (&emb, 5)];
+                whole.color(&geometry, &rays, &all[..codes], &mut rgb, &mut buf);
+                // Features that round to the other of two bf16 numbers move a result by their step.
+                let bound = if precision == Precision::F32 { 1e-5 } else { 2e-2 };
+                assert_close("sigma", &sigma, &want_sigma, bound);
+                assert_close("rgb", &rgb, &want_rgb, bound);
+            }
+        }
+    }
+    // Color that reads the position itself cannot be split off.
+    let mut net = ngp_net(8);
+    let mut layers = net.mlp.layers.clone();
+    layers[2].inputs.push(Source::Input(0));
+    net.mlp = Mlp::new(vec![8, 16, 5], layers);
+    let grid = HashGrid::new(HashGridConfig { levels: 4, features: 2, log2_size: 9, base: 4, finest: 64 });
+    let (table, params) = (vec![0.0; grid.params_len()], vec![0.0; net.mlp.params_len()]);
+    assert!(Inference::new(&grid, &table, &net, &params).is_none());
+}
