@@ -141,9 +141,9 @@ fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
     // A configuration that the run began with, and one that says something else.
     std::fs::copy(dir.path().join("run/config.toml"), dir.path().join("same.toml")).unwrap();
     let text = std::fs::read_to_string(dir.path().join("same.toml")).unwrap();
-    std::fs::write(dir.path().join("other.toml"), text.replace("distortion = 0.01", "distortion = 0.5")).unwrap();
+    std::fs::write(dir.path().join("other.toml"), text.replace("distortion = \"auto\"", "distortion = 0.5")).unwrap();
     works(dir.path(), &["train", "-o", "run", "--resume", "--config", "same.toml"]);
-    fails(dir.path(), &["train", "-o", "run", "--resume", "--config", "other.toml"], 2, &["loss.distortion", "0.01", "0.5"]);
+    fails(dir.path(), &["train", "-o", "run", "--resume", "--config", "other.toml"], 2, &["loss.distortion", "auto", "0.5"]);
 }
 
 #[test]

@@ -25,7 +25,7 @@ const NEUTRAL: [(&str, &str); 13] = [
 ];
 
 /// Switch, value, and what must be on for it to matter.
-const SWITCHES: [(&str, &str, &[(&str, &str)]); 44] = [
+const SWITCHES: [(&str, &str, &[(&str, &str)]); 45] = [
     ("method", "mlp", &[]),
     ("background", "black", &[]),
     ("seed", "2", &[]),
@@ -41,7 +41,7 @@ const SWITCHES: [(&str, &str, &[(&str, &str)]); 44] = [
     ("field.space", "unbounded", &[]),
     ("field.precision", "f32", &[]),
     ("loss.color", "mse", &[]),
-    ("loss.distortion", "0.1", &[]),
+    ("loss.distortion", "1.0", &[]),
     ("loss.alpha", "0.1", &[]),
     ("loss.near_scaling", "4.0", &[]),
     ("optim.rate", "0.02", &[]),
@@ -49,6 +49,7 @@ const SWITCHES: [(&str, &str, &[(&str, &str)]); 44] = [
     ("optim.warmup", "0.5", &[]),
     ("optim.decay_from", "0.9", &[]),
     ("optim.weight_decay", "0.1", &[]),
+    ("optim.table_decay", "0.1", &[]),
     ("sampling.rays", "128", &[]),
     ("sampling.batch_samples", "1048576", &[]),
     ("sampling.samples", "16", &[("method", "mlp")]),

@@ -33,7 +33,7 @@ const TASK: usize = 1 << 12;
 const LONGEST_STEP: f32 = 1e6;
 
 /// Distance from the camera, in inner cubes, beyond which unbounded space is sampled evenly in disparity.
-const DISPARITY_FROM: f32 = 1.0;
+const DISPARITY_FROM: f32 = 2.0;
 
 /// Points per side of an image's rim at which its extent is measured.
 const RIM: usize = 8;

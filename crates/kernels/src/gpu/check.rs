@@ -587,7 +587,7 @@ fn pixels(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 
 fn steps(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     for (n, sparse) in [(1, false), (999, false), (999, true)] {
-        let a = Adam { weight_decay: if sparse { 0.0 } else { 0.1 }, ..Adam::default() };
+        let a = Adam { weight_decay: 0.1, ..Adam::default() };
         let p = random(n, 1);
         let (pg, mg, vg) = (gpu.upload(&p), gpu.zeros(n), gpu.zeros(n));
         let (mut pw, mut mw, mut vw) = (wide(&p), vec![0.0; n], vec![0.0; n]);

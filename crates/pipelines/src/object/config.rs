@@ -4,7 +4,8 @@ use crate::error::{PipelineError, Result};
 use diorama_data::masks::{self, MaskOptions};
 use diorama_geom::Reduction;
 use diorama_kernels::device::Api;
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::path::PathBuf;
 
 /// The four methods (object.md, section 4).
@@ -114,14 +115,56 @@ pub struct FieldConfig {
     pub precision: String,
 }
 
+/// A number, or `auto`: by the run's space.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum Auto {
+    #[default]
+    Auto,
+    Is(f32),
+}
+
+impl Auto {
+    pub fn or(self, auto: f32) -> f32 {
+        match self {
+            Auto::Auto => auto,
+            Auto::Is(v) => v,
+        }
+    }
+}
+
+impl Serialize for Auto {
+    fn serialize<S: Serializer>(&self, s: S) -> std::result::Result<S::Ok, S::Error> {
+        match self {
+            Auto::Auto => s.serialize_str("auto"),
+            Auto::Is(v) => s.serialize_f32(*v),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Auto {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> std::result::Result<Auto, D::Error> {
+        let value = toml::Value::deserialize(d)?;
+        let number = match &value {
+            toml::Value::String(s) if s == "auto" => return Ok(Auto::Auto),
+            toml::Value::String(s) => s.parse().ok(),
+            toml::Value::Integer(v) => Some(*v as f64),
+            toml::Value::Float(v) => Some(*v),
+            _ => None,
+        };
+        let number = number.filter(|v| v.is_finite() && *v >= 0.0);
+        number.map(|v| Auto::Is(v as f32)).ok_or_else(|| D::Error::custom(format!("{value} is neither a number from 0 on nor \"auto\"")))
+    }
+}
+
 /// What the field is trained to do.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LossConfig {
     /// `mse` or `huber`.
     pub color: String,
-    /// Weight of the distortion loss; in unbounded space it is taken in `4 t / (1 + t)`.
-    pub distortion: f32,
+    /// Weight of the distortion loss; in unbounded space it is taken in `4 t / (1 + t)`. `auto`: 0.1 there,
+    /// growing from 0 while coarse geometry is found, 0.01 in a box.
+    pub distortion: Auto,
     pub alpha: f32,
     /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.
     pub near_scaling: f32,
@@ -138,6 +181,9 @@ pub struct OptimConfig {
     pub decay_from: f32,
     /// L2 penalty on the network's weights.
     pub weight_decay: f32,
+    /// L2 penalty on those rows of the hash grid that a step reads; `auto`: 1e-5 in unbounded space, else none.
+    #[serde(default)]
+    pub table_decay: Auto,
 }
 
 /// Rays and samples.
@@ -157,7 +203,8 @@ pub struct SamplingConfig {
     pub stop: f32,
     /// Samples of less opacity than this are not trained on.
     pub min_alpha: f32,
-    /// Nearest distance at which matter may be, in inner cubes.
+    /// Nearest distance at which matter may be, in inner cubes; 0: 0.7 of the distance to the closest sparse points that cameras
+    /// see, 0.1 where there are none.
     pub near: f32,
     pub occupancy_resolution: usize,
     /// Points of the occupancy grid sampled per update.
@@ -252,7 +299,7 @@ impl Config {
             },
             loss: LossConfig {
                 color: if ngp { "huber" } else { "mse" }.into(),
-                distortion: if ngp { 1e-2 } else { 0.0 },
+                distortion: if ngp { Auto::Auto } else { Auto::Is(0.0) },
                 alpha: 0.0,
                 near_scaling: if ngp { 1.0 } else { 0.0 },
             },
@@ -262,6 +309,7 @@ impl Config {
                 warmup: if ngp { 0.0 } else { 0.01 },
                 decay_from: if ngp { 0.3 } else { 0.0 },
                 weight_decay: 0.0,
+                table_decay: Auto::Auto,
             },
             sampling: SamplingConfig {
                 rays,
@@ -271,7 +319,7 @@ impl Config {
                 max_samples: 1024,
                 stop: 1e-4,
                 min_alpha: 3e-3,
-                near: 0.1,
+                near: 0.0,
                 occupancy_resolution: 128,
                 occupancy_points: 1 << 16,
                 occupancy_every: 16,
@@ -309,6 +357,7 @@ impl Config {
         let parsed = match at {
             toml::Value::String(_) => Some(toml::Value::String(value.into())),
             toml::Value::Integer(_) => value.parse().ok().map(toml::Value::Integer),
+            toml::Value::Float(_) if value == "auto" => Some(toml::Value::String(value.into())),
             toml::Value::Float(_) => value.parse().ok().filter(|v: &f64| v.is_finite()).map(toml::Value::Float),
             toml::Value::Boolean(_) => value.parse().ok().map(toml::Value::Boolean),
             _ => None,
@@ -438,7 +487,14 @@ mod tests {
         c.set("method", "mlp").unwrap();
         c.set("camera.refine", "true").unwrap();
         assert_eq!(Config::from_toml(&c.to_toml()).unwrap(), c);
-        assert!(c.camera.refine && c.method == Method::Mlp && c.loss.distortion == 0.01);
+        assert!(c.camera.refine && c.method == Method::Mlp && c.loss.distortion == Auto::Is(0.01));
+        for (value, want) in [("auto", Auto::Auto), ("2", Auto::Is(2.0)), ("0.5", Auto::Is(0.5))] {
+            c.set("loss.distortion", value).unwrap();
+            assert_eq!((c.loss.distortion, Config::from_toml(&c.to_toml()).unwrap().loss.distortion), (want, want));
+        }
+        assert!(
+            c.set("loss.distortion", "-1").is_err() && c.set("loss.distortion", "much").is_err() && c.set("optim.rate", "auto").is_err()
+        );
     }
 
     #[test]

@@ -30,6 +30,8 @@ pub(super) struct Drawing {
     pub refresh_errors: bool,
     pub stretch: f32,
     pub thin: f32,
+    /// Weight of the distortion loss.
+    pub distortion: f32,
     pub rate_scale: f32,
 }
 
@@ -400,7 +402,7 @@ mod running {
                 terms: Terms {
                     huber: if c.loss.color == "huber" { 0.1 } else { 0.0 },
                     relative: if m.is_linear() { RELATIVE } else { 0.0 },
-                    distortion: c.loss.distortion,
+                    distortion: d.distortion,
                     normalized: m.field.is_unbounded(),
                     alpha: c.loss.alpha,
                 },

@@ -32,9 +32,9 @@ pub const FOG_DB: f64 = 6.0;
 pub const GAP_DB: f64 = 3.0;
 
 /// What a gap means, and what helps.
-pub const GAP_MEANS: &str = "the field explains each photograph by matter close to its own camera, which stands before all others as fog; \
-what helps: poses that were checked (diorama doctor DATA), more photographs between these, --set loss.distortion=0, --background learned \
-(docs/troubleshooting.md)";
+pub const GAP_MEANS: &str = "photographs are explained in ways that do not hold from other places: fog, surfaces at wrong distances, mostly \
+where few photographs look; what helps: more photographs between these, poses that were checked (diorama doctor DATA), \
+--set field.appearance=8 where light or exposure vary (docs/troubleshooting.md)";
 
 /// Frames of a split; held-out ones fall back to validation where there is no test split.
 pub fn frames(capture: &Capture, split: Split) -> Vec<usize> {

@@ -12,6 +12,7 @@ pub mod held_out;
 pub mod kept_capture;
 pub mod memory;
 pub mod model;
+mod nearest;
 pub mod points;
 pub mod prepare;
 pub mod quickstart;

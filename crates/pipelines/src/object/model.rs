@@ -58,6 +58,16 @@ pub struct ObjectModel {
 /// there is found before what would stand in front of each camera.
 const INITIAL_DENSITY: f32 = 0.1;
 
+/// L2 penalty on the hash grid of unbounded fields: what few rays have a say in stays smooth.
+const TABLE_DECAY: f32 = 1e-5;
+
+/// Weight of the distortion loss in unbounded space and in a box.
+const DISTORTION: (f32, f32) = (0.1, 0.01);
+
+/// Steps in which the distortion loss of unbounded space grows to its weight: at once, it would gather what little matter there
+/// is before each camera, where nothing else is known yet.
+const DISTORTION_RAMP: u64 = 2000;
+
 /// Cascades of the occupancy grid of unbounded space: they reach 64 inner cubes far, beyond which a ray has a few samples left.
 const CASCADES: usize = 8;
 
@@ -168,12 +178,14 @@ impl ObjectModel {
             o.keep_visible(&cameras, model.config.sampling.min_cell_views);
         }
         let decay = model.config.optim.weight_decay;
+        let table_decay = model.config.optim.table_decay.or(if model.field.is_unbounded() { TABLE_DECAY } else { 0.0 });
         if model.config.method == Method::Ngp && model.field.is_unbounded() {
             model.field.net.sigma.shift = INITIAL_DENSITY.ln();
         }
         let precision = if model.config.field.precision == "auto" { Precision::Bf16 } else { Precision::F32 };
         for f in model.fields_mut() {
             f.weights.adam.weight_decay = decay;
+            f.table.iter_mut().for_each(|t| t.adam.weight_decay = table_decay);
             f.net.mlp.precision = precision;
             (f.net.rgb.activation, f.net.rgb.shift) = color_head(is_linear);
         }
@@ -217,6 +229,15 @@ impl ObjectModel {
     /// step, else a field could lose all of its samples before it has learned anything.
     pub fn thin(&self) -> f32 {
         0.7 * self.field.net.sigma.shift.exp()
+    }
+
+    /// Weight of the distortion loss at a training step.
+    pub fn distortion(&self, step: u64) -> f32 {
+        let weight = self.config.loss.distortion;
+        match self.field.is_unbounded() {
+            true => weight.or(DISTORTION.0) * (step as f32 / DISTORTION_RAMP as f32).min(1.0),
+            false => weight.or(DISTORTION.1),
+        }
     }
 
     /// The scene's outer cube in model space: lowest corner and edge.

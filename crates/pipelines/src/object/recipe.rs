@@ -1,10 +1,11 @@
 //! Training, from top to bottom.
 
-use super::config::{Background, Config, Method};
+use super::config::{Auto, Background, Config, LossConfig, Method};
 use super::device::{self, Aftermath, Drawing, Opened};
 use super::held_out::{self, HeldOutPixels};
 use super::memory;
 use super::model::{ObjectModel, is_linear};
+use super::nearest::nearest;
 use super::run_folder::{RunFolder, RunSummary};
 use super::viewing::RunView;
 use crate::bench::train::{StageFigure, TrainReport};
@@ -123,7 +124,7 @@ pub fn train(
     for note in &capture.notes {
         events(&Event::Note(note.clone()));
     }
-    let config = &with_white(config, &capture)?;
+    let config = &resolved(config, &capture)?;
     if config.data.white > 0.0 {
         let white = config.data.white;
         events(&Event::Note(format!("the photographs hold linear light: {white} is shown as white (--set data.white={white})")));
@@ -258,7 +259,7 @@ const WRONG: f32 = 0.01;
 /// A trainer whose run is not kept.
 fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'static>> {
     let capture = load_capture(config)?;
-    let config = &with_white(config, &capture)?;
+    let config = &resolved(config, &capture)?;
     let device = device::open(config)?;
     let (store, _) = load_pixels(config, &capture, &device)?;
     let has_alpha = store.has_alpha;
@@ -273,14 +274,17 @@ fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'stat
     Trainer::new(model, Photographs(store), Path::new(""), device)
 }
 
-/// The configuration with [`super::config::DataConfig::white`] as the training photographs have it.
-fn with_white(config: &Config, capture: &Capture) -> Result<Config> {
+/// The configuration with what the capture says where it leaves it open: white, and how near matter may be.
+fn resolved(config: &Config, capture: &Capture) -> Result<Config> {
     let mut config = config.clone();
     if !is_linear(capture) {
         config.data.white = 0.0;
     } else if config.data.white == 0.0 {
         let train: Vec<_> = capture.frames.iter().filter(|f| f.split == Split::Train).collect();
         config.data.white = photo_check::white(&train)?;
+    }
+    if config.sampling.near == 0.0 {
+        config.sampling.near = nearest(capture);
     }
     Ok(config)
 }
@@ -472,7 +476,7 @@ impl<'a> Trainer<'a> {
     }
 
     /// Occupied samples through the one field.
-    fn step_ngp(&mut self, step: u64) -> (f64, u64) {
+    fn step_ngp(&mut self, step: u64, terms: &LossConfig) -> (f64, u64) {
         let b = &mut self.buffers;
         let m = &mut self.model;
         let (s, thin) = (&m.config.sampling, m.thin());
@@ -499,7 +503,7 @@ impl<'a> Trainer<'a> {
         m.samples_per_ray = if step == 0 { per_ray } else { 0.9 * m.samples_per_ray + 0.1 * per_ray };
         let loss = train_field(
             &mut m.field,
-            &m.config,
+            terms,
             &b.batch,
             &b.marched,
             &b.positions,
@@ -527,6 +531,7 @@ impl<'a> Trainer<'a> {
             refresh_errors: step.is_multiple_of(ERROR_REFRESH),
             stretch: stretch(step),
             thin: m.thin(),
+            distortion: m.distortion(step),
             rate_scale: self.schedule.scale(progress as f32) * m.rate_scale,
         };
         let figures = self.device.step(&mut self.model, step, &drawing)?;
@@ -535,30 +540,30 @@ impl<'a> Trainer<'a> {
     }
 
     /// Stratified samples through the one field.
-    fn step_stratified(&mut self, first: u64) -> (f64, u64) {
+    fn step_stratified(&mut self, first: u64, terms: &LossConfig) -> (f64, u64) {
         let b = &mut self.buffers;
         let m = &mut self.model;
         let rng = Rng::new(m.config.seed, COARSE);
         stratified::stratified(&b.batch, m.config.sampling.samples, Some((rng, first)), &mut b.marched);
         positions(&b.batch, &b.marched, &mut b.positions);
         let d = m.corrections.is_some().then_some(&mut b.d_positions);
-        let loss = train_field(&mut m.field, &m.config, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
+        let loss = train_field(&mut m.field, terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
         (loss, b.marched.t.len() as u64)
     }
 
     /// Stratified samples through the coarse field, then more where it found matter through the fine one.
-    fn step_hierarchical(&mut self, first: u64) -> (f64, u64) {
+    fn step_hierarchical(&mut self, first: u64, terms: &LossConfig) -> (f64, u64) {
         let b = &mut self.buffers;
         let m = &mut self.model;
         let (n, more) = (m.config.sampling.samples, m.config.sampling.importance);
         stratified::stratified(&b.batch, n, Some((Rng::new(m.config.seed, COARSE), first)), &mut b.fine);
         positions(&b.batch, &b.fine, &mut b.positions);
         let coarse = m.coarse.as_mut().expect("nerf has a coarse field");
-        let coarse_loss = train_field(coarse, &m.config, &b.batch, &b.fine, &b.positions, &b.background, &mut b.field, None);
+        let coarse_loss = train_field(coarse, terms, &b.batch, &b.fine, &b.positions, &b.background, &mut b.field, None);
         stratified::refine(&b.fine, &b.field.out.weights, n, more, Some((Rng::new(m.config.seed, FINE), first)), &mut b.marched);
         positions(&b.batch, &b.marched, &mut b.positions);
         let d = m.corrections.is_some().then_some(&mut b.d_positions);
-        let loss = train_field(&mut m.field, &m.config, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
+        let loss = train_field(&mut m.field, terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
         (coarse_loss + loss, (b.fine.t.len() + b.marched.t.len()) as u64)
     }
 
@@ -620,7 +625,7 @@ fn positions(batch: &RayBatch, marched: &Marched, out: &mut Vec<f32>) {
 #[allow(clippy::too_many_arguments)]
 fn train_field(
     field: &mut Field,
-    config: &Config,
+    terms: &LossConfig,
     batch: &RayBatch,
     marched: &Marched,
     positions: &[f32],
@@ -629,9 +634,10 @@ fn train_field(
     d_positions: Option<&mut Vec<f32>>,
 ) -> f64 {
     let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
-    let color = if config.loss.color == "huber" { ColorLoss::Huber(0.1) } else { ColorLoss::Mse };
+    let color = if terms.color == "huber" { ColorLoss::Huber(0.1) } else { ColorLoss::Mse };
     let (mut starts, mut lengths) = (Vec::new(), Vec::new());
-    let spread = if config.loss.distortion > 0.0 && field.is_unbounded() {
+    let (distortion, alpha) = (terms.distortion.or(0.0), terms.alpha);
+    let spread = if distortion > 0.0 && field.is_unbounded() {
         distortion::cpu::normalize(&samples, &mut starts, &mut lengths);
         Packed { offsets: &marched.offsets, t: &starts, dt: &lengths }
     } else {
@@ -639,9 +645,8 @@ fn train_field(
     };
     // Linear light has a color head of its own.
     let relative = if field.net.rgb.activation == Activation::TruncatedExp { losses::RELATIVE } else { 0.0 };
-    let (distortion, alpha) = (config.loss.distortion, config.loss.alpha);
     let loss = Photometric { batch, samples: spread, background, color, relative, distortion, alpha };
-    let near_scaling = config.loss.near_scaling;
+    let near_scaling = terms.near_scaling;
     let b = Batch { samples, positions, dirs: &batch.dirs, images: Some(&batch.images), background, near_scaling };
     field.train(&b, &loss, buffers, d_positions);
     buffers.out.loss
@@ -678,10 +683,12 @@ impl Trainee for Trainer<'_> {
         }
         let first = self.model.origin.rays;
         self.draw(step, first);
-        let (loss, samples) = match self.model.config.method {
-            Method::Ngp => self.step_ngp(step),
-            Method::Mlp | Method::Baseline => self.step_stratified(first),
-            Method::Nerf => self.step_hierarchical(first),
+        let config = &self.model.config;
+        let terms = LossConfig { distortion: Auto::Is(self.model.distortion(step)), ..config.loss.clone() };
+        let (loss, samples) = match config.method {
+            Method::Ngp => self.step_ngp(step, &terms),
+            Method::Mlp | Method::Baseline => self.step_stratified(first, &terms),
+            Method::Nerf => self.step_hierarchical(first, &terms),
         };
         self.buffers.field.stages.done("network");
         let mse = self.score();

@@ -63,8 +63,9 @@ multiversion! {
             let g: &mut [f32; LINE] = (&mut g[span]).try_into().expect("a line");
             for i in 0..LINE {
                 let live = g[i] != 0.0;
-                let m1 = a.beta1 * m[i] + (1.0 - a.beta1) * g[i];
-                let v1 = a.beta2 * v[i] + (1.0 - a.beta2) * g[i] * g[i];
+                let d = g[i] + a.weight_decay * p[i];
+                let m1 = a.beta1 * m[i] + (1.0 - a.beta1) * d;
+                let v1 = a.beta2 * v[i] + (1.0 - a.beta2) * d * d;
                 let p1 = p[i] - f.step * m1 / (v1.sqrt() * f.root + a.epsilon);
                 m[i] = if live { m1 } else { m[i] };
                 v[i] = if live { v1 } else { v[i] };

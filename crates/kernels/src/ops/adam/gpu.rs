@@ -35,6 +35,7 @@ pub fn step(gpu: &Gpu, a: &Adam, t: u32, sparse: bool, p: &Buffer, m: &Buffer, v
     }
 }
 
+#[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
 fn adam(
     p: &mut [f32],
@@ -59,9 +60,8 @@ fn adam(
         if d == 0.0 {
             terminate!();
         }
-    } else {
-        d += decay * p[i];
     }
+    d += decay * p[i];
     let m1 = beta1 * m[i] + (1.0 - beta1) * d;
     let v1 = beta2 * v[i] + (1.0 - beta2) * d * d;
     m[i] = m1;

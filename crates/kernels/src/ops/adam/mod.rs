@@ -18,7 +18,7 @@ pub struct Adam {
     pub beta1: f32,
     pub beta2: f32,
     pub epsilon: f32,
-    /// L2 penalty added to the gradient of the dense form.
+    /// L2 penalty added to the gradient; the sparse form adds it to elements that have one.
     pub weight_decay: f32,
 }
 

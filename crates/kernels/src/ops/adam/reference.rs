@@ -9,7 +9,7 @@ pub fn step(a: &Adam, t: u32, sparse: bool, p: &mut [f64], m: &mut [f64], v: &mu
         if sparse && g[i] == 0.0 {
             continue;
         }
-        let g = g[i] + if sparse { 0.0 } else { a.weight_decay as f64 * p[i] };
+        let g = g[i] + a.weight_decay as f64 * p[i];
         m[i] = b1 * m[i] + (1.0 - b1) * g;
         v[i] = b2 * v[i] + (1.0 - b2) * g * g;
         let (mh, vh) = (m[i] / (1.0 - b1.powi(t as i32)), v[i] / (1.0 - b2.powi(t as i32)));

@@ -21,7 +21,7 @@ fn dense_matches_the_reference() {
 #[test]
 fn sparse_matches_the_reference_and_clears_what_it_used() {
     let n = cpu::LINE * 5000;
-    let a = Adam::default();
+    let a = Adam { weight_decay: 1e-2, ..Adam::default() };
     let (mut p, mut m, mut v) = (random(n, 1), vec![0.0; n], vec![0.0; n]);
     let (mut pr, mut mr, mut vr) = (wide(&p), wide(&m), wide(&v));
     for t in 1..4u32 {
