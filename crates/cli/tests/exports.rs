@@ -22,7 +22,7 @@ fn good() -> &'static Good {
         let (capture, run) = (folder.path().join("capture"), folder.path().join("run"));
         write_capture(&capture, 24, 64).unwrap();
         let small = ["--set", "field.log2_size=14", "--set", "field.finest=256"];
-        works(&[&["train", s(&capture), "-o", s(&run), "--steps", "250", "--device", "cpu"], &small[..]].concat());
+        works(&[&["train", s(&capture), "-o", s(&run), "--steps", "400", "--device", "cpu"], &small[..]].concat());
         Good { _folder: folder, run, lock: RwLock::new(()) }
     })
 }
@@ -78,6 +78,16 @@ fn bounds(points: &[Corner]) -> (Corner, Corner) {
     (fold(f64::min, f64::INFINITY), fold(f64::max, f64::NEG_INFINITY))
 }
 
+/// The first and the ninety-ninth percentile along each axis.
+fn most(points: &[Corner]) -> (Corner, Corner) {
+    let at = |k: usize, share: f64| {
+        let mut along: Vec<f64> = points.iter().map(|p| p[k]).collect();
+        along.sort_by(f64::total_cmp);
+        along[(share * (along.len() - 1) as f64) as usize]
+    };
+    (std::array::from_fn(|k| at(k, 0.01)), std::array::from_fn(|k| at(k, 0.99)))
+}
+
 #[test]
 fn points_lie_where_the_mesh_does() {
     let _held = good().lock.read().unwrap();
@@ -90,10 +100,13 @@ fn points_lie_where_the_mesh_does() {
     assert!(["nx", "nz", "red", "blue"].iter().all(|p| head.contains(p)) && !head.contains("element face"), "{head}");
     assert_eq!(points.len(), 20_000);
     let (_, vertices) = ply(&mesh);
-    let ((lo, hi), (mesh_lo, mesh_hi)) = (bounds(&points), bounds(&vertices));
+    // One of the two may hold a lump in the air that the other lacks.
+    let ((lo, hi), (mesh_lo, mesh_hi)) = (most(&points), most(&vertices));
     let longest = (0..3).map(|k| mesh_hi[k] - mesh_lo[k]).fold(0.0, f64::max);
     for k in 0..3 {
-        assert!((lo[k] - mesh_lo[k]).abs() < 0.12 * longest && (hi[k] - mesh_hi[k]).abs() < 0.12 * longest, "{lo:?} {mesh_lo:?}");
+        // What the thing stands on is seen from above alone: the mesh may reach deeper.
+        let below = if k == 2 { (mesh_lo[k] - lo[k]).max(0.0) } else { (lo[k] - mesh_lo[k]).abs() };
+        assert!(below < 0.12 * longest && (hi[k] - mesh_hi[k]).abs() < 0.12 * longest, "{lo:?} {mesh_lo:?} {hi:?} {mesh_hi:?}");
     }
     // Nine of ten points are within a fortieth of the mesh's length of one of its vertices.
     let near = points.iter().step_by(100).filter(|p| {

@@ -20,7 +20,7 @@ fn good() -> &'static Good {
         let (capture, run) = (folder.path().join("capture"), folder.path().join("run"));
         write_capture(&capture, 24, 64).unwrap();
         let small = ["--set", "field.log2_size=14", "--set", "field.finest=256"];
-        works(&[&["train", s(&capture), "-o", s(&run), "--steps", "250", "--device", "cpu"], &small[..]].concat());
+        works(&[&["train", s(&capture), "-o", s(&run), "--steps", "400", "--device", "cpu"], &small[..]].concat());
         Good { _folder: folder, capture, run }
     })
 }

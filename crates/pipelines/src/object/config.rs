@@ -163,7 +163,7 @@ pub struct LossConfig {
     /// `mse` or `huber`.
     pub color: String,
     /// Weight of the distortion loss; in unbounded space it is taken in `4 t / (1 + t)`. `auto`: 0.1 there,
-    /// growing from 0 while coarse geometry is found, 0.01 in a box.
+    /// growing from a tenth while coarse geometry is found, 0.01 in a box.
     pub distortion: Auto,
     pub alpha: f32,
     /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.

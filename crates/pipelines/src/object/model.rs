@@ -64,9 +64,9 @@ const TABLE_DECAY: f32 = 1e-5;
 /// Weight of the distortion loss in unbounded space and in a box.
 const DISTORTION: (f32, f32) = (0.1, 0.01);
 
-/// Steps in which the distortion loss of unbounded space grows to its weight: at once, it would gather what little matter there
-/// is before each camera, where nothing else is known yet.
-const DISTORTION_RAMP: u64 = 2000;
+/// Share of its weight with which the distortion loss of unbounded space begins, and steps in which it grows: at once, it would
+/// gather what little matter there is before each camera, where nothing else is known yet.
+const DISTORTION_RAMP: (f32, u64) = (0.1, 2000);
 
 /// Cascades of the occupancy grid of unbounded space: they reach 64 inner cubes far, beyond which a ray has a few samples left.
 const CASCADES: usize = 8;
@@ -235,7 +235,7 @@ impl ObjectModel {
     pub fn distortion(&self, step: u64) -> f32 {
         let weight = self.config.loss.distortion;
         match self.field.is_unbounded() {
-            true => weight.or(DISTORTION.0) * (step as f32 / DISTORTION_RAMP as f32).min(1.0),
+            true => weight.or(DISTORTION.0) * (step as f32 / DISTORTION_RAMP.1 as f32).clamp(DISTORTION_RAMP.0, 1.0),
             false => weight.or(DISTORTION.1),
         }
     }
