@@ -31,8 +31,28 @@ fn s(p: &Path) -> &str {
     p.to_str().unwrap()
 }
 
+/// How long a call may take: `view` would serve for ever.
+const LIMIT: Duration = Duration::from_secs(300);
+
 fn call(folder: &Path, arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_diorama")).args(arguments).current_dir(folder).output().unwrap()
+    let said = tempfile::tempdir().unwrap();
+    let file = |name: &str| std::fs::File::create(said.path().join(name)).unwrap();
+    let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
+    let mut child = c.args(arguments).current_dir(folder).stdout(file("out")).stderr(file("err")).spawn().unwrap();
+    let begin = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            break status;
+        }
+        if begin.elapsed() > LIMIT {
+            child.kill().unwrap();
+            child.wait().unwrap();
+            panic!("{arguments:?} goes on after {LIMIT:?}");
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    };
+    let read = |name: &str| std::fs::read(said.path().join(name)).unwrap();
+    Output { status, stdout: read("out"), stderr: read("err") }
 }
 
 /// What a call from `folder` prints, which succeeds.
