@@ -425,6 +425,9 @@ impl Config {
         if s.occupancy_resolution == 0 || !s.occupancy_resolution.is_multiple_of(16) {
             return fail("sampling.occupancy_resolution: must be a multiple of 16");
         }
+        if s.near < 0.0 {
+            return fail("sampling.near: 0 or more");
+        }
         if !(0.0..=1e9).contains(&self.data.white) {
             return fail("data.white: 0, or light above 0");
         }

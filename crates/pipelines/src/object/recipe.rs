@@ -1,6 +1,6 @@
 //! Training, from top to bottom.
 
-use super::config::{Auto, Background, Config, LossConfig, Method};
+use super::config::{Background, Config, LossConfig, Method};
 use super::device::{self, Aftermath, Drawing, Opened};
 use super::held_out::{self, HeldOutPixels};
 use super::memory;
@@ -476,10 +476,10 @@ impl<'a> Trainer<'a> {
     }
 
     /// Occupied samples through the one field.
-    fn step_ngp(&mut self, step: u64, terms: &LossConfig) -> (f64, u64) {
+    fn step_ngp(&mut self, step: u64) -> (f64, u64) {
         let b = &mut self.buffers;
         let m = &mut self.model;
-        let (s, thin) = (&m.config.sampling, m.thin());
+        let (s, thin, distortion) = (&m.config.sampling, m.thin(), m.distortion(step));
         let grid = m.occupancy.as_mut().expect("ngp has an occupancy grid");
         if step > 0 && step.is_multiple_of(s.occupancy_every) {
             let (until, block) = OCCUPANCY_WARMUP;
@@ -503,7 +503,8 @@ impl<'a> Trainer<'a> {
         m.samples_per_ray = if step == 0 { per_ray } else { 0.9 * m.samples_per_ray + 0.1 * per_ray };
         let loss = train_field(
             &mut m.field,
-            terms,
+            &m.config.loss,
+            distortion,
             &b.batch,
             &b.marched,
             &b.positions,
@@ -540,30 +541,34 @@ impl<'a> Trainer<'a> {
     }
 
     /// Stratified samples through the one field.
-    fn step_stratified(&mut self, first: u64, terms: &LossConfig) -> (f64, u64) {
+    fn step_stratified(&mut self, step: u64, first: u64) -> (f64, u64) {
         let b = &mut self.buffers;
         let m = &mut self.model;
+        let distortion = m.distortion(step);
         let rng = Rng::new(m.config.seed, COARSE);
         stratified::stratified(&b.batch, m.config.sampling.samples, Some((rng, first)), &mut b.marched);
         positions(&b.batch, &b.marched, &mut b.positions);
         let d = m.corrections.is_some().then_some(&mut b.d_positions);
-        let loss = train_field(&mut m.field, terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
+        let loss =
+            train_field(&mut m.field, &m.config.loss, distortion, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
         (loss, b.marched.t.len() as u64)
     }
 
     /// Stratified samples through the coarse field, then more where it found matter through the fine one.
-    fn step_hierarchical(&mut self, first: u64, terms: &LossConfig) -> (f64, u64) {
+    fn step_hierarchical(&mut self, step: u64, first: u64) -> (f64, u64) {
         let b = &mut self.buffers;
         let m = &mut self.model;
-        let (n, more) = (m.config.sampling.samples, m.config.sampling.importance);
+        let (n, more, distortion) = (m.config.sampling.samples, m.config.sampling.importance, m.distortion(step));
         stratified::stratified(&b.batch, n, Some((Rng::new(m.config.seed, COARSE), first)), &mut b.fine);
         positions(&b.batch, &b.fine, &mut b.positions);
         let coarse = m.coarse.as_mut().expect("nerf has a coarse field");
-        let coarse_loss = train_field(coarse, terms, &b.batch, &b.fine, &b.positions, &b.background, &mut b.field, None);
+        let coarse_loss =
+            train_field(coarse, &m.config.loss, distortion, &b.batch, &b.fine, &b.positions, &b.background, &mut b.field, None);
         stratified::refine(&b.fine, &b.field.out.weights, n, more, Some((Rng::new(m.config.seed, FINE), first)), &mut b.marched);
         positions(&b.batch, &b.marched, &mut b.positions);
         let d = m.corrections.is_some().then_some(&mut b.d_positions);
-        let loss = train_field(&mut m.field, terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
+        let loss =
+            train_field(&mut m.field, &m.config.loss, distortion, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
         (coarse_loss + loss, (b.fine.t.len() + b.marched.t.len()) as u64)
     }
 
@@ -626,6 +631,7 @@ fn positions(batch: &RayBatch, marched: &Marched, out: &mut Vec<f32>) {
 fn train_field(
     field: &mut Field,
     terms: &LossConfig,
+    distortion: f32,
     batch: &RayBatch,
     marched: &Marched,
     positions: &[f32],
@@ -636,7 +642,6 @@ fn train_field(
     let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
     let color = if terms.color == "huber" { ColorLoss::Huber(0.1) } else { ColorLoss::Mse };
     let (mut starts, mut lengths) = (Vec::new(), Vec::new());
-    let (distortion, alpha) = (terms.distortion.or(0.0), terms.alpha);
     let spread = if distortion > 0.0 && field.is_unbounded() {
         distortion::cpu::normalize(&samples, &mut starts, &mut lengths);
         Packed { offsets: &marched.offsets, t: &starts, dt: &lengths }
@@ -645,7 +650,7 @@ fn train_field(
     };
     // Linear light has a color head of its own.
     let relative = if field.net.rgb.activation == Activation::TruncatedExp { losses::RELATIVE } else { 0.0 };
-    let loss = Photometric { batch, samples: spread, background, color, relative, distortion, alpha };
+    let loss = Photometric { batch, samples: spread, background, color, relative, distortion, alpha: terms.alpha };
     let near_scaling = terms.near_scaling;
     let b = Batch { samples, positions, dirs: &batch.dirs, images: Some(&batch.images), background, near_scaling };
     field.train(&b, &loss, buffers, d_positions);
@@ -683,12 +688,10 @@ impl Trainee for Trainer<'_> {
         }
         let first = self.model.origin.rays;
         self.draw(step, first);
-        let config = &self.model.config;
-        let terms = LossConfig { distortion: Auto::Is(self.model.distortion(step)), ..config.loss.clone() };
-        let (loss, samples) = match config.method {
-            Method::Ngp => self.step_ngp(step, &terms),
-            Method::Mlp | Method::Baseline => self.step_stratified(first, &terms),
-            Method::Nerf => self.step_hierarchical(first, &terms),
+        let (loss, samples) = match self.model.config.method {
+            Method::Ngp => self.step_ngp(step),
+            Method::Mlp | Method::Baseline => self.step_stratified(step, first),
+            Method::Nerf => self.step_hierarchical(step, first),
         };
         self.buffers.field.stages.done("network");
         let mse = self.score();

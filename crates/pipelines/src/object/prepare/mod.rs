@@ -161,6 +161,7 @@ fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut d
     if !work.join(IMAGES_DONE).exists() && !take_images(o, &work, interrupt, note)? {
         return Ok(None);
     }
+    let broken = left_out(&work.join(BROKEN))?;
     let images = photo_import::list(&o.out.join(IMAGES))?;
     if images.len() < 3 {
         return Err(DataError::input(
@@ -199,7 +200,7 @@ fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut d
         points: placed.points,
         images: names.len(),
         lost,
-        broken: std::fs::read_to_string(work.join(BROKEN)).unwrap_or_default().lines().map(String::from).collect(),
+        broken,
         tilt: placed.tilt,
         floor: placed.floor,
         is_divided: false,
@@ -330,6 +331,15 @@ fn common_focal_ratio(all: &[PathBuf]) -> Option<f64> {
     let middle = *found.get(found.len() / 2)?;
     let agree = found.iter().filter(|f| (*f / middle - 1.0).abs() < 0.02).count();
     (agree * 10 >= all.len() * 9).then_some(middle)
+}
+
+/// Names of the photographs that were left out; none where an earlier version took them, which kept no list.
+fn left_out(file: &Path) -> Result<Vec<String>> {
+    match std::fs::read_to_string(file) {
+        Ok(names) => Ok(names.lines().map(String::from).collect()),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(Vec::new()),
+        Err(e) => Err(DataError::io(file, "read")(e).into()),
+    }
 }
 
 /// Fills the folder of images; false when interrupted.
