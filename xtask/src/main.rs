@@ -1,5 +1,7 @@
 //! Chores: `cargo xtask ci`, `cargo xtask gpu-check`, `cargo xtask viewer-check` and `cargo xtask tidy`.
 
+#[cfg(test)]
+mod ci_script;
 mod tidy;
 
 use std::process::{Command, ExitCode, Stdio};
