@@ -157,6 +157,7 @@ fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
         ("--seed", "8", "7"),
         ("--method", "nerf", "ngp"),
         ("--background", "black", "white"),
+        ("--format", "colmap", "transforms"),
         ("--set", "field.log2_size=13", "12"),
     ] {
         let named = if flag == "--set" { "field.log2_size" } else { flag };
@@ -164,6 +165,9 @@ fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
         let parts = [&format!("{named} cannot change")[..], &format!("has {had}, not {said}")];
         fails(dir.path(), &["train", "-o", "run", "--resume", flag, value], 2, &parts);
     }
+    // Another capture.
+    write_capture(&dir.path().join("other"), 6, 24).unwrap();
+    fails(dir.path(), &["train", "other", "-o", "run", "--resume"], 2, &[capture, "not on other", "--data FOLDER"]);
     // A configuration that the run began with, and one that says something else.
     std::fs::copy(dir.path().join("run/config.toml"), dir.path().join("same.toml")).unwrap();
     let text = std::fs::read_to_string(dir.path().join("same.toml")).unwrap();
@@ -176,7 +180,9 @@ fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
 fn the_preset_of_the_report_gives_exactly_100_pixels() {
     let dir = tempfile::tempdir().unwrap();
     write_capture(&dir.path().join("data"), 6, 150).unwrap();
-    works(dir.path(), &[&["train", "data", "-o", "run", "--steps", "1", "--preset", "report"], &SMALL[..]].concat());
+    let train = [&["train", "data", "-o", "run", "--steps", "1", "--preset", "report"], &SMALL[..]].concat();
+    works(dir.path(), &train);
+    works(dir.path(), &[&train[..], &["--resume"]].concat());
     works(dir.path(), &["render", "run", "--path", "held-out", "--images", "frames", "--device", "cpu", "--quality", "fast"]);
     assert_eq!(diorama_data::photo::size(&dir.path().join("frames/0000.png")).unwrap(), (100, 100));
     let report: serde_json::Value =
@@ -184,21 +190,26 @@ fn the_preset_of_the_report_gives_exactly_100_pixels() {
     assert!(report["psnr"].as_f64().unwrap().is_finite());
 }
 
+/// A call that may take so many bytes of memory.
+fn with_memory(folder: &Path, limit: &str, arguments: &[&str]) -> (Option<i32>, serde_json::Value, String) {
+    let o = call_in(folder, &[("DIORAMA_MEMORY", limit)], arguments);
+    (o.status.code(), serde_json::from_slice(&o.stdout).unwrap_or_default(), String::from_utf8_lossy(&o.stderr).into_owned())
+}
+
 #[test]
 fn what_does_not_fit_into_memory_is_refused_with_needs_has_and_cure() {
     let dir = tempfile::tempdir().unwrap();
     let table = ["--set", "field.log2_size=24", "--set", "field.levels=64", "--set", "field.features=8", "--json"];
     let all = [&["train", s(&good().capture), "-o", "run", "--steps", "1", "--device", "cpu"], &table[..]].concat();
-    fails(dir.path(), &all, 1, &["parameters 1", "GiB", "are available", "--set field.log2_size=19"]);
-    let told: serde_json::Value = serde_json::from_slice(&call(dir.path(), &all).stdout).unwrap();
-    assert_eq!((told["kind"].as_str(), told["exit_code"].as_i64()), (Some("memory"), Some(1)));
+    // Large machines are refused it, too.
+    let (code, told, said) = with_memory(dir.path(), "64GiB", &all);
+    assert_eq!((code, told["kind"].as_str(), told["exit_code"].as_i64()), (Some(1), Some("memory"), Some(1)), "{said}");
+    let line = told["error"].as_str().unwrap();
+    for part in ["parameters 1", "GiB", "are available", "--set field.log2_size=19"] {
+        assert!(line.contains(part), "{part:?} is not in {line}");
+    }
+    assert_eq!(said.lines().filter(|l| l.starts_with("diorama: ")).count(), 1, "{said}");
     assert!(!dir.path().join("run").exists());
-}
-
-/// A call that may take so many bytes of memory.
-fn with_memory(folder: &Path, limit: &str, arguments: &[&str]) -> (Option<i32>, serde_json::Value, String) {
-    let o = call_in(folder, &[("DIORAMA_MEMORY", limit)], arguments);
-    (o.status.code(), serde_json::from_slice(&o.stdout).unwrap_or_default(), String::from_utf8_lossy(&o.stderr).into_owned())
 }
 
 #[test]
@@ -225,6 +236,8 @@ fn an_export_that_does_not_fit_is_refused_with_needs_has_and_cure() {
     assert!(told["faces"].as_u64().unwrap() > 0 && !said.contains("needs about"), "{said}");
     let (code, told, _) = with_memory(dir.path(), "much", &[&small[..], &["--force"]].concat());
     assert!(code == Some(2) && told["error"].as_str().unwrap().contains("DIORAMA_MEMORY=much: expected bytes"), "{told}");
+    let (_, doctor, _) = with_memory(dir.path(), "10MiB", &["doctor", "--json"]);
+    assert_eq!(doctor["memory_available_bytes"].as_u64(), Some(10 << 20), "{doctor}");
 }
 
 #[test]
@@ -370,18 +383,18 @@ fn what_was_saved_in_the_viewer_is_never_ignored() {
     let crops = ["{\"min\":[0,0,0]", "{\"min\":[0,0,0],\"max\":[0,1,1]}", "{\"min\":[0,0,0],\"max\":[1,1,1],\"turn\":1}", ""];
     let scales = ["{\"points\":[[0,0,0],[0,0,0]],\"metres\":1}", "{\"points\":[[0,0,0],[0,0,1]],\"metres\":-1}", "[]"];
     let paths = ["{}", "[]", "{\"camera_path\":[{\"camera_to_world\":[1,2]}],\"render_width\":64,\"render_height\":48}"];
-    let view = &["view", ".", "--port", "0", "--device", "cpu"][..];
-    let train = &["train", "-o", ".", "--resume", "--steps", "61", "--view", "--port", "0"];
-    let export = &["export", ".", "-o", "new", "--format", "ply", "--resolution", "16", "--level", "0.01", "--device", "cpu"];
-    let render = &["render", ".", "--frames", "1", "--size", "16x16", "--images", "new", "--device", "cpu"];
-    let deep = &["render", ".", "--frames", "1", "--size", "16x16", "--images", "new", "--layers", "depth", "--device", "cpu"];
-    let along = &["render", ".", "--path", "camera_path.json", "--images", "new", "--device", "cpu"];
+    let view: &[&str] = &["view", ".", "--port", "0", "--device", "cpu"];
+    let train: &[&str] = &["train", "-o", ".", "--resume", "--steps", "61", "--view", "--port", "0"];
+    let export: &[&str] = &["export", ".", "-o", "new", "--format", "ply", "--resolution", "16", "--level", "0.01", "--device", "cpu"];
+    let render: &[&str] = &["render", ".", "--frames", "1", "--size", "16x16", "--images", "new", "--device", "cpu"];
+    let deep: &[&str] = &["render", ".", "--frames", "1", "--size", "16x16", "--images", "new", "--layers", "depth", "--device", "cpu"];
+    let along: &[&str] = &["render", ".", "--path", "camera_path.json", "--images", "new", "--device", "cpu"];
     let (_dir, run) = copy();
     let summary = std::fs::read(run.join("summary.json")).unwrap();
     for (name, texts, verbs) in [
-        ("crop.json", &crops[..], &[view, train, export, render, deep][..]),
-        ("scale.json", &scales, &[view, train, export, deep]),
-        ("camera_path.json", &paths, &[view, train, along]),
+        ("crop.json", &crops[..], &[export, render, deep, train, view][..]),
+        ("scale.json", &scales, &[export, deep, train, view]),
+        ("camera_path.json", &paths, &[along, train, view]),
     ] {
         for text in texts {
             std::fs::write(run.join(name), text).unwrap();
