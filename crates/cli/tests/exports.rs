@@ -185,6 +185,13 @@ fn the_summary_says_how_many_faces_went() {
     assert!(text.contains("removed: ") && text.contains("fewer than three cameras see"), "{text}");
     let removed = export(&file, &["--resolution", "48", "--keep-unseen", "--force"])["removed"].clone();
     assert_eq!((removed["unseen"].as_u64(), removed["before_cameras"].as_u64()), (Some(0), Some(0)));
+    // A field that was trained shortly has parts that hardly a camera sees; what goes is what --keep-unseen keeps.
+    let all = ["--resolution", "64", "--floaters", "0", "--faces", "0", "--force"];
+    let (seen, kept) = (export(&file, &all), export(&file, &[&all[..], &["--keep-unseen"]].concat()));
+    let count = |made: &serde_json::Value, what: &str| made["removed"][what].as_u64().unwrap();
+    let gone = count(&seen, "unseen") + count(&seen, "before_cameras");
+    assert!(gone > 0, "{seen}");
+    assert_eq!(seen["faces"].as_u64().unwrap() + gone, kept["faces"].as_u64().unwrap(), "{seen} {kept}");
 }
 
 #[test]
