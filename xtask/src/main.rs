@@ -2,6 +2,8 @@
 
 #[cfg(test)]
 mod ci_script;
+#[cfg(test)]
+mod named_tests;
 mod tidy;
 
 use std::process::{Command, ExitCode, Stdio};
