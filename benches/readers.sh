@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
 # Installs the foreign readers that crates/cli/tests/readers.rs hands exported meshes to, into FOLDER (DIORAMA_READERS, or target/readers):
-# trimesh, pycollada and usd-core in a virtual environment, Khronos' glTF validator for Node.js.
+# trimesh, pycollada, usd-core, laspy and pye57 in a virtual environment, Khronos' glTF validator for Node.js.
 #
 #     benches/readers.sh target/readers
 set -euo pipefail
 folder="${1:?usage: benches/readers.sh FOLDER}"
 mkdir -p "$folder"
 [ -x "$folder/venv/bin/python" ] || python3 -m venv "$folder/venv"
-"$folder/venv/bin/python" -m pip install --quiet --disable-pip-version-check numpy trimesh==5.2.0 pycollada==0.9.3 usd-core==26.11
+"$folder/venv/bin/python" -m pip install --quiet --disable-pip-version-check numpy trimesh==5.2.0 pycollada==0.9.3 usd-core==26.11 \
+    laspy==2.7.0 pye57==0.4.19 pillow==13.0.0
 npm install --prefix "$folder" --ignore-scripts --no-audit --no-fund --silent gltf-validator@2.0.0-dev.3.10

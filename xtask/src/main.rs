@@ -1,5 +1,9 @@
 //! Chores: `cargo xtask ci`, `cargo xtask gpu-check`, `cargo xtask viewer-check` and `cargo xtask tidy`.
 
+#[cfg(test)]
+mod ci_script;
+#[cfg(test)]
+mod named_tests;
 mod tidy;
 
 use std::process::{Command, ExitCode, Stdio};

@@ -85,7 +85,7 @@ impl Progress {
 pub struct ShareShown {
     bar: Option<ProgressBar>,
     begin: Instant,
-    last_line: Instant,
+    last_line: Option<Instant>,
 }
 
 impl ShareShown {
@@ -95,29 +95,32 @@ impl ShareShown {
             bar.set_style(ProgressStyle::with_template("{bar:30} {msg}").expect("a valid template"));
             bar
         });
-        ShareShown { bar, begin: Instant::now(), last_line: Instant::now() }
+        ShareShown { bar, begin: Instant::now(), last_line: None }
     }
 
     /// Tells that `share` of the work is done and what is being done.
     pub fn show(&mut self, share: f64, text: &str) {
         let now = Instant::now();
-        let text = match time_left(now - self.begin, share) {
-            Some(left) => format!("{text}; {left} left"),
-            None => text.to_string(),
-        };
+        let left = time_left(now - self.begin, share);
+        let is_known = left.is_some();
+        let text = left.map_or(text.to_string(), |left| format!("{text}; {left} left"));
         if let Some(b) = &self.bar {
             b.set_position((share * 1000.0) as u64);
             b.set_message(text);
-        } else if self.is_line_due(now) {
+        } else if self.is_line_due(now, is_known) {
             eprintln!("{text}");
         }
     }
 
-    /// Whether the last line is old enough for another, which then counts as the last.
-    fn is_line_due(&mut self, now: Instant) -> bool {
-        let due = now.duration_since(self.last_line) >= LINE_EVERY;
+    /// Whether the last line is old enough for another, which then counts as the last. The first comes as soon as the time left
+    /// is known.
+    fn is_line_due(&mut self, now: Instant, is_known: bool) -> bool {
+        let due = match self.last_line {
+            Some(last) => now.duration_since(last) >= LINE_EVERY,
+            None => is_known || now.duration_since(self.begin) >= LINE_EVERY,
+        };
         if due {
-            self.last_line = now;
+            self.last_line = Some(now);
         }
         due
     }
@@ -160,10 +163,13 @@ mod tests {
     }
 
     #[test]
-    fn lines_come_every_five_seconds() {
-        let mut s = ShareShown::new();
-        let begin = s.last_line;
-        let due: Vec<u64> = (0..12).filter(|i| s.is_line_due(begin + Duration::from_secs(*i))).collect();
-        assert_eq!(due, [5, 10]);
+    fn lines_come_every_five_seconds_and_the_first_when_the_time_left_is_known() {
+        let due = |known_from: u64| -> Vec<u64> {
+            let mut s = ShareShown::new();
+            let begin = s.begin;
+            (0..14).filter(|i| s.is_line_due(begin + Duration::from_secs(*i), *i >= known_from)).collect()
+        };
+        assert_eq!(due(1), [1, 6, 11]);
+        assert_eq!(due(9), [5, 10]);
     }
 }

@@ -185,6 +185,13 @@ fn the_summary_says_how_many_faces_went() {
     assert!(text.contains("removed: ") && text.contains("fewer than three cameras see"), "{text}");
     let removed = export(&file, &["--resolution", "48", "--keep-unseen", "--force"])["removed"].clone();
     assert_eq!((removed["unseen"].as_u64(), removed["before_cameras"].as_u64()), (Some(0), Some(0)));
+    // A field that was trained shortly has parts that hardly a camera sees; what goes is what --keep-unseen keeps.
+    let all = ["--resolution", "64", "--floaters", "0", "--faces", "0", "--force"];
+    let (seen, kept) = (export(&file, &all), export(&file, &[&all[..], &["--keep-unseen"]].concat()));
+    let count = |made: &serde_json::Value, what: &str| made["removed"][what].as_u64().unwrap();
+    let gone = count(&seen, "unseen") + count(&seen, "before_cameras");
+    assert!(gone > 0, "{seen}");
+    assert_eq!(seen["faces"].as_u64().unwrap() + gone, kept["faces"].as_u64().unwrap(), "{seen} {kept}");
 }
 
 #[test]
@@ -255,35 +262,105 @@ fn tensor(shape: &[usize], seed: u64, scale: f32) -> Vec<f32> {
     (0..shape.iter().product::<usize>() as u64).map(|i| (rng.uniform(i) - 0.5 + if seed >= 100 { 0.5 } else { 0.0 }) * scale).collect()
 }
 
-#[test]
-fn eval_judges_by_lpips_with_the_users_weights() {
-    let dir = tempfile::tempdir().unwrap();
-    let save = |name: &str, parts: &[(String, Vec<usize>, Vec<f32>)]| -> PathBuf {
-        let entries: Vec<_> =
-            parts.iter().map(|(n, shape, data)| checkpoint::Entry { name: n.clone(), shape: shape.clone(), data }).collect();
-        checkpoint::save(&dir.path().join(name), &entries, Default::default()).unwrap();
-        checkpoint::latest(&dir.path().join(name))
-    };
-    let layers = [(0, 3, 64, 11), (3, 64, 192, 5), (6, 192, 384, 3), (8, 384, 256, 3), (10, 256, 256, 3)];
-    let (mut trunk, mut heads) = (Vec::new(), Vec::new());
-    for (k, (i, from, to, kernel)) in layers.into_iter().enumerate() {
+type Tensor = (String, Vec<usize>, Vec<f32>);
+
+/// Convolutions `(number, from, to, kernel)` of a network as torchvision names them, and the heads of LPIPS above `taps` channels.
+fn network(convolutions: &[(usize, usize, usize, usize)], taps: &[usize]) -> (Vec<Tensor>, Vec<Tensor>) {
+    let mut trunk = Vec::new();
+    for &(i, from, to, kernel) in convolutions {
         let shape = vec![to, from, kernel, kernel];
         let scale = 2.0 * (6.0 / (from * kernel * kernel) as f32).sqrt();
         trunk.push((format!("features.{i}.weight"), shape.clone(), tensor(&shape, i as u64, scale)));
         trunk.push((format!("features.{i}.bias"), vec![to], tensor(&[to], i as u64 + 50, 0.1)));
-        heads.push((format!("lin{k}.model.1.weight"), vec![1, to, 1, 1], tensor(&[to], 100 + k as u64, 1.0)));
     }
-    let (trunk, heads) = (save("trunk", &trunk), save("heads", &heads));
-    let eval = |weights: &str| ["eval", s(&good().run), "--device", "cpu", "--json", "--lpips", weights].map(String::from);
-    let both = eval(&format!("{},{}", s(&trunk), s(&heads)));
-    let report: serde_json::Value = serde_json::from_str(&works(&both.each_ref().map(|a| &a[..]))).unwrap();
+    let head = |(k, n): (usize, &usize)| (format!("lin{k}.model.1.weight"), vec![1, *n, 1, 1], tensor(&[*n], 100 + k as u64, 1.0));
+    (trunk, taps.iter().enumerate().map(head).collect())
+}
+
+fn alexnet() -> (Vec<Tensor>, Vec<Tensor>) {
+    let convolutions = [(0, 3, 64, 11), (3, 64, 192, 5), (6, 192, 384, 3), (8, 384, 256, 3), (10, 256, 256, 3)];
+    network(&convolutions, &convolutions.map(|c| c.2))
+}
+
+fn vgg16() -> (Vec<Tensor>, Vec<Tensor>) {
+    let numbers = [0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28];
+    let channels = [3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512];
+    let convolutions: Vec<_> = numbers.iter().zip(channels.windows(2)).map(|(i, c)| (*i, c[0], c[1], 3)).collect();
+    network(&convolutions, &[64, 128, 256, 512, 512])
+}
+
+fn save_safetensors(folder: &Path, tensors: &[Tensor]) -> PathBuf {
+    let entries: Vec<_> =
+        tensors.iter().map(|(n, shape, data)| checkpoint::Entry { name: n.clone(), shape: shape.clone(), data }).collect();
+    checkpoint::save(folder, &entries, Default::default()).unwrap();
+    checkpoint::latest(folder)
+}
+
+/// Writes a `state_dict` as `torch.save` does: an archive of a pickle and of one storage per tensor.
+fn save_pth(file: &Path, tensors: &[Tensor]) {
+    use std::io::Write;
+    let mut zip = zip::ZipWriter::new(std::fs::File::create(file).unwrap());
+    let stored = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    let text = |t: &str| [b"X", &(t.len() as u32).to_le_bytes()[..], t.as_bytes()].concat();
+    let int = |n: usize| [b"J", &(n as i32).to_le_bytes()[..]].concat();
+    let tuple = |v: &[usize]| [b"(", &v.iter().flat_map(|n| int(*n)).collect::<Vec<u8>>()[..], b"t"].concat();
+    let mut pickle = b"\x80\x02}(".to_vec();
+    for (key, (name, shape, values)) in tensors.iter().enumerate() {
+        let strides: Vec<usize> = (0..shape.len()).map(|i| shape[i + 1..].iter().product()).collect();
+        let storage = [b"(", &text("storage")[..], b"ctorch\nFloatStorage\n", &text(&key.to_string()), &text("cpu"), &int(values.len())];
+        let storage = [&storage.concat()[..], b"tQ"].concat();
+        let rest = [int(0), tuple(shape), tuple(&strides)].concat();
+        // Without a gradient, and with no hooks.
+        pickle.extend([&text(name)[..], b"ctorch._utils\n_rebuild_tensor_v2\n(", &storage, &rest].concat());
+        pickle.extend(b"\x89ccollections\nOrderedDict\n)RtR");
+        zip.start_file(format!("weights/data/{key}"), stored).unwrap();
+        zip.write_all(&values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>()).unwrap();
+    }
+    pickle.extend(b"u.");
+    zip.start_file("weights/data.pkl", stored).unwrap();
+    zip.write_all(&pickle).unwrap();
+    zip.finish().unwrap();
+}
+
+/// Distances of the held-out views, and the report.
+fn lpips(files: &[&Path]) -> (Vec<f64>, serde_json::Value) {
+    let weights = files.iter().map(|f| s(f)).collect::<Vec<_>>().join(",");
+    let report = works(&["eval", s(&good().run), "--device", "cpu", "--json", "--lpips", &weights]);
+    let report: serde_json::Value = serde_json::from_str(&report).unwrap();
     let views: Vec<f64> = report["per_view"].as_array().unwrap().iter().map(|v| v["lpips"].as_f64().unwrap()).collect();
     let mean = views.iter().sum::<f64>() / views.len() as f64;
     assert!(views.iter().all(|v| *v > 0.0 && v.is_finite()) && (report["lpips"].as_f64().unwrap() - mean).abs() < 1e-12, "{report}");
-    let alone = eval(s(&trunk));
-    assert!(refused(&alone.each_ref().map(|a| &a[..])).contains("without the linear heads"));
-    let missing = eval("no/such.pth");
-    assert!(refused(&missing.each_ref().map(|a| &a[..])).contains("no/such.pth"));
+    (views, report)
+}
+
+#[test]
+fn eval_judges_by_lpips_with_the_users_weights() {
+    let dir = tempfile::tempdir().unwrap();
+    let (trunk, heads) = alexnet();
+    let in_one = dir.path().join("alex.pth");
+    save_pth(&in_one, &[&trunk[..], &heads].concat());
+    let (trunk, heads) = (save_safetensors(&dir.path().join("trunk"), &trunk), save_safetensors(&dir.path().join("heads"), &heads));
+    let (views, _) = lpips(&[&trunk, &heads]);
+    assert_eq!(lpips(&[&in_one]).0, views, "both formats hold the same weights");
+    let refused_with = |weights: &str| refused(&["eval", s(&good().run), "--device", "cpu", "--json", "--lpips", weights]);
+    assert!(refused_with(s(&trunk)).contains("without the linear heads"));
+    assert!(refused_with("no/such.pth").contains("no/such.pth"));
+    // What was cut off is refused by name.
+    let bytes = std::fs::read(&in_one).unwrap();
+    std::fs::write(&in_one, &bytes[..bytes.len() / 2]).unwrap();
+    assert!(refused_with(s(&in_one)).contains("alex.pth: cannot be read as weights"));
+}
+
+#[test]
+fn eval_judges_by_lpips_with_vgg_in_a_file_of_pytorch() {
+    let dir = tempfile::tempdir().unwrap();
+    let (trunk, heads) = vgg16();
+    let (network, weights) = (dir.path().join("vgg16.pth"), dir.path().join("heads.pth"));
+    save_pth(&network, &trunk);
+    save_pth(&weights, &heads);
+    lpips(&[&network, &weights]);
+    let text = works(&["eval", s(&good().run), "--device", "cpu", "--lpips", &format!("{},{}", s(&network), s(&weights))]);
+    assert!(text.lines().any(|l| l.starts_with("lpips 0.") && l.ends_with("(VGG16)")), "{text}");
 }
 
 #[test]

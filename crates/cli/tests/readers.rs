@@ -1,5 +1,5 @@
-//! Exported meshes in the hands of readers that this project did not write: Khronos' glTF validator, trimesh, usd-core, pycollada
-//! (`benches/readers.sh` installs them, `DIORAMA_READERS` names their folder).
+//! Exported meshes and point clouds in the hands of readers that this project did not write: Khronos' glTF validator, trimesh,
+//! usd-core, pycollada, laspy, pye57 (`benches/readers.sh` installs them, `DIORAMA_READERS` names their folder).
 
 use diorama_pipelines::object::quickstart::write_capture;
 use std::path::{Path, PathBuf};
@@ -47,10 +47,10 @@ fn every_export_is_read_by_foreign_readers() {
     let (capture, run) = (capture.to_str().unwrap(), run.to_str().unwrap());
     let small = ["--set", "field.log2_size=14", "--set", "field.finest=256"];
     diorama(&[&["train", capture, "-o", run, "--steps", "250", "--device", "cpu"], &small[..]].concat());
-    let export = |file: &Path, more: &[&str]| {
-        let all = ["export", run, "-o", file.to_str().unwrap(), "--resolution", "64", "--faces", "2000", "--device", "cpu", "--force"];
-        diorama(&[&all[..], more].concat());
+    let write = |file: &Path, more: &[&str]| {
+        diorama(&[&["export", run, "-o", file.to_str().unwrap(), "--device", "cpu", "--force"], more].concat());
     };
+    let export = |file: &Path, more: &[&str]| write(file, &[&["--resolution", "64", "--faces", "2000"], more].concat());
     let stem = dir.path().join("mesh");
     for format in ["glb", "obj", "usdz", "dae"] {
         export(&stem.with_extension(format), &["--texture", "128"]);
@@ -59,10 +59,23 @@ fn every_export_is_read_by_foreign_readers() {
         export(&stem.with_extension(format), &[]);
     }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../benches/formats.py");
-    println!("{}", works(Command::new(readers.join("venv/bin/python")).arg(&script).arg(&stem)));
     let (lit, plain) = (dir.path().join("lit.glb"), dir.path().join("plain.glb"));
-    export(&lit, &["--texture", "128", "--normal-map"]);
+    let lit_obj = lit.with_extension("obj");
+    for file in [&lit, &lit_obj] {
+        export(file, &["--texture", "128", "--normal-map"]);
+    }
     export(&plain, &["--texture", "0"]);
+    let formats = |arguments: &[&Path]| {
+        let mut c = Command::new(readers.join("venv/bin/python"));
+        c.arg(&script).args(arguments);
+        c
+    };
+    println!("{}", works(&mut formats(&[&stem, &lit, &plain, &lit_obj])));
+    let cloud = dir.path().join("cloud");
+    for format in ["ply", "las", "e57"] {
+        write(&cloud.with_extension(format), &["--format", "points", "--points", "3000"]);
+    }
+    println!("{}", works(&mut formats(&[Path::new("--points"), &cloud])));
     let validate = |file: &Path| {
         let mut c = Command::new("node");
         c.env("NODE_PATH", readers.join("node_modules")).arg("-e").arg(VALIDATE).arg(file);
@@ -80,5 +93,12 @@ fn every_export_is_read_by_foreign_readers() {
     let obj = stem.with_extension("obj");
     let text = std::fs::read(&obj).unwrap();
     std::fs::write(&obj, &text[..text.len() / 3]).unwrap();
-    assert!(!Command::new(readers.join("venv/bin/python")).arg(&script).arg(&stem).output().unwrap().status.success());
+    assert!(!formats(&[&stem]).output().unwrap().status.success());
+    for format in ["ply", "las", "e57"] {
+        let file = cloud.with_extension(format);
+        let whole = std::fs::read(&file).unwrap();
+        std::fs::write(&file, &whole[..whole.len() / 3]).unwrap();
+        assert!(!formats(&[Path::new("--points"), &cloud]).output().unwrap().status.success(), "a third of {format} is read");
+        std::fs::write(&file, &whole).unwrap();
+    }
 }

@@ -35,10 +35,16 @@ fn s(p: &Path) -> &str {
 const LIMIT: Duration = Duration::from_secs(300);
 
 fn call(folder: &Path, arguments: &[&str]) -> Output {
+    call_in(folder, &[], arguments)
+}
+
+/// A call with variables of its environment.
+fn call_in(folder: &Path, variables: &[(&str, &str)], arguments: &[&str]) -> Output {
     let said = tempfile::tempdir().unwrap();
     let file = |name: &str| std::fs::File::create(said.path().join(name)).unwrap();
     let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
-    let mut child = c.args(arguments).current_dir(folder).stdout(file("out")).stderr(file("err")).spawn().unwrap();
+    c.args(arguments).envs(variables.iter().copied());
+    let mut child = c.current_dir(folder).stdout(file("out")).stderr(file("err")).spawn().unwrap();
     let begin = Instant::now();
     let status = loop {
         if let Some(status) = child.try_wait().unwrap() {
@@ -151,6 +157,7 @@ fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
         ("--seed", "8", "7"),
         ("--method", "nerf", "ngp"),
         ("--background", "black", "white"),
+        ("--format", "colmap", "transforms"),
         ("--set", "field.log2_size=13", "12"),
     ] {
         let named = if flag == "--set" { "field.log2_size" } else { flag };
@@ -158,6 +165,9 @@ fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
         let parts = [&format!("{named} cannot change")[..], &format!("has {had}, not {said}")];
         fails(dir.path(), &["train", "-o", "run", "--resume", flag, value], 2, &parts);
     }
+    // Another capture.
+    write_capture(&dir.path().join("other"), 6, 24).unwrap();
+    fails(dir.path(), &["train", "other", "-o", "run", "--resume"], 2, &[capture, "not on other", "--data FOLDER"]);
     // A configuration that the run began with, and one that says something else.
     std::fs::copy(dir.path().join("run/config.toml"), dir.path().join("same.toml")).unwrap();
     let text = std::fs::read_to_string(dir.path().join("same.toml")).unwrap();
@@ -170,7 +180,9 @@ fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
 fn the_preset_of_the_report_gives_exactly_100_pixels() {
     let dir = tempfile::tempdir().unwrap();
     write_capture(&dir.path().join("data"), 6, 150).unwrap();
-    works(dir.path(), &[&["train", "data", "-o", "run", "--steps", "1", "--preset", "report"], &SMALL[..]].concat());
+    let train = [&["train", "data", "-o", "run", "--steps", "1", "--preset", "report"], &SMALL[..]].concat();
+    works(dir.path(), &train);
+    works(dir.path(), &[&train[..], &["--resume"]].concat());
     works(dir.path(), &["render", "run", "--path", "held-out", "--images", "frames", "--device", "cpu", "--quality", "fast"]);
     assert_eq!(diorama_data::photo::size(&dir.path().join("frames/0000.png")).unwrap(), (100, 100));
     let report: serde_json::Value =
@@ -178,15 +190,103 @@ fn the_preset_of_the_report_gives_exactly_100_pixels() {
     assert!(report["psnr"].as_f64().unwrap().is_finite());
 }
 
+/// A call that may take so many bytes of memory.
+fn with_memory(folder: &Path, limit: &str, arguments: &[&str]) -> (Option<i32>, serde_json::Value, String) {
+    let o = call_in(folder, &[("DIORAMA_MEMORY", limit)], arguments);
+    (o.status.code(), serde_json::from_slice(&o.stdout).unwrap_or_default(), String::from_utf8_lossy(&o.stderr).into_owned())
+}
+
 #[test]
 fn what_does_not_fit_into_memory_is_refused_with_needs_has_and_cure() {
     let dir = tempfile::tempdir().unwrap();
     let table = ["--set", "field.log2_size=24", "--set", "field.levels=64", "--set", "field.features=8", "--json"];
     let all = [&["train", s(&good().capture), "-o", "run", "--steps", "1", "--device", "cpu"], &table[..]].concat();
-    fails(dir.path(), &all, 1, &["parameters 1", "GiB", "are available", "--set field.log2_size=19"]);
-    let told: serde_json::Value = serde_json::from_slice(&call(dir.path(), &all).stdout).unwrap();
-    assert_eq!((told["kind"].as_str(), told["exit_code"].as_i64()), (Some("memory"), Some(1)));
+    // Large machines are refused it, too.
+    let (code, told, said) = with_memory(dir.path(), "64GiB", &all);
+    assert_eq!((code, told["kind"].as_str(), told["exit_code"].as_i64()), (Some(1), Some("memory"), Some(1)), "{said}");
+    let line = told["error"].as_str().unwrap();
+    for part in ["parameters 1", "GiB", "are available", "--set field.log2_size=19"] {
+        assert!(line.contains(part), "{part:?} is not in {line}");
+    }
+    assert_eq!(said.lines().filter(|l| l.starts_with("diorama: ")).count(), 1, "{said}");
     assert!(!dir.path().join("run").exists());
+}
+
+#[test]
+fn an_export_that_does_not_fit_is_refused_with_needs_has_and_cure() {
+    let dir = tempfile::tempdir().unwrap();
+    let export = ["export", s(&good().run), "-o", "a.glb", "--level", "0.01", "--device", "cpu", "--json"];
+    for (resolution, texture, largest, cure) in
+        [("128", "0", "surface", "try --resolution 64"), ("32", "1024", "texture", "try --texture 512")]
+    {
+        let size = ["--resolution", resolution, "--texture", texture];
+        let (code, told, said) = with_memory(dir.path(), "10MiB", &[&export[..], &size].concat());
+        assert_eq!((code, told["kind"].as_str(), told["exit_code"].as_i64()), (Some(1), Some("memory"), Some(1)), "{said}");
+        let line = told["error"].as_str().unwrap();
+        for part in ["the export needs about ", largest, "10 MiB are available", cure] {
+            assert!(line.contains(part), "{part:?} is not in {line}");
+        }
+        assert!(!line.contains('\n') && said.contains(line), "{said}");
+    }
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0, "a refusal left something behind");
+    // What fits is written, and a limit that is none is no reason to go on without one.
+    let small = [&export[..], &["--resolution", "16", "--texture", "64"]].concat();
+    let (code, told, said) = with_memory(dir.path(), "1GiB", &small);
+    assert_eq!(code, Some(0), "{said}");
+    assert!(told["faces"].as_u64().unwrap() > 0 && !said.contains("needs about"), "{said}");
+    let (code, told, _) = with_memory(dir.path(), "much", &[&small[..], &["--force"]].concat());
+    assert!(code == Some(2) && told["error"].as_str().unwrap().contains("DIORAMA_MEMORY=much: expected bytes"), "{told}");
+    let (_, doctor, _) = with_memory(dir.path(), "10MiB", &["doctor", "--json"]);
+    assert_eq!(doctor["memory_available_bytes"].as_u64(), Some(10 << 20), "{doctor}");
+}
+
+#[test]
+fn training_and_exports_that_hardly_fit_say_so() {
+    let dir = tempfile::tempdir().unwrap();
+    let train = [&["train", s(&good().capture), "-o", "run", "--steps", "1", "--json"], &SMALL[..]].concat();
+    let export = ["export", s(&good().run), "-o", "a.ply", "--resolution", "64", "--level", "0.01", "--device", "cpu", "--json"];
+    for (arguments, what, written) in [(&train[..], "training needs about ", "run"), (&export, "the export needs about ", "a.ply")] {
+        let (code, told, _) = with_memory(dir.path(), "1MiB", arguments);
+        assert_eq!((code, told["kind"].as_str()), (Some(1), Some("memory")), "{told}");
+        assert!(!dir.path().join(written).exists());
+        let needs = told["error"].as_str().unwrap().strip_prefix(what).unwrap().split(" MiB").next().unwrap();
+        let needs: f64 = needs.parse().unwrap();
+        // A tenth more than that is tight, three times as much is not.
+        for (factor, is_tight) in [(1.1, true), (3.0, false)] {
+            let (code, _, said) = with_memory(dir.path(), &format!("{}MiB", needs * factor), &[arguments, &["--force"]].concat());
+            assert_eq!(code, Some(0), "{said}");
+            let note = said.lines().find(|l| l.starts_with(&format!("note: {what}")));
+            assert_eq!(note.is_some_and(|l| l.contains("if it does not fit: ")), is_tight, "{factor}: {said}");
+        }
+    }
+}
+
+#[test]
+fn eval_tells_the_view_and_the_time_left() {
+    let o = call(&good().run, &["eval", s(&good().run), "--device", "cpu"]);
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert!(o.status.success(), "{said}");
+    let line = said.lines().find(|l| l.starts_with("view ")).unwrap_or_else(|| panic!("no progress in {said}"));
+    // Two views are held out, and two training views are judged beside them.
+    let (view, left) = line.split_once("; ").unwrap_or_else(|| panic!("no time left in {line}"));
+    assert!(view.starts_with("view 1 of 4 (images/view_00): "), "{line}");
+    let time = left.strip_suffix(" s left").or(left.strip_suffix(" min left")).unwrap_or_else(|| panic!("{line}"));
+    time.parse::<u32>().unwrap();
+}
+
+/// Frames of a film that the machine's ffmpeg decodes without a complaint, or a line that says that this was skipped.
+#[cfg(unix)]
+fn decoded(film: &Path) -> Option<usize> {
+    let Ok(ffmpeg) = diorama_data::video::ffmpeg() else {
+        assert!(std::env::var_os("DIORAMA_REQUIRE_FFMPEG").is_none(), "ffmpeg is required");
+        println!("skipped: no ffmpeg");
+        return None;
+    };
+    let all = ["-v", "warning", "-xerror", "-i", s(film), "-map", "0:v", "-f", "framemd5", "-"];
+    let o = Command::new(ffmpeg).args(all).output().unwrap();
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert!(o.status.success() && said.is_empty(), "{said}");
+    Some(String::from_utf8(o.stdout).unwrap().lines().filter(|l| !l.starts_with('#')).count())
 }
 
 #[cfg(unix)]
@@ -221,8 +321,10 @@ fn an_interrupted_film_has_the_frames_so_far() {
     let stsz = mp4.windows(4).position(|w| w == b"stsz").unwrap();
     assert_eq!(u32::from_be_bytes(mp4[stsz + 12..stsz + 16].try_into().unwrap()) as usize, done, "frames of the film");
     assert!(mp4[4..8] == *b"ftyp" && mp4.windows(4).any(|w| w == b"mdat"));
-    let (gif, _) = film("a.gif", 1);
+    decoded(&dir.path().join("a.mp4")).into_iter().for_each(|frames| assert_eq!(frames, done));
+    let (gif, done) = film("a.gif", 1);
     assert!(gif.starts_with(b"GIF89a") && gif.last() == Some(&0x3b), "it has its end");
+    decoded(&dir.path().join("a.gif")).into_iter().for_each(|frames| assert_eq!(frames, done));
 }
 
 #[test]
@@ -243,8 +345,22 @@ fn every_run_is_looked_at_before_the_first_is_judged() {
     let dir = tempfile::tempdir().unwrap();
     let (_copy, damaged) = copy();
     std::fs::remove_dir_all(damaged.join("checkpoints")).unwrap();
-    for (second, why) in [("missing", "not a run folder"), (s(&damaged), "no checkpoint")] {
-        let said = fails(dir.path(), &["compare", s(&good().run), second, "-o", "cmp"], 2, &[second, why]);
+    // Photographs that went after training, and a run that holds none out.
+    write_capture(&dir.path().join("data"), 8, 24).unwrap();
+    works(dir.path(), &[&["train", "data", "-o", "bare", "--steps", "1"], &SMALL[..]].concat());
+    works(dir.path(), &[&["train", "data", "-o", "all", "--steps", "1", "--split", "all"], &SMALL[..]].concat());
+    std::fs::rename(dir.path().join("data/images/view_00.png"), dir.path().join("data/away.png")).unwrap();
+    let capture = s(&good().capture);
+    works(dir.path(), &[&["train", capture, "-o", "whole", "--steps", "1", "--split", "all"], &SMALL[..]].concat());
+    for (second, why) in [
+        ("missing", "not a run folder"),
+        (s(&damaged), "no checkpoint"),
+        ("bare", "does not exist"),
+        ("all", "does not exist"),
+        ("whole", "holds no views out"),
+    ] {
+        let second_named = if why == "does not exist" { "view_00.png" } else { second };
+        let said = fails(dir.path(), &["compare", s(&good().run), second, "-o", "cmp"], 2, &[second_named, why]);
         assert!(!said.contains("judging") && !dir.path().join("cmp").exists(), "{said}");
     }
 }
@@ -264,17 +380,34 @@ fn compare_shows_the_memory_of_training() {
 
 #[test]
 fn what_was_saved_in_the_viewer_is_never_ignored() {
-    for (name, text) in [
-        ("crop.json", "{\"min\":[0,0,0]"),
-        ("crop.json", "{\"min\":[0,0,0],\"max\":[0,1,1]}"),
-        ("scale.json", "{\"points\":[[0,0,0],[0,0,0]],\"metres\":1}"),
-        ("camera_path.json", "{}"),
-        ("camera_path.json", "[]"),
+    let crops = ["{\"min\":[0,0,0]", "{\"min\":[0,0,0],\"max\":[0,1,1]}", "{\"min\":[0,0,0],\"max\":[1,1,1],\"turn\":1}", ""];
+    let scales = ["{\"points\":[[0,0,0],[0,0,0]],\"metres\":1}", "{\"points\":[[0,0,0],[0,0,1]],\"metres\":-1}", "[]"];
+    let paths = ["{}", "[]", "{\"camera_path\":[{\"camera_to_world\":[1,2]}],\"render_width\":64,\"render_height\":48}"];
+    let view: &[&str] = &["view", ".", "--port", "0", "--device", "cpu"];
+    let train: &[&str] = &["train", "-o", ".", "--resume", "--steps", "61", "--view", "--port", "0"];
+    let export: &[&str] = &["export", ".", "-o", "new", "--format", "ply", "--resolution", "16", "--level", "0.01", "--device", "cpu"];
+    let render: &[&str] = &["render", ".", "--frames", "1", "--size", "16x16", "--images", "new", "--device", "cpu"];
+    let deep: &[&str] = &["render", ".", "--frames", "1", "--size", "16x16", "--images", "new", "--layers", "depth", "--device", "cpu"];
+    let along: &[&str] = &["render", ".", "--path", "camera_path.json", "--images", "new", "--device", "cpu"];
+    let (_dir, run) = copy();
+    let summary = std::fs::read(run.join("summary.json")).unwrap();
+    for (name, texts, verbs) in [
+        ("crop.json", &crops[..], &[export, render, deep, train, view][..]),
+        ("scale.json", &scales, &[export, deep, train, view]),
+        ("camera_path.json", &paths, &[along, train, view]),
     ] {
-        let (_dir, run) = copy();
-        std::fs::write(run.join(name), text).unwrap();
-        fails(&run, &["view", s(&run), "--port", "0", "--device", "cpu"], 2, &[name, "remove the file"]);
+        for text in texts {
+            std::fs::write(run.join(name), text).unwrap();
+            for verb in verbs {
+                // A path that the user names is the user's: no word of what the viewer does.
+                let cure = if std::ptr::eq(*verb, along) { name } else { "remove the file" };
+                fails(&run, verb, 2, &[name, cure]);
+                assert!(!run.join("new").exists(), "{verb:?} left something behind");
+            }
+        }
+        std::fs::remove_file(run.join(name)).unwrap();
     }
+    assert_eq!(std::fs::read(run.join("summary.json")).unwrap(), summary, "nothing was trained");
 }
 
 #[test]

@@ -53,7 +53,7 @@ fn machine(a: &DoctorArgs) -> Result<Outcome> {
     let devices: Vec<&str> = std::iter::once("cpu").chain(gpus.iter().map(|g| g.api.name())).collect();
     let about: Vec<_> =
         gpus.iter().map(|g| serde_json::json!({ "device": g.api.name(), "name": g.name, "software": g.software })).collect();
-    let memory::MachineMemory { total, available } = memory::of_machine();
+    let (total, available) = (memory::of_machine().total, diorama_pipelines::object::memory::available()?);
     let ffmpeg = tool("ffmpeg", "DIORAMA_FFMPEG", "-version");
     let colmap = tool("colmap", "DIORAMA_COLMAP", "-h");
     let data = std::env::var("DIORAMA_TEST_DATA").ok().filter(|d| std::path::Path::new(d).is_dir());

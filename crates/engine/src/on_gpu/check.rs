@@ -4,7 +4,7 @@ use super::GpuTracer;
 use crate::fields::{self, Batch, FieldBuffers};
 use crate::losses::{ColorLoss, Photometric};
 use crate::renderers::supervised::Supervised;
-use crate::renderers::volume::{self, Accelerator, Quality, Sampling, Tracer, View};
+use crate::renderers::volume::{self, Accelerator, Quality, Sampling, Tracer};
 use crate::samplers::RayBatch;
 use crate::samplers::occupancy::Occupancy;
 use crate::samplers::pixels::{self, DrawOptions, ErrorMap, PixelSource};
@@ -513,12 +513,12 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 ///
 /// # Errors
 /// When it failed, or did not draw at all: what the CPU draws in its place proves nothing.
-fn drawn(gpu: &Gpu, device: GpuTracer, draw: impl FnOnce(&dyn Accelerator) -> View) -> Result<View, GpuError> {
-    let device = Supervised::new(Box::new(device), &gpu.name, true, Box::new(|_| {}));
+fn drawn<T>(name: &str, device: Box<dyn Accelerator>, draw: impl FnOnce(&dyn Accelerator) -> T) -> Result<T, GpuError> {
+    let device = Supervised::new(device, name, true, Box::new(|_| {}));
     let view = draw(&device);
     match device.fatal() {
-        Some(why) => Err(GpuError::Lost(gpu.name.clone(), why)),
-        None if device.served() == 0 => Err(GpuError::Lost(gpu.name.clone(), "it drew nothing of a view".into())),
+        Some(why) => Err(GpuError::Lost(name.into(), why)),
+        None if device.served() == 0 => Err(GpuError::Lost(name.into(), "it drew nothing of a view".into())),
         None => Ok(view),
     }
 }
@@ -551,7 +551,7 @@ fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             };
             let device = GpuTracer::new(gpu.clone(), &f, None, Some(&occupancy)).with_room(room);
             let want = on_cpu.view(&camera, &mut |_| {});
-            let got = drawn(gpu, device, |by| Tracer { accelerator: Some(by), ..on_cpu }.view(&camera, &mut |_| {}))?;
+            let got = drawn(&gpu.name, Box::new(device), |by| Tracer { accelerator: Some(by), ..on_cpu }.view(&camera, &mut |_| {}))?;
             let shape = format!("{quality:?} room {room} images={images}");
             table.close("view", "color", &shape, &gpu.upload(&got.rgb.data), &wide(&want.rgb.data))?;
             table.close("view", "opacity", &shape, &gpu.upload(&got.opacity.data), &wide(&want.opacity.data))?;
@@ -593,7 +593,7 @@ fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let tracer = || GpuTracer::new(gpu.clone(), field, guide, None).with_room(room);
             let device = tracer();
             let want = on_cpu.view(&camera, &mut |_| {});
-            let got = drawn(gpu, tracer(), |by| Tracer { accelerator: Some(by), ..on_cpu }.view(&camera, &mut |_| {}))?;
+            let got = drawn(&gpu.name, Box::new(tracer()), |by| Tracer { accelerator: Some(by), ..on_cpu }.view(&camera, &mut |_| {}))?;
             let shape = format!("{name} room {room}");
             table.close("view", "color", &shape, &gpu.upload(&got.rgb.data), &wide(&want.rgb.data))?;
             table.close("view", "opacity", &shape, &gpu.upload(&got.opacity.data), &wide(&want.opacity.data))?;
@@ -633,4 +633,46 @@ fn look_ups(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         table.close("look up", "d table", &shape, &got, &want)?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fields::Pruning;
+    use crate::renderers::supervised::Unserved;
+    use crate::renderers::volume::{Placement, Traced};
+
+    /// Evaluates densities where it works.
+    struct Device {
+        works: bool,
+    }
+
+    impl Accelerator for Device {
+        fn trace(&self, _: &RayBatch, _: &Placement, _: Pruning, _: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
+            Err(Unserved::Failed("unplugged".into()))
+        }
+        fn density(&self, model: &[f32]) -> Result<Vec<f32>, Unserved> {
+            if self.works { Ok(vec![1.0; model.len() / 3]) } else { Err(Unserved::Failed("unplugged".into())) }
+        }
+        fn color(&self, _: &[f32], _: &[f32]) -> Result<Vec<f32>, Unserved> {
+            Err(Unserved::Failed("unplugged".into()))
+        }
+        fn rays(&self) -> usize {
+            1
+        }
+    }
+
+    #[test]
+    fn what_a_device_did_not_draw_counts_as_lost() {
+        let by = |works: bool, asked: bool| {
+            let on_cpu = vec![2.0];
+            drawn("fake", Box::new(Device { works }), |by| if asked { by.density(&[0.0; 3]).unwrap_or(on_cpu) } else { on_cpu })
+        };
+        assert_eq!(by(true, true).unwrap(), [1.0]);
+        // The CPU's result is there both times.
+        for (works, asked, why) in [(true, false, "it drew nothing of a view"), (false, true, "unplugged")] {
+            let Err(GpuError::Lost(name, text)) = by(works, asked) else { panic!("works {works}, asked {asked}: it counts") };
+            assert_eq!((&name[..], &text[..]), ("fake", why));
+        }
+    }
 }

@@ -7,6 +7,8 @@ use crate::error::{PipelineError, Result};
 use diorama_engine::renderers::supervised::Say;
 #[cfg(feature = "gpu")]
 use diorama_engine::renderers::supervised::Supervised;
+#[cfg(feature = "gpu")]
+use diorama_engine::renderers::volume::Accelerator;
 use diorama_geom::rng::Rng;
 use diorama_kernels::device::Api;
 #[cfg(feature = "gpu")]
@@ -117,10 +119,16 @@ pub fn accelerate(model: &mut ObjectModel, device: &str, say: Say) -> Result<Str
     if let Some(r) = opened.running {
         let (field, coarse, occupancy) = (&model.field, model.coarse.as_ref(), model.occupancy.as_ref());
         let tracer = diorama_engine::on_gpu::GpuTracer::new(r.gpu().clone(), field, coarse, occupancy);
-        model.accelerator = Some(Supervised::new(Box::new(tracer), r.name(), device != "auto", say));
+        model.accelerator = Some(supervised(Box::new(tracer), r.name(), device, say));
         return Ok(r.name());
     }
     Ok(cpu_name())
+}
+
+/// An opened device as the one that was `asked` for by `--device`: any name but `auto` makes its failure the result.
+#[cfg(feature = "gpu")]
+fn supervised(device: Box<dyn Accelerator>, name: String, asked: &str, say: Say) -> Supervised {
+    Supervised::new(device, name, asked != "auto", say)
 }
 
 /// The CPU in words.
@@ -485,6 +493,18 @@ mod running {
 #[cfg(test)]
 mod tests {
     use super::*;
+    #[cfg(feature = "gpu")]
+    use diorama_engine::{
+        fields::Pruning,
+        renderers::{
+            supervised::Unserved,
+            volume::{Placement, Traced},
+        },
+        samplers::RayBatch,
+    };
+
+    #[cfg(feature = "gpu")]
+    type TracedRays = (Traced, Option<Vec<f32>>);
 
     #[test]
     fn a_device_outside_of_the_build_is_named_with_its_cure() {
@@ -521,6 +541,40 @@ mod tests {
         assert!(matches!(aftermath(lost(), "auto", 0, ""), Aftermath::Cpu(why) if why.contains("gone")));
         let Aftermath::Fail(e) = aftermath(lost(), "cuda", 0, "") else { panic!("it goes on") };
         assert!(e.kind() == "device" && e.to_string().contains("--resume"), "{e}");
+    }
+
+    #[cfg(feature = "gpu")]
+    struct Unplugged;
+
+    #[cfg(feature = "gpu")]
+    impl Accelerator for Unplugged {
+        fn trace(&self, _: &RayBatch, _: &Placement, _: Pruning, _: Option<u32>) -> std::result::Result<TracedRays, Unserved> {
+            Err(Unserved::Failed("unplugged".into()))
+        }
+        fn density(&self, _: &[f32]) -> std::result::Result<Vec<f32>, Unserved> {
+            Err(Unserved::Failed("unplugged".into()))
+        }
+        fn color(&self, _: &[f32], _: &[f32]) -> std::result::Result<Vec<f32>, Unserved> {
+            Err(Unserved::Failed("unplugged".into()))
+        }
+        fn rays(&self) -> usize {
+            1
+        }
+    }
+
+    #[cfg(feature = "gpu")]
+    #[test]
+    fn a_device_that_was_asked_for_by_name_is_supervised_as_named() {
+        use std::sync::{Arc, Mutex};
+        for asked in ["auto", "vulkan", "cuda", "webgpu", "metal"] {
+            let said = Arc::new(Mutex::new(Vec::new()));
+            let to = said.clone();
+            let say: Say = Box::new(move |text| to.lock().unwrap().push(text.to_string()));
+            let device = supervised(Box::new(Unplugged), "fake".into(), asked, say);
+            assert!(device.density(&[0.0; 3]).is_err());
+            let is_named = asked != "auto";
+            assert_eq!((device.fatal().is_some(), said.lock().unwrap().len()), (is_named, !is_named as usize), "{asked}");
+        }
     }
 
     #[test]

@@ -59,6 +59,34 @@ pub fn size(bytes: u64) -> String {
     if mib < 1024.0 { format!("{mib:.0} MiB") } else { format!("{:.1} GiB", mib / 1024.0) }
 }
 
+/// The variable that limits what training and export may take.
+const LIMIT: &str = "DIORAMA_MEMORY";
+
+/// Bytes that training and export may take: what the machine has available, or less where `DIORAMA_MEMORY` says so.
+///
+/// # Errors
+/// When the variable holds no size.
+pub fn available() -> Result<Option<u64>> {
+    let limit = match std::env::var_os(LIMIT) {
+        None => None,
+        Some(text) => Some(bytes(&text.to_string_lossy()).map_err(|e| PipelineError::Usage(format!("{LIMIT}={e}")))?),
+    };
+    Ok(memory::of_machine().available.into_iter().chain(limit).min())
+}
+
+/// Bytes of a size in words.
+fn bytes(text: &str) -> std::result::Result<u64, String> {
+    let number = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let unit = match &text[number.len()..] {
+        "" => 1,
+        "MiB" => 1 << 20,
+        "GiB" => 1 << 30,
+        _ => 0,
+    };
+    let value = number.trim().parse::<f64>().ok().filter(|v| v.is_finite() && *v > 0.0 && unit > 0);
+    value.map(|v| (v * unit as f64) as u64).ok_or_else(|| format!("{text}: expected bytes, or a number of MiB or GiB, such as 8GiB"))
+}
+
 /// What training a configuration on a capture takes, whose pixels are kept in `format`, with so many samples in a step.
 pub fn of_training(config: &Config, capture: &Capture, format: PixelFormat, samples: usize) -> Needs {
     let train = capture.indices(Split::Train);
@@ -122,7 +150,7 @@ pub fn check_training(config: &Config, capture: &Capture) -> Result<Option<Strin
         "batch" => "--set sampling.batch_samples=0".into(),
         _ => format!("--set field.log2_size={}, or fewer field.levels", config.field.log2_size.saturating_sub(2).clamp(4, 19)),
     };
-    judge("training", &needs, memory::of_machine().available, &cure)
+    judge("training", &needs, available()?, &cure)
 }
 
 /// Compares what an export takes with what there is: a note where it is tight.
@@ -133,9 +161,11 @@ pub fn check_export(model: &ObjectModel, o: &ExportOptions, grid: &Grid, texels:
     let needs = of_export(model, o, grid, texels);
     let cure = match needs.largest() {
         "texture" => format!("--texture {}", (texels / 2).max(64)),
+        // Only a texture asks the cameras.
+        "depth maps" => "--texture 0".into(),
         _ => format!("--resolution {}", (o.resolution / 2).max(16)),
     };
-    judge("the export", &needs, memory::of_machine().available, &cure)
+    judge("the export", &needs, available()?, &cure)
 }
 
 /// One line of needs, has and cure: an error where it does not fit, a note where it is tight.
@@ -208,6 +238,16 @@ mod tests {
         assert!(judge("training", &needs, Some(10 << 30), "").unwrap().is_none());
         assert!(judge("training", &needs, Some(7 << 29), "--downscale 2").unwrap().unwrap().contains("--downscale 2"));
         assert!(judge("training", &needs, None, "").unwrap().is_none());
+    }
+
+    #[test]
+    fn sizes_have_units() {
+        for (text, want) in [("1000", 1000), ("2MiB", 2 << 20), ("1.5 GiB", 3 << 29)] {
+            assert_eq!(bytes(text), Ok(want), "{text}");
+        }
+        for text in ["", "GiB", "8 GB", "-1", "0", "nan", "eight"] {
+            assert!(bytes(text).unwrap_err().starts_with(text), "{text}");
+        }
     }
 
     #[test]
