@@ -20,6 +20,7 @@ pub mod recipe;
 pub mod render;
 pub mod report;
 pub mod run_folder;
+pub mod seen_by;
 mod texture;
 pub mod viewing;
 pub mod viewing_points;
