@@ -13,6 +13,7 @@ pub mod kept_capture;
 pub mod memory;
 pub mod model;
 mod nearest;
+mod observations;
 pub mod points;
 pub mod prepare;
 pub mod quickstart;
