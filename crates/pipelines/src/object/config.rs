@@ -166,7 +166,7 @@ pub struct LossConfig {
     /// growing from nothing while coarse geometry is found, 0.01 in a box.
     pub distortion: Auto,
     pub alpha: f32,
-    /// Weight of the light that ends away from the sparse points which photographs show; `auto`: 0.1 in unbounded space, else none.
+    /// Weight of the light that ends away from the sparse points which photographs show; `auto`: 0.3 in unbounded space, else none.
     #[serde(default)]
     pub depth: Auto,
     /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.

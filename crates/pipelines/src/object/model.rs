@@ -85,7 +85,7 @@ const DISTORTION_RAMP: u64 = 2000;
 const HUBER: f32 = 0.1;
 
 /// Weight of the light that ends away from sparse points, in unbounded space.
-const DEPTH: f32 = 0.1;
+const DEPTH: f32 = 0.3;
 
 /// Cascades of the occupancy grid of unbounded space: they reach 64 inner cubes far, beyond which a ray has a few samples left.
 const CASCADES: usize = 8;

@@ -4,7 +4,6 @@ use super::*;
 use diorama_engine::renderers::volume::Quality;
 use diorama_geom::Reduction;
 use diorama_geom::capture::SparsePoint;
-use diorama_geom::glam::DVec3;
 
 /// A real trainer whose parameters are spoilt before some steps, and what its losses were.
 struct Spoilt {
