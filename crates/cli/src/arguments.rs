@@ -271,6 +271,9 @@ pub struct EvalArgs {
     /// Write each render beside its photograph into RUN/eval
     #[arg(long)]
     pub save_images: bool,
+    /// Tell how many training views see what each view shows, and draw it into RUN/eval: purple none, red one, orange two, yellow three, green more
+    #[arg(long)]
+    pub explain: bool,
     #[arg(long)]
     pub threads: Option<usize>,
     #[arg(long)]

@@ -141,6 +141,7 @@ fn photographs_become_a_finished_data_set() {
     assert!((apart - 1.0).abs() < 0.15, "half the light is one stop: {stops:?}");
     let finished = import::import(&out, &Default::default()).unwrap();
     assert_eq!(finished.frames.len(), 12);
+    assert!(finished.points.iter().all(|p| p.frames.iter().all(|f| *f < 12)) && finished.points.iter().any(|p| p.frames.len() > 2));
     let images: Vec<(usize, ImageU8)> =
         finished.frames.iter().map(|f| (f.name[f.name.len() - 2..].parse().unwrap(), photo::load(&f.image).unwrap())).collect();
     for (f, (_, im)) in finished.frames.iter().zip(&images) {
@@ -212,6 +213,13 @@ fn a_posed_capture_is_finished_without_colmap() {
     same(&plain);
     assert!(plain.frames.len() == VIEWS && plain.frames[0].image.ends_with("images/view_00.jpg"));
     assert!(plain.points.len() == given.points.len() && (plain.points[7].position - given.points[7].position).length() < 1e-5);
+    assert!(given.points.iter().any(|p| p.frames.len() > 2), "the model says who sees its points");
+    for (p, g) in plain.points.iter().zip(&given.points) {
+        let seen = |c: &diorama_geom::Capture, p: &diorama_geom::SparsePoint| -> Vec<_> {
+            p.frames.iter().map(|f| c.frames[*f as usize].image.file_stem().map(|s| s.to_owned())).collect()
+        };
+        assert_eq!((seen(&plain, p), p.error), (seen(&given, g), g.error));
+    }
     assert!(plain.scene.aabb_scale == given.scene.aabb_scale && (plain.scene.center - given.scene.center).length() < 1e-9);
 
     let all = ["--select", "diverse:12", "--crop", "20,10,160,170", "--normalize-exposure", "--denoise", "--remove-background", "auto"];

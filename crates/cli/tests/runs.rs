@@ -1,5 +1,6 @@
 //! Runs that are moved, repeated, interrupted, compared and judged, by the real program.
 
+use diorama_data::photo;
 use diorama_pipelines::object::quickstart::write_capture;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -272,6 +273,27 @@ fn eval_tells_the_view_and_the_time_left() {
     assert!(view.starts_with("view 1 of 4 (images/view_00): "), "{line}");
     let time = left.strip_suffix(" s left").or(left.strip_suffix(" min left")).unwrap_or_else(|| panic!("{line}"));
     time.parse::<u32>().unwrap();
+}
+
+#[test]
+fn eval_explains_how_many_training_views_see_what_a_view_shows() {
+    let (dir, run) = copy();
+    let folder = dir.path();
+    let o = call(folder, &["eval", s(&run), "--device", "cpu", "--explain", "--json"]);
+    assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&o.stdout).unwrap();
+    let views = report["seen_by"].as_array().unwrap();
+    assert_eq!(views.len(), report["per_view"].as_array().unwrap().len());
+    for v in views {
+        let shares: Vec<f64> = v["shares"].as_array().unwrap().iter().map(|s| s.as_f64().unwrap()).collect();
+        assert!(shares.len() == 5 && (shares.iter().sum::<f64>() - 1.0).abs() < 1e-6, "{v}");
+        // Cameras all around the still life look at its middle.
+        assert!(shares[4] > 0.3, "{v}");
+        let map = photo::load(&run.join("eval").join(format!("{}.seen.png", v["name"].as_str().unwrap().replace('/', "_")))).unwrap();
+        assert!(map.data.chunks_exact(map.channels).any(|p| p[..3] == [60, 150, 90]), "green where four or more see it");
+    }
+    let told = works(folder, &["eval", s(&run), "--device", "cpu", "--explain"]);
+    assert!(told.contains("training views that see what a view shows") && told.lines().any(|l| l.contains("images/view_00")), "{told}");
 }
 
 /// Frames of a film that the machine's ffmpeg decodes without a complaint, or a line that says that this was skipped.

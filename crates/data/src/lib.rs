@@ -30,6 +30,7 @@ pub mod plot;
 pub mod point_cloud;
 pub mod process;
 pub mod sparse;
+pub mod sparse_ply;
 pub mod splat_ply;
 pub mod split;
 pub mod tfevents;

@@ -4,6 +4,7 @@
 use crate::error::{DataError, Result};
 use crate::import::{Imported, locate};
 use crate::json::{self, Object};
+use crate::sparse_ply;
 use diorama_geom::capture::{Frame, Split};
 use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::{Camera, Lens, Pose, SceneBox, Similarity, SparsePoint};
@@ -32,7 +33,7 @@ pub fn read(file: &Path, root: &Path) -> Result<Imported> {
     Ok(out)
 }
 
-/// nerfstudio's `ply_file_path`: points in the frames' world; nobody says which photographs see them.
+/// nerfstudio's `ply_file_path`: points in the frames' world. Which photographs see them only our own files say.
 fn read_points(head: &Object, root: &Path, out: &mut Imported) -> Result<()> {
     let Some(name) = head.text("ply_file_path")? else { return Ok(()) };
     let Some(file) = locate(root, name, head.path, "ply_file_path")? else {
@@ -45,15 +46,19 @@ fn read_points(head: &Object, root: &Path, out: &mut Imported) -> Result<()> {
         out.notes.push(format!("{name} holds {} points; one of {step} is kept", cloud.len()));
     }
     let all = cloud.positions.iter().zip(&cloud.rgb_srgb).step_by(step);
-    out.points = all
+    let mut points: Vec<SparsePoint> = all
         .map(|(p, c)| SparsePoint {
             position: DVec3::from_array(p.map(f64::from)),
             color: c.map(diorama_geom::color::u8_from_unit),
             error: 0.0,
             frames: Vec::new(),
         })
-        .filter(|p| p.position.is_finite())
         .collect();
+    if step == 1 {
+        sparse_ply::observe(&file, &crate::error::read(&file, u64::MAX)?, &out.frames, &mut points)?;
+    }
+    points.retain(|p| p.position.is_finite());
+    out.points = points;
     Ok(())
 }
 

@@ -8,7 +8,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 /// Switches that leave the parameters alone.
-const NEUTRAL: [(&str, &str); 13] = [
+const NEUTRAL: [(&str, &str); 14] = [
     ("device", "this build has one"),
     ("data.path", "names the capture"),
     ("data.format", "tested with the importers"),
@@ -17,6 +17,7 @@ const NEUTRAL: [(&str, &str); 13] = [
     ("data.memory_budget", "must not change the result: tested in pixel_store"),
     ("data.white", "of linear light alone: tested in cli/tests/photographs.rs"),
     ("data.skip_broken", "tested with broken photographs in cli/tests/photographs.rs"),
+    ("loss.depth", "this capture has no sparse points: tested in object/recipe_tests.rs"),
     ("run.seconds", "the other budget: tested in train::run"),
     ("run.log_every", "tested in train::run"),
     ("run.save_every_seconds", "must not change the result"),

@@ -7,9 +7,11 @@ use diorama_data::{DataError, photo};
 use diorama_geom::ImageU8;
 use diorama_geom::capture::Split;
 use diorama_pipelines::object::evaluate::{EvaluationProgress, ScoredView};
+use diorama_pipelines::object::seen_by::{SeenBy, Sights};
 use diorama_pipelines::object::{device, evaluate, kept_capture, run_folder};
 use diorama_pipelines::{PipelineError, Result};
 use std::cell::RefCell;
+use std::path::Path;
 
 pub fn run(a: &EvalArgs) -> Result<Outcome> {
     use_threads(a.threads)?;
@@ -26,10 +28,20 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
     kept_capture::require_photographs(&model.capture)?;
     device::accelerate(&mut model, &a.device, Box::new(note))?;
     let folder = a.run.join("eval");
-    if a.save_images {
+    if a.save_images || a.explain {
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
     let shown = RefCell::new(ShareShown::new());
+    let sights = a.explain.then(|| {
+        let mut told = |done: usize, all: usize| {
+            shown.borrow_mut().show(done as f64 / all as f64, &format!("training view {} of {all}: where its rays end", done + 1));
+        };
+        Sights::of(&model, &mut told)
+    });
+    shown.borrow().finish();
+    shown.replace(ShareShown::new());
+    let file = |name: &str, what: &str| folder.join(format!("{}{what}.png", name.replace(['/', '\\'], "_")));
+    let mut seen_by = Vec::new();
     let mut each = |name: &str, v: &ScoredView| -> Result<()> {
         shown.borrow().line(&format!("{name}: psnr {:.2} ssim {:.3}", v.scores.psnr, v.scores.ssim));
         if a.save_images {
@@ -37,7 +49,12 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
             let rows = r.data.chunks_exact(r.width * 3).zip(p.data.chunks_exact(p.width * 3));
             let data = rows.flat_map(|(a, b)| [a, b].concat()).collect();
             let both = ImageU8 { width: r.width + p.width, height: r.height, channels: 3, data };
-            photo::save_png(&folder.join(format!("{}.png", name.replace(['/', '\\'], "_"))), &both)?;
+            photo::save_png(&file(name, ""), &both)?;
+        }
+        if let (Some(sights), Some(frame)) = (&sights, model.capture.frames.iter().position(|f| f.name == name)) {
+            let (seen, map) = sights.explain(&model, frame, v);
+            photo::save_png(&file(name, ".seen"), &map)?;
+            seen_by.push(seen);
         }
         Ok(())
     };
@@ -52,6 +69,9 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         let mut object = serde_json::to_value(&report).expect("a report is JSON");
         object["gap"] = serde_json::json!(report.gap());
         object["advice"] = serde_json::json!(report.advice());
+        if a.explain {
+            object["seen_by"] = serde_json::json!(seen_by);
+        }
         println!("{object}");
     } else {
         println!(
@@ -68,6 +88,9 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         if let fog @ [_, ..] = &report.behind_fog()[..] {
             println!("behind fog: {}", fog.join(", "));
         }
+        if !seen_by.is_empty() {
+            print_seen_by(&seen_by, &folder);
+        }
         if model.is_linear() {
             println!("scored in {}: the photographs hold linear light", report.scored_in);
         }
@@ -76,4 +99,16 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         }
     }
     Ok(Outcome::Done)
+}
+
+/// Which share of each view's light comes from places that so many training views see, and who sees what few see.
+fn print_seen_by(views: &[SeenBy], folder: &Path) {
+    println!("training views that see what a view shows, in percent of its light (maps in {}):", folder.display());
+    println!("{:>6}{:>6}{:>6}{:>6}{:>6}", "none", "1", "2", "3", "more");
+    for v in views {
+        let shares: String = v.shares.iter().map(|s| format!("{:>6.1}", 100.0 * s)).collect();
+        let sources: Vec<String> = v.sources.iter().map(|s| format!("{} {:.1}", s.name, 100.0 * s.share)).collect();
+        let of_few = if sources.is_empty() { String::new() } else { format!("; what one or two see is of {}", sources.join(", ")) };
+        println!("{shares}  {}{of_few}", v.name);
+    }
 }

@@ -3,7 +3,7 @@
 use crate::samplers::RayBatch;
 use diorama_geom::color::srgb_from_linear;
 use diorama_kernels::ops::composite::Packed;
-use diorama_kernels::ops::distortion;
+use diorama_kernels::ops::{depth_loss, distortion};
 use diorama_kernels::ops::ngp_field::{RayGradient, RayLoss, RayOutput};
 
 /// How a colour difference counts.
@@ -41,6 +41,10 @@ pub struct Photometric<'a> {
     pub distortion: f32,
     /// Weight of the squared difference between opacity and the photograph's alpha.
     pub alpha: f32,
+    /// Weight of the light that ends away from surfaces of known distance ([`depth_loss`]).
+    pub depth: f32,
+    /// In distance from the camera; not read without `depth`.
+    pub along: Packed<'a>,
 }
 
 /// What [`Photometric::relative`] is for linear light.
@@ -92,6 +96,10 @@ impl RayLoss for Photometric<'_> {
         if self.distortion > 0.0 {
             loss += self.distortion * distortion::cpu::ray(&self.samples, r, out.weights, self.distortion * scale, g.weights);
         }
+        if self.depth > 0.0 && self.batch.distance[r] > 0.0 {
+            let (t, dt) = (&self.along.t[out.first..], &self.along.dt[out.first..]);
+            loss += self.depth * depth_loss::ray(t, dt, out.weights, self.batch.distance[r], self.depth * scale, g.weights);
+        }
         (loss * scale) as f64
     }
 }
@@ -118,7 +126,9 @@ mod tests {
         let (offsets, t, dt) = ([0u32, 1, 2], [0.0, 1.0], [0.5, 0.5]);
         let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
         for color in [ColorLoss::Mse, ColorLoss::Huber(0.1)] {
-            let p = Photometric { batch: &batch, samples, background: &[1.0; 6], color, relative: 1e-6, distortion: 0.0, alpha: 0.0 };
+            let background = &[1.0; 6];
+            let (distortion, alpha, depth) = (0.0, 0.0, 0.0);
+            let p = Photometric { batch: &batch, samples, background, color, relative: 1e-6, distortion, alpha, depth, along: samples };
             let run = |r: usize, v: f32| {
                 let mut w = [0.0];
                 let out = RayOutput { rgb: [v; 3], opacity: 1.0, depth: 1.0, weights: &[1.0], first: 0 };
@@ -139,16 +149,19 @@ mod tests {
         batch.target = vec![0.2, 0.4, 0.6, 0.5];
         let (offsets, t, dt) = ([0u32, 2], [0.0, 1.0], [0.5, 0.5]);
         let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
-        let run = |batch: &RayBatch, distortion: f32, alpha: f32, color: ColorLoss| {
-            let p = Photometric { batch, samples, background: &[1.0; 3], color, relative: 0.0, distortion, alpha };
+        let run = |batch: &RayBatch, distortion: f32, alpha: f32, color: ColorLoss, depth: f32| {
+            let p = Photometric { batch, samples, background: &[1.0; 3], color, relative: 0.0, distortion, alpha, depth, along: samples };
             let mut w = [0.0; 2];
             let out = RayOutput { rgb: [0.5, 0.5, 0.5], opacity: 0.9, depth: 1.0, weights: &[0.4, 0.5], first: 0 };
             p.ray(0, &out, &mut RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut w })
         };
-        let base = run(&batch, 0.0, 0.0, ColorLoss::Mse);
-        assert!(run(&batch, 0.1, 0.0, ColorLoss::Mse) > base && run(&batch, 0.0, 0.1, ColorLoss::Mse) > base);
-        assert_ne!(run(&batch, 0.0, 0.0, ColorLoss::Huber(0.1)), base);
+        let base = run(&batch, 0.0, 0.0, ColorLoss::Mse, 0.0);
+        assert!(run(&batch, 0.1, 0.0, ColorLoss::Mse, 0.0) > base && run(&batch, 0.0, 0.1, ColorLoss::Mse, 0.0) > base);
+        assert_ne!(run(&batch, 0.0, 0.0, ColorLoss::Huber(0.1), 0.0), base);
+        assert_eq!(run(&batch, 0.0, 0.0, ColorLoss::Mse, 0.1), base, "no surface is known");
+        batch.distance[0] = 9.0;
+        assert!(run(&batch, 0.0, 0.0, ColorLoss::Mse, 0.1) > base, "all light ends before the surface");
         batch.target[0] = f32::NAN;
-        assert_eq!(run(&batch, 0.1, 0.1, ColorLoss::Mse), 0.0);
+        assert_eq!(run(&batch, 0.1, 0.1, ColorLoss::Mse, 0.1), 0.0);
     }
 }

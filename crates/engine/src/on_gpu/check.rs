@@ -7,7 +7,7 @@ use crate::renderers::supervised::Supervised;
 use crate::renderers::volume::{self, Accelerator, Quality, Sampling, Tracer};
 use crate::samplers::RayBatch;
 use crate::samplers::occupancy::Occupancy;
-use crate::samplers::pixels::{self, DrawOptions, ErrorMap, PixelSource};
+use crate::samplers::pixels::{self, DrawOptions, ErrorMap, Observation, PixelSource};
 use crate::samplers::stratified;
 use diorama_geom::contraction;
 use diorama_geom::glam::DVec3;
@@ -108,14 +108,26 @@ fn draws(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     errors.errors.iter_mut().enumerate().for_each(|(i, e)| *e = [0.0625, 0.0, 1.0, 0.25][i * 7 % 4]);
     errors.refresh();
     use PixelFormat::{Half, Unorm8, Unorm16};
-    for (stride, map, format) in [(1, None, Unorm8), (3, None, Unorm8), (1, Some(&errors), Unorm8), (3, None, Unorm16), (1, None, Half)] {
+    // Some of them masked, in the second photograph; and none.
+    let seen: Vec<Observation> = (0..30)
+        .map(|i| Observation { image: i % 2, x: i * 3 % [8, 33][i as usize % 2], y: i % [4, 7][i as usize % 2], distance: 0.5 + i as f32 })
+        .collect();
+    for (stride, map, format, observed) in [
+        (1, None, Unorm8, 0),
+        (3, None, Unorm8, 30),
+        (1, Some(&errors), Unorm8, 30),
+        (3, None, Unorm16, 0),
+        (1, None, Half, 1),
+    ] {
+        let observations = &seen[..observed];
         let two = Two { stride, format };
         let (sizes, kept) = ([two.size(0), two.size(1)], two.kept());
         let own = pixel_gather::words_per_pixel(format);
         let words: Vec<u32> = kept.iter().flat_map(|(i, x, y)| two.words(*i, *x, *y).into_iter().take(own)).collect();
         let mut mask = vec![0u32; kept.len().div_ceil(32)];
         kept.iter().enumerate().for_each(|(at, (i, x, y))| mask[at / 32] |= (two.counts(*i, *x, *y) as u32) << (at % 32));
-        let photographs = GpuPhotographs::upload(gpu, &sizes, stride, &[0, 1].map(Two::kept_by), (format, &words), Some(&mask));
+        let mut photographs = GpuPhotographs::upload(gpu, &sizes, stride, &[0, 1].map(Two::kept_by), (format, &words), Some(&mask));
+        photographs.observe(gpu, &observations.iter().map(|o| (o.image, o.x, o.y, o.distance)).collect::<Vec<_>>());
         let camera = PosedCamera { camera: Camera::pinhole(8, 4, 1.0), pose: Pose::look_at(DVec3::X, DVec3::ZERO, DVec3::Z) };
         let on_gpu = map.map(|m| GpuErrorMap::upload(gpu, &m.errors, &m.drawn));
         let (rng, back) = (Rng::new(3, 1), Rng::new(3, 2));
@@ -123,11 +135,11 @@ fn draws(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         for (n, first) in [(0, 0), (1, 5), (700, (1 << 33) + 12_345)] {
             let mut batch = RayBatch::default();
             batch.resize(n);
-            let o = DrawOptions { cameras: &[camera; 2], first, rng, near: 0.1, cube: (0.0, 1.0), error_map: map };
+            let o = DrawOptions { cameras: &[camera; 2], first, rng, near: 0.1, cube: (0.0, 1.0), error_map: map, observations };
             pixels::draw(&two, &o, &mut batch);
             let drawn = photographs.draw(gpu, n, first, &rng, on_gpu.as_ref(), Backdrop::Random(back));
             let (shape, exact) = (
-                format!("R={n} from {first} 1 of {stride}² {format:?}{}", if map.is_some() { " by error" } else { "" }),
+                format!("R={n} from {first} 1 of {stride}² {format:?}{} observed={observed}", if map.is_some() { " by error" } else { "" }),
                 |v: &[f32]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>(),
             );
             table.equal("draw", "images", &shape, &drawn.images, &batch.images)?;
@@ -135,6 +147,7 @@ fn draws(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             table.equal("draw", "jitter", &shape, &drawn.jitter, &exact(&batch.jitter))?;
             let refused: Vec<u32> = batch.target.chunks_exact(4).map(|t| t[0].is_nan() as u32).collect();
             table.equal("draw", "left out", &shape, &drawn.left_out, &refused)?;
+            table.equal("draw", "distance", &shape, &drawn.distance, &exact(&batch.distance))?;
             let background: Vec<f32> = (0..n * 3).map(|i| back.uniform(first * 3 + i as u64)).collect();
             table.equal("draw", "background", &shape, &drawn.background, &exact(&background))?;
             let mut got = gpu.read(&drawn.target)?;
@@ -414,18 +427,20 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         batch.resize(rays);
         batch.target = random_unit(rays * 4, 7);
         batch.target.chunks_exact_mut(4).skip(2).step_by(9).for_each(|t| t[0] = f32::NAN);
+        // Every third ray's surface is known.
+        batch.distance.iter_mut().step_by(3).zip(random_unit(rays, 10)).for_each(|(d, u)| *d = 0.1 + 3.0 * u);
         let (rgb, background) = (random_unit(s * 3, 8), random_unit(rays * 3, 9));
         let out = composite::forward(&p, &scene.sigma, &rgb, 3, &background);
         let (mut starts, mut lengths) = (Vec::new(), Vec::new());
         distortion::cpu::normalize(&p, &mut starts, &mut lengths);
         let in_distance = Packed { t: &starts, dt: &lengths, ..p };
         let wide_huber = ColorLoss::Huber(0.1);
-        for (color, huber, relative, normalized) in
-            [(ColorLoss::Mse, 0.0, 0.0, true), (wide_huber, 0.1, 0.0, false), (wide_huber, 0.1, 0.05, false)]
+        for (color, huber, relative, normalized, depth) in
+            [(ColorLoss::Mse, 0.0, 0.0, true, 0.4), (wide_huber, 0.1, 0.0, false, 0.0), (wide_huber, 0.1, 0.05, false, 0.4)]
         {
             let (distortion, alpha) = (0.3, 0.2);
             let spread = if normalized { in_distance } else { p };
-            let photometric = Photometric { batch: &batch, samples: spread, background: &background, color, relative, distortion, alpha };
+            let photometric = Photometric { batch: &batch, samples: spread, background: &background, color, relative, distortion, alpha, depth, along: p };
             let (mut value, mut error, mut counted) = (0.0f64, 0.0f64, 0usize);
             let mut of_rays = vec![0.0f64; rays];
             let (mut d_color, mut d_opacity, mut d_weights) = (vec![0.0; rays * 3], vec![0.0; rays], vec![0.0; s]);
@@ -456,10 +471,11 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let left_out: Vec<u32> = batch.target.chunks_exact(4).map(|t| t[0].is_nan() as u32).collect();
             let rgba: Vec<f32> = batch.target.iter().map(|v| if v.is_nan() { 0.3 } else { *v }).collect();
             let (rgba, background, left_out, sums) = (up(&rgba), up(&background), gpu.upload_u32(&left_out), gpu.zeros(SUMS));
-            let target = Target { rgba: &rgba, background: &background, left_out: &left_out };
+            let distance = up(&batch.distance);
+            let target = Target { rgba: &rgba, background: &background, left_out: &left_out, distance: &distance };
             let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
-            let (d, errors) = loss::loss(gpu, Terms { huber, relative, distortion, normalized, alpha }, &on_gpu, &results, target, figures);
-            let shape = format!("R={rays} S={s} {color:?} relative {relative} normalized={normalized}");
+            let (d, errors) = loss::loss(gpu, Terms { huber, relative, distortion, normalized, alpha, depth }, &on_gpu, &results, target, figures);
+            let shape = format!("R={rays} S={s} {color:?} relative {relative} normalized={normalized} depth={depth}");
             table.close("loss", "errors", &shape, &errors, &of_rays)?;
             table.close("loss", "d color", &shape, &d.color, &wide(&d_color))?;
             table.close("loss", "d opacity", &shape, &d.opacity, &wide(&d_opacity))?;
@@ -471,7 +487,7 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 
             // All of it at once.
             for reach in [0.0, near] {
-                let terms = Terms { huber, relative, distortion, normalized, alpha };
+                let terms = Terms { huber, relative, distortion, normalized, alpha, depth };
                 let (sigma_gpu, rgb_gpu, sums) = (up(&scene.sigma), up(&rgb), gpu.zeros(SUMS));
                 let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
                 let (g, own_errors) = loss::composite_and_loss(gpu, terms, &on_gpu, &sigma_gpu, &rgb_gpu, target, reach, figures);

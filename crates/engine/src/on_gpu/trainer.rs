@@ -295,7 +295,7 @@ impl GpuTrainer {
             (every_ray, codes, rgb)
         });
         let background = sky.as_ref().map_or(&drawn.background, |(_, _, rgb)| rgb);
-        let target = Target { rgba: &drawn.target, background, left_out: &drawn.left_out };
+        let target = Target { rgba: &drawn.target, background, left_out: &drawn.left_out, distance: &drawn.distance };
         let moves = self.corrections.is_some();
         let train = |of: &GpuField, packed: &GpuPacked, (points, features), marched: &Buffer, target, is_main: bool, wants_weights| {
             let figures = loss::Figures { sums: &self.sums, marched, is_main };

@@ -21,6 +21,8 @@ pub struct RayBatch {
     pub jitter: Vec<f32>,
     /// Straight RGBA, `[R, 4]`.
     pub target: Vec<f32>,
+    /// Distance of the surface along the ray where it is known, else 0, `[R]`.
+    pub distance: Vec<f32>,
 }
 
 impl RayBatch {
@@ -36,6 +38,7 @@ impl RayBatch {
     pub fn resize(&mut self, n: usize) {
         self.images.resize(n, 0);
         self.jitter.resize(n, 0.0);
+        self.distance.resize(n, 0.0);
         for (v, c) in [(&mut self.pixels, 2), (&mut self.origins, 3), (&mut self.dirs, 3), (&mut self.near_far, 2), (&mut self.target, 4)] {
             v.resize(n * c, 0.0);
         }

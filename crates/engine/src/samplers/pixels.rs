@@ -72,6 +72,19 @@ impl ErrorMap {
     }
 }
 
+/// A pixel in which a point at a known distance is seen.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Observation {
+    pub image: u32,
+    pub x: u32,
+    pub y: u32,
+    /// From the camera, in model space.
+    pub distance: f32,
+}
+
+/// One ray of so many goes through a pixel of known distance, where there are any.
+pub const OBSERVED_EVERY: usize = 8;
+
 /// What [`draw`] needs besides the pixels.
 pub struct DrawOptions<'a> {
     pub cameras: &'a [PosedCamera],
@@ -82,6 +95,8 @@ pub struct DrawOptions<'a> {
     /// The scene's outer cube in model space: lowest corner and edge.
     pub cube: (f32, f32),
     pub error_map: Option<&'a ErrorMap>,
+    /// Pixels of known distance.
+    pub observations: &'a [Observation],
 }
 
 /// Fills `batch` (already resized) with random training rays.
@@ -90,12 +105,15 @@ pub struct DrawOptions<'a> {
 pub fn draw(source: &dyn PixelSource, o: &DrawOptions, batch: &mut RayBatch) {
     let images = source.images() as u64;
     let picked = batch.images.par_iter_mut().zip(batch.pixels.par_chunks_mut(2)).zip(batch.target.par_chunks_mut(4)).zip(&mut batch.jitter);
-    picked.enumerate().with_min_len(256).for_each(|(i, (((image, pixel), target), jitter))| {
+    picked.zip(&mut batch.distance).enumerate().with_min_len(256).for_each(|(i, ((((image, pixel), target), jitter), distance))| {
         // Sixteen numbers per ray: the draw may be repeated where a mask refuses the pixel.
         let base = (o.first + i as u64) * 16;
         *jitter = o.rng.uniform(base);
         for attempt in 0..5u64 {
             let at = base + 1 + attempt * 3;
+            let seen = !o.observations.is_empty() && i % OBSERVED_EVERY == 0 && attempt == 0;
+            let seen = seen.then(|| o.observations[o.rng.below(at, o.observations.len() as u64) as usize]);
+            *distance = seen.map_or(0.0, |s| s.distance);
             let (img, u, v) = match o.error_map {
                 Some(map) if i as f32 % 1024.0 / 1024.0 >= UNIFORM_SHARE => {
                     let cell = map.draw(o.rng.uniform(at));
@@ -107,6 +125,7 @@ pub fn draw(source: &dyn PixelSource, o: &DrawOptions, batch: &mut RayBatch) {
             };
             let (w, h) = source.size(img as usize);
             let (x, y) = (((u * w as f32) as u32).min(w - 1), ((v * h as f32) as u32).min(h - 1));
+            let (img, x, y) = seen.map_or((img, x, y), |s| (s.image as u64, s.x, s.y));
             let (x, y) = source.snap(img as usize, x, y);
             *image = img as u32;
             pixel.copy_from_slice(&[x as f32 + 0.5, y as f32 + 0.5]);
@@ -151,13 +170,35 @@ mod tests {
     }
 
     fn draw_with(map: Option<&ErrorMap>) -> RayBatch {
+        draw_through(map, &[])
+    }
+
+    fn draw_through(error_map: Option<&ErrorMap>, observations: &[Observation]) -> RayBatch {
         let camera =
             PosedCamera { camera: Camera::pinhole(8, 4, 1.0), pose: Pose::look_at(DVec3::new(2.0, 0.5, 0.5), DVec3::splat(0.5), DVec3::Z) };
         let mut batch = RayBatch::default();
         batch.resize(4096);
-        let o = DrawOptions { cameras: &[camera, camera], first: 0, rng: Rng::new(1, 1), near: 0.1, cube: (0.0, 1.0), error_map: map };
+        let o = DrawOptions { cameras: &[camera, camera], first: 0, rng: Rng::new(1, 1), near: 0.1, cube: (0.0, 1.0), error_map, observations };
         draw(&Half, &o, &mut batch);
         batch
+    }
+
+    #[test]
+    fn one_ray_in_eight_goes_through_a_pixel_of_known_distance_unless_it_is_masked() {
+        let seen = [(0, 5, 1, 2.5), (1, 6, 3, 3.5), (0, 1, 0, 9.0)].map(|(image, x, y, distance)| Observation { image, x, y, distance });
+        let b = draw_through(None, &seen);
+        let mut of = [0; 3];
+        for (r, d) in b.distance.iter().enumerate() {
+            let Some(k) = seen.iter().position(|s| s.distance == *d) else {
+                assert_eq!(*d, 0.0);
+                continue;
+            };
+            assert!(r % OBSERVED_EVERY == 0, "ray {r}");
+            assert_eq!((b.images[r], b.pixels[2 * r], b.pixels[2 * r + 1]), (seen[k].image, seen[k].x as f32 + 0.5, seen[k].y as f32 + 0.5));
+            of[k] += 1;
+        }
+        assert!(of[0] > 120 && of[1] > 120 && of[2] == 0, "{of:?} of 512; the third is masked");
+        assert!(draw_with(None).distance.iter().all(|d| *d == 0.0), "without observations no distance is known");
     }
 
     #[test]

@@ -176,12 +176,12 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
         composite::backward(gpu, &p, &rgb, 3, &background, &out, &d);
     })?;
     let (target, left_out, sums) = (random(gpu, p.rays() * 4, 8), gpu.upload_u32(&vec![0; p.rays()]), gpu.zeros(SUMS));
-    let target = Target { rgba: &target, background: &background, left_out: &left_out };
+    let target = Target { rgba: &target, background: &background, left_out: &left_out, distance: &left_out };
     t.row("composite, loss and backward", "3 channels, 32 samples per ray", "sample", s, 0.0, 64.0, || {
         let figures = Figures { sums: &sums, marched: &p.offsets, is_main: true };
         loss::composite_and_loss(
             gpu,
-            Terms { huber: 0.0, relative: 0.0, distortion: 0.0, normalized: false, alpha: 0.0 },
+            Terms { huber: 0.0, relative: 0.0, distortion: 0.0, normalized: false, alpha: 0.0, depth: 0.0 },
             &p,
             &sigma,
             &rgb,

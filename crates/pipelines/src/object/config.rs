@@ -163,9 +163,12 @@ pub struct LossConfig {
     /// `mse` or `huber`.
     pub color: String,
     /// Weight of the distortion loss; in unbounded space it is taken in `4 t / (1 + t)`. `auto`: 0.1 there,
-    /// growing from a tenth while coarse geometry is found, 0.01 in a box.
+    /// growing from nothing while coarse geometry is found, 0.01 in a box.
     pub distortion: Auto,
     pub alpha: f32,
+    /// Weight of the light that ends away from the sparse points which photographs show; `auto`: 0.3 in unbounded space, else none.
+    #[serde(default)]
+    pub depth: Auto,
     /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.
     pub near_scaling: f32,
 }
@@ -300,6 +303,7 @@ impl Config {
             loss: LossConfig {
                 color: if ngp { "huber" } else { "mse" }.into(),
                 distortion: if ngp { Auto::Auto } else { Auto::Is(0.0) },
+                depth: Auto::Auto,
                 alpha: 0.0,
                 near_scaling: if ngp { 1.0 } else { 0.0 },
             },

@@ -1,7 +1,7 @@
 //! Where a run trains: on the CPU, or on a GPU that keeps all of its state.
 
 use super::config::{Config, Method};
-use super::model::ObjectModel;
+use super::model::{ObjectModel, Terms};
 use super::recipe::Photographs;
 use crate::error::{PipelineError, Result};
 use diorama_engine::renderers::supervised::Say;
@@ -9,6 +9,7 @@ use diorama_engine::renderers::supervised::Say;
 use diorama_engine::renderers::supervised::Supervised;
 #[cfg(feature = "gpu")]
 use diorama_engine::renderers::volume::Accelerator;
+use diorama_engine::samplers::pixels::Observation;
 use diorama_geom::rng::Rng;
 use diorama_kernels::device::Api;
 #[cfg(feature = "gpu")]
@@ -32,8 +33,7 @@ pub(super) struct Drawing {
     pub refresh_errors: bool,
     pub stretch: f32,
     pub thin: f32,
-    /// Weight of the distortion loss.
-    pub distortion: f32,
+    pub terms: Terms,
     pub rate_scale: f32,
 }
 
@@ -192,7 +192,7 @@ impl Opened {
         u64::MAX
     }
 
-    pub fn upload(&mut self, _: &ObjectModel, _: &Photographs) -> Result<()> {
+    pub fn upload(&mut self, _: &ObjectModel, _: &Photographs, _: &[Observation]) -> Result<()> {
         Ok(())
     }
 
@@ -279,8 +279,8 @@ impl Opened {
     ///
     /// # Errors
     /// When they do not fit there.
-    pub fn upload(&mut self, model: &ObjectModel, photographs: &Photographs) -> Result<()> {
-        self.running.as_mut().map_or(Ok(()), |r| r.upload(model, photographs))
+    pub fn upload(&mut self, model: &ObjectModel, photographs: &Photographs, observations: &[Observation]) -> Result<()> {
+        self.running.as_mut().map_or(Ok(()), |r| r.upload(model, photographs, observations))
     }
 
     /// One step; its figures are those of the last time that the device was asked.
@@ -316,12 +316,13 @@ mod running {
     use crate::object::model::ObjectModel;
     use crate::object::recipe::Photographs;
     use diorama_data::pixel_store::PixelStore;
-    use diorama_engine::losses::RELATIVE;
+    use diorama_engine::losses::{ColorLoss, RELATIVE};
+    use diorama_engine::samplers::pixels::Observation;
     use diorama_engine::on_gpu::{GpuStep, GpuTrainer, Placing, Trainees, TraineesMut};
     use diorama_geom::rng::Rng;
     use diorama_kernels::gpu::{Gpu, GpuError};
     use diorama_kernels::ops::march::gpu::prune::Limits;
-    use diorama_kernels::ops::ngp_field::gpu::loss::Terms;
+    use diorama_kernels::ops::ngp_field::gpu::loss;
     use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, GpuPhotographs};
 
     /// Most steps between which the device is not asked how they went.
@@ -354,7 +355,7 @@ mod running {
             format!("{} ({})", self.gpu.name, self.gpu.api.name())
         }
 
-        pub fn upload(&mut self, m: &ObjectModel, photographs: &Photographs) -> Result<()> {
+        pub fn upload(&mut self, m: &ObjectModel, photographs: &Photographs, observations: &[Observation]) -> Result<()> {
             let store = photographs.store();
             // Of the smallest budgets even 1 of 64 × 64 pixels may be more.
             let bytes: u64 = (0..store.len()).map(|i| (store.kept(i) * store.format().bytes()) as u64).sum();
@@ -377,7 +378,8 @@ mod running {
                 corrections: m.corrections.as_ref().map(|g| (g, m.config.camera.refine_focal)),
                 error_map: m.error_map.as_ref(),
             };
-            let images = resident(&self.gpu, store);
+            let mut images = resident(&self.gpu, store);
+            images.observe(&self.gpu, &observations.iter().map(|o| (o.image, o.x, o.y, o.distance)).collect::<Vec<_>>());
             // What an earlier trainer has there makes room first.
             self.trainer = None;
             self.gpu.release();
@@ -407,14 +409,15 @@ mod running {
                 backdrop: d.background.map_or(Backdrop::Color(m.backdrop_color()), Backdrop::Random),
                 near: s.near,
                 placing,
-                terms: Terms {
-                    huber: if c.loss.color == "huber" { 0.1 } else { 0.0 },
+                terms: loss::Terms {
+                    huber: if let ColorLoss::Huber(width) = d.terms.color { width } else { 0.0 },
                     relative: if m.is_linear() { RELATIVE } else { 0.0 },
-                    distortion: d.distortion,
+                    distortion: d.terms.distortion,
                     normalized: m.field.is_unbounded(),
-                    alpha: c.loss.alpha,
+                    alpha: d.terms.alpha,
+                    depth: d.terms.depth,
                 },
-                near_scaling: c.loss.near_scaling,
+                near_scaling: d.terms.near_scaling,
                 t: step as u32 + 1,
                 rate_scale: d.rate_scale,
                 refresh_errors: d.refresh_errors,

@@ -5,6 +5,7 @@ use crate::error::{PipelineError, Result};
 use diorama_data::checkpoint::{Checkpoint, Entry};
 use diorama_engine::background::LearnedBackground;
 use diorama_engine::fields::{self, Batch, Field, FieldBuffers};
+use diorama_engine::losses::ColorLoss;
 use diorama_engine::params::ParamGroup;
 use diorama_engine::renderers::supervised::{Supervised, Unserved};
 use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Sampling, Tracer};
@@ -54,6 +55,18 @@ pub struct ObjectModel {
     pub accelerator: Option<Supervised>,
 }
 
+/// What training counts, and how much.
+#[derive(Clone, Copy, Debug)]
+pub struct Terms {
+    pub color: ColorLoss,
+    pub distortion: f32,
+    /// Of light that ends away from sparse points.
+    pub depth: f32,
+    pub alpha: f32,
+    /// Distance within which samples learn more slowly; 0: none.
+    pub near_scaling: f32,
+}
+
 /// Density per inner cube at the start of unbounded fields: light passes most of the inner cube, so that what stands
 /// there is found before what would stand in front of each camera.
 const INITIAL_DENSITY: f32 = 0.1;
@@ -64,9 +77,15 @@ const TABLE_DECAY: f32 = 1e-5;
 /// Weight of the distortion loss in unbounded space and in a box.
 const DISTORTION: (f32, f32) = (0.1, 0.01);
 
-/// Share of its weight with which the distortion loss of unbounded space begins, and steps in which it grows: at once, it would
-/// gather what little matter there is before each camera, where nothing else is known yet.
-const DISTORTION_RAMP: (f32, u64) = (0.1, 2000);
+/// Steps in which the distortion loss of unbounded space grows to its weight, from nothing: at once, it would gather what little
+/// matter there is before each camera, where nothing else is known yet. Even a tenth of it does so on captures of plain surfaces.
+const DISTORTION_RAMP: u64 = 2000;
+
+/// Width of the Huber loss's quadratic part.
+const HUBER: f32 = 0.1;
+
+/// Weight of the light that ends away from sparse points, in unbounded space.
+const DEPTH: f32 = 0.3;
 
 /// Cascades of the occupancy grid of unbounded space: they reach 64 inner cubes far, beyond which a ray has a few samples left.
 const CASCADES: usize = 8;
@@ -231,13 +250,25 @@ impl ObjectModel {
         0.7 * self.field.net.sigma.shift.exp()
     }
 
+    /// What counts at a training step, and how much.
+    pub fn terms(&self, step: u64) -> Terms {
+        let l = &self.config.loss;
+        let color = if l.color == "huber" { ColorLoss::Huber(HUBER) } else { ColorLoss::Mse };
+        Terms { color, distortion: self.distortion(step), depth: self.depth(), alpha: l.alpha, near_scaling: l.near_scaling }
+    }
+
     /// Weight of the distortion loss at a training step.
-    pub fn distortion(&self, step: u64) -> f32 {
+    fn distortion(&self, step: u64) -> f32 {
         let weight = self.config.loss.distortion;
         match self.field.is_unbounded() {
-            true => weight.or(DISTORTION.0) * (step as f32 / DISTORTION_RAMP.1 as f32).clamp(DISTORTION_RAMP.0, 1.0),
+            true => weight.or(DISTORTION.0) * (step as f32 / DISTORTION_RAMP as f32).min(1.0),
             false => weight.or(DISTORTION.1),
         }
+    }
+
+    /// Weight of the light that ends away from sparse points.
+    pub fn depth(&self) -> f32 {
+        self.config.loss.depth.or(if self.field.is_unbounded() { DEPTH } else { 0.0 })
     }
 
     /// The scene's outer cube in model space: lowest corner and edge.

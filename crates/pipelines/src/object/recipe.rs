@@ -1,11 +1,12 @@
 //! Training, from top to bottom.
 
-use super::config::{Background, Config, LossConfig, Method};
+use super::config::{Background, Config, Method};
 use super::device::{self, Aftermath, Drawing, Opened};
 use super::held_out::{self, HeldOutPixels};
 use super::memory;
-use super::model::{ObjectModel, is_linear};
+use super::model::{ObjectModel, Terms, is_linear};
 use super::nearest::nearest;
+use super::observations;
 use super::run_folder::{RunFolder, RunSummary};
 use super::viewing::RunView;
 use crate::bench::train::{StageFigure, TrainReport};
@@ -15,9 +16,9 @@ use diorama_data::import::{self, ImportOptions};
 use diorama_data::photo_check;
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_engine::fields::{Batch, Field, FieldBuffers, Pruning};
-use diorama_engine::losses::{self, ColorLoss, Photometric};
+use diorama_engine::losses::{self, Photometric};
 use diorama_engine::params::Schedule;
-use diorama_engine::samplers::pixels::{self, DrawOptions, PixelSource};
+use diorama_engine::samplers::pixels::{self, DrawOptions, Observation, PixelSource};
 use diorama_engine::samplers::{RayBatch, stratified};
 use diorama_engine::stages::Stages;
 use diorama_engine::train::{self, Event, HeldOut, RunError, RunOptions, StepReport, Summary, Trainee};
@@ -154,6 +155,9 @@ pub fn train(
     let origin = model.origin;
     let checkpoints = folder.checkpoints();
     let mut trainer = Trainer { view, held_out, ..Trainer::new(model, Photographs(store), &checkpoints, opened)? };
+    if let n @ 1.. = trainer.observations.len() {
+        events(&Event::Note(format!("sparse points tell the distance of {n} pixels (--set loss.depth=0: do not use them)")));
+    }
     let (mut log_error, mut judged) = (None, HeldOut::default());
     let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
         if let Err(e) = folder.log(e) {
@@ -374,6 +378,8 @@ struct Trainer<'a> {
     recovered: bool,
     /// Samples before any were left out.
     marched: u64,
+    /// Pixels of known distance; none where they do not count.
+    observations: Vec<Observation>,
     device: Opened,
     /// How a device failed, and what was made of it.
     setback: Option<Setback>,
@@ -387,7 +393,8 @@ impl<'a> Trainer<'a> {
         let o = &model.config.optim;
         let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
         let cameras = model.cameras();
-        device.upload(&model, &photographs)?;
+        let observations = if model.depth() > 0.0 { observations::of(&model) } else { Vec::new() };
+        device.upload(&model, &photographs, &observations)?;
         Ok(Trainer {
             cameras,
             model,
@@ -397,6 +404,7 @@ impl<'a> Trainer<'a> {
             schedule,
             recovered: false,
             marched: 0,
+            observations,
             device,
             setback: None,
             held_out: None,
@@ -444,6 +452,7 @@ impl<'a> Trainer<'a> {
             near: m.config.sampling.near,
             cube: m.cube(),
             error_map: m.error_map.as_ref(),
+            observations: &self.observations,
         };
         pixels::draw(&self.photographs, &options, &mut self.buffers.batch);
         self.fill_background(first);
@@ -479,7 +488,7 @@ impl<'a> Trainer<'a> {
     fn step_ngp(&mut self, step: u64) -> (f64, u64) {
         let b = &mut self.buffers;
         let m = &mut self.model;
-        let (s, thin, distortion) = (&m.config.sampling, m.thin(), m.distortion(step));
+        let (s, thin, terms) = (&m.config.sampling, m.thin(), m.terms(step));
         let grid = m.occupancy.as_mut().expect("ngp has an occupancy grid");
         if step > 0 && step.is_multiple_of(s.occupancy_every) {
             let (until, block) = OCCUPANCY_WARMUP;
@@ -503,8 +512,7 @@ impl<'a> Trainer<'a> {
         m.samples_per_ray = if step == 0 { per_ray } else { 0.9 * m.samples_per_ray + 0.1 * per_ray };
         let loss = train_field(
             &mut m.field,
-            &m.config.loss,
-            distortion,
+            &terms,
             &b.batch,
             &b.marched,
             &b.positions,
@@ -532,7 +540,7 @@ impl<'a> Trainer<'a> {
             refresh_errors: step.is_multiple_of(ERROR_REFRESH),
             stretch: stretch(step),
             thin: m.thin(),
-            distortion: m.distortion(step),
+            terms: m.terms(step),
             rate_scale: self.schedule.scale(progress as f32) * m.rate_scale,
         };
         let figures = self.device.step(&mut self.model, step, &drawing)?;
@@ -544,13 +552,13 @@ impl<'a> Trainer<'a> {
     fn step_stratified(&mut self, step: u64, first: u64) -> (f64, u64) {
         let b = &mut self.buffers;
         let m = &mut self.model;
-        let distortion = m.distortion(step);
+        let terms = m.terms(step);
         let rng = Rng::new(m.config.seed, COARSE);
         stratified::stratified(&b.batch, m.config.sampling.samples, Some((rng, first)), &mut b.marched);
         positions(&b.batch, &b.marched, &mut b.positions);
         let d = m.corrections.is_some().then_some(&mut b.d_positions);
         let loss =
-            train_field(&mut m.field, &m.config.loss, distortion, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
+            train_field(&mut m.field, &terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
         (loss, b.marched.t.len() as u64)
     }
 
@@ -558,17 +566,17 @@ impl<'a> Trainer<'a> {
     fn step_hierarchical(&mut self, step: u64, first: u64) -> (f64, u64) {
         let b = &mut self.buffers;
         let m = &mut self.model;
-        let (n, more, distortion) = (m.config.sampling.samples, m.config.sampling.importance, m.distortion(step));
+        let (n, more, terms) = (m.config.sampling.samples, m.config.sampling.importance, m.terms(step));
         stratified::stratified(&b.batch, n, Some((Rng::new(m.config.seed, COARSE), first)), &mut b.fine);
         positions(&b.batch, &b.fine, &mut b.positions);
         let coarse = m.coarse.as_mut().expect("nerf has a coarse field");
         let coarse_loss =
-            train_field(coarse, &m.config.loss, distortion, &b.batch, &b.fine, &b.positions, &b.background, &mut b.field, None);
+            train_field(coarse, &terms, &b.batch, &b.fine, &b.positions, &b.background, &mut b.field, None);
         stratified::refine(&b.fine, &b.field.out.weights, n, more, Some((Rng::new(m.config.seed, FINE), first)), &mut b.marched);
         positions(&b.batch, &b.marched, &mut b.positions);
         let d = m.corrections.is_some().then_some(&mut b.d_positions);
         let loss =
-            train_field(&mut m.field, &m.config.loss, distortion, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
+            train_field(&mut m.field, &terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
         (coarse_loss + loss, (b.fine.t.len() + b.marched.t.len()) as u64)
     }
 
@@ -630,8 +638,7 @@ fn positions(batch: &RayBatch, marched: &Marched, out: &mut Vec<f32>) {
 #[allow(clippy::too_many_arguments)]
 fn train_field(
     field: &mut Field,
-    terms: &LossConfig,
-    distortion: f32,
+    terms: &Terms,
     batch: &RayBatch,
     marched: &Marched,
     positions: &[f32],
@@ -640,9 +647,8 @@ fn train_field(
     d_positions: Option<&mut Vec<f32>>,
 ) -> f64 {
     let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
-    let color = if terms.color == "huber" { ColorLoss::Huber(0.1) } else { ColorLoss::Mse };
     let (mut starts, mut lengths) = (Vec::new(), Vec::new());
-    let spread = if distortion > 0.0 && field.is_unbounded() {
+    let spread = if terms.distortion > 0.0 && field.is_unbounded() {
         distortion::cpu::normalize(&samples, &mut starts, &mut lengths);
         Packed { offsets: &marched.offsets, t: &starts, dt: &lengths }
     } else {
@@ -650,8 +656,8 @@ fn train_field(
     };
     // Linear light has a color head of its own.
     let relative = if field.net.rgb.activation == Activation::TruncatedExp { losses::RELATIVE } else { 0.0 };
-    let loss = Photometric { batch, samples: spread, background, color, relative, distortion, alpha: terms.alpha };
-    let near_scaling = terms.near_scaling;
+    let Terms { color, distortion, depth, alpha, near_scaling } = *terms;
+    let loss = Photometric { batch, samples: spread, background, color, relative, distortion, alpha, depth, along: samples };
     let b = Batch { samples, positions, dirs: &batch.dirs, images: Some(&batch.images), background, near_scaling };
     field.train(&b, &loss, buffers, d_positions);
     buffers.out.loss
@@ -751,7 +757,7 @@ impl Trainee for Trainer<'_> {
             }
         };
         self.cameras = self.model.cameras();
-        self.device.upload(&self.model, &self.photographs)?;
+        self.device.upload(&self.model, &self.photographs, &self.observations)?;
         Ok(Some((self.model.origin.step, why)))
     }
 

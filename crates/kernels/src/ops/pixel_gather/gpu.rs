@@ -69,6 +69,10 @@ const NUMBERS: u32 = 16;
 const PHOTOGRAPH: usize = 5;
 /// Rays of each 1024 that are drawn uniformly whatever the error map says.
 const UNIFORM: u32 = 512;
+/// One ray of so many goes through a pixel of known distance, where there are any.
+pub const OBSERVED_EVERY: u32 = 8;
+/// Numbers that describe such a pixel: image, x, y, and the bits of the distance.
+const OBSERVATION: usize = 4;
 /// Cells per side of the error map of one image.
 pub const CELLS: usize = 16;
 
@@ -83,6 +87,8 @@ pub struct GpuPhotographs {
     format: PixelFormat,
     /// One bit per pixel that may be trained on; none: all may.
     mask: Option<Buffer>,
+    /// [`OBSERVATION`] numbers of each pixel of known distance.
+    observations: Option<Buffer>,
 }
 
 /// Drawn pixels.
@@ -97,6 +103,8 @@ pub struct Drawn {
     pub jitter: Buffer,
     /// 1 where masks refused every draw, `[R]`.
     pub left_out: Buffer,
+    /// Distance of the surface along the ray, 0 where it is not known, `[R]`.
+    pub distance: Buffer,
     /// `[R, 3]`
     pub background: Buffer,
 }
@@ -133,7 +141,13 @@ impl GpuPhotographs {
         }
         assert_eq!(first as usize * words_per_pixel(format), pixels.len(), "photographs: pixels");
         let mask = mask.map(|m| gpu.upload_u32(m));
-        GpuPhotographs { count: sizes.len(), stride, sizes: gpu.upload_u32(&rows), pixels: gpu.upload_u32(pixels), format, mask }
+        GpuPhotographs { count: sizes.len(), stride, sizes: gpu.upload_u32(&rows), pixels: gpu.upload_u32(pixels), format, mask, observations: None }
+    }
+
+    /// Draws some rays through pixels of known distance: image, x, y and distance of each.
+    pub fn observe(&mut self, gpu: &Gpu, observations: &[(u32, u32, u32, f32)]) {
+        let words: Vec<u32> = observations.iter().flat_map(|(image, x, y, d)| [*image, *x, *y, d.to_bits()]).collect();
+        self.observations = (!words.is_empty()).then(|| gpu.upload_u32(&words));
     }
 
     /// `n` random training pixels, half of them where `errors` are high; `first` counts those drawn before.
@@ -144,6 +158,7 @@ impl GpuPhotographs {
             target: gpu.empty(n * 4),
             jitter: gpu.empty(n),
             left_out: gpu.empty(n),
+            distance: gpu.empty(n),
             background: gpu.empty(n * 3),
         };
         let ((key_high, key_low), (high, low)) = (key(rng), halves(first.wrapping_mul(NUMBERS as u64)));
@@ -154,6 +169,7 @@ impl GpuPhotographs {
         let (third_high, third_low) = halves(first.wrapping_mul(3));
         // Bound where there is no mask to read.
         let mask = self.mask.as_ref().unwrap_or(&self.sizes);
+        let observations = self.observations.as_ref().unwrap_or(&self.sizes);
         let none = gpu.empty(1);
         let cdf = errors.map_or(&none, |e| e.cdf());
         if n > 0 {
@@ -167,13 +183,16 @@ impl GpuPhotographs {
                     self.pixels.arg(),
                     mask.arg(),
                     cdf.arg(),
+                    observations.arg(),
                     d.images.arg(),
                     d.pixels.arg(),
                     d.target.arg(),
                     d.jitter.arg(),
                     d.left_out.arg(),
+                    d.distance.arg(),
                     n as u32,
                     self.count as u32,
+                    (observations.len() / OBSERVATION) as u32,
                     key_high,
                     key_low,
                     high,
@@ -181,6 +200,7 @@ impl GpuPhotographs {
                     self.stride,
                     self.mask.is_some(),
                     errors.is_some(),
+                    self.observations.is_some(),
                     code(self.format),
                 );
                 back::launch_unchecked(
@@ -211,13 +231,16 @@ fn choose(
     pixels: &[u32],
     mask: &[u32],
     cdf: &[f32],
+    observations: &[u32],
     images: &mut [u32],
     centres: &mut [f32],
     target: &mut [f32],
     jitter: &mut [f32],
     left_out: &mut [u32],
+    distance: &mut [f32],
     n: u32,
     count: u32,
+    observed: u32,
     key_high: u32,
     key_low: u32,
     high: u32,
@@ -225,6 +248,7 @@ fn choose(
     stride: u32,
     #[comptime] is_masked: bool,
     #[comptime] by_error: bool,
+    #[comptime] is_observed: bool,
     #[comptime] format: u32,
 ) {
     let r = ABSOLUTE_POS;
@@ -240,6 +264,7 @@ fn choose(
     let mut x = 0u32;
     let mut y = 0u32;
     let mut at = 0u32;
+    let mut surface = 0.0f32;
     while refused == 1 && attempt < ATTEMPTS {
         let draw = sum(&base, &widened(1 + attempt * 3));
         let mut u = uniform(&key, &sum(&draw, &widened(1u32)));
@@ -268,11 +293,28 @@ fn choose(
         } else {
             image = below(&key, &draw, count);
         }
+        let mut seen = 0usize;
+        let mut is_seen = false;
+        if comptime!(is_observed) {
+            is_seen = attempt == 0 && r as u32 % OBSERVED_EVERY == 0;
+            if is_seen {
+                seen = below(&key, &draw, observed) as usize * OBSERVATION;
+                image = observations[seen];
+            }
+        }
         let own = image as usize * PHOTOGRAPH;
         let w = sizes[own];
         let h = sizes[own + 1];
         x = min(u32::cast_from(u * f32::cast_from(w)), w - 1);
         y = min(u32::cast_from(v * f32::cast_from(h)), h - 1);
+        surface = 0.0f32;
+        if comptime!(is_observed) {
+            if is_seen {
+                x = observations[seen + 1];
+                y = observations[seen + 2];
+                surface = f32::reinterpret(observations[seen + 3]);
+            }
+        }
         at = sizes[own + 2] + y / stride * w.div_ceil(stride) + x / stride;
         if stride > 1 {
             // The pixel that was kept of its square.
@@ -292,6 +334,7 @@ fn choose(
     centres[r * 2] = f32::cast_from(x) + 0.5;
     centres[r * 2 + 1] = f32::cast_from(y) + 0.5;
     left_out[r] = refused;
+    distance[r] = surface;
     target[r * 4] = channel(pixels, at as usize, 0usize, format);
     target[r * 4 + 1] = channel(pixels, at as usize, 1usize, format);
     target[r * 4 + 2] = channel(pixels, at as usize, 2usize, format);

@@ -11,12 +11,11 @@ use crate::error::{PipelineError, Result};
 use diorama_data::masks::MaskOptions;
 use diorama_data::split::{self, SplitRule};
 use diorama_data::video::{self, Choice};
-use diorama_data::{DataError, atomic, colmap, import, lock, mesh_text, photo, photo_import, transforms_json};
+use diorama_data::{DataError, atomic, colmap, import, lock, photo, photo_import, sparse_ply, transforms_json};
 use diorama_geom::capture::{Frame, MaskRule, Split};
-use diorama_geom::glam::DVec3;
-use diorama_geom::{Capture, Mesh, SceneBox};
+use diorama_geom::{Capture, SceneBox, SparsePoint};
 use serde::Serialize;
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -121,8 +120,8 @@ struct Posed {
     /// From the frames' world to the one in which they are finished: upright, the origin in the middle, cameras [`world::DISTANCE`] away.
     finishing_from_world: diorama_geom::Similarity,
     found: finish::Found,
-    /// In the frames' world.
-    points: Vec<(DVec3, [u8; 3])>,
+    /// In the frames' world; seen by frames as they are numbered here.
+    points: Vec<SparsePoint>,
     images: usize,
     lost: Vec<String>,
     broken: Vec<String>,
@@ -183,7 +182,8 @@ fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut d
     enough(o, &names, &lost)?;
     note("turning the world upright");
     let points = colmap::points(&model)?;
-    let mut frames = colmap::read(&o.out)?.frames;
+    let read = colmap::read(&o.out)?;
+    let mut frames = read.frames;
     let placed = world::place(&mut frames, &points);
     let observed = if o.finish.touches_pixels() { colmap::observations(&model)? } else { Vec::new() };
     let found = finish::Found {
@@ -197,7 +197,7 @@ fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut d
         masks: MaskRule::default(),
         finishing_from_world: diorama_geom::Similarity::IDENTITY,
         found,
-        points: placed.points,
+        points: read.points.into_iter().zip(placed.points).map(|(p, (position, _))| SparsePoint { position, ..p }).collect(),
         images: names.len(),
         lost,
         broken,
@@ -211,6 +211,7 @@ fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut d
 fn complete(mut p: Posed, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Prepared>> {
     let registered = p.frames.len();
     let to_world = p.finishing_from_world.inverse();
+    let before: Vec<String> = p.frames.iter().map(|f| f.name.clone()).collect();
     p.frames.iter_mut().for_each(|f| f.world_from_camera = p.finishing_from_world.pose(&f.world_from_camera));
     let made = finish::finish(&o.finish, &o.out, &p.found, &mut p.frames, interrupt, note).inspect_err(|_| finish::discard(&o.out))?;
     let Some(finished) = made else {
@@ -226,14 +227,12 @@ fn complete(mut p: Posed, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut
     }
     let capture = Capture { masks: p.masks, ..Capture::new(p.frames, p.scene) };
     finish::put_in_place(&o.out)?;
-    let cloud = Mesh {
-        positions: p.points.iter().map(|p| p.0.as_vec3().to_array()).collect(),
-        colors_srgb: p.points.iter().map(|p| p.1.map(|v| v as f32 / 255.0)).collect(),
-        ..Mesh::default()
-    };
     let has_points = !p.points.is_empty();
     if has_points {
-        mesh_text::save_ply(&o.out.join(POINTS), &cloud)?;
+        // Photographs may have been left out since the points were found.
+        let now: HashMap<&str, u32> = capture.frames.iter().enumerate().map(|(i, f)| (&f.name[..], i as u32)).collect();
+        p.points.iter_mut().for_each(|p| p.frames = p.frames.iter().filter_map(|f| now.get(&before[*f as usize][..]).copied()).collect());
+        sparse_ply::write(&o.out.join(POINTS), &p.points, &capture.frames, &o.out)?;
     }
     transforms_json::write(&o.out.join("transforms.json"), &o.out, &capture, has_points.then_some(POINTS))?;
     let sheet = o.out.join("sheet.png");

@@ -8,7 +8,7 @@ use diorama_data::split::{self, SplitRule};
 use diorama_data::{DataError, atomic, photo, photo_check, photo_import};
 use diorama_geom::capture::{Frame, focus_point};
 use diorama_geom::glam::DVec3;
-use diorama_geom::{Capture, ImageU8, Lens, Pose, Similarity};
+use diorama_geom::{Capture, ImageU8, Lens, Pose, Similarity, SparsePoint};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -92,7 +92,7 @@ pub fn take(capture: Capture, o: &PrepareOptions, interrupt: &AtomicBool, note: 
         masks: diorama_geom::capture::MaskRule { inverted: false, ..capture.masks },
         finishing_from_world,
         found,
-        points: capture.points.iter().map(|p| (p.position, p.color)).collect(),
+        points: seen_by(&capture.points, &chosen),
         frames,
         lost: Vec::new(),
         broken: capture.broken,
@@ -145,6 +145,12 @@ fn copy(
         note(&format!("photographs: {} of {}", i + 1, frames.len()));
     }
     Ok(true)
+}
+
+/// The points, with the frames that were chosen among those that see them, by their new numbers.
+fn seen_by(points: &[SparsePoint], chosen: &[usize]) -> Vec<SparsePoint> {
+    let place: HashMap<u32, u32> = chosen.iter().enumerate().map(|(k, i)| (*i as u32, k as u32)).collect();
+    points.iter().map(|p| SparsePoint { frames: p.frames.iter().filter_map(|f| place.get(f).copied()).collect(), ..p.clone() }).collect()
 }
 
 /// The capture's points as those that finish photographs need them; `chosen` are the numbers that `frames` had in the capture.

@@ -4,7 +4,7 @@ use crate::error::Result;
 use diorama_data::photo;
 use diorama_geom::capture::Split;
 use diorama_geom::glam::{DVec2, DVec3};
-use diorama_geom::{Capture, ImageU8};
+use diorama_geom::{Capture, ImageU8, SparsePoint};
 use rayon::prelude::*;
 use std::path::Path;
 
@@ -18,7 +18,7 @@ const TRAIN: [u8; 3] = [40, 90, 200];
 const HELD_OUT: [u8; 3] = [220, 60, 40];
 
 /// Draws the sheet.
-pub fn draw(path: &Path, capture: &Capture, points: &[(DVec3, [u8; 3])]) -> Result<()> {
+pub fn draw(path: &Path, capture: &Capture, points: &[SparsePoint]) -> Result<()> {
     let n = capture.frames.len();
     let shown: Vec<usize> = (0..n.min(SHOWN)).map(|i| i * n / n.min(SHOWN)).collect();
     let thumbs: Vec<ImageU8> = shown.par_iter().map(|i| Ok(photo::load_small(&capture.frames[*i].image, THUMB)?)).collect::<Result<_>>()?;
@@ -43,14 +43,14 @@ pub fn draw(path: &Path, capture: &Capture, points: &[(DVec3, [u8; 3])]) -> Resu
 }
 
 /// Points and frusta seen along one axis, in a square whose left edge is `x0`.
-fn plan(sheet: &mut ImageU8, x0: usize, capture: &Capture, points: &[(DVec3, [u8; 3])], flat: impl Fn(DVec3) -> DVec2) {
+fn plan(sheet: &mut ImageU8, x0: usize, capture: &Capture, points: &[SparsePoint], flat: impl Fn(DVec3) -> DVec2) {
     let reach = capture.frames.iter().map(|f| flat(f.world_from_camera.translation).abs().max_element()).fold(1e-6, f64::max) * 1.25;
     let place = |p: DVec3| (flat(p) / reach + 1.0) * 0.5 * (PLAN - 1) as f64;
     let inside = |q: DVec2| q.min_element() >= 0.0 && q.max_element() < PLAN as f64;
-    for (p, rgb) in points {
-        let q = place(*p);
+    for p in points {
+        let q = place(p.position);
         if inside(q) {
-            dot(sheet, x0 as f64 + q.x, q.y, *rgb);
+            dot(sheet, x0 as f64 + q.x, q.y, p.color);
         }
     }
     for f in &capture.frames {

@@ -1,8 +1,8 @@
-//! The photometric loss of a batch of rays: colour, opacity and distortion, each a mean over the rays.
+//! The loss of a batch of rays: colour, opacity, distortion and depth, each a mean over the rays.
 
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use crate::ops::composite::gpu::{GpuComposited, GpuGradients, GpuPacked};
-use crate::ops::distortion;
+use crate::ops::{depth_loss, distortion};
 use cubecl::prelude::*;
 
 /// Sums that [`loss`] adds to: loss, mean squared error, trained samples, marched samples, steps.
@@ -24,6 +24,8 @@ pub struct Terms {
     pub normalized: bool,
     /// Weight of the squared difference between opacity and the photograph's alpha.
     pub alpha: f32,
+    /// Weight of the light that ends away from surfaces of known distance ([`depth_loss`]).
+    pub depth: f32,
 }
 
 /// Where a step's figures are added.
@@ -46,6 +48,8 @@ pub struct Target<'a> {
     pub background: &'a Buffer,
     /// Rays that do not count: not 0, `[R]`.
     pub left_out: &'a Buffer,
+    /// Distance of the surface along the ray, 0 where it is not known, `[R]`; not read without [`Terms::depth`].
+    pub distance: &'a Buffer,
 }
 
 /// Composites packed samples with densities `[S]` and colours `[S, 3]`, compares them, and takes the gradients back to
@@ -82,6 +86,7 @@ pub fn composite_and_loss(
             target.rgba.arg(),
             target.background.arg(),
             target.left_out.arg(),
+            target.distance.arg(),
             g.sigma.arg(),
             g.features.arg(),
             g.background.arg(),
@@ -94,7 +99,9 @@ pub fn composite_and_loss(
             terms.alpha,
             terms.distortion,
             near_scaling,
+            terms.depth,
             terms.normalized,
+            terms.depth > 0.0,
         );
     }
     // The values hold the distortion already.
@@ -137,6 +144,10 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
     } else {
         distortion::gpu::both(gpu, p, &out.weights, &d_spread)
     };
+    if terms.depth > 0.0 {
+        let scale = 1.0 / r.max(1) as f32;
+        depth_loss::gpu::add(gpu, p, &out.weights, target.distance, target.left_out, terms.depth, scale, &values, &weights);
+    }
     add_up(gpu, p, target.left_out, &values, &errors, &spread, terms.distortion, figures);
     (GpuComposited { weights, ..d }, errors)
 }
@@ -249,6 +260,7 @@ fn middle(t: f32, dt: f32, first: f32, #[comptime] normalized: bool) -> f32 {
     (t - first) / share + 0.5 * length(t, dt, normalized)
 }
 
+#[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
 fn blend_and_compare(
     offsets: &[u32],
@@ -259,6 +271,7 @@ fn blend_and_compare(
     rgba: &[f32],
     background: &[f32],
     left_out: &[u32],
+    surface: &[f32],
     d_sigma: &mut [f32],
     d_rgb: &mut [f32],
     d_background: &mut [f32],
@@ -271,7 +284,9 @@ fn blend_and_compare(
     alpha: f32,
     distortion: f32,
     near: f32,
+    depth: f32,
     #[comptime] normalized: bool,
+    #[comptime] by_depth: bool,
 ) {
     let r = ABSOLUTE_POS;
     if r >= rays as usize {
@@ -346,6 +361,13 @@ fn blend_and_compare(
             kept = share * share;
         }
         let mut g = counts * distortion * (2.0 * pairs + w * length * 2.0 / 3.0);
+        if comptime!(by_depth) {
+            if surface[r] > 0.0 {
+                let away = depth * depth_loss::gpu::away(t[i] + 0.5 * dt[i], surface[r]);
+                value += away * w;
+                g += counts * away;
+            }
+        }
         #[unroll]
         for k in 0..3usize {
             g += d_color[k] * rgb[i * 3 + k];

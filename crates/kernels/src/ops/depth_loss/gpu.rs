@@ -1,0 +1,77 @@
+//! One unit per ray.
+
+use super::{EXACT, MOST};
+use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::ops::composite::gpu::GpuPacked;
+use cubecl::prelude::*;
+
+/// What light counts that ends at distance `middle`.
+#[cube]
+pub fn away(middle: f32, surface: f32) -> f32 {
+    clamp((middle / surface - 1.0).abs() - EXACT, 0.0, MOST)
+}
+
+/// Adds `depth` times the loss of each ray that counts and whose surface is known (`surface` not 0, `[R]`) to `values` `[R]`,
+/// and `depth · scale` times its gradient to that of the weights `[S]`.
+#[allow(clippy::too_many_arguments)]
+pub fn add(
+    gpu: &Gpu,
+    p: &GpuPacked,
+    weights: &Buffer,
+    surface: &Buffer,
+    left_out: &Buffer,
+    depth: f32,
+    scale: f32,
+    values: &Buffer,
+    d_weights: &Buffer,
+) {
+    let r = p.rays();
+    if r > 0 {
+        // SAFETY: units past the rays stop; offsets bound the samples.
+        unsafe {
+            judge::launch_unchecked(
+                &gpu.client,
+                units(r),
+                CubeDim::new_1d(CUBE),
+                p.offsets.arg(),
+                p.t.arg(),
+                p.dt.arg(),
+                weights.arg(),
+                surface.arg(),
+                left_out.arg(),
+                values.arg(),
+                d_weights.arg(),
+                r as u32,
+                depth,
+                scale,
+            );
+        }
+    }
+}
+
+#[cube(launch_unchecked)]
+fn judge(
+    offsets: &[u32],
+    t: &[f32],
+    dt: &[f32],
+    weights: &[f32],
+    surface: &[f32],
+    left_out: &[u32],
+    values: &mut [f32],
+    d_weights: &mut [f32],
+    rays: u32,
+    depth: f32,
+    scale: f32,
+) {
+    let r = ABSOLUTE_POS;
+    if r >= rays as usize || left_out[r] != 0 || surface[r] <= 0.0 {
+        terminate!();
+    }
+    let mut sum = 0.0f32;
+    for i in offsets[r] as usize..offsets[r + 1] as usize {
+        let away = depth * away(t[i] + 0.5 * dt[i], surface[r]);
+        sum += away * weights[i];
+        d_weights[i] += scale * away;
+    }
+    values[r] += sum;
+}

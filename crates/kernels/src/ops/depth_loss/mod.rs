@@ -1,0 +1,58 @@
+//! Light that ends away from a surface of known distance, such as a sparse point that the ray's photograph shows (after
+//! Deng et al. 2022, DS-NeRF): of a ray `Σ_i w_i · min(max(|m_i / d − 1| − 0.02, 0), 0.5)`, with the weights `w`, the middles
+//! `m` of the samples and the surface's distance `d`.
+//!
+//! The weights are judged, not their mean distance, so that fog before a surface counts as much as matter behind it.
+
+#[cfg(feature = "gpu")]
+pub mod gpu;
+
+/// Share of the distance within which light may end: sparse points are not exact.
+pub const EXACT: f32 = 0.02;
+
+/// What counts at most: a wrong point must not outweigh the photographs.
+pub const MOST: f32 = 0.5;
+
+/// What light counts that ends at distance `middle` from the camera on a ray whose surface is at `surface`.
+#[inline(always)]
+pub fn away(middle: f32, surface: f32) -> f32 {
+    ((middle / surface - 1.0).abs() - EXACT).clamp(0.0, MOST)
+}
+
+/// Loss of a ray with samples from `t` on of lengths `dt` and weights `w`; adds `scale · ∂loss/∂w` to `g`.
+pub fn ray(t: &[f32], dt: &[f32], w: &[f32], surface: f32, scale: f32, g: &mut [f32]) -> f32 {
+    let mut loss = 0.0;
+    for i in 0..w.len() {
+        let away = away(t[i] + 0.5 * dt[i], surface);
+        loss += away * w[i];
+        g[i] += scale * away;
+    }
+    loss
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn light_counts_before_and_behind_the_surface_and_not_at_it() {
+        let cases = [(2.0, 0.0), (2.03, 0.0), (2.2, 0.08), (1.8, 0.08), (0.2, 0.5), (90.0, 0.5)];
+        for (middle, expected) in cases {
+            assert!((away(middle, 2.0) - expected).abs() < 1e-6, "{middle}: {}", away(middle, 2.0));
+        }
+    }
+
+    #[test]
+    fn the_gradient_is_the_slope_of_the_loss() {
+        let (t, dt, w) = ([0.5, 1.9, 3.0], [0.1, 0.2, 0.4], [0.2f32, 0.5, 0.1]);
+        let mut g = [1.0; 3];
+        let loss = ray(&t, &dt, &w, 2.0, 3.0, &mut g);
+        for i in 0..3 {
+            let mut more = w;
+            more[i] += 0.25;
+            let slope = (ray(&t, &dt, &more, 2.0, 3.0, &mut [0.0; 3]) - loss) / 0.25;
+            assert!((g[i] - 1.0 - 3.0 * slope).abs() < 1e-5, "{i}: {} {slope}", g[i]);
+        }
+        assert!((loss - (0.2 * MOST + 0.1 * MOST)).abs() < 1e-6, "{loss}");
+    }
+}
