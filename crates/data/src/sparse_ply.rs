@@ -63,7 +63,10 @@ pub fn observe(path: &Path, data: &[u8], frames: &[Frame], points: &mut [SparseP
     for pair in data[vertices..end].chunks_exact(OBSERVATION_BYTES) {
         let (point, name) = (number(pair) as usize, number(&pair[4..]) as usize);
         let (Some(p), Some(frame)) = (points.get_mut(point), frame_of.get(name)) else {
-            return Err(DataError::input(path, format!("point {point} is seen by image {name}, one of which is not there; run prepare again")));
+            return Err(DataError::input(
+                path,
+                format!("point {point} is seen by image {name}, one of which is not there; run prepare again"),
+            ));
         };
         p.frames.extend(frame);
     }

@@ -3,8 +3,8 @@
 use crate::samplers::RayBatch;
 use diorama_geom::color::srgb_from_linear;
 use diorama_kernels::ops::composite::Packed;
-use diorama_kernels::ops::{depth_loss, distortion};
 use diorama_kernels::ops::ngp_field::{RayGradient, RayLoss, RayOutput};
+use diorama_kernels::ops::{depth_loss, distortion};
 
 /// How a colour difference counts.
 #[derive(Clone, Copy, Debug, PartialEq)]

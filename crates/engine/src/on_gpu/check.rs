@@ -112,13 +112,9 @@ fn draws(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     let seen: Vec<Observation> = (0..30)
         .map(|i| Observation { image: i % 2, x: i * 3 % [8, 33][i as usize % 2], y: i % [4, 7][i as usize % 2], distance: 0.5 + i as f32 })
         .collect();
-    for (stride, map, format, observed) in [
-        (1, None, Unorm8, 0),
-        (3, None, Unorm8, 30),
-        (1, Some(&errors), Unorm8, 30),
-        (3, None, Unorm16, 0),
-        (1, None, Half, 1),
-    ] {
+    for (stride, map, format, observed) in
+        [(1, None, Unorm8, 0), (3, None, Unorm8, 30), (1, Some(&errors), Unorm8, 30), (3, None, Unorm16, 0), (1, None, Half, 1)]
+    {
         let observations = &seen[..observed];
         let two = Two { stride, format };
         let (sizes, kept) = ([two.size(0), two.size(1)], two.kept());
@@ -440,7 +436,17 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         {
             let (distortion, alpha) = (0.3, 0.2);
             let spread = if normalized { in_distance } else { p };
-            let photometric = Photometric { batch: &batch, samples: spread, background: &background, color, relative, distortion, alpha, depth, along: p };
+            let photometric = Photometric {
+                batch: &batch,
+                samples: spread,
+                background: &background,
+                color,
+                relative,
+                distortion,
+                alpha,
+                depth,
+                along: p,
+            };
             let (mut value, mut error, mut counted) = (0.0f64, 0.0f64, 0usize);
             let mut of_rays = vec![0.0f64; rays];
             let (mut d_color, mut d_opacity, mut d_weights) = (vec![0.0; rays * 3], vec![0.0; rays], vec![0.0; s]);
@@ -474,7 +480,8 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let distance = up(&batch.distance);
             let target = Target { rgba: &rgba, background: &background, left_out: &left_out, distance: &distance };
             let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
-            let (d, errors) = loss::loss(gpu, Terms { huber, relative, distortion, normalized, alpha, depth }, &on_gpu, &results, target, figures);
+            let (d, errors) =
+                loss::loss(gpu, Terms { huber, relative, distortion, normalized, alpha, depth }, &on_gpu, &results, target, figures);
             let shape = format!("R={rays} S={s} {color:?} relative {relative} normalized={normalized} depth={depth}");
             table.close("loss", "errors", &shape, &errors, &of_rays)?;
             table.close("loss", "d color", &shape, &d.color, &wide(&d_color))?;

@@ -111,7 +111,7 @@ pub fn draw(source: &dyn PixelSource, o: &DrawOptions, batch: &mut RayBatch) {
         *jitter = o.rng.uniform(base);
         for attempt in 0..5u64 {
             let at = base + 1 + attempt * 3;
-            let seen = !o.observations.is_empty() && i % OBSERVED_EVERY == 0 && attempt == 0;
+            let seen = !o.observations.is_empty() && i.is_multiple_of(OBSERVED_EVERY) && attempt == 0;
             let seen = seen.then(|| o.observations[o.rng.below(at, o.observations.len() as u64) as usize]);
             *distance = seen.map_or(0.0, |s| s.distance);
             let (img, u, v) = match o.error_map {
@@ -178,7 +178,8 @@ mod tests {
             PosedCamera { camera: Camera::pinhole(8, 4, 1.0), pose: Pose::look_at(DVec3::new(2.0, 0.5, 0.5), DVec3::splat(0.5), DVec3::Z) };
         let mut batch = RayBatch::default();
         batch.resize(4096);
-        let o = DrawOptions { cameras: &[camera, camera], first: 0, rng: Rng::new(1, 1), near: 0.1, cube: (0.0, 1.0), error_map, observations };
+        let o =
+            DrawOptions { cameras: &[camera, camera], first: 0, rng: Rng::new(1, 1), near: 0.1, cube: (0.0, 1.0), error_map, observations };
         draw(&Half, &o, &mut batch);
         batch
     }
@@ -194,7 +195,10 @@ mod tests {
                 continue;
             };
             assert!(r % OBSERVED_EVERY == 0, "ray {r}");
-            assert_eq!((b.images[r], b.pixels[2 * r], b.pixels[2 * r + 1]), (seen[k].image, seen[k].x as f32 + 0.5, seen[k].y as f32 + 0.5));
+            assert_eq!(
+                (b.images[r], b.pixels[2 * r], b.pixels[2 * r + 1]),
+                (seen[k].image, seen[k].x as f32 + 0.5, seen[k].y as f32 + 0.5)
+            );
             of[k] += 1;
         }
         assert!(of[0] > 120 && of[1] > 120 && of[2] == 0, "{of:?} of 512; the third is masked");

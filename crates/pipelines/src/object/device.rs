@@ -317,8 +317,8 @@ mod running {
     use crate::object::recipe::Photographs;
     use diorama_data::pixel_store::PixelStore;
     use diorama_engine::losses::{ColorLoss, RELATIVE};
-    use diorama_engine::samplers::pixels::Observation;
     use diorama_engine::on_gpu::{GpuStep, GpuTrainer, Placing, Trainees, TraineesMut};
+    use diorama_engine::samplers::pixels::Observation;
     use diorama_geom::rng::Rng;
     use diorama_kernels::gpu::{Gpu, GpuError};
     use diorama_kernels::ops::march::gpu::prune::Limits;

@@ -83,7 +83,11 @@ impl HeldOutPixels {
         batch.resize(if model.config.method == Method::Ngp { RAYS } else { SLOW_RAYS });
         let (near, cube) = (model.config.sampling.near, model.cube());
         let rng = Rng::new(model.config.seed, PIXELS);
-        pixels::draw(&photographs, &DrawOptions { cameras: &cameras, first: 0, rng, near, cube, error_map: None, observations: &[] }, &mut batch);
+        pixels::draw(
+            &photographs,
+            &DrawOptions { cameras: &cameras, first: 0, rng, near, cube, error_map: None, observations: &[] },
+            &mut batch,
+        );
         batch.jitter.fill(0.5);
         Ok(Some(HeldOutPixels { batch, frames }))
     }

@@ -557,8 +557,7 @@ impl<'a> Trainer<'a> {
         stratified::stratified(&b.batch, m.config.sampling.samples, Some((rng, first)), &mut b.marched);
         positions(&b.batch, &b.marched, &mut b.positions);
         let d = m.corrections.is_some().then_some(&mut b.d_positions);
-        let loss =
-            train_field(&mut m.field, &terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
+        let loss = train_field(&mut m.field, &terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
         (loss, b.marched.t.len() as u64)
     }
 
@@ -570,13 +569,11 @@ impl<'a> Trainer<'a> {
         stratified::stratified(&b.batch, n, Some((Rng::new(m.config.seed, COARSE), first)), &mut b.fine);
         positions(&b.batch, &b.fine, &mut b.positions);
         let coarse = m.coarse.as_mut().expect("nerf has a coarse field");
-        let coarse_loss =
-            train_field(coarse, &terms, &b.batch, &b.fine, &b.positions, &b.background, &mut b.field, None);
+        let coarse_loss = train_field(coarse, &terms, &b.batch, &b.fine, &b.positions, &b.background, &mut b.field, None);
         stratified::refine(&b.fine, &b.field.out.weights, n, more, Some((Rng::new(m.config.seed, FINE), first)), &mut b.marched);
         positions(&b.batch, &b.marched, &mut b.positions);
         let d = m.corrections.is_some().then_some(&mut b.d_positions);
-        let loss =
-            train_field(&mut m.field, &terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
+        let loss = train_field(&mut m.field, &terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
         (coarse_loss + loss, (b.fine.t.len() + b.marched.t.len()) as u64)
     }
 

@@ -141,7 +141,15 @@ impl GpuPhotographs {
         }
         assert_eq!(first as usize * words_per_pixel(format), pixels.len(), "photographs: pixels");
         let mask = mask.map(|m| gpu.upload_u32(m));
-        GpuPhotographs { count: sizes.len(), stride, sizes: gpu.upload_u32(&rows), pixels: gpu.upload_u32(pixels), format, mask, observations: None }
+        GpuPhotographs {
+            count: sizes.len(),
+            stride,
+            sizes: gpu.upload_u32(&rows),
+            pixels: gpu.upload_u32(pixels),
+            format,
+            mask,
+            observations: None,
+        }
     }
 
     /// Draws some rays through pixels of known distance: image, x, y and distance of each.
@@ -296,7 +304,7 @@ fn choose(
         let mut seen = 0usize;
         let mut is_seen = false;
         if comptime!(is_observed) {
-            is_seen = attempt == 0 && r as u32 % OBSERVED_EVERY == 0;
+            is_seen = attempt == 0 && r as u32 % OBSERVED_EVERY < 1;
             if is_seen {
                 seen = below(&key, &draw, observed) as usize * OBSERVATION;
                 image = observations[seen];
