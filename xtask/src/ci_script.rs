@@ -15,7 +15,7 @@ fn faults(script: &str) -> Vec<String> {
     let Some(tests) = lines.iter().position(|l| *l == "cargo xtask ci") else { return vec!["it runs no tests".into()] };
     let (before, after) = lines.split_at(tests);
     let mut out = Vec::new();
-    if !lines.iter().any(|l| l.starts_with("set -") && l.contains('e') && l.contains("pipefail")) {
+    if !lines.iter().any(|l| l.starts_with("set -e") && l.contains("pipefail")) {
         out.push("it goes on after a failure".into());
     }
     let words = |start: &str| -> Vec<&str> { before.iter().filter(|l| l.starts_with(start)).flat_map(|l| l.split_whitespace()).collect() };

@@ -42,7 +42,7 @@ impl Sparse {
         let mut out = Sparse { index: HashMap::new(), points: Vec::new(), samples: Vec::new(), observations: 0, absent: 0, images: 0 };
         colmap::each_point(model, &mut |p, _| {
             out.index.insert(p.id, out.points.len() as u32);
-            out.points.push(SparsePoint { position: p.position, color: p.rgb, error: p.error as f32, frames: Vec::new() });
+            out.points.push(SparsePoint { position: p.position, color: p.rgb, error: p.error.max(0.0) as f32, frames: Vec::new() });
         })?;
         Ok(out)
     }

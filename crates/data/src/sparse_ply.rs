@@ -5,6 +5,7 @@ use crate::atomic;
 use crate::error::{DataError, Result};
 use diorama_geom::SparsePoint;
 use diorama_geom::capture::Frame;
+use std::collections::HashMap;
 use std::io::Write;
 use std::path::Path;
 
@@ -44,22 +45,26 @@ pub fn write(path: &Path, points: &[SparsePoint], frames: &[Frame], root: &Path)
 }
 
 /// Adds errors and frames to points that were read from the file's vertices, in their order; files that [`write`] did not write
-/// say nothing of them. Images that are not among `frames` are left out.
+/// say nothing of them. Images, relative to `root`, that are not among `frames` are left out.
 ///
 /// # Errors
 /// When the file ends early, or a pair names a point or an image that is not there.
-pub fn observe(path: &Path, data: &[u8], frames: &[Frame], points: &mut [SparsePoint]) -> Result<()> {
+pub fn observe(path: &Path, root: &Path, data: &[u8], frames: &[Frame], points: &mut [SparsePoint]) -> Result<()> {
     let Some((names, n, pairs, body)) = head(data) else { return Ok(()) };
-    let (vertices, end) = (body + n * POINT_BYTES, body + n * POINT_BYTES + pairs * OBSERVATION_BYTES);
-    if n != points.len() || data.len() < end {
-        return Err(DataError::input(path, format!("ends early: {n} points and {pairs} observations are {end} bytes; run prepare again")));
+    let end_of = |from: usize, n: usize, bytes: usize| n.checked_mul(bytes)?.checked_add(from).filter(|end| *end <= data.len());
+    let ends = end_of(body, n, POINT_BYTES).and_then(|v| Some((v, end_of(v, pairs, OBSERVATION_BYTES)?)));
+    let Some((vertices, end)) = ends else {
+        return Err(DataError::input(path, format!("ends early: it claims {n} points and {pairs} observations; run prepare again")));
+    };
+    if n != points.len() {
+        return Err(DataError::input(path, format!("{} of {n} points are finite; run prepare again", points.len())));
     }
     let number = |b: &[u8]| u32::from_le_bytes([b[0], b[1], b[2], b[3]]);
     for (p, row) in points.iter_mut().zip(data[body..vertices].chunks_exact(POINT_BYTES)) {
         p.error = f32::from_bits(number(&row[ERROR_AT..]));
     }
-    let frame_of: Vec<Option<u32>> =
-        names.iter().map(|name| frames.iter().position(|f| f.image.ends_with(name)).map(|i| i as u32)).collect();
+    let frame: HashMap<_, u32> = frames.iter().enumerate().map(|(i, f)| (f.image.clone(), i as u32)).collect();
+    let frame_of: Vec<Option<u32>> = names.iter().map(|name| frame.get(&root.join(name)).copied()).collect();
     for pair in data[vertices..end].chunks_exact(OBSERVATION_BYTES) {
         let (point, name) = (number(pair) as usize, number(&pair[4..]) as usize);
         let (Some(p), Some(frame)) = (points.get_mut(point), frame_of.get(name)) else {
@@ -82,6 +87,7 @@ fn head(data: &[u8]) -> Option<(Vec<&str>, usize, usize, usize)> {
     let mark = b"end_header\n";
     let body = data.windows(mark.len()).position(|w| w == mark)? + mark.len();
     let text = std::str::from_utf8(&data[..body]).ok()?;
+    text.starts_with("ply\nformat binary_little_endian 1.0\n").then_some(())?;
     let names = text.lines().filter_map(|l| l.strip_prefix(FRAME)).collect();
     let (_, elements) = text.split_once("element vertex ")?;
     let (points, rest) = elements.split_once('\n')?;
@@ -115,33 +121,44 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("points.ply");
         let all = frames(&["images/a.jpg", "images/b c.jpg", "images/c.jpg"]);
-        write(&file, &points(), &all, Path::new("/home/capture")).unwrap();
+        let root = Path::new("/home/capture");
+        write(&file, &points(), &all, root).unwrap();
         let cloud = crate::splat_ply::read(&file).unwrap();
         assert_eq!((cloud.len(), cloud.positions[2]), (3, [-1.0, 0.5, -2.0]));
         let data = std::fs::read(&file).unwrap();
         let bare = || points().into_iter().map(|p| SparsePoint { error: 0.0, frames: Vec::new(), ..p }).collect::<Vec<_>>();
         let mut read = bare();
-        observe(&file, &data, &all, &mut read).unwrap();
+        observe(&file, root, &data, &all, &mut read).unwrap();
         assert_eq!(read, points());
 
         // Frames in another order, one of them gone.
         let mut fewer = bare();
-        observe(&file, &data, &frames(&["images/c.jpg", "images/a.jpg"]), &mut fewer).unwrap();
+        observe(&file, root, &data, &frames(&["images/c.jpg", "images/a.jpg"]), &mut fewer).unwrap();
         assert_eq!(fewer.iter().map(|p| p.frames.clone()).collect::<Vec<_>>(), [vec![0, 1], vec![], vec![0]]);
 
-        let e = observe(&file, &data[..data.len() - 1], &all, &mut bare()).unwrap_err().to_string();
+        let e = observe(&file, root, &data[..data.len() - 1], &all, &mut bare()).unwrap_err().to_string();
         assert!(e.contains("points.ply") && e.contains("ends early"), "{e}");
         let mut wrong = data.clone();
         let last = wrong.len() - 4;
         wrong[last] = 9;
-        let e = observe(&file, &wrong, &all, &mut bare()).unwrap_err().to_string();
+        let e = observe(&file, root, &wrong, &all, &mut bare()).unwrap_err().to_string();
         assert!(e.contains("image 9"), "{e}");
+
+        // Counts beyond what a machine can add.
+        let text = String::from_utf8_lossy(&data[..400]).replace("observation 4", "observation 2305843009213693951");
+        let e = observe(&file, root, text.as_bytes(), &all, &mut bare()).unwrap_err().to_string();
+        assert!(e.contains("2305843009213693951 observations"), "{e}");
+        let e = observe(&file, root, &data, &all, &mut bare()[..2]).unwrap_err().to_string();
+        assert!(e.contains("2 of 3 points are finite"), "{e}");
     }
 
     #[test]
     fn files_of_others_say_nothing() {
-        let mut p = points();
-        observe(Path::new("a.ply"), b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n", &[], &mut p).unwrap();
-        assert_eq!(p, points());
+        let ours_as_text = format!("ply\nformat ascii 1.0\nelement vertex 3\n{POINT}element observation 1\n{OBSERVATION}end_header\n0 0\n");
+        for text in ["ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n", &ours_as_text] {
+            let mut p = points();
+            observe(Path::new("a.ply"), Path::new(""), text.as_bytes(), &[], &mut p).unwrap();
+            assert_eq!(p, points());
+        }
     }
 }

@@ -45,8 +45,10 @@ fn read_points(head: &Object, root: &Path, out: &mut Imported) -> Result<()> {
     if step > 1 {
         out.notes.push(format!("{name} holds {} points; one of {step} is kept", cloud.len()));
     }
-    let all = cloud.positions.iter().zip(&cloud.rgb_srgb).step_by(step);
-    let mut points: Vec<SparsePoint> = all
+    let mut points: Vec<SparsePoint> = cloud
+        .positions
+        .iter()
+        .zip(&cloud.rgb_srgb)
         .map(|(p, c)| SparsePoint {
             position: DVec3::from_array(p.map(f64::from)),
             color: c.map(diorama_geom::color::u8_from_unit),
@@ -54,10 +56,8 @@ fn read_points(head: &Object, root: &Path, out: &mut Imported) -> Result<()> {
             frames: Vec::new(),
         })
         .collect();
-    if step == 1 {
-        sparse_ply::observe(&file, &crate::error::read(&file, u64::MAX)?, &out.frames, &mut points)?;
-    }
-    points.retain(|p| p.position.is_finite());
+    sparse_ply::observe(&file, root, &crate::error::read(&file, u64::MAX)?, &out.frames, &mut points)?;
+    let points: Vec<SparsePoint> = points.into_iter().step_by(step).collect();
     out.points = points;
     Ok(())
 }

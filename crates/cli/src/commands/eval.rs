@@ -8,7 +8,7 @@ use diorama_geom::ImageU8;
 use diorama_geom::capture::Split;
 use diorama_pipelines::object::evaluate::{EvaluationProgress, ScoredView};
 use diorama_pipelines::object::seen_by::{SeenBy, Sights};
-use diorama_pipelines::object::{device, evaluate, kept_capture, run_folder};
+use diorama_pipelines::object::{device, evaluate, held_out, kept_capture, run_folder};
 use diorama_pipelines::{PipelineError, Result};
 use std::cell::RefCell;
 use std::path::Path;
@@ -32,6 +32,9 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
     let shown = RefCell::new(ShareShown::new());
+    if a.explain && held_out::frames(&model.capture, split).is_empty() {
+        return Err(PipelineError::Usage("the run holds no views out; train with --split every:8 or judge --on train".into()));
+    }
     let sights = a.explain.then(|| {
         let mut told = |done: usize, all: usize| {
             shown.borrow_mut().show(done as f64 / all as f64, &format!("training view {} of {all}: where its rays end", done + 1));
@@ -40,6 +43,7 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
     });
     shown.borrow().finish();
     shown.replace(ShareShown::new());
+    let asked = sights.as_ref().map_or(0, Sights::len);
     let file = |name: &str, what: &str| folder.join(format!("{}{what}.png", name.replace(['/', '\\'], "_")));
     let mut seen_by = Vec::new();
     let mut each = |name: &str, v: &ScoredView| -> Result<()> {
@@ -71,6 +75,7 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         object["advice"] = serde_json::json!(report.advice());
         if a.explain {
             object["seen_by"] = serde_json::json!(seen_by);
+            object["seen_by_of"] = serde_json::json!(asked);
         }
         println!("{object}");
     } else {
@@ -89,7 +94,7 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
             println!("behind fog: {}", fog.join(", "));
         }
         if !seen_by.is_empty() {
-            print_seen_by(&seen_by, &folder);
+            print_seen_by(&seen_by, asked, model.train.len(), &folder);
         }
         if model.is_linear() {
             println!("scored in {}: the photographs hold linear light", report.scored_in);
@@ -102,8 +107,9 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
 }
 
 /// Which share of each view's light comes from places that so many training views see, and who sees what few see.
-fn print_seen_by(views: &[SeenBy], folder: &Path) {
-    println!("training views that see what a view shows, in percent of its light (maps in {}):", folder.display());
+fn print_seen_by(views: &[SeenBy], asked: usize, all: usize, folder: &Path) {
+    let of = if asked < all { format!("of {asked} of the {all} training views, those") } else { "training views".into() };
+    println!("{of} that see what a view shows, in percent of its light (maps in {}):", folder.display());
     println!("{:>6}{:>6}{:>6}{:>6}{:>6}", "none", "1", "2", "3", "more");
     for v in views {
         let shares: String = v.shares.iter().map(|s| format!("{:>6.1}", 100.0 * s)).collect();

@@ -78,6 +78,11 @@ pub struct DataConfig {
     pub skip_broken: bool,
 }
 
+/// Of runs from before there was a choice.
+fn no_weight() -> Auto {
+    Auto::Is(0.0)
+}
+
 fn use_masks() -> String {
     "use".into()
 }
@@ -167,7 +172,7 @@ pub struct LossConfig {
     pub distortion: Auto,
     pub alpha: f32,
     /// Weight of the light that ends away from the sparse points which photographs show; `auto`: 0.3 in unbounded space, else none.
-    #[serde(default)]
+    #[serde(default = "no_weight")]
     pub depth: Auto,
     /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.
     pub near_scaling: f32,
@@ -303,7 +308,7 @@ impl Config {
             loss: LossConfig {
                 color: if ngp { "huber" } else { "mse" }.into(),
                 distortion: if ngp { Auto::Auto } else { Auto::Is(0.0) },
-                depth: Auto::Auto,
+                depth: if ngp { Auto::Auto } else { Auto::Is(0.0) },
                 alpha: 0.0,
                 near_scaling: if ngp { 1.0 } else { 0.0 },
             },

@@ -187,7 +187,7 @@ pub(crate) fn scores(view: &View, photo: &Image, counts: &Option<ImageU8>) -> Sc
 }
 
 /// Whether a pixel counts.
-fn admits(counts: &Option<ImageU8>) -> impl Fn(usize, usize) -> bool {
+pub(super) fn admits(counts: &Option<ImageU8>) -> impl Fn(usize, usize) -> bool + Sync {
     move |x, y| counts.as_ref().is_none_or(|m| m.pixel(x, y)[0] >= masks::COUNTS)
 }
 

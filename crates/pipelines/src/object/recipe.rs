@@ -155,8 +155,13 @@ pub fn train(
     let origin = model.origin;
     let checkpoints = folder.checkpoints();
     let mut trainer = Trainer { view, held_out, ..Trainer::new(model, Photographs(store), &checkpoints, opened)? };
-    if let n @ 1.. = trainer.observations.len() {
-        events(&Event::Note(format!("sparse points tell the distance of {n} pixels (--set loss.depth=0: do not use them)")));
+    match trainer.observations.len() {
+        0 if trainer.model.depth() == 0.0 || trainer.model.capture.points.is_empty() => {}
+        0 => events(&Event::Note(
+            "the sparse points tell no distances: nobody says which photographs see them (diorama prepare does), or fewer than three do"
+                .into(),
+        )),
+        n => events(&Event::Note(format!("sparse points tell the distance of {n} pixels (--set loss.depth=0: do not use them)"))),
     }
     let (mut log_error, mut judged) = (None, HeldOut::default());
     let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
@@ -393,7 +398,9 @@ impl<'a> Trainer<'a> {
         let o = &model.config.optim;
         let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
         let cameras = model.cameras();
-        let observations = if model.depth() > 0.0 { observations::of(&model) } else { Vec::new() };
+        let mut observations = if model.depth() > 0.0 { observations::of(&model) } else { Vec::new() };
+        // Where memory holds a share of the pixels, another one would be drawn in place of the point's.
+        observations.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y));
         device.upload(&model, &photographs, &observations)?;
         Ok(Trainer {
             cameras,

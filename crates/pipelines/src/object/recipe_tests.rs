@@ -105,7 +105,9 @@ fn observations_are_the_pixels_and_distances_of_points_that_are_sure() {
     let scale = t.model.model_from_world.scale;
     add_point(&mut t, 0.5, 0.4, &[0, 1, 2, 3]);
     add_point(&mut t, 0.5, 9.0, &[0, 1, 2, 3]);
-    add_point(&mut t, 0.5, 0.4, &[1, 2]);
+    add_point(&mut t, 0.5, 0.4, &[0, 1, 2]);
+    let too_close = 0.5 * t.model.config.sampling.near as f64 / scale;
+    add_point(&mut t, too_close, 0.4, &[1, 2, 3]);
     let got = observations::of(&t.model);
     let image = t.model.train.iter().position(|f| *f == 1).unwrap() as u32;
     assert!(got.iter().all(|o| t.model.train[o.image as usize] != 0), "frame 0 is held out: {got:?}");

@@ -1,11 +1,12 @@
 //! Where held-out rays end, and how many training views see that place: what few of them see, nothing but those few explains.
 
-use super::evaluate::ScoredView;
+use super::evaluate::{ScoredView, admits};
 use super::held_out::spread;
 use super::model::ObjectModel;
 use diorama_engine::renderers::volume::Quality;
-use diorama_geom::glam::{DMat3, DVec3};
+use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, Image, ImageU8, Pose, Reduction};
+use rayon::prelude::*;
 use serde::Serialize;
 
 /// Most training views that are asked, and pixels along the shorter side of their pictures of distances.
@@ -15,7 +16,7 @@ const VIEW_PX: u32 = 96;
 const SLACK: f64 = 0.1;
 /// Places that so many training views see are well explained.
 const MANY: usize = 4;
-/// Colors of places that no, one, two, three, and [`MANY`] or more training views see; and of rays that end nowhere.
+/// Colors of places that no, one, two, three, and [`MANY`] or more training views see; and of rays that end nowhere, or do not count.
 const COLORS: [[u8; 3]; MANY + 1] = [[90, 0, 110], [200, 30, 40], [240, 140, 30], [250, 220, 90], [60, 150, 90]];
 const NOWHERE: [u8; 3] = [40, 40, 40];
 /// Training views that are named beside a held-out one.
@@ -90,34 +91,46 @@ impl Sights {
         Sights(frames.into_iter().enumerate().map(sight).collect())
     }
 
-    /// Sights that see a point.
-    fn seeing(&self, p_in_world: DVec3) -> Vec<&Sight> {
-        self.0.iter().filter(|s| s.sees(p_in_world)).collect()
+    /// Training views that were asked.
+    pub fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Sights other than frame `own` that see a point.
+    fn seeing(&self, p_in_world: DVec3, own: usize) -> Vec<&Sight> {
+        self.0.iter().filter(|s| s.frame != own && s.sees(p_in_world)).collect()
     }
 
     /// Who sees what frame `frame` shows, and a map of how many do: [`COLORS`].
     pub fn explain(&self, model: &ObjectModel, frame: usize, scored: &ScoredView) -> (SeenBy, ImageU8) {
         let f = &model.capture.frames[frame];
         let unit = 1.0 / model.model_from_world.scale;
-        let world = |x: usize, y: usize, (w, h): (usize, usize), distance: f64| {
-            let sx = f.camera.width as f64 / w as f64;
-            let sy = f.camera.height as f64 / h as f64;
-            let turned: DMat3 = f.world_from_camera.rotation;
-            let along = turned * f.camera.direction((x as f64 + 0.5) * sx, (y as f64 + 0.5) * sy);
-            f.world_from_camera.translation + along * distance
-        };
         let view = &scored.view;
         let (w, h) = (view.rgb.width, view.rgb.height);
+        let (sx, sy) = (f.camera.width as f64 / w as f64, f.camera.height as f64 / h as f64);
+        let counts = admits(&scored.counts);
+        // None where the ray ends nowhere, or the pixel does not count.
+        let seeing = |i: usize| {
+            let (x, y) = (i % w, i / w);
+            (view.opacity.data[i] > 0.5 && counts(x, y)).then(|| {
+                let direction = f.camera.direction((x as f64 + 0.5) * sx, (y as f64 + 0.5) * sy);
+                self.seeing(f.world_from_camera.point(direction * (view.depth.data[i] as f64 * unit)), frame)
+            })
+        };
+        let all: Vec<Option<Vec<&Sight>>> = (0..w * h).into_par_iter().map(seeing).collect();
         let mut tally = Tally::default();
         let mut map = ImageU8 { width: w, height: h, channels: 3, data: Vec::with_capacity(w * h * 3) };
-        for (i, (&d, &o)) in view.depth.data.iter().zip(&view.opacity.data).enumerate() {
-            if o <= 0.5 {
+        for (i, seeing) in all.iter().enumerate() {
+            let Some(seeing) = seeing else {
                 map.data.extend(NOWHERE);
                 continue;
-            }
-            let seeing = self.seeing(world(i % w, i / w, (w, h), d as f64 * unit));
+            };
             map.data.extend(COLORS[seeing.len().min(MANY)]);
-            tally.add(&seeing, o as f64, squared_error(&view.rgb, &scored.photo, i));
+            tally.add(seeing, view.opacity.data[i] as f64, squared_error(&view.rgb, &scored.photo, i));
         }
         (tally.told(&f.name, |i| model.capture.frames[i].name.clone()), map)
     }
@@ -196,8 +209,9 @@ mod tests {
         let sights = Sights(vec![sight(3, 0.0, 4.0), sight(5, 1.0, 4.0), sight(8, 2.0, 1.0)]);
         let mut tally = Tally::default();
         for (p, error) in [(DVec3::ZERO, 0.1), (DVec3::ZERO, 0.3), (DVec3::new(9.0, 9.0, 9.0), 0.5), (DVec3::new(0.0, -3.0, 0.0), 0.7)] {
-            tally.add(&sights.seeing(p), 1.0, error);
+            tally.add(&sights.seeing(p, 9), 1.0, error);
         }
+        assert!(sights.seeing(DVec3::ZERO, 3).iter().all(|s| s.frame != 3), "a training view does not vouch for itself");
         let told = tally.told("held out", |i| format!("view {i}"));
         assert_eq!(told.shares, [0.25, 0.25, 0.5, 0.0, 0.0]);
         assert_eq!(told.errors.map(|e| e.map(|e| (e * 10.0).round())), [Some(5.0), Some(7.0), Some(2.0), None, None]);

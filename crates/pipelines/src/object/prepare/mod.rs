@@ -227,6 +227,7 @@ fn complete(mut p: Posed, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut
     }
     let capture = Capture { masks: p.masks, ..Capture::new(p.frames, p.scene) };
     finish::put_in_place(&o.out)?;
+    p.points.retain(|p| p.position.as_vec3().is_finite());
     let has_points = !p.points.is_empty();
     if has_points {
         // Photographs may have been left out since the points were found.
