@@ -151,7 +151,14 @@ fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
     let more = ["--background", "white", "--format", "transforms"];
     let all = [&command[..], &more, &SMALL].concat();
     works(dir.path(), &all);
-    works(dir.path(), &[&all[..], &["--resume"]].concat());
+    let summary = || std::fs::read_to_string(dir.path().join("run/summary.json")).unwrap();
+    let before = summary();
+    // Nothing is left to do, and nothing of what the run came to is lost.
+    let o = call(dir.path(), &[&all[..], &["--resume"]].concat());
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert!(o.status.success() && said.contains("the run has its 4 steps") && !said.contains("NaN"), "{said}");
+    assert!(!String::from_utf8_lossy(&o.stdout).contains("NaN") && !before.contains("\"psnr_train\": null"), "{before}");
+    assert_eq!(summary(), before);
     for (flag, value, had) in [
         ("--downscale", "4", "2"),
         ("--split", "every:8", "every:4"),

@@ -64,7 +64,7 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
     });
     if a.json {
         println!("{object}");
-    } else {
+    } else if summary.psnr.is_finite() {
         println!(
             "{}: {} steps in {:.1} s, {:.0} rays/s, psnr {:.2} dB on training rays{}",
             a.out.display(),

@@ -184,6 +184,14 @@ pub fn train(
     trainer.show()?;
     folder.draw_curves()?;
     let name = |i: usize| trainer.model.capture.frames[i].name.clone();
+    if resume && summary.step == origin.step {
+        // What the run came to stays in its summary.
+        let (steps, seconds) = (origin.step, origin.seconds);
+        events(&Event::Note(format!(
+            "the run has its {steps} steps and {seconds:.0} s already; --steps and --seconds are of the whole run"
+        )));
+        return Ok(Trained { device: trainer.device.name(), model: trainer.model, summary });
+    }
     folder.write_summary(&RunSummary {
         steps: summary.step,
         seconds: summary.seconds,

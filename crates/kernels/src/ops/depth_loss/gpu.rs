@@ -64,7 +64,10 @@ fn judge(
     scale: f32,
 ) {
     let r = ABSOLUTE_POS;
-    if r >= rays as usize || left_out[r] != 0 || surface[r] <= 0.0 {
+    if r >= rays as usize {
+        terminate!();
+    }
+    if left_out[r] != 0 || surface[r] <= 0.0 {
         terminate!();
     }
     let mut sum = 0.0f32;
