@@ -36,3 +36,15 @@ pub(super) fn of(model: &ObjectModel) -> Vec<Observation> {
     });
     seen.collect()
 }
+
+/// What a user should know of `n` observations.
+pub(super) fn note(model: &ObjectModel, n: usize) -> Option<String> {
+    match n {
+        0 if model.depth() == 0.0 || model.capture.points.is_empty() => None,
+        0 => {
+            let why = "nobody says which photographs see them (diorama prepare does), or fewer than three do";
+            Some(format!("the sparse points tell no distances: {why}"))
+        }
+        n => Some(format!("sparse points tell the distance of {n} pixels (--set loss.depth=0: do not use them)")),
+    }
+}

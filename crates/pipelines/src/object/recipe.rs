@@ -155,14 +155,7 @@ pub fn train(
     let origin = model.origin;
     let checkpoints = folder.checkpoints();
     let mut trainer = Trainer { view, held_out, ..Trainer::new(model, Photographs(store), &checkpoints, opened)? };
-    match trainer.observations.len() {
-        0 if trainer.model.depth() == 0.0 || trainer.model.capture.points.is_empty() => {}
-        0 => events(&Event::Note(
-            "the sparse points tell no distances: nobody says which photographs see them (diorama prepare does), or fewer than three do"
-                .into(),
-        )),
-        n => events(&Event::Note(format!("sparse points tell the distance of {n} pixels (--set loss.depth=0: do not use them)"))),
-    }
+    observations::note(&trainer.model, trainer.observations.len()).into_iter().for_each(|n| events(&Event::Note(n)));
     let (mut log_error, mut judged) = (None, HeldOut::default());
     let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
         if let Err(e) = folder.log(e) {
