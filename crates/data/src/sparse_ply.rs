@@ -44,7 +44,7 @@ pub fn write(path: &Path, points: &[SparsePoint], frames: &[Frame], root: &Path)
     })
 }
 
-/// Adds errors and frames to points that were read from the file's vertices, in their order; files that [`write`] did not write
+/// Adds errors and frames to points that were read from the file's vertices, in their order; files that [`write()`] did not write
 /// say nothing of them. Images, relative to `root`, that are not among `frames` are left out.
 ///
 /// # Errors

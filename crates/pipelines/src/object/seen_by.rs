@@ -105,7 +105,7 @@ impl Sights {
         self.0.iter().filter(|s| s.frame != own && s.sees(p_in_world)).collect()
     }
 
-    /// Who sees what frame `frame` shows, and a map of how many do: [`COLORS`].
+    /// Who sees what frame `frame` shows, and a map of how many do.
     pub fn explain(&self, model: &ObjectModel, frame: usize, scored: &ScoredView) -> (SeenBy, ImageU8) {
         let f = &model.capture.frames[frame];
         let unit = 1.0 / model.model_from_world.scale;
