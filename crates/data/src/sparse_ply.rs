@@ -50,7 +50,9 @@ pub fn write(path: &Path, points: &[SparsePoint], frames: &[Frame], root: &Path)
 /// # Errors
 /// When the file ends early, or a pair names a point or an image that is not there.
 pub fn observe(path: &Path, root: &Path, data: &[u8], frames: &[Frame], points: &mut [SparsePoint]) -> Result<()> {
-    let Some((names, n, pairs, body)) = head(data) else { return Ok(()) };
+    let Some((names, [n, pairs], body)) = head(data) else { return Ok(()) };
+    let count = |text: &str| text.parse().map_err(|_| DataError::input(path, format!("element: {text:?} is no count; run prepare again")));
+    let (n, pairs): (usize, usize) = (count(n)?, count(pairs)?);
     let end_of = |from: usize, n: usize, bytes: usize| n.checked_mul(bytes)?.checked_add(from).filter(|end| *end <= data.len());
     let ends = end_of(body, n, POINT_BYTES).and_then(|v| Some((v, end_of(v, pairs, OBSERVATION_BYTES)?)));
     let Some((vertices, end)) = ends else {
@@ -82,8 +84,8 @@ pub fn observe(path: &Path, root: &Path, data: &[u8], frames: &[Frame], points: 
     Ok(())
 }
 
-/// Images, numbers of points and observations, and where the points begin.
-fn head(data: &[u8]) -> Option<(Vec<&str>, usize, usize, usize)> {
+/// Images, what says how many points and observations there are, and where the points begin; none where the head is not of [`write()`].
+fn head(data: &[u8]) -> Option<(Vec<&str>, [&str; 2], usize)> {
     let mark = b"end_header\n";
     let body = data.windows(mark.len()).position(|w| w == mark)? + mark.len();
     let text = std::str::from_utf8(&data[..body]).ok()?;
@@ -93,7 +95,7 @@ fn head(data: &[u8]) -> Option<(Vec<&str>, usize, usize, usize)> {
     let (points, rest) = elements.split_once('\n')?;
     let (observations, rest) = rest.strip_prefix(POINT)?.strip_prefix("element observation ")?.split_once('\n')?;
     (rest.strip_prefix(OBSERVATION)? == "end_header\n").then_some(())?;
-    Some((names, points.parse().ok()?, observations.parse().ok()?, body))
+    Some((names, [points, observations], body))
 }
 
 #[cfg(test)]
@@ -148,6 +150,9 @@ mod tests {
         let text = String::from_utf8_lossy(&data[..400]).replace("observation 4", "observation 2305843009213693951");
         let e = observe(&file, root, text.as_bytes(), &all, &mut bare()).unwrap_err().to_string();
         assert!(e.contains("2305843009213693951 observations"), "{e}");
+        let text = String::from_utf8_lossy(&data[..400]).replace("observation 4", "observation four");
+        let e = observe(&file, root, text.as_bytes(), &all, &mut bare()).unwrap_err().to_string();
+        assert!(e.contains("\"four\" is no count"), "{e}");
         let e = observe(&file, root, &data, &all, &mut bare()[..2]).unwrap_err().to_string();
         assert!(e.contains("2 of 3 points are finite"), "{e}");
     }

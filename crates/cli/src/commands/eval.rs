@@ -8,7 +8,7 @@ use diorama_geom::ImageU8;
 use diorama_geom::capture::Split;
 use diorama_pipelines::object::evaluate::{EvaluationProgress, ScoredView};
 use diorama_pipelines::object::seen_by::{SeenBy, Sights};
-use diorama_pipelines::object::{device, evaluate, held_out, kept_capture, run_folder};
+use diorama_pipelines::object::{device, evaluate, kept_capture, run_folder};
 use diorama_pipelines::{PipelineError, Result};
 use std::cell::RefCell;
 use std::path::Path;
@@ -32,9 +32,8 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
     let shown = RefCell::new(ShareShown::new());
-    if a.explain && held_out::frames(&model.capture, split).is_empty() {
-        return Err(PipelineError::Usage("the run holds no views out; train with --split every:8 or judge --on train".into()));
-    }
+    // Before the training views are drawn.
+    evaluate::judged(&model, split)?;
     let sights = a.explain.then(|| {
         let mut told = |done: usize, all: usize| {
             shown.borrow_mut().show(done as f64 / all as f64, &format!("training view {} of {all}: where its rays end", done + 1));

@@ -2,6 +2,7 @@
 
 use super::RayBatch;
 use diorama_geom::rng::Rng;
+use diorama_kernels::ops::pixel_gather::OBSERVED_EVERY;
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use diorama_kernels::ops::{ray_aabb, ray_generation};
 use rayon::prelude::*;
@@ -82,9 +83,6 @@ pub struct Observation {
     pub distance: f32,
 }
 
-/// One ray of so many goes through a pixel of known distance, where there are any.
-pub const OBSERVED_EVERY: usize = 8;
-
 /// What [`draw`] needs besides the pixels.
 pub struct DrawOptions<'a> {
     pub cameras: &'a [PosedCamera],
@@ -111,7 +109,7 @@ pub fn draw(source: &dyn PixelSource, o: &DrawOptions, batch: &mut RayBatch) {
         *jitter = o.rng.uniform(base);
         for attempt in 0..5u64 {
             let at = base + 1 + attempt * 3;
-            let seen = !o.observations.is_empty() && i.is_multiple_of(OBSERVED_EVERY) && attempt == 0;
+            let seen = !o.observations.is_empty() && (i as u32).is_multiple_of(OBSERVED_EVERY) && attempt == 0;
             let seen = seen.then(|| o.observations[o.rng.below(at, o.observations.len() as u64) as usize]);
             *distance = seen.map_or(0.0, |s| s.distance);
             let (img, u, v) = match o.error_map {
@@ -194,7 +192,7 @@ mod tests {
                 assert_eq!(*d, 0.0);
                 continue;
             };
-            assert!(r % OBSERVED_EVERY == 0, "ray {r}");
+            assert!((r as u32).is_multiple_of(OBSERVED_EVERY), "ray {r}");
             assert_eq!(
                 (b.images[r], b.pixels[2 * r], b.pixels[2 * r + 1]),
                 (seen[k].image, seen[k].x as f32 + 0.5, seen[k].y as f32 + 0.5)

@@ -297,6 +297,19 @@ pub fn load_lpips(files: &[PathBuf]) -> Result<Lpips> {
     Lpips::new(tensors).map_err(|e| PipelineError::Usage(format!("{}: {e}", names.join(","))))
 }
 
+/// Frames of a split.
+///
+/// # Errors
+/// When there are none.
+pub fn judged(model: &ObjectModel, split: Split) -> Result<Vec<usize>> {
+    match held_out::frames(&model.capture, split) {
+        none if none.is_empty() => {
+            Err(PipelineError::Usage("the run holds no views out; train with --split every:8 or judge --on train".into()))
+        }
+        frames => Ok(frames),
+    }
+}
+
 /// [`evaluate`], with the perceptual distance where `lpips` is given.
 fn evaluate_counted(
     model: &ObjectModel,
@@ -306,10 +319,7 @@ fn evaluate_counted(
     each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
     count: &mut Count,
 ) -> Result<Report> {
-    let frames = held_out::frames(&model.capture, split);
-    if frames.is_empty() {
-        return Err(PipelineError::Usage("the run holds no views out; train with --split every:8 or judge --on train".into()));
-    }
+    let frames = judged(model, split)?;
     let mean = mean_image(model)?;
     let (mut per_view, mut mean_scores) = (Vec::new(), Vec::new());
     for i in frames {

@@ -3,7 +3,7 @@
 pub mod error_map;
 
 use self::error_map::GpuErrorMap;
-use super::words_per_pixel;
+use super::{OBSERVED_EVERY, words_per_pixel};
 use crate::gpu::random::{Wide, below, bits, halves, key, product, sum, uniform, widened};
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use cubecl::prelude::*;
@@ -69,8 +69,6 @@ const NUMBERS: u32 = 16;
 const PHOTOGRAPH: usize = 5;
 /// Rays of each 1024 that are drawn uniformly whatever the error map says.
 const UNIFORM: u32 = 512;
-/// One ray of so many goes through a pixel of known distance, where there are any.
-pub const OBSERVED_EVERY: u32 = 8;
 /// Numbers that describe such a pixel: image, x, y, and the bits of the distance.
 const OBSERVATION: usize = 4;
 /// Cells per side of the error map of one image.
