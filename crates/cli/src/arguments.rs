@@ -291,8 +291,9 @@ pub struct RenderArgs {
     /// orbit, spiral, interpolate, held-out, or a camera_path.json
     #[arg(long, default_value = "orbit")]
     pub path: String,
-    #[arg(long, default_value_t = 90)]
-    pub frames: usize,
+    /// [default: 90, or all held-out views]
+    #[arg(long)]
+    pub frames: Option<usize>,
     /// WIDTHxHEIGHT [default: that of the run, or of the path's file]
     #[arg(long)]
     pub size: Option<String>,

@@ -162,6 +162,8 @@ pub fn detect(root: &Path) -> Result<Format> {
         Ok(Format::Colmap)
     } else if root.join("poses_bounds.npy").exists() {
         Ok(Format::Llff)
+    } else if root.join("config.toml").exists() && root.join("capture.json").exists() {
+        Err(DataError::input(root, "is the folder of a run; give that of the photographs (diorama info RUN names it)"))
     } else {
         Err(DataError::input(
             root,

@@ -231,9 +231,20 @@ fn glyph(c: char) -> [u8; 7] {
     }
 }
 
+/// A line of text, black on white.
+pub fn caption(text: &str) -> ImageU8 {
+    let (width, height) = ((text.chars().count() * ADVANCE).max(1), 22);
+    let mut im = ImageU8 { width, height, channels: 3, data: vec![255; width * height * 3] };
+    write(&mut im, (0.0, 6.0), text, 0.0, [0; 3]);
+    im
+}
+
+/// Edge of a glyph's dots, and pixels from one glyph to the next.
+const DOT: usize = 2;
+const ADVANCE: usize = 6 * DOT;
+
 fn write(im: &mut ImageU8, at: (f64, f64), text: &str, anchor: f64, color: [u8; 3]) {
-    let scale = 2usize;
-    let advance = 6 * scale;
+    let (scale, advance) = (DOT, ADVANCE);
     let n = text.chars().count();
     let left = (at.0 - anchor * (n * advance) as f64).max(0.0) as usize;
     for (i, c) in text.chars().enumerate() {

@@ -49,7 +49,7 @@ fn model(dir: &Path, named: bool) -> (ObjectModel, Arc<Mutex<Vec<String>>>) {
 fn film(m: &ObjectModel, file: &Path) -> diorama_pipelines::Result<(usize, bool)> {
     let options = RenderOptions {
         path: PathKind::Orbit,
-        frames: 2,
+        frames: Some(2),
         size: Some((16, 16)),
         fov: None,
         layers: vec![Layer::Rgb],

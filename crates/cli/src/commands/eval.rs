@@ -6,6 +6,7 @@ use crate::terminal::ShareShown;
 use diorama_data::{DataError, photo};
 use diorama_geom::ImageU8;
 use diorama_geom::capture::Split;
+use diorama_pipelines::object::depth_error::DepthError;
 use diorama_pipelines::object::evaluate::{EvaluationProgress, ScoredView};
 use diorama_pipelines::object::seen_by::{SeenBy, Sights};
 use diorama_pipelines::object::{device, evaluate, kept_capture, run_folder};
@@ -24,7 +25,8 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
     let quality = a.quality.parse().map_err(|e| PipelineError::Usage(format!("--{e}")))?;
     let lpips = if a.lpips.is_empty() { None } else { Some(evaluate::load_lpips(&a.lpips)?) };
     let (mut model, notes) = run_folder::load_model_of(&a.run, a.data.as_deref())?;
-    notes.iter().for_each(|n| note(n));
+    let no_points = run_folder::add_points(&mut model, &a.run, a.data.as_deref())?;
+    notes.iter().chain(&no_points).for_each(|n| note(n));
     kept_capture::require_photographs(&model.capture)?;
     device::accelerate(&mut model, &a.device, Box::new(note))?;
     let folder = a.run.join("eval");
@@ -88,6 +90,11 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         if let Some(t) = &report.training {
             println!("{} training views: psnr {:.2} dB, ssim {:.4}", t.views, t.psnr, t.ssim);
         }
+        if let Some(d) = &report.depth {
+            let (off, elsewhere) = (100.0 * d.median, 100.0 * d.elsewhere);
+            println!("depth: {off:.1} % off (median of {} sparse points), {elsewhere:.0} % of them more than 10 % off", d.points);
+        }
+        report.depth.iter().filter_map(DepthError::advice).for_each(|a| println!("{a}"));
         report.advice().into_iter().for_each(|a| println!("{a}"));
         if let fog @ [_, ..] = &report.behind_fog()[..] {
             println!("behind fog: {}", fog.join(", "));

@@ -72,15 +72,13 @@ pub fn run(a: &ExportArgs) -> Result<Outcome> {
         println!("{}", serde_json::to_string(&made).expect("plain values"));
     } else {
         println!(
-            "{}: {} vertices, {} faces, {}{} KiB, {:.3} x {:.3} x {:.3} m, {:.1} s, level {:.2}{}",
+            "{}: {} vertices, {} faces, {}{} KiB, {}, {:.1} s, level {:.2}{}",
             made.file.display(),
             made.vertices,
             made.faces,
             if made.texture > 0 { format!("texture {0} x {0}, ", made.texture) } else { String::new() },
             made.bytes >> 10,
-            made.extent_m[0],
-            made.extent_m[1],
-            made.extent_m[2],
+            extent(made.extent_m, size),
             made.seconds,
             made.level,
             if made.watertight { ", watertight" } else { "" }
@@ -142,19 +140,26 @@ fn export_points(a: &ExportArgs, model: &ObjectModel, options: &PointOptions) ->
         return Ok(Outcome::Done);
     }
     println!(
-        "{}: {} points, {} KiB, {:.3} x {:.3} x {:.3} m, {:.1} s",
+        "{}: {} points, {} KiB, {}, {:.1} s",
         made.file.display(),
         made.points,
         made.bytes >> 10,
-        made.extent_m[0],
-        made.extent_m[1],
-        made.extent_m[2],
+        extent(made.extent_m, options.size),
         made.seconds
     );
     if made.points < made.asked {
         println!("note: {} points instead of {}: the cameras see little surface there", made.points, made.asked);
     }
     Ok(Outcome::Done)
+}
+
+/// Lengths of the sides, and in what.
+fn extent([x, y, z]: [f32; 3], size: Size) -> String {
+    let unit = match size {
+        Size::Unknown => " units of the capture, written as metres (--measured or --scale-to says how large it is)",
+        _ => " m",
+    };
+    format!("{x:.3} x {y:.3} x {z:.3}{unit}")
 }
 
 /// Says every few seconds how far a stage is.
@@ -210,7 +215,7 @@ fn size(a: &ExportArgs) -> Result<Size> {
                 file.display()
             );
         }
-        return Ok(measured.unwrap_or(Size::Scaled(1.0)));
+        return Ok(measured.unwrap_or(Size::Unknown));
     };
     if !(scale > 0.0 && scale.is_finite()) {
         return Err(usage("--scale", &scale.to_string(), "a number above 0"));

@@ -13,13 +13,32 @@ pub fn run(a: &InfoArgs) -> Result<Outcome> {
         println!("{object}");
     } else if let Some(map) = object.as_object() {
         for (k, v) in map {
-            match v {
-                serde_json::Value::String(s) => println!("{k:<18} {s}"),
-                v => println!("{k:<18} {v}"),
-            }
+            println!("{:<18} {}", k.replace('_', " "), shown(v));
         }
     }
     Ok(Outcome::Done)
+}
+
+/// A value for people: four digits, lists without brackets.
+fn shown(v: &serde_json::Value) -> String {
+    use serde_json::Value;
+    match v {
+        Value::Null => "-".into(),
+        Value::String(s) => s.clone(),
+        Value::Number(n) if n.is_f64() => {
+            let n = n.as_f64().unwrap_or_default();
+            let digits = (3 - n.abs().max(1e-9).log10().floor() as i32).clamp(0, 6) as usize;
+            let text = format!("{n:.digits$}");
+            if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').into() } else { text }
+        }
+        Value::Array(all) if all.is_empty() => "none".into(),
+        Value::Array(all) => {
+            let apart = if all.iter().any(Value::is_string) { "; " } else { ", " };
+            all.iter().map(shown).collect::<Vec<_>>().join(apart)
+        }
+        Value::Object(map) => map.iter().map(|(k, v)| format!("{k} {}", shown(v))).collect::<Vec<_>>().join(", "),
+        other => other.to_string(),
+    }
 }
 
 fn describe_run(a: &InfoArgs) -> Result<serde_json::Value> {

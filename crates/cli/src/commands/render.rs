@@ -13,7 +13,7 @@ pub fn run(a: &RenderArgs) -> Result<Outcome> {
     use_threads(a.threads)?;
     let usage = |e: String| PipelineError::Usage(format!("--{e}"));
     let size = a.size.as_deref().map(parse_size).transpose()?;
-    if a.frames == 0 || a.fps == Some(0) {
+    if a.frames == Some(0) || a.fps == Some(0) {
         return Err(PipelineError::Usage("--frames and --fps: must be at least 1".into()));
     }
     if a.fov.is_some_and(|f| !(f > 0.0 && f < 179.0)) {

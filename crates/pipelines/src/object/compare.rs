@@ -13,6 +13,9 @@ use diorama_geom::capture::Split;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
+/// Held-out views that are shown, evenly taken from all.
+const SHOWN: usize = 4;
+
 /// One run's line.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Compared {
@@ -53,19 +56,21 @@ pub fn compare(runs: &[PathBuf], data: Option<&Path>, out: &Path, note: &mut dyn
     for run in runs {
         note(&format!("judging {}", run.display()));
         let (model, peak_memory_bytes) = complete(run, data)?;
+        let shown = held_out::spread(&held_out::frames(&model.capture, Split::Test), SHOWN);
+        let shown: Vec<&String> = shown.iter().map(|i| &model.capture.frames[*i].name).collect();
         let mut views = Vec::new();
         let mut photos = Vec::new();
-        let report = evaluate::evaluate(&model, Split::Test, Quality::Full, &mut |_, v| {
-            if views.len() < 4 {
+        let report = evaluate::evaluate(&model, Split::Test, Quality::Full, &mut |name, v| {
+            if shown.iter().any(|s| *s == name) {
                 views.push(v.view.rgb.to_u8());
                 photos.push(v.photo.to_u8());
             }
             Ok(())
         })?;
         if strips.is_empty() {
-            strips.push(photos);
+            strips.extend([vec![plot::caption("photographs")], photos]);
         }
-        strips.push(views);
+        strips.extend([vec![plot::caption(&format!("{}: {:.2} dB", run.display(), report.psnr))], views]);
         table.push(Compared {
             run: run.clone(),
             method: model.config.method.to_string(),

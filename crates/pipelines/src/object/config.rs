@@ -371,7 +371,12 @@ impl Config {
             toml::Value::Boolean(_) => value.parse().ok().map(toml::Value::Boolean),
             _ => None,
         };
-        *at = parsed.ok_or_else(|| PipelineError::Usage(format!("{key}: {value:?} does not fit; it is {at} now")))?;
+        let expected = match at {
+            toml::Value::Integer(_) => "a whole number",
+            toml::Value::Float(_) => "a number",
+            _ => "true or false",
+        };
+        *at = parsed.ok_or_else(|| PipelineError::Usage(format!("{key}: {value:?} is not {expected}")))?;
         *self = table.try_into().map_err(|e: toml::de::Error| PipelineError::Usage(format!("{key} = {value:?}: {}", e.message())))?;
         self.check()
     }
@@ -440,8 +445,11 @@ impl Config {
         if !(0.0..=1e9).contains(&self.data.white) {
             return fail("data.white: 0, or light above 0");
         }
-        if self.data.downscale == 0 || self.run.log_every == 0 {
-            return fail("data.downscale and run.log_every: at least 1");
+        if self.data.downscale == 0 {
+            return fail("data.downscale (--downscale): at least 1, which leaves photographs as they are");
+        }
+        if self.run.log_every == 0 {
+            return fail("run.log_every: at least 1");
         }
         self.data.masks()?;
         if self.data.shortest_side > 0 && self.data.downscale > 1 {

@@ -182,9 +182,17 @@ fn poses(c: &Capture) -> Vec<Finding> {
     };
     let twins: Vec<(usize, usize)> =
         (0..poses.len()).flat_map(|i| (i + 1..poses.len()).map(move |j| (i, j))).filter(|(i, j)| near(*i, *j)).collect();
-    if let Some((i, j)) = twins.first() {
-        let text = format!("{} pairs of views have one pose, for example {} and {}", twins.len(), c.frames[*i].name, c.frames[*j].name);
-        out.push(finding("poses", Grade::Trouble, text, "remove one of each, or find the poses again"));
+    let trained = |i: &usize| (c.frames[*i].split == Split::Train) as usize;
+    for (of, what, grade, cure) in [
+        (2, "pairs of training views have one pose", Grade::Trouble, "remove one of each, or find the poses again"),
+        (1, "held-out views have a training view's pose", Grade::Trouble, "scores on them say little: remove one of each"),
+        (0, "pairs of held-out views have one pose", Grade::Note, "no harm where val and test are the same photographs"),
+    ] {
+        let mut same = twins.iter().filter(|(i, j)| trained(i) + trained(j) == of).peekable();
+        if let Some((i, j)) = same.peek().copied() {
+            let text = format!("{} {what}, for example {} and {}", same.count(), c.frames[*i].name, c.frames[*j].name);
+            out.push(finding("poses", grade, text, cure));
+        }
     }
     let lonely = strays(&poses);
     if !lonely.is_empty() {
@@ -428,7 +436,16 @@ mod tests {
             diagnose(&c).unwrap()
         };
         let twins = spoilt(&|c| c.frames[3].world_from_camera = c.frames[2].world_from_camera);
-        assert!(worst(&twins, "poses").unwrap().text.contains("one pose"));
+        assert!(worst(&twins, "poses").unwrap().text.contains("training views have one pose"), "{twins:?}");
+        let held_out = |of: &'static [usize]| {
+            spoilt(&move |c| {
+                of.iter().for_each(|i| c.frames[*i].split = Split::Test);
+                c.frames[3].world_from_camera = c.frames[2].world_from_camera;
+            })
+        };
+        let (leaked, twice) = (held_out(&[3]), held_out(&[2, 3]));
+        assert!(worst(&leaked, "poses").is_some_and(|f| f.grade == Grade::Trouble && f.text.contains("a training view's pose")));
+        assert_eq!(worst(&twice, "poses").unwrap().grade, Grade::Note, "{twice:?}");
         let outside = spoilt(&|c| c.scene.center = DVec3::splat(9.0));
         assert_eq!(worst(&outside, "scale").unwrap().grade, Grade::Trouble);
         let stretched = spoilt(&|c| c.frames.iter_mut().for_each(|f| f.camera.fy *= 1.5));

@@ -1,5 +1,6 @@
 //! Scores on held-out views: full images, in the photographs' own distorted pixels.
 
+use super::depth_error::{self, DepthError};
 use super::fog::{self, Surfaces};
 use super::held_out::{self, GAP_DB, GAP_MEANS};
 use super::model::ObjectModel;
@@ -64,6 +65,8 @@ pub struct Report {
     pub psnr_mean_image: Option<f64>,
     /// Perceptual distance over whole pictures; its weights are the user's.
     pub lpips: Option<f64>,
+    /// How far surfaces are from sparse points, where held-out views show enough of them.
+    pub depth: Option<DepthError>,
     /// Some training views, where they were asked for.
     pub training: Option<TrainingScores>,
     /// What drew the views.
@@ -321,7 +324,7 @@ fn evaluate_counted(
 ) -> Result<Report> {
     let frames = judged(model, split)?;
     let mean = mean_image(model)?;
-    let (mut per_view, mut mean_scores) = (Vec::new(), Vec::new());
+    let (mut per_view, mut mean_scores, mut depth_errors) = (Vec::new(), Vec::new(), Vec::new());
     for i in frames {
         let frame = &model.capture.frames[i];
         let full = photo::load_full(&frame.image)?;
@@ -329,6 +332,7 @@ fn evaluate_counted(
         if let Some(mean) = mean.as_ref().filter(|m| (m.width, m.height) == (scored.photo.width, scored.photo.height)) {
             mean_scores.push(metrics::compare(mean, &scored.photo, admits(&scored.counts)).psnr);
         }
+        depth_errors.extend(depth_error::errors(model, i, &scored));
         each(&frame.name, &scored)?;
         let s = scored.scores;
         let too_small = |e: String| PipelineError::Usage(format!("{}: {e}", frame.name));
@@ -358,6 +362,7 @@ fn evaluate_counted(
         psnr_affine: average(|v| v.psnr_affine),
         psnr_mean_image: (!mean_scores.is_empty()).then(|| mean_of_numbers(mean_scores.into_iter())),
         lpips: lpips.map(|_| mean_of_numbers(per_view.iter().filter_map(|v| v.lpips))),
+        depth: DepthError::of(depth_errors),
         training: None,
         device: model.drew_on(),
         scored_in: if model.is_linear() { "sRGB, of linear light up to white" } else { "sRGB" },

@@ -100,6 +100,8 @@ pub const TEXELS: usize = 2048;
 /// How large the mesh is made.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Size {
+    /// Nobody measured: a unit of the capture is written as a metre.
+    Unknown,
     /// A unit of the capture is so many metres.
     Scaled(f64),
     /// The longest side becomes so many metres.
@@ -276,7 +278,7 @@ impl Size {
     pub fn meters_per_unit(self) -> f64 {
         match self {
             Size::Scaled(s) => s,
-            Size::Longest(_) => 1.0,
+            Size::Unknown | Size::Longest(_) => 1.0,
             Size::Measured { points: [a, b], metres } => metres / (DVec3::from(a) - DVec3::from(b)).length().max(1e-12),
         }
     }

@@ -2,6 +2,8 @@
 //!
 //! Paths are relative to the data set's folder, which is kept both as it was and as seen from the run.
 
+use super::config::Config;
+use super::recipe;
 use crate::error::Result;
 use diorama_data::{DataError, atomic, error, import};
 use diorama_geom::Capture;
@@ -79,6 +81,18 @@ fn open(run: &Path) -> Result<KeptCapture> {
     let file = run.join(NAME);
     let bytes = error::read(&file, LIMIT)?;
     Ok(serde_json::from_slice(&bytes).map_err(|e| DataError::input(&file, format!("is damaged: {e}; train again")))?)
+}
+
+/// Reads the sparse points of a kept capture, which its run has not kept, from its data set; a note says so where they cannot be had.
+pub fn add_points(kept: &mut Capture, config: &Config, data: &Path) {
+    let mut config = config.clone();
+    config.data.path = data.to_path_buf();
+    let names = |c: &Capture| c.frames.iter().map(|f| f.name.clone()).collect::<Vec<_>>();
+    match recipe::load_capture(&config) {
+        Ok(fresh) if names(&fresh) == names(kept) => kept.points = fresh.points,
+        Ok(_) => kept.notes.push("the capture has changed since the run began: its sparse points are not used".into()),
+        Err(e) => kept.notes.push(format!("the capture's sparse points cannot be read again: {e}")),
+    }
 }
 
 /// The folder in which the first photograph lies: where it was, else where it lay as seen from the run.

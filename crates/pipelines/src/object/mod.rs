@@ -2,6 +2,7 @@
 
 pub mod compare;
 pub mod config;
+pub mod depth_error;
 pub mod device;
 pub mod diagnose;
 pub mod evaluate;

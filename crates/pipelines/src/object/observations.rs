@@ -6,7 +6,7 @@ use diorama_geom::capture::SparsePoint;
 
 /// Fewest training photographs that show a point, and largest mean reprojection error in their pixels: else its distance is unsure.
 const FEWEST: usize = 3;
-const LARGEST_ERROR: f32 = 2.0;
+pub(super) const LARGEST_ERROR: f32 = 2.0;
 
 /// Most observations that are kept, evenly taken from all.
 const MOST: usize = 1 << 20;

@@ -84,7 +84,7 @@ pub fn quickstart(
     let video = folder.join("turntable.mp4");
     let options = RenderOptions {
         path: PathKind::Orbit,
-        frames: 60,
+        frames: Some(60),
         size: None,
         fov: None,
         layers: vec![Layer::Rgb],
@@ -108,7 +108,7 @@ pub fn quickstart(
         texture: Some(1024),
         normal_map: false,
         watertight: false,
-        size: Size::Scaled(1.0),
+        size: Size::Unknown,
         unit_m: 1.0,
         clip: None,
         floaters: 0.05,

@@ -77,20 +77,6 @@ pub fn load_capture(config: &Config) -> Result<Capture> {
     Ok(capture)
 }
 
-/// A capture that a run has kept, with the sparse points that it has not; a note says so where they cannot be had.
-fn with_points(folder: &RunFolder, config: &Config) -> Result<Capture> {
-    let mut kept = folder.capture()?;
-    let mut config = config.clone();
-    config.data.path = folder.data_set()?;
-    let names = |c: &Capture| c.frames.iter().map(|f| f.name.clone()).collect::<Vec<_>>();
-    match load_capture(&config) {
-        Ok(fresh) if names(&fresh) == names(&kept) => kept.points = fresh.points,
-        Ok(_) => kept.notes.push("the capture has changed since the run began: its sparse points are not used".into()),
-        Err(e) => kept.notes.push(format!("the capture's sparse points cannot be read again: {e}")),
-    }
-    Ok(kept)
-}
-
 /// The device that a configuration will train on, in words.
 ///
 /// # Errors
@@ -121,7 +107,7 @@ pub fn train(
 ) -> Result<Trained> {
     let opened = device::open(config)?;
     opened.note().into_iter().for_each(|n| events(&Event::Note(n)));
-    let capture = if resume { with_points(folder, config)? } else { load_capture(config)? };
+    let capture = if resume { folder.capture_with_points()? } else { load_capture(config)? };
     for note in &capture.notes {
         events(&Event::Note(note.clone()));
     }

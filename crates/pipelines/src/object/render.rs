@@ -88,7 +88,8 @@ impl std::str::FromStr for Layer {
 #[derive(Clone, Debug)]
 pub struct RenderOptions {
     pub path: PathKind,
-    pub frames: usize,
+    /// None: [`FRAMES`], or all that the path has.
+    pub frames: Option<usize>,
     /// Width and height; none: those of the run, or of a path's file.
     pub size: Option<(u32, u32)>,
     /// Horizontal field of view in radians; none: that of the capture, or the vertical one of a path's file.
@@ -112,14 +113,20 @@ pub struct RenderOptions {
 /// Frames per second where nobody says.
 pub const FPS: u32 = 30;
 
+/// Frames of a path where nobody says.
+pub const FRAMES: usize = 90;
+
 /// The views of a path in the world.
+///
+/// # Errors
+/// When the path's file is malformed, there are no held-out views, or something is asked that such a path has of its own.
 pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> {
     let frames = &model.capture.frames;
     let poses: Vec<Pose> = model.train.iter().map(|&i| frames[i].world_from_camera).collect();
     let (center, _) = focus_point(&poses);
     let base = frames[model.train[0]].camera.reduced(model.config.reduction());
     let camera = view_camera(&base, o.size, o.fov);
-    let n = o.frames.max(1);
+    let n = o.frames.unwrap_or(FRAMES).max(1);
     let views = |poses: Vec<Pose>| poses.into_iter().map(|p| PathView { camera, world_from_camera: p }).collect();
     let (up, fps) = (DVec3::Z, o.fps.unwrap_or(FPS) as f64);
     Ok(match &o.path {
@@ -127,6 +134,9 @@ pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> 
         PathKind::Spiral => CameraPath { views: views(camera_path::spiral(&poses, center, up, n)), fps, crop: None },
         PathKind::Interpolate => CameraPath { views: views(camera_path::interpolate(&poses, n)), fps, crop: None },
         PathKind::File(f) => {
+            if o.frames.is_some() {
+                return Err(PipelineError::Usage(format!("--frames: {} says how many; leave it out", f.display())));
+            }
             let mut path = camera_path_json::read(f, &model.capture.world_from_capture)?;
             path.fps = o.fps.map_or(path.fps, f64::from);
             if o.size.is_some() || o.fov.is_some() {
@@ -141,6 +151,10 @@ pub fn path_views(model: &ObjectModel, o: &RenderOptions) -> Result<CameraPath> 
             if held.is_empty() {
                 return Err(PipelineError::Usage("the run holds no views out; choose another --path".into()));
             }
+            if o.size.is_some() || o.fov.is_some() {
+                return Err(PipelineError::Usage("--size and --fov: held-out views have those of their photographs".into()));
+            }
+            let held = super::held_out::spread(&held, o.frames.unwrap_or(held.len()));
             let views =
                 held.iter().map(|&i| PathView { camera: model.posed(i).camera, world_from_camera: frames[i].world_from_camera }).collect();
             CameraPath { views, fps, crop: None }

@@ -75,6 +75,7 @@ mod tests {
             psnr_affine: held_out,
             psnr_mean_image: None,
             lpips: None,
+            depth: None,
             training: Some(TrainingScores { views: 2, psnr: 30.0, ssim: 0.9 }),
             device: "cpu".into(),
             scored_in: "sRGB",

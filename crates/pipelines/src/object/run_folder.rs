@@ -76,6 +76,13 @@ impl RunFolder {
         Ok(capture)
     }
 
+    /// [`RunFolder::capture`] with its sparse points; a note says so where they cannot be had.
+    pub fn capture_with_points(&self) -> Result<Capture> {
+        let mut capture = self.capture()?;
+        kept_capture::add_points(&mut capture, &read_config(&self.path)?, &self.data_set()?);
+        Ok(capture)
+    }
+
     /// The data set that the run was trained on, where it is now.
     pub fn data_set(&self) -> Result<PathBuf> {
         kept_capture::data_set(&self.path, &read_config(&self.path)?.data.path)
@@ -303,6 +310,20 @@ pub fn read_summary(path: &Path) -> Result<Option<RunSummary>> {
 /// A trained model, read from its folder.
 pub fn load_model(path: &Path) -> Result<(ObjectModel, Vec<String>)> {
     load_model_of(path, None)
+}
+
+/// Reads the sparse points of a model's capture, whose photographs are in `data` now, if that is given; else a note says why not.
+///
+/// # Errors
+/// When the run's capture is damaged.
+pub fn add_points(model: &mut ObjectModel, path: &Path, data: Option<&Path>) -> Result<Vec<String>> {
+    let data = match data {
+        Some(moved) => moved.to_path_buf(),
+        None => kept_capture::data_set(path, &model.config.data.path)?,
+    };
+    let told = model.capture.notes.len();
+    kept_capture::add_points(&mut model.capture, &model.config, &data);
+    Ok(model.capture.notes.split_off(told))
 }
 
 /// A trained model whose photographs are in `data` now, if that is given.

@@ -323,7 +323,7 @@ impl ViewSource for RunView {
             texture: None,
             normal_map: false,
             watertight: false,
-            size: Self::tell(read_scale(&self.folder))?.unwrap_or(Size::Scaled(1.0)),
+            size: Self::tell(read_scale(&self.folder))?.unwrap_or(Size::Unknown),
             unit_m: 1.0,
             clip: r.clip,
             floaters: 0.01,
