@@ -2,6 +2,7 @@
 
 pub mod occupancy;
 pub mod pixels;
+pub mod stereo;
 pub mod stratified;
 
 /// A batch of rays in model space with what they are to match.

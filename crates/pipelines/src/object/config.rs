@@ -83,6 +83,10 @@ fn no_weight() -> Auto {
     Auto::Is(0.0)
 }
 
+fn from_points() -> String {
+    "points".into()
+}
+
 fn use_masks() -> String {
     "use".into()
 }
@@ -174,6 +178,10 @@ pub struct LossConfig {
     /// Weight of the light that ends away from the sparse points which photographs show; `auto`: 0.3 in unbounded space, else none.
     #[serde(default = "no_weight")]
     pub depth: Auto,
+    /// Where distances come from: `points` (those of the capture), `stereo` (photographs compared with their neighbours), or `auto`:
+    /// points where photographs show any, else stereo.
+    #[serde(default = "from_points")]
+    pub depth_from: String,
     /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.
     pub near_scaling: f32,
 }
@@ -309,6 +317,7 @@ impl Config {
                 color: if ngp { "huber" } else { "mse" }.into(),
                 distortion: if ngp { Auto::Auto } else { Auto::Is(0.0) },
                 depth: if ngp { Auto::Auto } else { Auto::Is(0.0) },
+                depth_from: "auto".into(),
                 alpha: 0.0,
                 near_scaling: if ngp { 1.0 } else { 0.0 },
             },
@@ -426,6 +435,9 @@ impl Config {
         if !["auto", "f32"].contains(&&f.precision[..]) {
             return fail("field.precision: expected auto or f32");
         }
+        if !["auto", "points", "stereo"].contains(&&self.loss.depth_from[..]) {
+            return fail("loss.depth_from: expected auto, points or stereo");
+        }
         if !["mse", "huber"].contains(&&self.loss.color[..]) {
             return fail("loss.color: expected mse or huber");
         }
@@ -532,6 +544,7 @@ mod tests {
         for (k, v) in [
             ("field.features", "3"),
             ("loss.color", "l7"),
+            ("loss.depth_from", "lidar"),
             ("optim.rate", "fast"),
             ("optim.rate", "inf"),
             ("data.downscale", "0"),

@@ -226,6 +226,11 @@ impl ObjectModel {
         PosedCamera { camera, pose: self.model_from_world.pose(world_from_camera) }
     }
 
+    /// How far cameras stand from what they look at, in inner cubes.
+    pub fn viewing_distance(&self) -> f64 {
+        viewing_distance(&self.capture)
+    }
+
     /// The training cameras as given.
     pub fn base_cameras(&self) -> Vec<PosedCamera> {
         self.train.iter().map(|&i| self.posed(i)).collect()

@@ -1,12 +1,13 @@
 //! How near to cameras matter may be.
 
+use diorama_engine::samplers::pixels::Observation;
 use diorama_geom::Capture;
 use diorama_geom::capture::SparsePoint;
 
 /// Where nothing is known, in inner cubes.
-const UNKNOWN: f32 = 0.1;
+pub const UNKNOWN: f32 = 0.1;
 
-/// Observations of sparse points that tell how near matter is, and the share of them, the closest, that may be wrong.
+/// Observations that tell how near matter is, and the share of them, the closest, that may be wrong.
 const OBSERVATIONS: usize = 1000;
 const WRONG: f64 = 0.01;
 
@@ -14,19 +15,29 @@ const WRONG: f64 = 0.01;
 const EMPTY: f64 = 0.7;
 
 /// Distance, in inner cubes, from which on matter may be before a camera: most of the way to the closest sparse points that
-/// cameras see. Before that stands nothing, but many a field finds it easiest to hang each photograph before its own camera.
-pub fn nearest(capture: &Capture) -> f32 {
+/// cameras see, where these are enough. Before that stands nothing, but many a field finds it easiest to hang each photograph before
+/// its own camera.
+pub fn of_points(capture: &Capture) -> Option<f32> {
     let distance = |p: &SparsePoint, frame: u32| {
         let camera = &capture.frames[frame as usize].world_from_camera;
         (p.position - camera.translation).length()
     };
-    let mut all: Vec<f64> = capture.points.iter().flat_map(|p| p.frames.iter().map(|f| distance(p, *f))).collect();
+    let all = capture.points.iter().flat_map(|p| p.frames.iter().map(|f| distance(p, *f))).collect();
+    most_of_the_way(all, capture.scene.model_from_world().scale)
+}
+
+/// The same by observations.
+pub fn of_observations(observations: &[Observation]) -> Option<f32> {
+    most_of_the_way(observations.iter().map(|o| o.distance as f64).collect(), 1.0)
+}
+
+fn most_of_the_way(mut all: Vec<f64>, scale: f64) -> Option<f32> {
     if all.len() < OBSERVATIONS {
-        return UNKNOWN;
+        return None;
     }
     let closest = (all.len() as f64 * WRONG) as usize;
     let (_, near, _) = all.select_nth_unstable_by(closest, f64::total_cmp);
-    UNKNOWN.max((EMPTY * *near * capture.scene.model_from_world().scale) as f32)
+    Some(UNKNOWN.max((EMPTY * *near * scale) as f32))
 }
 
 #[cfg(test)]
@@ -55,7 +66,7 @@ mod tests {
     fn matter_is_looked_for_from_shortly_before_the_closest_points_on() {
         let scale = capture(0).scene.model_from_world().scale;
         for strays in [0, 9] {
-            let got = nearest(&capture(strays)) as f64 / scale;
+            let got = of_points(&capture(strays)).unwrap() as f64 / scale;
             assert!((1.39..1.42).contains(&got), "{got} with {strays} stray points");
         }
     }
@@ -66,6 +77,6 @@ mod tests {
         few.points.truncate(400);
         let mut silent = capture(0);
         silent.points.iter_mut().for_each(|p| p.frames.clear());
-        assert_eq!((nearest(&few), nearest(&silent)), (UNKNOWN, UNKNOWN));
+        assert_eq!((of_points(&few), of_points(&silent)), (None, None));
     }
 }

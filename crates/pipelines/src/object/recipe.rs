@@ -5,7 +5,7 @@ use super::device::{self, Aftermath, Drawing, Opened};
 use super::held_out::{self, HeldOutPixels};
 use super::memory;
 use super::model::{ObjectModel, Terms, is_linear};
-use super::nearest::nearest;
+use super::nearest;
 use super::observations;
 use super::run_folder::{RunFolder, RunSummary};
 use super::viewing::RunView;
@@ -124,6 +124,9 @@ pub fn train(
     }
     let has_alpha = store.has_alpha;
     let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
+    let photographs = Photographs(store);
+    let (observations, source) = observations::find(&mut model, &photographs);
+    observations::note(&model, observations.len(), source).into_iter().for_each(|n| events(&Event::Note(n)));
     let held_out = HeldOutPixels::draw(&model)?;
     if resume {
         if checkpoint::exists(&folder.checkpoints()) {
@@ -135,13 +138,12 @@ pub fn train(
         }
         folder.cut_metrics(model.origin.step)?;
     } else {
-        folder.write_description(config, &model.capture)?;
+        folder.write_description(&model.config, &model.capture)?;
     }
     let options = RunOptions { held_out_rays: held_out.as_ref().map_or(0, |h| h.rays() as u64), ..run_options(config) };
     let origin = model.origin;
     let checkpoints = folder.checkpoints();
-    let mut trainer = Trainer { view, held_out, ..Trainer::new(model, Photographs(store), &checkpoints, opened)? };
-    observations::note(&trainer.model, trainer.observations.len()).into_iter().for_each(|n| events(&Event::Note(n)));
+    let mut trainer = Trainer { view, held_out, ..Trainer::new(model, photographs, observations, &checkpoints, opened)? };
     let (mut log_error, mut judged) = (None, HeldOut::default());
     let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
         if let Err(e) = folder.log(e) {
@@ -267,7 +269,9 @@ fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'stat
             *v = if moves { WRONG * (2.0 * rng.uniform(i as u64) - 1.0) } else { 0.0 };
         }
     }
-    Trainer::new(model, Photographs(store), Path::new(""), device)
+    let photographs = Photographs(store);
+    let (observations, _) = observations::find(&mut model, &photographs);
+    Trainer::new(model, photographs, observations, Path::new(""), device)
 }
 
 /// The configuration with what the capture says where it leaves it open: white, and how near matter may be.
@@ -280,7 +284,7 @@ fn resolved(config: &Config, capture: &Capture) -> Result<Config> {
         config.data.white = photo_check::white(&train)?;
     }
     if config.sampling.near == 0.0 {
-        config.sampling.near = nearest(capture);
+        config.sampling.near = nearest::of_points(capture).unwrap_or(0.0);
     }
     Ok(config)
 }
@@ -381,13 +385,16 @@ struct Trainer<'a> {
 }
 
 impl<'a> Trainer<'a> {
-    fn new(model: ObjectModel, photographs: Photographs, checkpoints: &'a Path, mut device: Opened) -> Result<Self> {
+    fn new(
+        model: ObjectModel,
+        photographs: Photographs,
+        observations: Vec<Observation>,
+        checkpoints: &'a Path,
+        mut device: Opened,
+    ) -> Result<Self> {
         let o = &model.config.optim;
         let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
         let cameras = model.cameras();
-        let mut observations = if model.depth() > 0.0 { observations::of(&model) } else { Vec::new() };
-        // Where memory holds a share of the pixels, another one would be drawn in place of the point's.
-        observations.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y));
         device.upload(&model, &photographs, &observations)?;
         Ok(Trainer {
             cameras,

@@ -108,7 +108,8 @@ fn observations_are_the_pixels_and_distances_of_points_that_are_sure() {
     add_point(&mut t, 0.5, 0.4, &[0, 1, 2]);
     let too_close = 0.5 * t.model.config.sampling.near as f64 / scale;
     add_point(&mut t, too_close, 0.4, &[1, 2, 3]);
-    let got = observations::of(&t.model);
+    let (got, source) = observations::find(&mut t.model, &t.photographs);
+    assert_eq!(source, observations::Source::Points);
     let image = t.model.train.iter().position(|f| *f == 1).unwrap() as u32;
     assert!(got.iter().all(|o| t.model.train[o.image as usize] != 0), "frame 0 is held out: {got:?}");
     let ahead: Vec<_> = got.iter().filter(|o| o.image == image).collect();
@@ -123,7 +124,7 @@ fn depth_in_the_middle(depth: &str) -> f64 {
     let camera = t.model.capture.frames[1].camera;
     // Closer than anything that the photographs show.
     add_point(&mut t, 0.4, 0.0, &[1, 2, 3]);
-    t.observations = if t.model.depth() > 0.0 { observations::of(&t.model) } else { Vec::new() };
+    t.observations = if t.model.depth() > 0.0 { observations::of_points(&t.model) } else { Vec::new() };
     t.observations.retain(|o| t.model.train[o.image as usize] == 1);
     for step in 0..100 {
         t.step(step, step as f64 / 100.0).unwrap();
