@@ -291,7 +291,7 @@ pub struct RenderArgs {
     /// orbit, spiral, interpolate, held-out, or a camera_path.json
     #[arg(long, default_value = "orbit")]
     pub path: String,
-    /// [default: 90, or all held-out views]
+    /// How many frames [default: 90, or all held-out views]
     #[arg(long)]
     pub frames: Option<usize>,
     /// WIDTHxHEIGHT [default: that of the run, or of the path's file]

@@ -88,8 +88,6 @@ fn fine_texture_alone_tells_how_far_away_a_floor_is() {
         let report = evaluate::evaluate(&model, Split::Test, Quality::Full, &mut |_, _| Ok(())).unwrap();
         let depth = report.depth.expect("held-out views show the points");
         println!("seed {seed}: {depth:?}, {:.1} dB", report.psnr);
-        if std::env::var("INITIAL").is_err() {
-            assert!(depth.points > 400 && depth.elsewhere < 0.15 && depth.median < 0.04, "seed {seed}: {depth:?}");
-        }
+        assert!(depth.points > 400 && depth.elsewhere < 0.15 && depth.median < 0.04, "seed {seed}: {depth:?}");
     }
 }

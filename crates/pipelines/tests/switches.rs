@@ -8,7 +8,7 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 /// Switches that leave the parameters alone.
-const NEUTRAL: [(&str, &str); 14] = [
+const NEUTRAL: [(&str, &str); 15] = [
     ("device", "this build has one"),
     ("data.path", "names the capture"),
     ("data.format", "tested with the importers"),
@@ -18,7 +18,7 @@ const NEUTRAL: [(&str, &str); 14] = [
     ("data.white", "of linear light alone: tested in cli/tests/photographs.rs"),
     ("data.skip_broken", "tested with broken photographs in cli/tests/photographs.rs"),
     ("loss.depth", "this capture has alpha: tested in object/recipe_tests.rs"),
-    ("loss.depth_from", "the same: tested in tests/speckles.rs"),
+    ("loss.depth_from", "the same: tested in object/recipe_tests.rs"),
     ("run.seconds", "the other budget: tested in train::run"),
     ("run.log_every", "tested in train::run"),
     ("run.save_every_seconds", "must not change the result"),

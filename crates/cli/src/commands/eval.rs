@@ -74,6 +74,7 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         let mut object = serde_json::to_value(&report).expect("a report is JSON");
         object["gap"] = serde_json::json!(report.gap());
         object["advice"] = serde_json::json!(report.advice());
+        object["depth_advice"] = serde_json::json!(report.depth.as_ref().and_then(DepthError::advice));
         if a.explain {
             object["seen_by"] = serde_json::json!(seen_by);
             object["seen_by_of"] = serde_json::json!(asked);
@@ -90,10 +91,7 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         if let Some(t) = &report.training {
             println!("{} training views: psnr {:.2} dB, ssim {:.4}", t.views, t.psnr, t.ssim);
         }
-        if let Some(d) = &report.depth {
-            let (off, elsewhere) = (100.0 * d.median, 100.0 * d.elsewhere);
-            println!("depth: {off:.1} % off (median of {} sparse points), {elsewhere:.0} % of them more than 10 % off", d.points);
-        }
+        report.depth.iter().for_each(|d| println!("{d}"));
         report.depth.iter().filter_map(DepthError::advice).for_each(|a| println!("{a}"));
         report.advice().into_iter().for_each(|a| println!("{a}"));
         if let fog @ [_, ..] = &report.behind_fog()[..] {

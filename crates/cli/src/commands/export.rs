@@ -156,7 +156,7 @@ fn export_points(a: &ExportArgs, model: &ObjectModel, options: &PointOptions) ->
 /// Lengths of the sides, and in what.
 fn extent([x, y, z]: [f32; 3], size: Size) -> String {
     let unit = match size {
-        Size::Unknown => " units of the capture, written as metres (--measured or --scale-to says how large it is)",
+        Size::Unknown => " units of the capture, taken as meters (--measured or --scale-to says how large it is)",
         _ => " m",
     };
     format!("{x:.3} x {y:.3} x {z:.3}{unit}")

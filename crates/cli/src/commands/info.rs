@@ -27,16 +27,22 @@ fn shown(v: &serde_json::Value) -> String {
         Value::String(s) => s.clone(),
         Value::Number(n) if n.is_f64() => {
             let n = n.as_f64().unwrap_or_default();
+            if n != 0.0 && n.abs() < 1e-4 {
+                return format!("{n:.3e}");
+            }
             let digits = (3 - n.abs().max(1e-9).log10().floor() as i32).clamp(0, 6) as usize;
             let text = format!("{n:.digits$}");
             if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').into() } else { text }
         }
         Value::Array(all) if all.is_empty() => "none".into(),
         Value::Array(all) => {
-            let apart = if all.iter().any(Value::is_string) { "; " } else { ", " };
-            all.iter().map(shown).collect::<Vec<_>>().join(apart)
+            let apart = if all.iter().any(Value::is_string) { format!("\n{:<19}", "") } else { ", ".into() };
+            all.iter().map(shown).collect::<Vec<_>>().join(&apart)
         }
-        Value::Object(map) => map.iter().map(|(k, v)| format!("{k} {}", shown(v))).collect::<Vec<_>>().join(", "),
+        Value::Object(map) => {
+            let part = |(k, v): (&String, &Value)| if v.is_array() { format!("{k} [{}]", shown(v)) } else { format!("{k} {}", shown(v)) };
+            map.iter().map(part).collect::<Vec<_>>().join(", ")
+        }
         other => other.to_string(),
     }
 }

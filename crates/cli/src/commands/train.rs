@@ -158,7 +158,10 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
     }
     for o in &a.overrides {
         let (key, value) = o.split_once('=').ok_or_else(|| PipelineError::Usage(format!("--set {o}: expected KEY=VALUE")))?;
-        c.set(key.trim(), value.trim())?;
+        // What a run has settled stays so.
+        if !(a.resume && is_settled_later(key.trim(), value.trim())) {
+            c.set(key.trim(), value.trim())?;
+        }
     }
     if let Some(p) = &a.preset {
         if p != "report" {
@@ -196,11 +199,18 @@ fn same(a: &TrainArgs, before: &Config, now: &Config) -> Result<()> {
         let set = a.overrides.iter().any(|o| o.split('=').next().is_some_and(|k| k.trim() == key));
         set || FLAGS.iter().any(|f| f.1 == key && is_given(a, f.0)) || key.starts_with("run.") || ["device", "data.path"].contains(&key)
     };
-    // Light of 0 stands for what the photographs say.
-    let unsaid = |key: &str, given: &str| key == "data.white" && given.parse::<f64>() == Ok(0.0);
-    match run.iter().zip(&given).find(|((key, run), (_, given))| run != given && !flagged(key) && !unsaid(key, given)) {
+    match run.iter().zip(&given).find(|((key, run), (_, given))| run != given && !flagged(key) && !is_settled_later(key, given)) {
         Some(((key, run), (_, given))) => changed(&format!("--config {}: {key}", file.display()), run, given),
         None => Ok(()),
+    }
+}
+
+/// Whether a value leaves open what the photographs say, which a run then keeps.
+fn is_settled_later(key: &str, value: &str) -> bool {
+    match key {
+        "data.white" | "sampling.near" => value.parse::<f64>() == Ok(0.0),
+        "field.appearance" | "loss.depth_from" => value.trim_matches('"') == "auto",
+        _ => false,
     }
 }
 

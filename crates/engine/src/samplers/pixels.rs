@@ -15,6 +15,10 @@ pub trait PixelSource: Sync {
     fn snap(&self, _image: usize, x: u32, y: u32) -> (u32, u32) {
         (x, y)
     }
+    /// Edge of the squares of which one pixel is at hand.
+    fn stride(&self) -> u32 {
+        1
+    }
     /// Straight RGBA in the photographs' own space: sRGB, or linear light, which may exceed 1.
     fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4];
     /// Whether the pixel may be trained on.

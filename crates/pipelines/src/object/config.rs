@@ -116,8 +116,8 @@ pub struct FieldConfig {
     pub base: u32,
     /// Cells per axis at the finest level; 0: half as wide as a pixel where cameras look, 512 to 2048 per inner cube.
     pub finest: u32,
-    /// Length of the per-image appearance code; 0: none.
-    pub appearance: usize,
+    /// Length of the per-image appearance code; 0: none; `auto`: 8 for `ngp` where exposure or light differ between photographs.
+    pub appearance: Auto,
     /// `auto`: unbounded for opaque photographs, else the capture's box; `box`; `unbounded`.
     pub space: String,
     /// `auto`: networks multiply in bf16 where the CPU has tiles for it; `f32`.
@@ -309,7 +309,7 @@ impl Config {
                 log2_size: 0,
                 base: 16,
                 finest: 0,
-                appearance: 0,
+                appearance: if ngp { Auto::Auto } else { Auto::Is(0.0) },
                 space: "auto".into(),
                 precision: "auto".into(),
             },
@@ -467,7 +467,11 @@ impl Config {
         if self.data.shortest_side > 0 && self.data.downscale > 1 {
             return fail("data.shortest_side and data.downscale: give one of them");
         }
-        if self.field.appearance > 0 && matches!(self.method, Method::Mlp | Method::Baseline) {
+        let code = self.field.appearance.or(0.0);
+        if code.fract() != 0.0 || code > 256.0 {
+            return fail("field.appearance: expected auto or a whole number up to 256");
+        }
+        if code > 0.0 && matches!(self.method, Method::Mlp | Method::Baseline) {
             return fail("field.appearance: only ngp and nerf have a view-dependent part that takes an appearance code");
         }
         if self.run.steps == 0 && self.run.seconds <= 0.0 {

@@ -18,8 +18,19 @@ const ELSEWHERE: f64 = 0.1;
 const WRONG: f64 = 0.3;
 
 /// What is wrong where so many points are elsewhere, and what helps.
-const MEANS: &str = "the surfaces are not where the sparse points are, whatever the pictures look like; train longer, or give sparse \
-                     points to all photographs (diorama prepare), or try --set loss.distortion=0.01";
+const MEANS: &str = "the surfaces are not where the sparse points are, whatever the pictures look like; more training, or \
+                     more photographs between these help; loss.depth=0 leaves the points out (docs/troubleshooting.md)";
+
+impl std::fmt::Display for DepthError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let (n, elsewhere) = (self.points, 100.0 * self.elsewhere);
+        match self.median {
+            m if m.is_finite() => write!(f, "depth: {:.1} % off (median of {n} sparse points)", 100.0 * m)?,
+            _ => write!(f, "depth: most of {n} sparse points have no surface")?,
+        }
+        write!(f, ", {elsewhere:.0} % of them more than 10 % off")
+    }
+}
 
 /// Distances of surfaces against those of sparse points.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -64,9 +75,8 @@ pub fn errors(model: &ObjectModel, frame: usize, scored: &ScoredView) -> Vec<f64
         let (x, y) = (px.x * sx, px.y * sy);
         let is_inside = (0.0..w as f64).contains(&x) && (0.0..h as f64).contains(&y);
         let (x, y) = (x as usize, y as usize);
-        let pixel = y * w + x;
-        (is_inside && counts(x, y)).then(|| match scored.view.opacity.data[pixel] {
-            o if o > 0.5 => (scored.view.depth.data[pixel] as f64 * unit / q.length() - 1.0).abs(),
+        (is_inside && counts(x, y)).then(|| match scored.view.opacity.data[y * w + x] {
+            o if o > 0.5 => (scored.view.depth.data[y * w + x] as f64 * unit / q.length() - 1.0).abs(),
             _ => f64::INFINITY,
         })
     };

@@ -185,12 +185,12 @@ fn poses(c: &Capture) -> Vec<Finding> {
     let trained = |i: &usize| (c.frames[*i].split == Split::Train) as usize;
     for (of, what, grade, cure) in [
         (2, "pairs of training views have one pose", Grade::Trouble, "remove one of each, or find the poses again"),
-        (1, "held-out views have a training view's pose", Grade::Trouble, "scores on them say little: remove one of each"),
+        (1, "pairs of a held-out and a training view have one pose", Grade::Trouble, "scores on them say little: remove one of each"),
         (0, "pairs of held-out views have one pose", Grade::Note, "no harm where val and test are the same photographs"),
     ] {
-        let mut same = twins.iter().filter(|(i, j)| trained(i) + trained(j) == of).peekable();
-        if let Some((i, j)) = same.peek().copied() {
-            let text = format!("{} {what}, for example {} and {}", same.count(), c.frames[*i].name, c.frames[*j].name);
+        let same: Vec<_> = twins.iter().filter(|(i, j)| trained(i) + trained(j) == of).collect();
+        if let Some((i, j)) = same.first() {
+            let text = format!("{} {what}, for example {} and {}", same.len(), c.frames[*i].name, c.frames[*j].name);
             out.push(finding("poses", grade, text, cure));
         }
     }
@@ -344,7 +344,7 @@ fn pixels(capture: &Capture) -> Result<Vec<Finding>> {
             "exposure",
             Grade::Note,
             format!("brightness differs by {spread:.1} stops between views"),
-            "if the camera did it, not the scene: `diorama prepare --normalize-exposure`, or train with --set field.appearance=16",
+            "if the camera did it, not the scene: `diorama prepare --normalize-exposure`, training gives each photograph an appearance code where it finds so (field.appearance)",
         )
     } else {
         finding("exposure", Grade::Good, format!("brightness differs by {spread:.1} stops between views"), "")
@@ -444,7 +444,7 @@ mod tests {
             })
         };
         let (leaked, twice) = (held_out(&[3]), held_out(&[2, 3]));
-        assert!(worst(&leaked, "poses").is_some_and(|f| f.grade == Grade::Trouble && f.text.contains("a training view's pose")));
+        assert!(worst(&leaked, "poses").is_some_and(|f| f.grade == Grade::Trouble && f.text.contains("a held-out and a training view")));
         assert_eq!(worst(&twice, "poses").unwrap().grade, Grade::Note, "{twice:?}");
         let outside = spoilt(&|c| c.scene.center = DVec3::splat(9.0));
         assert_eq!(worst(&outside, "scale").unwrap().grade, Grade::Trouble);

@@ -7,6 +7,7 @@ use super::recipe;
 use crate::error::Result;
 use diorama_data::{DataError, atomic, error, import};
 use diorama_geom::Capture;
+use diorama_geom::capture::Frame;
 use serde::{Deserialize, Serialize};
 use std::path::{Component, Path, PathBuf};
 
@@ -87,12 +88,21 @@ fn open(run: &Path) -> Result<KeptCapture> {
 pub fn add_points(kept: &mut Capture, config: &Config, data: &Path) {
     let mut config = config.clone();
     config.data.path = data.to_path_buf();
-    let names = |c: &Capture| c.frames.iter().map(|f| f.name.clone()).collect::<Vec<_>>();
     match recipe::load_capture(&config) {
-        Ok(fresh) if names(&fresh) == names(kept) => kept.points = fresh.points,
+        Ok(fresh) if has_same_views(&fresh, kept) => kept.points = fresh.points,
         Ok(_) => kept.notes.push("the capture has changed since the run began: its sparse points are not used".into()),
         Err(e) => kept.notes.push(format!("the capture's sparse points cannot be read again: {e}")),
     }
+}
+
+/// Whether photographs have the same names and poses: else the points are of another world.
+fn has_same_views(a: &Capture, b: &Capture) -> bool {
+    let close = 1e-5 * b.scene.half;
+    let is_same = |(a, b): (&Frame, &Frame)| {
+        let (p, q) = (&a.world_from_camera, &b.world_from_camera);
+        a.name == b.name && (p.translation - q.translation).length() <= close && p.rotation.abs_diff_eq(q.rotation, 1e-5)
+    };
+    a.frames.len() == b.frames.len() && a.frames.iter().zip(&b.frames).all(is_same)
 }
 
 /// The folder in which the first photograph lies: where it was, else where it lay as seen from the run.
@@ -184,6 +194,22 @@ mod tests {
         std::fs::remove_file(far.join("images/view_02.png")).unwrap();
         let wrong = found(&run, Some(&far)).unwrap_err().to_string();
         assert!(wrong.contains("far") && wrong.contains("view_02.png"), "{wrong}");
+    }
+
+    #[test]
+    fn points_of_another_world_are_not_used() {
+        let dir = tempfile::tempdir().unwrap();
+        let (data, run) = pair(dir.path());
+        let config = Config::new(super::super::config::Method::Ngp, data.clone());
+        let mut kept = read(&run, None, &data).unwrap();
+        add_points(&mut kept, &config, &data);
+        assert_eq!(kept.notes, Vec::<String>::new(), "the same capture");
+        kept.frames[1].world_from_camera.translation.x += 0.1;
+        add_points(&mut kept, &config, &data);
+        assert!(kept.notes[0].contains("has changed"), "{:?}", kept.notes);
+        std::fs::remove_file(data.join("transforms.json")).unwrap();
+        add_points(&mut kept, &config, &data);
+        assert!(kept.notes[1].contains("cannot be read again"), "{:?}", kept.notes);
     }
 
     #[test]

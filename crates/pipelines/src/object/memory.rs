@@ -1,12 +1,13 @@
 //! What training and export take in memory, before they begin: needs, what the machine has, and what helps. Only what
 //! is certain counts, so that nothing is refused that would fit.
 
-use super::config::{Config, Method};
+use super::config::{Auto, Config, Method};
 use super::device;
 use super::export::ExportOptions;
 use super::model::{self, ObjectModel};
 use crate::error::{PipelineError, Result};
 use diorama_data::{memory, pixel_store};
+use diorama_engine::samplers::stereo;
 use diorama_geom::capture::Split;
 use diorama_geom::{Capture, PixelFormat};
 use diorama_kernels::ops::hash_grid::HashGrid;
@@ -91,9 +92,11 @@ fn bytes(text: &str) -> std::result::Result<u64, String> {
 pub fn of_training(config: &Config, capture: &Capture, format: PixelFormat, samples: usize) -> Needs {
     let train = capture.indices(Split::Train);
     let (mut pixels, mut masks, mut largest) = (0u64, 0u64, 0u64);
+    let mut sizes = Vec::new();
     for f in train.iter().map(|&i| &capture.frames[i]) {
         let (w, h) = config.reduction().size((f.camera.width, f.camera.height));
         pixels += w as u64 * h as u64;
+        sizes.push((w, h));
         masks += if f.mask.is_some() { w as u64 * h as u64 } else { 0 };
         largest = largest.max(f.camera.width as u64 * f.camera.height as u64);
     }
@@ -112,11 +115,14 @@ pub fn of_training(config: &Config, capture: &Capture, format: PixelFormat, samp
     let cells = (config.sampling.occupancy_resolution as u64).saturating_pow(3).saturating_mul(model::cascades(space) as u64);
     let occupancy = if config.method == Method::Ngp { cells.saturating_mul(9) } else { 0 };
     let batch = if config.method == Method::Ngp { (samples as u64).saturating_mul(SAMPLE) } else { 0 };
+    // Whether sparse points tell enough is not known yet.
+    let compares = config.method == Method::Ngp && config.loss.depth != Auto::Is(0.0) && config.loss.depth_from != "points";
     Needs(vec![
         ("photographs", kept + masks + at_once * largest * decoded),
         ("parameters", parameters),
         ("occupancy grid", occupancy),
         ("batch", batch),
+        ("comparison of photographs", if compares { stereo::bytes(sizes.into_iter()) } else { 0 }),
     ])
 }
 

@@ -7,6 +7,7 @@ pub mod device;
 pub mod diagnose;
 pub mod evaluate;
 pub mod export;
+mod exposure_spread;
 pub(crate) mod extent;
 pub mod fog;
 pub mod held_out;

@@ -159,7 +159,7 @@ impl ObjectModel {
         let train = capture.indices(Split::Train);
         let is_linear = is_linear(&capture);
         let space = space(&config, &capture, has_alpha);
-        let (seed, rate, images, dims) = (config.seed, config.optim.rate, train.len(), config.field.appearance);
+        let (seed, rate, images, dims) = (config.seed, config.optim.rate, train.len(), config.field.appearance.or(0.0) as usize);
         let (field, coarse) = match config.method {
             Method::Ngp => (fields::ngp(hash_grid(&config, &capture, space), space, rate, images, dims, seed), None),
             Method::Nerf => (fields::nerf(space, rate, images, dims, seed, 1), Some(fields::nerf(space, rate, images, dims, seed, 0))),

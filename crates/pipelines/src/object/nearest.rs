@@ -7,7 +7,7 @@ use diorama_geom::capture::SparsePoint;
 /// Where nothing is known, in inner cubes.
 pub const UNKNOWN: f32 = 0.1;
 
-/// Observations that tell how near matter is, and the share of them, the closest, that may be wrong.
+/// Fewest observations that give an estimate, and the share of the closest that is ignored as outliers.
 const OBSERVATIONS: usize = 1000;
 const WRONG: f64 = 0.01;
 

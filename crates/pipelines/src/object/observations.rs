@@ -1,11 +1,11 @@
-//! Pixels of training photographs in which it is known how far away what they show is: by the capture's sparse points, or by comparing
-//! the photographs.
+//! Pixels of training photographs whose distance is known, from sparse points or from stereo.
 
 use super::model::ObjectModel;
 use super::nearest;
 use diorama_engine::samplers::pixels::{Observation, PixelSource};
 use diorama_engine::samplers::stereo;
 use diorama_geom::capture::SparsePoint;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Fewest training photographs that show a point, and largest mean reprojection error in their pixels: else its distance is unsure.
 const FEWEST: usize = 3;
@@ -18,25 +18,44 @@ const MOST: usize = 1 << 20;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Source {
     Points,
-    Photographs,
+    Stereo,
 }
 
-/// Finds distances as `loss.depth_from` says, and from them how near matter may be, where the configuration leaves that open.
-pub(super) fn find(model: &mut ObjectModel, photographs: &dyn PixelSource) -> (Vec<Observation>, Source) {
-    let from = &model.config.loss.depth_from[..];
+/// Fewest observations of sparse points with which stereo is not asked.
+const ENOUGH: usize = 1000;
+
+/// Finds distances as `loss.depth_from` says and settles what the configuration leaves open: where they come from, and how near matter
+/// may be.
+pub(super) fn find(
+    model: &mut ObjectModel,
+    photographs: &dyn PixelSource,
+    interrupt: &AtomicBool,
+    note: &mut dyn FnMut(String),
+) -> (Vec<Observation>, Source) {
+    // Where memory holds a share of the pixels, another one would be drawn in place of the observed one.
+    let is_stored = |o: &Observation| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y);
     let is_wanted = model.depth() > 0.0;
+    let from = model.config.loss.depth_from.clone();
     let mut found = if is_wanted && from != "stereo" { of_points(model) } else { Vec::new() };
-    let source = if from == "stereo" || (from == "auto" && found.is_empty()) { Source::Photographs } else { Source::Points };
-    if is_wanted && source == Source::Photographs {
-        found = stereo::observe(photographs, &model.base_cameras(), model.viewing_distance());
+    found.retain(is_stored);
+    let source = if from == "stereo" || (from == "auto" && found.len() < ENOUGH) { Source::Stereo } else { Source::Points };
+    let viewing_distance = model.viewing_distance();
+    if is_wanted && source == Source::Stereo {
+        note(format!("comparing {} photographs with their neighbors to find distances", photographs.images()));
+        found = stereo::observe(photographs, &model.base_cameras(), viewing_distance, interrupt);
+        found.retain(is_stored);
+    }
+    if is_wanted && from == "auto" && !interrupt.load(Ordering::Relaxed) {
+        model.config.loss.depth_from = if source == Source::Points { "points" } else { "stereo" }.into();
     }
     let near = &mut model.config.sampling.near;
     if *near == 0.0 {
-        *near = nearest::of_observations(&found).unwrap_or(nearest::UNKNOWN);
+        // Stereo looks no nearer than that, so that what it does not find there may be there all the same.
+        let most = (stereo::NEAREST * viewing_distance) as f32;
+        *near = nearest::of_observations(&found).map_or(nearest::UNKNOWN, |n| n.min(most).max(nearest::UNKNOWN));
     }
-    // Rays begin beyond what is closer, so that no sample could be there; and where memory holds a share of the pixels, another one would
-    // be drawn in place of the observed one.
-    found.retain(|o| o.distance > *near && photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y));
+    // Rays begin beyond what is closer, so that no sample could be there.
+    found.retain(|o| o.distance > *near);
     (found, source)
 }
 
@@ -65,7 +84,7 @@ pub(super) fn of_points(model: &ObjectModel) -> Vec<Observation> {
     seen.collect()
 }
 
-/// What a user should know of `n` observations.
+/// Message about `n` observations for the user.
 pub(super) fn note(model: &ObjectModel, n: usize, source: Source) -> Option<String> {
     if model.depth() == 0.0 || (n == 0 && model.capture.points.is_empty() && source == Source::Points) {
         return None;
@@ -75,9 +94,12 @@ pub(super) fn note(model: &ObjectModel, n: usize, source: Source) -> Option<Stri
             let why = "nobody says which photographs see them (diorama prepare does), or fewer than three do";
             format!("the sparse points tell no distances: {why}")
         }
-        (0, Source::Photographs) => "no distances were found by comparing photographs: too few overlap, or they show little texture".into(),
+        (0, Source::Stereo) => {
+            "no distances were found by comparing photographs: too few overlap, they show little texture, or all cameras look the same way"
+                .into()
+        }
         (n, Source::Points) => format!("sparse points tell the distance of {n} pixels (--set loss.depth=0: do not use them)"),
-        (n, Source::Photographs) => {
+        (n, Source::Stereo) => {
             format!("the distance of {n} pixels was found by comparing photographs (--set loss.depth=0: do not use it)")
         }
     })

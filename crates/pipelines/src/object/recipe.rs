@@ -2,6 +2,7 @@
 
 use super::config::{Background, Config, Method};
 use super::device::{self, Aftermath, Drawing, Opened};
+use super::exposure_spread;
 use super::held_out::{self, HeldOutPixels};
 use super::memory;
 use super::model::{ObjectModel, Terms, is_linear};
@@ -125,8 +126,10 @@ pub fn train(
     let has_alpha = store.has_alpha;
     let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
     let photographs = Photographs(store);
-    let (observations, source) = observations::find(&mut model, &photographs);
+    let (observations, source) = observations::find(&mut model, &photographs, interrupt, &mut |n| events(&Event::Note(n)));
     observations::note(&model, observations.len(), source).into_iter().for_each(|n| events(&Event::Note(n)));
+    let (mut model, note) = exposure_spread::settle_codes(model, &photographs, &observations)?;
+    note.into_iter().for_each(|n| events(&Event::Note(n)));
     let held_out = HeldOutPixels::draw(&model)?;
     if resume {
         if checkpoint::exists(&folder.checkpoints()) {
@@ -262,6 +265,9 @@ fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'stat
     let (store, _) = load_pixels(config, &capture, &device)?;
     let has_alpha = store.has_alpha;
     let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
+    let photographs = Photographs(store);
+    let (observations, _) = observations::find(&mut model, &photographs, &AtomicBool::new(false), &mut |_| {});
+    let (mut model, _) = exposure_spread::settle_codes(model, &photographs, &observations)?;
     if let (true, Some(group)) = (wrong_cameras, &mut model.corrections) {
         let rng = Rng::new(config.seed, 0);
         for (i, v) in group.values.iter_mut().enumerate() {
@@ -269,8 +275,6 @@ fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'stat
             *v = if moves { WRONG * (2.0 * rng.uniform(i as u64) - 1.0) } else { 0.0 };
         }
     }
-    let photographs = Photographs(store);
-    let (observations, _) = observations::find(&mut model, &photographs);
     Trainer::new(model, photographs, observations, Path::new(""), device)
 }
 
@@ -335,6 +339,9 @@ impl PixelSource for Photographs {
     }
     fn snap(&self, image: usize, x: u32, y: u32) -> (u32, u32) {
         self.0.snap(image, x, y)
+    }
+    fn stride(&self) -> u32 {
+        self.0.stride() as u32
     }
     fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4] {
         pixel_gather::cpu::convert(self.0.format(), self.0.pixel(image, x, y))

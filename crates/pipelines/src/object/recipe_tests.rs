@@ -108,13 +108,34 @@ fn observations_are_the_pixels_and_distances_of_points_that_are_sure() {
     add_point(&mut t, 0.5, 0.4, &[0, 1, 2]);
     let too_close = 0.5 * t.model.config.sampling.near as f64 / scale;
     add_point(&mut t, too_close, 0.4, &[1, 2, 3]);
-    let (got, source) = observations::find(&mut t.model, &t.photographs);
+    t.model.config.set("loss.depth_from", "points").unwrap();
+    let (got, source) = observations::find(&mut t.model, &t.photographs, &AtomicBool::new(false), &mut |_| {});
     assert_eq!(source, observations::Source::Points);
     let image = t.model.train.iter().position(|f| *f == 1).unwrap() as u32;
     assert!(got.iter().all(|o| t.model.train[o.image as usize] != 0), "frame 0 is held out: {got:?}");
     let ahead: Vec<_> = got.iter().filter(|o| o.image == image).collect();
     assert!(ahead.len() == 1 && (ahead[0].x, ahead[0].y) == (12, 12), "the middle of 24 pixels, once: {got:?}");
     assert!((ahead[0].distance as f64 / scale - 0.5).abs() < 1e-5, "{got:?}");
+}
+
+#[test]
+fn distances_come_from_where_the_configuration_says() {
+    for (from, points, want) in [
+        ("points", 0, observations::Source::Points),
+        ("stereo", 2000, observations::Source::Stereo),
+        ("auto", 0, observations::Source::Stereo),
+        ("auto", 3, observations::Source::Stereo),
+        ("auto", 2000, observations::Source::Points),
+    ] {
+        let mut t = unbounded();
+        (0..points).for_each(|_| add_point(&mut t, 0.5, 0.4, &[1, 2, 3]));
+        t.model.config.loss.depth_from = from.into();
+        let (found, source) = observations::find(&mut t.model, &t.photographs, &AtomicBool::new(false), &mut |_| {});
+        assert_eq!(source, want, "{from} with {points} points");
+        assert!(source == observations::Source::Stereo || found.len() >= points, "{from}: {} of {points}", found.len());
+        // What was found once stays so when the run is resumed.
+        assert_eq!(t.model.config.loss.depth_from, if want == observations::Source::Points { "points" } else { "stereo" });
+    }
 }
 
 /// How far matter stands, on average over the light, in the middle of frame 1, in the world.

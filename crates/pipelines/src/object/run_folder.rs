@@ -321,9 +321,9 @@ pub fn add_points(model: &mut ObjectModel, path: &Path, data: Option<&Path>) -> 
         Some(moved) => moved.to_path_buf(),
         None => kept_capture::data_set(path, &model.config.data.path)?,
     };
-    let told = model.capture.notes.len();
+    let n_notes = model.capture.notes.len();
     kept_capture::add_points(&mut model.capture, &model.config, &data);
-    Ok(model.capture.notes.split_off(told))
+    Ok(model.capture.notes.split_off(n_notes))
 }
 
 /// A trained model whose photographs are in `data` now, if that is given.

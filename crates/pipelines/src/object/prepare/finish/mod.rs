@@ -3,7 +3,7 @@
 
 pub mod background;
 mod denoise;
-mod exposure;
+pub(crate) mod exposure;
 mod grab_cut;
 mod graph_cut;
 #[cfg(feature = "onnx")]

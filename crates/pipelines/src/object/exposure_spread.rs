@@ -1,0 +1,158 @@
+//! How much exposure and light differ between training photographs, by the colors of places that several show.
+
+use super::config::Auto;
+use super::model::ObjectModel;
+use super::prepare::finish::exposure::gains;
+use crate::error::Result;
+use diorama_engine::samplers::pixels::{Observation, PixelSource};
+use diorama_geom::color::linear_from_srgb;
+use diorama_geom::glam::DVec3;
+use diorama_kernels::ops::ray_generation::PosedCamera;
+use rayon::prelude::*;
+
+/// Standard deviation of the log exposures from which on each photograph wears an appearance code, and the code's numbers.
+const DIFFERS: f32 = 0.1;
+const CODE: f32 = 8.0;
+
+/// Most places that are asked, and in how many photographs besides their own: those that look from closest by, within so many degrees.
+const PLACES: usize = 6000;
+const OTHERS: usize = 4;
+const ANGLE_DEG: f64 = 30.0;
+/// Clipped colors, and those too dark to tell.
+const RANGE: (f32, f32) = (0.03, 0.97);
+/// Fewest places.
+const FEWEST: usize = 200;
+
+/// Gives an untrained model appearance codes where the photographs' light differs and its configuration leaves that open; a note says so.
+pub(super) fn settle_codes(model: ObjectModel, source: &dyn PixelSource, known: &[Observation]) -> Result<(ObjectModel, Option<String>)> {
+    if model.config.field.appearance != Auto::Auto {
+        return Ok((model, None));
+    }
+    let spread = of(source, &model.base_cameras(), known).filter(|s| *s > DIFFERS);
+    let ObjectModel { mut config, capture, has_alpha, .. } = model;
+    config.field.appearance = Auto::Is(if spread.is_some() { CODE } else { 0.0 });
+    let note = spread.map(|s| {
+        let percent = 100.0 * s;
+        format!(
+            "exposure or light differ by {percent:.0} % between photographs: each wears an appearance code (--set field.appearance=0: none)"
+        )
+    });
+    Ok((ObjectModel::new(config, capture, has_alpha)?, note))
+}
+
+/// Standard deviation (by the middle two thirds) of the photographs' log gains; none where too few places are known.
+fn of(source: &dyn PixelSource, cameras: &[PosedCamera], observations: &[Observation]) -> Option<f32> {
+    let step = observations.len().div_ceil(PLACES).max(1);
+    let places: Vec<&Observation> = observations.iter().step_by(step).collect();
+    if places.len() < FEWEST {
+        return None;
+    }
+    let from_world: Vec<_> = cameras.iter().map(|c| c.pose.inverse()).collect();
+    let shown = |o: &Observation| -> Vec<(usize, [f32; 3])> {
+        let own = &cameras[o.image as usize];
+        let (x, y) = (o.x as f64 + 0.5, o.y as f64 + 0.5);
+        let p = own.pose.point(own.camera.direction(x, y) * o.distance as f64);
+        let angle = |c: &PosedCamera| (c.pose.translation - p).angle_between(own.pose.translation - p).to_degrees();
+        let mut others: Vec<(f64, usize)> = cameras.iter().map(angle).zip(0..).filter(|(a, _)| *a < ANGLE_DEG).collect();
+        others.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let seen = |i: usize| {
+            let q: DVec3 = from_world[i].point(p);
+            let px = cameras[i].camera.project(q)?;
+            color(source, i, px.x, px.y).map(|c| (i, c))
+        };
+        // Its own photograph comes first, at no angle.
+        others.into_iter().filter_map(|(_, i)| seen(i)).take(OTHERS + 1).collect()
+    };
+    let all: Vec<Vec<(usize, [f32; 3])>> = places.par_iter().map(|o| shown(o)).collect();
+    let mut of_photographs = vec![Vec::new(); cameras.len()];
+    for (id, place) in all.iter().enumerate() {
+        place.iter().for_each(|(image, c)| of_photographs[*image].push((id as u64, *c)));
+    }
+    let mut green: Vec<f32> = gains(&of_photographs).iter().map(|g| g[1]).collect();
+    green.sort_by(f32::total_cmp);
+    let at = |share: f64| green[((green.len() - 1) as f64 * share).round() as usize];
+    Some(0.5 * (at(5.0 / 6.0) - at(1.0 / 6.0)))
+}
+
+/// Log of the mean linear color of 3 x 3 pixels; none where it is clipped, dark, outside of the photograph, or does not count.
+fn color(source: &dyn PixelSource, image: usize, x: f64, y: f64) -> Option<[f32; 3]> {
+    let (w, h) = source.size(image);
+    if !(1.0..w as f64 - 1.0).contains(&x) || !(1.0..h as f64 - 1.0).contains(&y) {
+        return None;
+    }
+    let mut sum = [0.0f32; 3];
+    for k in 0..9u32 {
+        let (x, y) = source.snap(image, x as u32 + k % 3 - 1, y as u32 + k / 3 - 1);
+        let c = source.rgba(image, x, y);
+        if !source.counts(image, x, y) || c[..3].iter().any(|v| !(RANGE.0..=RANGE.1).contains(v)) {
+            return None;
+        }
+        (0..3).for_each(|n| sum[n] += linear_from_srgb(c[n]) / 9.0);
+    }
+    Some(sum.map(f32::ln))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diorama_geom::{Camera, Pose};
+
+    const SIZE: u32 = 64;
+
+    /// A wall of slow waves that cameras on an arc photograph, each with its own log exposure.
+    struct Wall(Vec<PosedCamera>, Vec<f32>);
+
+    impl Wall {
+        fn new(exposure: fn(usize) -> f32) -> Wall {
+            let posed = |i: usize| {
+                let turn = (i as f64 - 6.0) * 0.08;
+                let eye = DVec3::new(3.0 * turn.sin(), 0.0, 3.0 * turn.cos());
+                PosedCamera { camera: Camera::pinhole(SIZE, SIZE, 0.6), pose: Pose::look_at(eye, DVec3::ZERO, DVec3::Y) }
+            };
+            Wall((0..12).map(posed).collect(), (0..12).map(exposure).collect())
+        }
+
+        fn meets(&self, image: usize, x: f64, y: f64) -> (DVec3, f64) {
+            let d = self.0[image].pose.rotation * self.0[image].camera.direction(x, y);
+            let t = -self.0[image].pose.translation.z / d.z;
+            (self.0[image].pose.translation + d * t, t)
+        }
+
+        fn spread(&self, places: u32) -> Option<f32> {
+            let place = |k: u32| {
+                let (image, x, y) = (k % 12, 4 + k * 37 % (SIZE - 8), 4 + k * 11 % (SIZE - 8));
+                let (_, t) = self.meets(image as usize, x as f64 + 0.5, y as f64 + 0.5);
+                Observation { image, x, y, distance: t as f32 }
+            };
+            of(self, &self.0, &(0..places).map(place).collect::<Vec<_>>())
+        }
+    }
+
+    impl PixelSource for Wall {
+        fn images(&self) -> usize {
+            self.0.len()
+        }
+        fn size(&self, _: usize) -> (u32, u32) {
+            (SIZE, SIZE)
+        }
+        fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4] {
+            let (p, _) = self.meets(image, x as f64 + 0.5, y as f64 + 0.5);
+            let light = (0.2 + 0.1 * (3.0 * p.x).sin() * (4.0 * p.y).cos()) as f32 * self.1[image].exp();
+            let v = diorama_geom::color::srgb_from_linear(light);
+            [v, v, v, 1.0]
+        }
+        fn counts(&self, _: usize, _: u32, _: u32) -> bool {
+            true
+        }
+    }
+
+    #[test]
+    fn exposures_that_differ_are_measured_and_equal_ones_are_not() {
+        // One photograph in three is brighter or darker.
+        let differing = Wall::new(|i| [0.0, 0.2, -0.2][i % 3]).spread(3000).unwrap();
+        assert!((differing - 0.2).abs() < 0.02, "{differing}");
+        let equal = Wall::new(|_| 0.3).spread(3000).unwrap();
+        assert!(equal < 0.01, "{equal}");
+        assert_eq!(Wall::new(|_| 0.0).spread(FEWEST as u32 - 1), None, "too few places");
+    }
+}
