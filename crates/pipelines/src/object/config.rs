@@ -175,7 +175,7 @@ pub struct LossConfig {
     /// growing from nothing while coarse geometry is found, 0.01 in a box.
     pub distortion: Auto,
     pub alpha: f32,
-    /// Weight of the light that ends away from the sparse points which photographs show; `auto`: 0.3 in unbounded space, else none.
+    /// Weight of the light that ends away from what pixels of known distance show; `auto`: 0.3 in unbounded space, else none.
     #[serde(default = "no_weight")]
     pub depth: Auto,
     /// Where distances come from: `points` (those of the capture), `stereo` (photographs compared with their neighbours), or `auto`:
@@ -220,7 +220,7 @@ pub struct SamplingConfig {
     /// Samples of less opacity than this are not trained on.
     pub min_alpha: f32,
     /// Nearest distance at which matter may be, in inner cubes; 0: 0.7 of the distance to the closest sparse points that cameras
-    /// see, 0.1 where there are none.
+    /// see; by stereo at most a fifth of the viewing distance; 0.1 where nothing is known.
     pub near: f32,
     pub occupancy_resolution: usize,
     /// Points of the occupancy grid sampled per update.

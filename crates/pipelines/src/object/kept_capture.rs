@@ -3,7 +3,7 @@
 //! Paths are relative to the data set's folder, which is kept both as it was and as seen from the run.
 
 use super::config::Config;
-use super::recipe;
+use super::loading;
 use crate::error::Result;
 use diorama_data::{DataError, atomic, error, import};
 use diorama_geom::Capture;
@@ -88,7 +88,7 @@ fn open(run: &Path) -> Result<KeptCapture> {
 pub fn add_points(kept: &mut Capture, config: &Config, data: &Path) {
     let mut config = config.clone();
     config.data.path = data.to_path_buf();
-    match recipe::load_capture(&config) {
+    match loading::load_capture(&config) {
         Ok(fresh) if has_same_views(&fresh, kept) => kept.points = fresh.points,
         Ok(_) => kept.notes.push("the capture has changed since the run began: its sparse points are not used".into()),
         Err(e) => kept.notes.push(format!("the capture's sparse points cannot be read again: {e}")),

@@ -12,6 +12,7 @@ pub(crate) mod extent;
 pub mod fog;
 pub mod held_out;
 pub mod kept_capture;
+mod loading;
 pub mod memory;
 pub mod model;
 mod nearest;

@@ -60,7 +60,7 @@ pub struct ObjectModel {
 pub struct Terms {
     pub color: ColorLoss,
     pub distortion: f32,
-    /// Of light that ends away from sparse points.
+    /// Of light that ends away from what is known to be there.
     pub depth: f32,
     pub alpha: f32,
     /// Distance within which samples learn more slowly; 0: none.
@@ -84,7 +84,7 @@ const DISTORTION_RAMP: u64 = 2000;
 /// Width of the Huber loss's quadratic part.
 const HUBER: f32 = 0.1;
 
-/// Weight of the light that ends away from sparse points, in unbounded space.
+/// Weight of the light that ends away from what pixels of known distance show, in unbounded space.
 const DEPTH: f32 = 0.3;
 
 /// Cascades of the occupancy grid of unbounded space: they reach 64 inner cubes far, beyond which a ray has a few samples left.
@@ -271,7 +271,7 @@ impl ObjectModel {
         }
     }
 
-    /// Weight of the light that ends away from sparse points.
+    /// Weight of the light that ends away from what pixels of known distance show.
     pub fn depth(&self) -> f32 {
         self.config.loss.depth.or(if self.field.is_unbounded() { DEPTH } else { 0.0 })
     }

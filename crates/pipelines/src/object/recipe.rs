@@ -4,6 +4,7 @@ use super::config::{Background, Config, Method};
 use super::device::{self, Aftermath, Drawing, Opened};
 use super::exposure_spread;
 use super::held_out::{self, HeldOutPixels};
+pub use super::loading::load_capture;
 use super::memory;
 use super::model::{ObjectModel, Terms, is_linear};
 use super::nearest;
@@ -13,7 +14,6 @@ use super::viewing::RunView;
 use crate::bench::train::{StageFigure, TrainReport};
 use crate::error::{PipelineError, Result};
 use diorama_data::checkpoint;
-use diorama_data::import::{self, ImportOptions};
 use diorama_data::photo_check;
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_engine::fields::{Batch, Field, FieldBuffers, Pruning};
@@ -55,28 +55,6 @@ const BATCH_RAMP: (u64, u64) = (256, 1024);
 /// How much longer the steps of a march are at first, and the training step from which they have their own length:
 /// what a scene is roughly like is learned from few samples per ray and so from many rays.
 const MARCH_RAMP: (f32, u64) = (16.0, 1024);
-
-/// Reads the capture that a configuration names.
-pub fn load_capture(config: &Config) -> Result<Capture> {
-    let split = config.data.split.parse().map_err(PipelineError::Usage)?;
-    let format = match &config.data.format[..] {
-        "" => None,
-        f => Some(f.parse().map_err(PipelineError::Usage)?),
-    };
-    let options = ImportOptions {
-        format,
-        split,
-        seed: config.seed,
-        masks: config.data.masks()?,
-        skip_broken: config.data.skip_broken,
-        ..ImportOptions::default()
-    };
-    let mut capture = import::import(&config.data.path, &options)?;
-    if config.data.skip_broken {
-        photo_check::leave_out_broken(&mut capture)?;
-    }
-    Ok(capture)
-}
 
 /// The device that a configuration will train on, in words.
 ///
@@ -341,7 +319,7 @@ impl PixelSource for Photographs {
         self.0.snap(image, x, y)
     }
     fn stride(&self) -> u32 {
-        self.0.stride() as u32
+        self.0.stride()
     }
     fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4] {
         pixel_gather::cpu::convert(self.0.format(), self.0.pixel(image, x, y))
