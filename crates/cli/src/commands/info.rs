@@ -25,8 +25,8 @@ fn shown(v: &serde_json::Value) -> String {
     match v {
         Value::Null => "-".into(),
         Value::String(s) => s.clone(),
-        Value::Number(n) if n.is_f64() => {
-            let n = n.as_f64().unwrap_or_default();
+        Value::Number(n) => {
+            let Some(n) = n.as_f64().filter(|_| n.is_f64()) else { return n.to_string() };
             if n != 0.0 && n.abs() < 1e-4 {
                 return format!("{n:.3e}");
             }

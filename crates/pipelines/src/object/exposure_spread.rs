@@ -24,24 +24,29 @@ const RANGE: (f32, f32) = (0.03, 0.97);
 const FEWEST: usize = 200;
 
 /// Gives an untrained model appearance codes where the photographs' light differs and its configuration leaves that open; a note says so.
-pub(super) fn settle_codes(model: ObjectModel, source: &dyn PixelSource, known: &[Observation]) -> Result<(ObjectModel, Option<String>)> {
+pub(super) fn settle_codes(
+    mut model: ObjectModel,
+    source: &dyn PixelSource,
+    known: &[Observation],
+) -> Result<(ObjectModel, Option<String>)> {
     if model.config.field.appearance != Auto::Auto {
         return Ok((model, None));
     }
-    let spread = of(source, &model.base_cameras(), known).filter(|s| *s > DIFFERS);
+    let Some(spread) = of(source, &model.base_cameras(), known, model.is_linear()).filter(|s| *s > DIFFERS) else {
+        model.config.field.appearance = Auto::Is(0.0);
+        return Ok((model, None));
+    };
+    let percent = 100.0 * spread;
+    let note = format!(
+        "exposure or light differ by {percent:.0} % between photographs: each wears an appearance code (--set field.appearance=0: none)"
+    );
     let ObjectModel { mut config, capture, has_alpha, .. } = model;
-    config.field.appearance = Auto::Is(if spread.is_some() { CODE } else { 0.0 });
-    let note = spread.map(|s| {
-        let percent = 100.0 * s;
-        format!(
-            "exposure or light differ by {percent:.0} % between photographs: each wears an appearance code (--set field.appearance=0: none)"
-        )
-    });
-    Ok((ObjectModel::new(config, capture, has_alpha)?, note))
+    config.field.appearance = Auto::Is(CODE);
+    Ok((ObjectModel::new(config, capture, has_alpha)?, Some(note)))
 }
 
 /// Standard deviation (by the middle two thirds) of the photographs' log gains; none where too few places are known.
-fn of(source: &dyn PixelSource, cameras: &[PosedCamera], observations: &[Observation]) -> Option<f32> {
+fn of(source: &dyn PixelSource, cameras: &[PosedCamera], observations: &[Observation], is_linear: bool) -> Option<f32> {
     let step = observations.len().div_ceil(PLACES).max(1);
     let places: Vec<&Observation> = observations.iter().step_by(step).collect();
     if places.len() < FEWEST {
@@ -58,7 +63,7 @@ fn of(source: &dyn PixelSource, cameras: &[PosedCamera], observations: &[Observa
         let seen = |i: usize| {
             let q: DVec3 = from_world[i].point(p);
             let px = cameras[i].camera.project(q)?;
-            color(source, i, px.x, px.y).map(|c| (i, c))
+            color(source, i, px.x, px.y, is_linear).map(|c| (i, c))
         };
         // Its own photograph comes first, at no angle.
         others.into_iter().filter_map(|(_, i)| seen(i)).take(OTHERS + 1).collect()
@@ -75,7 +80,7 @@ fn of(source: &dyn PixelSource, cameras: &[PosedCamera], observations: &[Observa
 }
 
 /// Log of the mean linear color of 3 x 3 pixels; none where it is clipped, dark, outside of the photograph, or does not count.
-fn color(source: &dyn PixelSource, image: usize, x: f64, y: f64) -> Option<[f32; 3]> {
+fn color(source: &dyn PixelSource, image: usize, x: f64, y: f64, is_linear: bool) -> Option<[f32; 3]> {
     let (w, h) = source.size(image);
     if !(1.0..w as f64 - 1.0).contains(&x) || !(1.0..h as f64 - 1.0).contains(&y) {
         return None;
@@ -87,7 +92,7 @@ fn color(source: &dyn PixelSource, image: usize, x: f64, y: f64) -> Option<[f32;
         if !source.counts(image, x, y) || c[..3].iter().any(|v| !(RANGE.0..=RANGE.1).contains(v)) {
             return None;
         }
-        (0..3).for_each(|n| sum[n] += linear_from_srgb(c[n]) / 9.0);
+        (0..3).for_each(|n| sum[n] += if is_linear { c[n] } else { linear_from_srgb(c[n]) } / 9.0);
     }
     Some(sum.map(f32::ln))
 }
@@ -99,8 +104,8 @@ mod tests {
 
     const SIZE: u32 = 64;
 
-    /// A wall of slow waves that cameras on an arc photograph, each with its own log exposure.
-    struct Wall(Vec<PosedCamera>, Vec<f32>);
+    /// A wall of slow waves that cameras on an arc photograph, each with its own log exposure; whether pixels are linear light.
+    struct Wall(Vec<PosedCamera>, Vec<f32>, bool);
 
     impl Wall {
         fn new(exposure: fn(usize) -> f32) -> Wall {
@@ -109,7 +114,7 @@ mod tests {
                 let eye = DVec3::new(3.0 * turn.sin(), 0.0, 3.0 * turn.cos());
                 PosedCamera { camera: Camera::pinhole(SIZE, SIZE, 0.6), pose: Pose::look_at(eye, DVec3::ZERO, DVec3::Y) }
             };
-            Wall((0..12).map(posed).collect(), (0..12).map(exposure).collect())
+            Wall((0..12).map(posed).collect(), (0..12).map(exposure).collect(), false)
         }
 
         fn meets(&self, image: usize, x: f64, y: f64) -> (DVec3, f64) {
@@ -124,7 +129,7 @@ mod tests {
                 let (_, t) = self.meets(image as usize, x as f64 + 0.5, y as f64 + 0.5);
                 Observation { image, x, y, distance: t as f32 }
             };
-            of(self, &self.0, &(0..places).map(place).collect::<Vec<_>>())
+            of(self, &self.0, &(0..places).map(place).collect::<Vec<_>>(), self.2)
         }
     }
 
@@ -138,7 +143,7 @@ mod tests {
         fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4] {
             let (p, _) = self.meets(image, x as f64 + 0.5, y as f64 + 0.5);
             let light = (0.2 + 0.1 * (3.0 * p.x).sin() * (4.0 * p.y).cos()) as f32 * self.1[image].exp();
-            let v = diorama_geom::color::srgb_from_linear(light);
+            let v = if self.2 { light } else { diorama_geom::color::srgb_from_linear(light) };
             [v, v, v, 1.0]
         }
         fn counts(&self, _: usize, _: u32, _: u32) -> bool {
@@ -151,6 +156,10 @@ mod tests {
         // One photograph in three is brighter or darker.
         let differing = Wall::new(|i| [0.0, 0.2, -0.2][i % 3]).spread(3000).unwrap();
         assert!((differing - 0.2).abs() < 0.02, "{differing}");
+        let mut linear = Wall::new(|i| [0.0, 0.2, -0.2][i % 3]);
+        linear.2 = true;
+        let of_linear = linear.spread(3000).unwrap();
+        assert!((of_linear - 0.2).abs() < 0.02, "{of_linear} in linear light");
         let equal = Wall::new(|_| 0.3).spread(3000).unwrap();
         assert!(equal < 0.01, "{equal}");
         assert_eq!(Wall::new(|_| 0.0).spread(FEWEST as u32 - 1), None, "too few places");
