@@ -1,7 +1,11 @@
 //! Every parser of bytes that may come from strangers, as a function that must neither crash nor hang.
 
-use diorama_data::{archive, camera_path_json, checkpoint, colmap, import, llff, photo, photo_import, splat_ply, transforms_json, weights};
-use diorama_geom::{ImageU8, Similarity};
+use diorama_data::{
+    archive, camera_path_json, checkpoint, colmap, import, llff, photo, photo_import, sparse_ply, splat_ply, transforms_json, weights,
+};
+use diorama_geom::capture::Frame;
+use diorama_geom::glam::DVec3;
+use diorama_geom::{Camera, ImageU8, Pose, Similarity, SparsePoint};
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::viewing;
 use std::path::PathBuf;
@@ -32,6 +36,7 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "run_config", run: run_config, seeds: config_seeds },
     Parser { name: "crop_json", run: crop_json, seeds: crop_seeds },
     Parser { name: "splat_ply", run: splats, seeds: splat_seeds },
+    Parser { name: "sparse_ply", run: sparse_points, seeds: sparse_seeds },
     Parser { name: "weights", run: load_weights, seeds: weights_seeds },
 ];
 
@@ -339,6 +344,28 @@ fn crop_seeds() -> Vec<Vec<u8>> {
 fn splats(data: &[u8]) {
     let path = file("points.ply", data);
     let _ = splat_ply::read(&path);
+}
+
+/// The capture whose points [`sparse_points`] reads: three points, two photographs.
+fn sparse() -> (Vec<SparsePoint>, Vec<Frame>) {
+    let point =
+        |i: u32| SparsePoint { position: DVec3::new(i as f64, 2.0, -1.0), color: [10, 20, 30], error: 0.5, frames: (0..=i % 2).collect() };
+    let frame = |name: &str| Frame::new(name, folder().join(name), Camera::pinhole(4, 3, 1.0), Pose::IDENTITY);
+    ((0..3).map(point).collect(), vec![frame("images/a.png"), frame("images/b ü.png")])
+}
+
+fn sparse_points(data: &[u8]) {
+    let (mut points, frames) = sparse();
+    points.iter_mut().for_each(|p| p.frames.clear());
+    let read = sparse_ply::observe(&folder().join("points.ply"), folder(), data, &frames, &mut points);
+    assert!(read.is_err() || points.iter().flat_map(|p| &p.frames).all(|f| (*f as usize) < frames.len()));
+}
+
+fn sparse_seeds() -> Vec<Vec<u8>> {
+    let (points, frames) = sparse();
+    let path = folder().join("sparse.ply");
+    sparse_ply::write(&path, &points, &frames, folder()).expect("a scratch file");
+    vec![std::fs::read(path).expect("a scratch file")]
 }
 
 fn splat_seeds() -> Vec<Vec<u8>> {

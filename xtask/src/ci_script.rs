@@ -4,8 +4,14 @@
 const INSTALLED: [&str; 8] =
     ["mesa-vulkan-drivers", "g++", "chromium", "npm", "ffmpeg", "python3-venv", "python3-torch", "build-essential"];
 /// Variables that make a test fail, or run at all, where it would be skipped.
-const REQUIRED: [&str; 5] =
-    ["DIORAMA_REQUIRE_READERS=1", "DIORAMA_REQUIRE_FFMPEG=1", "DIORAMA_REQUIRE_GPU=1", "DIORAMA_READERS=", "DIORAMA_TORCH_PYTHON="];
+const REQUIRED: [&str; 6] = [
+    "DIORAMA_REQUIRE_READERS=1",
+    "DIORAMA_REQUIRE_FFMPEG=1",
+    "DIORAMA_REQUIRE_GPU=1",
+    "DIORAMA_READERS=",
+    "DIORAMA_TORCH_PYTHON=",
+    "DIORAMA_NEW_FFMPEG=",
+];
 /// Checks that need a device or a browser.
 const CHECKS: [&str; 3] = ["cargo xtask gpu-check vulkan", "cargo xtask gpu-check webgpu,cuda", "cargo xtask viewer-check"];
 
@@ -53,6 +59,7 @@ fn the_script_installs_before_it_tests_and_lets_nothing_be_skipped() {
         ("benches/readers.sh", "echo"),
         (" DIORAMA_REQUIRE_GPU=1", ""),
         (" DIORAMA_REQUIRE_FFMPEG=1", ""),
+        ("DIORAMA_NEW_FFMPEG=", "NEW_FFMPEG="),
         ("DIORAMA_REQUIRE_READERS=1", "DIORAMA_REQUIRE_READERS="),
         (" DIORAMA_TORCH_PYTHON=/usr/bin/python3", ""),
         ("ffmpeg\n", "\n"),

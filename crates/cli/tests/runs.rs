@@ -399,8 +399,13 @@ fn compare_shows_the_memory_of_training() {
     let dir = tempfile::tempdir().unwrap();
     let run = s(&good().run);
     let table: serde_json::Value = serde_json::from_str(&works(dir.path(), &["compare", run, "-o", "cmp", "--json"])).unwrap();
+    // An earlier comparison is replaced, a folder of other things is not.
     let text = works(dir.path(), &["compare", run, "-o", "cmp"]);
     assert!(text.lines().next().unwrap().contains("memory"), "{text}");
+    std::fs::create_dir(dir.path().join("mine")).unwrap();
+    std::fs::write(dir.path().join("mine/views.png"), b"mine").unwrap();
+    fails(dir.path(), &["compare", run, "-o", "mine"], 2, &["mine", "holds no comparison"]);
+    assert_eq!(std::fs::read(dir.path().join("mine/views.png")).unwrap(), b"mine");
     if cfg!(target_os = "linux") {
         assert!((10 << 20..8 << 30).contains(&table[0]["peak_memory_bytes"].as_u64().unwrap()), "{table}");
         assert!(text.contains("MiB") || text.contains("GiB"), "{text}");

@@ -200,7 +200,8 @@ fn finish(data: &Path, root: &Path, mut imported: Imported, options: &ImportOpti
     if let Some(a) = &imported.agreement {
         if a.is_broken() && !options.allow_broken {
             let model = imported.model.as_deref().unwrap_or(data);
-            return Err(DataError::input(model, format!("{}; {}", sparse::broken(a), sparse::BROKEN_CURE)));
+            let others = sparse::others_beside(model).map_or(String::new(), |files| format!("; {files}"));
+            return Err(DataError::input(model, format!("{}; {}{others}", sparse::broken(a), sparse::BROKEN_CURE)));
         }
         if !a.is_broken() {
             notes.extend(sparse::warnings(a, &imported.frames));

@@ -6,7 +6,7 @@ use crate::error::{DataError, Result};
 use crate::masks::{self, COUNTS};
 use crate::photo::{self, Depth, Photo};
 use diorama_geom::capture::{ColorSpace, Frame, MaskRule};
-use diorama_geom::color::u16_from_unit;
+use diorama_geom::color::{linear_from_srgb, srgb_from_linear, u8_from_unit, u16_from_unit};
 use diorama_geom::rng::Rng;
 use diorama_geom::{ImageU8, PixelFormat, Reduction};
 use half::f16;
@@ -145,6 +145,26 @@ impl PixelStore {
     /// place in the square, x by the lower half, y by the upper.
     pub fn kept_by(&self, i: usize) -> Rng {
         Rng::new(i as u64, KEPT)
+    }
+
+    /// Multiplies the light of frame `i`, channel by channel; what then exceeds the format's range is cut off.
+    pub fn brighten(&mut self, i: usize, by: [f32; 3]) {
+        let own = self.offsets[i]..self.offsets[i + 1];
+        let srgb = |v: f32, k: usize| srgb_from_linear((linear_from_srgb(v) * by[k]).min(1.0));
+        let half = |v: u16, k: usize| f16::from_f32((f16::from_bits(v).to_f32() * by[k]).clamp(-LARGEST, LARGEST)).to_bits();
+        match (&mut self.values, self.format) {
+            (Values::Bytes(v), _) => {
+                let table = [0, 1, 2].map(|k| -> [u8; 256] { std::array::from_fn(|v| u8_from_unit(srgb(v as f32 / 255.0, k))) });
+                v[own].as_chunks_mut::<4>().0.iter_mut().for_each(|p| (0..3).for_each(|k| p[k] = table[k][p[k] as usize]));
+            }
+            (Values::Words(v), PixelFormat::Half) => {
+                v[own].as_chunks_mut::<4>().0.par_iter_mut().for_each(|p| (0..3).for_each(|k| p[k] = half(p[k], k)));
+            }
+            (Values::Words(v), _) => {
+                let at = |v: u16, k: usize| u16_from_unit(srgb(v as f32 / 65535.0, k));
+                v[own].as_chunks_mut::<4>().0.par_iter_mut().for_each(|p| (0..3).for_each(|k| p[k] = at(p[k], k)));
+            }
+        }
     }
 
     /// How values are written.
@@ -368,6 +388,33 @@ mod tests {
         // A run that was begun before stays in sRGB.
         f.color_space = ColorSpace::Srgb;
         assert_eq!(PixelStore::load(&[&f], &options, &|| {}).unwrap().format(), PixelFormat::Unorm8);
+    }
+
+    #[test]
+    fn light_is_multiplied_and_cut_off_at_the_formats_range() {
+        let dir = tempfile::tempdir().unwrap();
+        let options = StoreOptions { reduction: Reduction::Times(1), budget: 1 << 20, masks: MaskRule::default(), white: 1.0 };
+        let by = [0.5, 1.0, 8.0];
+        let want = |v: f32| by.map(|b| srgb_from_linear((linear_from_srgb(v) * b).min(1.0)));
+        let (mut f, other) = (frame(dir.path(), "a.png", 2, 1, 120), frame(dir.path(), "b.png", 2, 1, 120));
+        let mut s = PixelStore::load(&[&f, &other], &options, &|| {}).unwrap();
+        s.brighten(0, by);
+        let bytes = want(120.0 / 255.0).map(u8_from_unit);
+        assert_eq!(s.pixel(0, 1, 0)[0].to_le_bytes(), [bytes[0], 120, 255, 255]);
+        assert_eq!(s.pixel(1, 1, 0)[0].to_le_bytes(), [120, 120, 120, 255], "another photograph");
+        let im = Image { width: 2, height: 1, channels: 3, data: vec![0.2; 6] };
+        std::fs::write(&f.image, photo::encode_png_16(&im)).unwrap();
+        let mut s = PixelStore::load(&[&f], &options, &|| {}).unwrap();
+        s.brighten(0, by);
+        let got = four_words(s.pixel(0, 1, 0)).map(|v| v as f32 / 65535.0);
+        assert!(got.iter().zip(want(0.2)).all(|(g, w)| (g - w).abs() < 2e-5) && got[3] == 1.0, "{got:?}");
+        f.image.set_extension("exr");
+        f.color_space = ColorSpace::Linear;
+        photo::save_exr(&f.image, &im).unwrap();
+        let mut s = PixelStore::load(&[&f], &options, &|| {}).unwrap();
+        s.brighten(0, by);
+        let got = four_words(s.pixel(0, 1, 0)).map(|v| f16::from_bits(v).to_f32());
+        assert!(got.iter().zip([0.1, 0.2, 1.6, 1.0]).all(|(g, w)| (g - w).abs() < 1e-3), "{got:?}");
     }
 
     #[test]

@@ -130,8 +130,12 @@ fn poses_that_contradict_the_points_are_refused_and_can_be_looked_at() {
     let broken = Kind { wrong: (0..VIEWS).collect(), ..GOOD };
     let e = read(&broken).unwrap_err();
     assert!(e.contains("sparse/0") && e.contains("contradict") && e.contains("prepare") && e.contains("points3D"), "{e}");
+    assert!(!e.contains("lies beside"), "{e}");
     let dir = tempfile::tempdir().unwrap();
     write(dir.path(), &broken);
+    std::fs::write(dir.path().join("sparse/0/images_0.bin"), b"").unwrap();
+    let e = import::import(dir.path(), &ImportOptions::default()).err().unwrap().to_string();
+    assert!(e.contains("images_0.bin lies beside"), "{e}");
     let looked = import::import(dir.path(), &ImportOptions { allow_broken: true, ..ImportOptions::default() }).unwrap();
     assert!(looked.agreement.unwrap().is_broken());
     // As the message says: without points the poses are taken as they are.

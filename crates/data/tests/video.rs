@@ -17,14 +17,18 @@ fn extract(program: &Path, file: &Path, folder: &Path, choice: Choice) -> Result
     video::extract(program, file, folder, choice, &folder.with_extension("log"), &AtomicBool::new(false))
 }
 
-/// The machine's ffmpeg, or a line that says that the test was skipped.
-fn ffmpeg() -> Option<PathBuf> {
-    let found = video::ffmpeg().ok();
-    if found.is_none() {
-        assert!(std::env::var("DIORAMA_REQUIRE_FFMPEG").is_err(), "ffmpeg is required");
-        println!("skipped: no ffmpeg");
+/// The machine's ffmpeg and that of `DIORAMA_NEW_FFMPEG`, or lines that say which is skipped.
+fn ffmpegs() -> Vec<PathBuf> {
+    let machine = video::ffmpeg().ok();
+    let new = std::env::var_os("DIORAMA_NEW_FFMPEG").map(PathBuf::from);
+    assert!(new.as_ref().is_none_or(|f| f.is_file()), "DIORAMA_NEW_FFMPEG is no file");
+    for (found, what) in [(&machine, "no ffmpeg"), (&new, "no newer ffmpeg (DIORAMA_NEW_FFMPEG)")] {
+        assert!(found.is_some() || std::env::var("DIORAMA_REQUIRE_FFMPEG").is_err(), "{what}, and it is required");
+        if found.is_none() {
+            println!("skipped: {what}");
+        }
     }
-    found
+    machine.into_iter().chain(new).collect()
 }
 
 /// A checkered picture, fine where it is sharp; its mean tells its number.
@@ -71,33 +75,39 @@ fn frames(folder: &Path) -> Vec<PathBuf> {
 
 #[test]
 fn the_sharp_frames_of_a_real_video_are_written() {
-    let Some(ffmpeg) = ffmpeg() else { return };
+    ffmpegs().iter().for_each(|f| sharp_frames_are_written(f));
+}
+
+fn sharp_frames_are_written(ffmpeg: &Path) {
     let dir = tempfile::tempdir().unwrap();
-    let file = video(&ffmpeg, dir.path());
+    let file = video(ffmpeg, dir.path());
     let out = dir.path().join("out");
-    let made = extract(&ffmpeg, &file, &out, Choice::Count(6)).unwrap().unwrap();
+    let made = extract(ffmpeg, &file, &out, Choice::Count(6)).unwrap().unwrap();
     assert_eq!(made, Extracted { frames: FRAMES, taken: 6, fault: None });
     assert_eq!(frames(&out).iter().map(|f| number(f)).collect::<Vec<_>>(), [2, 6, 10, 14, 18, 22]);
     // All of them are neighbours of each other.
     let all = dir.path().join("all");
-    assert_eq!(extract(&ffmpeg, &file, &all, Choice::Count(99)).unwrap().unwrap().taken, FRAMES);
+    assert_eq!(extract(ffmpeg, &file, &all, Choice::Count(99)).unwrap().unwrap().taken, FRAMES);
     assert_eq!(frames(&all).iter().map(|f| number(f)).collect::<Vec<_>>(), (0..FRAMES).collect::<Vec<_>>());
 }
 
 #[test]
 fn what_ffmpeg_cannot_decode_is_told_in_its_own_words() {
-    let Some(ffmpeg) = ffmpeg() else { return };
+    ffmpegs().iter().for_each(|f| failures_are_told(f));
+}
+
+fn failures_are_told(ffmpeg: &Path) {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("a.mp4");
     std::fs::write(&file, b"this is no video, though it is named like one").unwrap();
-    let e = extract(&ffmpeg, &file, &dir.path().join("out"), Choice::Count(6)).unwrap_err();
+    let e = extract(ffmpeg, &file, &dir.path().join("out"), Choice::Count(6)).unwrap_err();
     assert!(e.is_input() && e.to_string().contains("a.mp4") && e.to_string().contains("Invalid data found"), "{e}");
     // Half a video gives its first frames, and says so.
-    let whole = video(&ffmpeg, dir.path());
+    let whole = video(ffmpeg, dir.path());
     let bytes = std::fs::read(&whole).unwrap();
     std::fs::write(&file, &bytes[..bytes.len() / 2]).unwrap();
     let half = dir.path().join("half");
-    let made = extract(&ffmpeg, &file, &half, Choice::Count(3)).unwrap().unwrap();
+    let made = extract(ffmpeg, &file, &half, Choice::Count(3)).unwrap().unwrap();
     assert!(made.frames < FRAMES && made.taken == 3 && frames(&half).len() == 3, "{made:?}");
 }
 
@@ -137,6 +147,16 @@ cp {here}/frame.png "$(printf "$last" 1)"
         ),
     );
     program
+}
+
+/// Debian's ffmpeg 5 still takes what version 8 dropped.
+#[test]
+fn the_newer_ffmpeg_lacks_the_options_that_are_gone() {
+    let Some(new) = ffmpegs().into_iter().nth(1) else { return };
+    let said =
+        Command::new(&new).args(["-f", "lavfi", "-i", "color", "-vsync", "0", "-frames:v", "1", "-f", "null", "-"]).output().unwrap();
+    let words = String::from_utf8_lossy(&said.stderr).into_owned();
+    assert!(!said.status.success() && words.contains("Unrecognized option 'vsync'"), "{words}");
 }
 
 #[test]

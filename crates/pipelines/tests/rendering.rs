@@ -46,6 +46,17 @@ fn full_views_score_as_exhaustive_ones_do() {
 }
 
 #[test]
+fn full_views_are_drawn_faster_than_exhaustive_ones() {
+    let dir = tempfile::tempdir().unwrap();
+    let model = train(dir.path(), 400);
+    let r = bench::render::run(&model, 5, "cpu".into()).unwrap();
+    println!("{r:?}");
+    assert!((r.full.psnr - r.exhaustive.psnr).abs() < 0.05, "{r:?}");
+    assert!(r.full.frames_per_s > 2.0 * r.exhaustive.frames_per_s, "{r:?}");
+    assert!(r.fast.frames_per_s > r.full.frames_per_s, "{r:?}");
+}
+
+#[test]
 fn an_evaluation_tells_how_far_it_is() {
     let dir = tempfile::tempdir().unwrap();
     let model = train(dir.path(), 4);

@@ -1,6 +1,8 @@
 //! Every op on a device against its f64 reference, forward and backward, over empty, single, odd and
 //! ragged shapes.
 
+mod losses;
+
 use super::{Buffer, Gpu, GpuError, Rows};
 use crate::device::Api;
 use crate::ops::adam::{self, Adam};
@@ -16,8 +18,7 @@ use crate::ops::ngp_field::{self, FieldNet, Head};
 use crate::ops::ray_generation::{self, PosedCamera, gpu::GpuCameras};
 use crate::ops::trilinear_corner_grid::{self, Corners, gpu::GpuCorners};
 use crate::ops::{
-    distortion, frequency, marching_cubes, marching_tetrahedra, pixel_gather, ray_aabb, sample_pdf, scan, spherical_harmonics, ssim,
-    triangle_wave,
+    frequency, marching_cubes, marching_tetrahedra, pixel_gather, ray_aabb, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
 };
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
@@ -136,7 +137,8 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         layers,
         networks,
         compositing,
-        distortions,
+        losses::distortions,
+        losses::depths,
         sums,
         boxes,
         marches,
@@ -408,20 +410,6 @@ fn compositing(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             table.close("composite", "d features", &shape, &g.features, &df)?;
             table.close("composite", "d background", &shape, &g.background, &db)?;
         }
-    }
-    Ok(())
-}
-
-fn distortions(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
-    for rays in [0, 1, 130] {
-        let scene = Rays::new(rays);
-        let (w, d) = (random_unit(scene.t.len(), 1), random(rays, 2));
-        let (p, wg) = (GpuPacked::upload(gpu, &scene.packed()), gpu.upload(&w));
-        let shape = format!("R={rays}");
-        let want = distortion::reference::forward(&scene.packed(), &wide(&w));
-        table.close("distortion", "forward", &shape, &distortion::gpu::forward(gpu, &p, &wg), &want)?;
-        let want = distortion::reference::backward(&scene.packed(), &wide(&w), &wide(&d));
-        table.close("distortion", "d weights", &shape, &distortion::gpu::backward(gpu, &p, &wg, &gpu.upload(&d)), &want)?;
     }
     Ok(())
 }

@@ -33,6 +33,9 @@ pub struct Compared {
     pub peak_memory_bytes: Option<u64>,
 }
 
+/// The table's file.
+const TABLE: &str = "compare.json";
+
 /// Reads a run with all that judging it takes.
 fn complete(run: &Path, data: Option<&Path>) -> Result<(ObjectModel, Option<u64>)> {
     let (model, _) = load_model_of(run, data)?;
@@ -43,10 +46,20 @@ fn complete(run: &Path, data: Option<&Path>) -> Result<(ObjectModel, Option<u64>
     Ok((model, read_summary(run)?.and_then(|s| s.peak_memory_bytes)))
 }
 
+/// Refuses a folder that holds something but no comparison.
+fn refuse_others(out: &Path) -> Result<()> {
+    let is_filled = std::fs::read_dir(out).is_ok_and(|mut d| d.next().is_some());
+    if is_filled && !out.join(TABLE).is_file() {
+        return Err(DataError::input(out, "is not empty and holds no comparison; give another -o").into());
+    }
+    Ok(())
+}
+
 /// Scores every run, and writes `curves.svg`, `curves.png` and `views.png` (photograph, then each run)
-/// into `out`; `data` is where the photographs of all runs are now, if they moved. Every run is read before the first is
+/// into `out`, in place of an earlier comparison; `data` is where the photographs of all runs are now, if they moved. Every run is read before the first is
 /// judged.
 pub fn compare(runs: &[PathBuf], data: Option<&Path>, out: &Path, note: &mut dyn FnMut(&str)) -> Result<Vec<Compared>> {
+    refuse_others(out)?;
     for run in runs {
         complete(run, data)?;
     }
@@ -97,7 +110,7 @@ pub fn compare(runs: &[PathBuf], data: Option<&Path>, out: &Path, note: &mut dyn
     photo::save_png(&out.join("curves.png"), &plot::raster(&charts))?;
     photo::save_png(&out.join("views.png"), &tile(&strips))?;
     let json = serde_json::to_vec_pretty(&table).expect("a table is JSON");
-    atomic::write(&out.join("compare.json"), &json)?;
+    atomic::write(&out.join(TABLE), &json)?;
     Ok(table)
 }
 

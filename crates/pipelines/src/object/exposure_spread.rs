@@ -1,4 +1,4 @@
-//! How much exposure and light differ between training photographs, by the colors of places that several show.
+//! How exposure and light differ between training photographs, by the colors of places that several show, and what is done about it.
 
 use super::config::Auto;
 use super::model::ObjectModel;
@@ -23,16 +23,18 @@ const RANGE: (f32, f32) = (0.03, 0.97);
 /// Fewest places.
 const FEWEST: usize = 200;
 
+/// Log gains of training photographs, `[N][3]`; none where too few places are known, or where nobody asks.
+pub(super) fn measure(source: &dyn PixelSource, model: &ObjectModel, known: &[Observation]) -> Option<Vec<[f32; 3]>> {
+    let is_asked = model.config.field.appearance != Auto::Is(0.0);
+    if is_asked { log_gains(source, &model.base_cameras(), known, model.is_linear()) } else { None }
+}
+
 /// Gives an untrained model appearance codes where the photographs' light differs and its configuration leaves that open; a note says so.
-pub(super) fn settle_codes(
-    mut model: ObjectModel,
-    source: &dyn PixelSource,
-    known: &[Observation],
-) -> Result<(ObjectModel, Option<String>)> {
+pub(super) fn settle_codes(mut model: ObjectModel, gains: Option<&[[f32; 3]]>) -> Result<(ObjectModel, Option<String>)> {
     if model.config.field.appearance != Auto::Auto {
         return Ok((model, None));
     }
-    let Some(spread) = of(source, &model.base_cameras(), known, model.is_linear()).filter(|s| *s > DIFFERS) else {
+    let Some(spread) = gains.map(spread).filter(|s| *s > DIFFERS) else {
         model.config.field.appearance = Auto::Is(0.0);
         return Ok((model, None));
     };
@@ -45,8 +47,22 @@ pub(super) fn settle_codes(
     Ok((ObjectModel::new(config, capture, has_alpha)?, Some(note)))
 }
 
-/// Standard deviation (by the middle two thirds) of the photographs' log gains; none where too few places are known.
-fn of(source: &dyn PixelSource, cameras: &[PosedCamera], observations: &[Observation], is_linear: bool) -> Option<f32> {
+/// By what to multiply the light of each photograph so that all have the mean exposure: what codes then say is what differs beyond that,
+/// and the mean code is that of a photograph of mean exposure.
+pub(super) fn to_the_mean(gains: &[[f32; 3]]) -> Vec<[f32; 3]> {
+    let mean = [0, 1, 2].map(|k| gains.iter().map(|g| g[k]).sum::<f32>() / gains.len() as f32);
+    gains.iter().map(|g| [0, 1, 2].map(|k| (mean[k] - g[k]).exp())).collect()
+}
+
+/// Standard deviation (by the middle two thirds) of the photographs' log gains.
+fn spread(gains: &[[f32; 3]]) -> f32 {
+    let mut green: Vec<f32> = gains.iter().map(|g| g[1]).collect();
+    green.sort_by(f32::total_cmp);
+    let at = |share: f64| green[((green.len() - 1) as f64 * share).round() as usize];
+    0.5 * (at(5.0 / 6.0) - at(1.0 / 6.0))
+}
+
+fn log_gains(source: &dyn PixelSource, cameras: &[PosedCamera], observations: &[Observation], is_linear: bool) -> Option<Vec<[f32; 3]>> {
     let step = observations.len().div_ceil(PLACES).max(1);
     let places: Vec<&Observation> = observations.iter().step_by(step).collect();
     if places.len() < FEWEST {
@@ -73,10 +89,7 @@ fn of(source: &dyn PixelSource, cameras: &[PosedCamera], observations: &[Observa
     for (id, place) in all.iter().enumerate() {
         place.iter().for_each(|(image, c)| of_photographs[*image].push((id as u64, *c)));
     }
-    let mut green: Vec<f32> = gains(&of_photographs).iter().map(|g| g[1]).collect();
-    green.sort_by(f32::total_cmp);
-    let at = |share: f64| green[((green.len() - 1) as f64 * share).round() as usize];
-    Some(0.5 * (at(5.0 / 6.0) - at(1.0 / 6.0)))
+    Some(gains(&of_photographs))
 }
 
 /// Log of the mean linear color of 3 x 3 pixels; none where it is clipped, dark, outside of the photograph, or does not count.
@@ -123,13 +136,17 @@ mod tests {
             (self.0[image].pose.translation + d * t, t)
         }
 
-        fn spread(&self, places: u32) -> Option<f32> {
+        fn gains(&self, places: u32) -> Option<Vec<[f32; 3]>> {
             let place = |k: u32| {
                 let (image, x, y) = (k % 12, 4 + k * 37 % (SIZE - 8), 4 + k * 11 % (SIZE - 8));
                 let (_, t) = self.meets(image as usize, x as f64 + 0.5, y as f64 + 0.5);
                 Observation { image, x, y, distance: t as f32 }
             };
-            of(self, &self.0, &(0..places).map(place).collect::<Vec<_>>(), self.2)
+            log_gains(self, &self.0, &(0..places).map(place).collect::<Vec<_>>(), self.2)
+        }
+
+        fn spread(&self, places: u32) -> Option<f32> {
+            self.gains(places).map(|g| spread(&g))
         }
     }
 
@@ -163,5 +180,15 @@ mod tests {
         let equal = Wall::new(|_| 0.3).spread(3000).unwrap();
         assert!(equal < 0.01, "{equal}");
         assert_eq!(Wall::new(|_| 0.0).spread(FEWEST as u32 - 1), None, "too few places");
+    }
+
+    #[test]
+    fn photographs_come_to_their_mean_exposure() {
+        let exposure = |i: usize| [0.0, 0.3, -0.1][i % 3];
+        let by = to_the_mean(&Wall::new(exposure).gains(3000).unwrap());
+        let mean = 0.2 / 3.0;
+        for (i, by) in by.iter().enumerate() {
+            assert!(by.iter().all(|b| (b.ln() - (mean - exposure(i))).abs() < 0.03), "{i}: {by:?}");
+        }
     }
 }

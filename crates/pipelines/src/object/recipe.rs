@@ -103,10 +103,10 @@ pub fn train(
     }
     let has_alpha = store.has_alpha;
     let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
-    let photographs = Photographs(store);
+    let mut photographs = Photographs(store);
     let (observations, source) = observations::find(&mut model, &photographs, interrupt, &mut |n| events(&Event::Note(n)));
     observations::note(&model, observations.len(), source).into_iter().for_each(|n| events(&Event::Note(n)));
-    let (mut model, note) = exposure_spread::settle_codes(model, &photographs, &observations)?;
+    let (mut model, note) = settle_exposure(model, &mut photographs, &observations)?;
     note.into_iter().for_each(|n| events(&Event::Note(n)));
     let held_out = HeldOutPixels::draw(&model)?;
     if resume {
@@ -243,9 +243,9 @@ fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'stat
     let (store, _) = load_pixels(config, &capture, &device)?;
     let has_alpha = store.has_alpha;
     let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
-    let photographs = Photographs(store);
+    let mut photographs = Photographs(store);
     let (observations, _) = observations::find(&mut model, &photographs, &AtomicBool::new(false), &mut |_| {});
-    let (mut model, _) = exposure_spread::settle_codes(model, &photographs, &observations)?;
+    let (mut model, _) = settle_exposure(model, &mut photographs, &observations)?;
     if let (true, Some(group)) = (wrong_cameras, &mut model.corrections) {
         let rng = Rng::new(config.seed, 0);
         for (i, v) in group.values.iter_mut().enumerate() {
@@ -254,6 +254,17 @@ fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'stat
         }
     }
     Trainer::new(model, photographs, observations, Path::new(""), device)
+}
+
+/// Gives photographs appearance codes where their light differs, and those that wear one the mean exposure.
+fn settle_exposure(model: ObjectModel, photographs: &mut Photographs, known: &[Observation]) -> Result<(ObjectModel, Option<String>)> {
+    let gains = exposure_spread::measure(photographs, &model, known);
+    let (model, note) = exposure_spread::settle_codes(model, gains.as_deref())?;
+    let Some(gains) = gains.filter(|_| model.field.appearance.is_some()) else {
+        return Ok((model, note));
+    };
+    exposure_spread::to_the_mean(&gains).into_iter().enumerate().for_each(|(i, by)| photographs.0.brighten(i, by));
+    Ok((model, note))
 }
 
 /// The configuration with what the capture says where it leaves it open: white, and how near matter may be.

@@ -6,6 +6,7 @@
 
 #[cfg(feature = "gpu")]
 pub mod gpu;
+pub mod reference;
 
 /// Share of the distance within which light may end: sparse points are not exact.
 pub const EXACT: f32 = 0.02;
@@ -33,6 +34,36 @@ pub fn ray(t: &[f32], dt: &[f32], w: &[f32], surface: f32, scale: f32, g: &mut [
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ops::composite::tests::scene;
+    use diorama_testkit::{assert_close, assert_gradient, random_unit, wide};
+
+    /// Distances of the surfaces of some rays; none for every third.
+    fn surfaces(rays: usize) -> Vec<f32> {
+        random_unit(rays, 8).iter().zip(0..).map(|(v, r)| if r % 3 == 2 { 0.0 } else { 0.2 + 2.0 * v }).collect()
+    }
+
+    #[test]
+    fn matches_the_reference_both_ways() {
+        let s = scene(77, 3);
+        let (p, w, surface) = (s.packed(), random_unit(s.t.len(), 1), surfaces(77));
+        let mut g = vec![0.0; w.len()];
+        let of = |r: usize| {
+            let i = p.range(r);
+            if surface[r] > 0.0 { ray(&p.t[i.clone()], &p.dt[i.clone()], &w[i.clone()], surface[r], 0.7, &mut g[i]) } else { 0.0 }
+        };
+        let loss: Vec<f32> = (0..77).map(of).collect();
+        let want = reference::forward(&p, &wide(&w), &surface);
+        assert!(want.iter().filter(|v| **v > 0.01).count() > 20, "{want:?}");
+        assert_close("loss", &loss, &want, 1e-5);
+        assert_close("weights", &g, &reference::backward(&p, &surface, 0.7), 1e-5);
+    }
+
+    #[test]
+    fn reference_gradient_matches_central_differences() {
+        let s = scene(4, 6);
+        let (p, w, surface) = (s.packed(), wide(&random_unit(s.t.len(), 1)), surfaces(4));
+        assert_gradient("weights", &reference::backward(&p, &surface, 1.0), &w, 1e-5, |w| reference::forward(&p, w, &surface).iter().sum());
+    }
 
     #[test]
     fn light_counts_before_and_behind_the_surface_and_not_at_it() {
