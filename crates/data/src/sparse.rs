@@ -200,7 +200,8 @@ pub fn broken(a: &Agreement) -> String {
 pub const BROKEN_CURE: &str =
     "run `diorama prepare` on the photographs; or remove points3D.bin (or .txt) if the poses are known to be right";
 
-/// Other lists of images in a model's folder, of which one may be the right one; none where there are none.
+/// Other lists of images in a model's folder, of which one may be the right one; none where there are none, or the folder cannot be
+/// listed: it is a hint beside an error.
 pub fn others_beside(model: &Path) -> Option<String> {
     let is_other = |n: &String| n.starts_with("images") && (n.ends_with(".bin") || n.ends_with(".txt")) && n.len() > "images.bin".len();
     let names = std::fs::read_dir(model).ok()?.flatten().map(|e| e.file_name().to_string_lossy().into_owned());
