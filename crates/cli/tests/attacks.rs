@@ -193,7 +193,7 @@ fn fault_03_resume_after_a_kill_is_bit_equal() {
     let (whole, parts) = (dir.path().join("whole"), dir.path().join("parts"));
     let start = |run: &Path, resume: bool| {
         let mut c = program();
-        c.arg("train").arg("--out").arg(run).args(["--steps", "120"]).stdout(Stdio::null()).stderr(Stdio::null());
+        c.arg("train").arg("--out").arg(run).args(["--steps", "400"]).stdout(Stdio::null()).stderr(Stdio::null());
         if resume {
             c.arg("--resume");
         } else {
@@ -213,13 +213,13 @@ fn fault_03_resume_after_a_kill_is_bit_equal() {
     assert!(start(&whole, false).wait().unwrap().success());
     let mut child = start(&parts, false);
     let begin = Instant::now();
-    while !checkpoint::exists(&parts.join("checkpoints")) && begin.elapsed() < Duration::from_secs(20) {
+    while !checkpoint::exists(&parts.join("checkpoints")) && begin.elapsed() < Duration::from_secs(60) {
         std::thread::sleep(Duration::from_millis(1));
     }
     child.kill().unwrap();
     child.wait().unwrap();
     let step = |run: &Path| checkpoint::load(&run.join("checkpoints")).unwrap().0.metadata["step"].parse::<u32>().unwrap();
-    assert!(step(&parts) < 120, "it ended before it could be killed");
+    assert!(step(&parts) < 400, "it ended before it could be killed");
     assert!(start(&parts, true).wait().unwrap().success());
     let bits = |run: &Path| {
         let mut c = checkpoint::read(&checkpoint::latest(&run.join("checkpoints"))).unwrap();
@@ -227,7 +227,7 @@ fn fault_03_resume_after_a_kill_is_bit_equal() {
         c.tensors.into_iter().map(|t| (t.0, t.2.iter().map(|v| v.to_bits()).collect::<Vec<_>>())).collect::<Vec<_>>()
     };
     assert!(bits(&whole) == bits(&parts), "the runs differ");
-    assert_eq!(step(&parts), 120);
+    assert_eq!(step(&parts), 400);
 }
 
 #[test]

@@ -32,12 +32,12 @@ fn stages_of_a_step_add_up() {
     diorama_pipelines::object::quickstart::write_capture(dir.path(), 8, 24).unwrap();
     let data = dir.path().to_str().unwrap();
     let before = listing(dir.path());
-    let v = json(&diorama(&["bench", "train", data, "--device", "cpu", "--warmup", "20", "--steps", "5", "--json"]));
-    assert_eq!(v["steps"], 5);
+    let v = json(&diorama(&["bench", "train", data, "--device", "cpu", "--warmup", "20", "--steps", "20", "--json"]));
+    assert_eq!(v["steps"], 20);
     let stages = v["stages"].as_array().unwrap();
     let total: f64 = stages.iter().map(|s| s["share"].as_f64().unwrap()).sum();
     assert!((total - 1.0).abs() < 1e-6);
-    let spent: f64 = stages.iter().map(|s| s["ms"].as_f64().unwrap() * 5e-3).sum();
+    let spent: f64 = stages.iter().map(|s| s["ms"].as_f64().unwrap() * 20e-3).sum();
     let seconds = v["seconds"].as_f64().unwrap();
     assert!(spent <= seconds * 1.001 && spent > 0.8 * seconds, "{spent} of {seconds}");
     let per_ray = |key: &str| v[key].as_f64().unwrap_or_else(|| panic!("{key} is missing: {v}"));

@@ -59,9 +59,9 @@ fn kills_change_nothing() {
     println!("seed {seed}");
     let rng = diorama_geom::rng::Rng::new(seed, 0);
     let mut attempt = 0u64;
-    while kills < wanted {
+    while kills < wanted || inside_a_save == 0 {
         attempt += 1;
-        assert!(attempt < 12 * wanted, "the run ends before it can be killed so often");
+        assert!(attempt < 12 * wanted, "{kills} kills, {inside_a_save} of them inside a save: the run is over too soon");
         let resume = killed.join("config.toml").exists();
         let mut child = start(&data, &killed, resume);
         let pause = whole.mul_f32(0.1 + 0.35 * rng.uniform(attempt));
@@ -90,7 +90,6 @@ fn kills_change_nothing() {
         kills += 1;
     }
     println!("{kills} kills, {inside_a_save} of them inside a save");
-    assert!(inside_a_save >= 1, "no kill fell inside a save");
     assert!(start(&data, &killed, killed.join("config.toml").exists()).wait().unwrap().success());
     let mut got = checkpoint::read(&checkpoint::latest(&killed.join("checkpoints"))).unwrap();
     assert_eq!(got.metadata["step"], want.metadata["step"]);

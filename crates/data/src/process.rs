@@ -180,8 +180,8 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let begin = Instant::now();
         let stop = AtomicBool::new(true);
-        let ended = run(Command::new("sleep").arg("20"), &dir.path().join("log"), &stop, &mut |_| {}).unwrap();
-        assert!(ended == Ended::Interrupted && begin.elapsed() < Duration::from_secs(5));
+        let ended = run(Command::new("sleep").arg("60"), &dir.path().join("log"), &stop, &mut |_| {}).unwrap();
+        assert!(ended == Ended::Interrupted && begin.elapsed() < Duration::from_secs(30));
     }
 
     #[test]

@@ -241,10 +241,9 @@ fn light_is_of_one_kind_and_known_from_the_files() {
 fn a_thousand_photographs_are_looked_at_fast() {
     let dir = tempfile::tempdir().unwrap();
     let mut c = capture(dir.path(), "images", (200, 120));
-    // Large files: reading them whole would take seconds.
+    // Large files, most of them a hole: reading them whole would take minutes.
     let first = c.frames[0].clone();
-    let whole = [&std::fs::read(&first.image).unwrap()[..], &vec![0; 4 << 20]].concat();
-    std::fs::write(&first.image, whole).unwrap();
+    std::fs::File::options().write(true).open(&first.image).unwrap().set_len(1 << 30).unwrap();
     c.frames = (0..1000).map(|i| Frame { name: i.to_string(), ..first.clone() }).collect();
     for (i, f) in c.frames.iter_mut().enumerate() {
         f.world_from_camera.translation.x += i as f64;
@@ -253,5 +252,5 @@ fn a_thousand_photographs_are_looked_at_fast() {
     photo_check::fit(&mut c.frames, false).unwrap();
     let took = start.elapsed().as_secs_f64();
     println!("1000 heads in {took:.3} s");
-    assert!(took < 1.0, "{took} s");
+    assert!(took < 10.0, "{took} s");
 }

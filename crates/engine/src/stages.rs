@@ -19,7 +19,10 @@ impl Default for Stages {
 impl Stages {
     /// Books the time since the last call on `stage`.
     pub fn done(&mut self, stage: &'static str) {
-        let now = Instant::now();
+        self.done_at(stage, Instant::now());
+    }
+
+    fn done_at(&mut self, stage: &'static str, now: Instant) {
         let spent = (now - self.last).as_secs_f64();
         self.last = now;
         match self.seconds.iter_mut().find(|s| s.0 == stage) {
@@ -32,17 +35,19 @@ impl Stages {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::time::Duration;
 
     #[test]
     fn time_is_booked_once() {
-        let begin = Instant::now();
         let mut s = Stages::default();
-        for name in ["a", "b", "a"] {
-            std::thread::sleep(std::time::Duration::from_millis(2));
-            s.done(name);
+        let mut now = s.last;
+        for (name, ms) in [("a", 2), ("b", 3), ("a", 4)] {
+            now += Duration::from_millis(ms);
+            s.done_at(name, now);
         }
-        let sum: f64 = s.seconds.iter().map(|s| s.1).sum();
-        assert_eq!(s.seconds.iter().map(|s| s.0).collect::<Vec<_>>(), ["a", "b"]);
-        assert!(s.seconds[0].1 > s.seconds[1].1 && sum <= begin.elapsed().as_secs_f64());
+        let booked: Vec<_> = s.seconds.iter().map(|s| (s.0, (s.1 * 1e6).round())).collect();
+        assert_eq!(booked, [("a", 6000.0), ("b", 3000.0)]);
+        s.done("c");
+        assert_eq!((s.seconds[2].0, s.seconds[2].1.is_finite()), ("c", true));
     }
 }
