@@ -296,11 +296,15 @@ fn eval_explains_how_many_training_views_see_what_a_view_shows() {
         assert!(shares.len() == 5 && (shares.iter().sum::<f64>() - 1.0).abs() < 1e-6, "{v}");
         // Cameras all around the still life look at its middle.
         assert!(shares[4] > 0.3, "{v}");
+        let whole = report["per_view"].as_array().unwrap().iter().find(|p| p["name"] == v["name"]).unwrap()["psnr"].as_f64().unwrap();
+        let seen = v["psnr_where_seen"].as_f64().unwrap();
+        assert!((seen - whole).abs() < 3.0, "most of it is seen: {seen} of {whole}");
         let map = photo::load(&run.join("eval").join(format!("{}.seen.png", v["name"].as_str().unwrap().replace('/', "_")))).unwrap();
         assert!(map.data.chunks_exact(map.channels).any(|p| p[..3] == [60, 150, 90]), "green where four or more see it");
     }
     let told = works(folder, &["eval", s(&run), "--device", "cpu", "--explain"]);
     assert!(told.contains("training views that see what a view shows") && told.lines().any(|l| l.contains("images/view_00")), "{told}");
+    assert!(told.contains("where two or more training views see it: psnr "), "{told}");
 }
 
 /// Frames of a film that the machine's ffmpeg decodes without a complaint, or a line that says that this was skipped.

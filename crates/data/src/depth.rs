@@ -138,10 +138,9 @@ fn round_step(least: f64) -> f64 {
 /// # Errors
 /// When the file is no 16-bit PNG of one channel.
 pub fn read_png(path: &Path) -> Result<Vec<u16>> {
-    match image::open(path) {
-        Ok(DynamicImage::ImageLuma16(im)) => Ok(im.into_raw()),
-        Ok(_) => Err(DataError::input(path, "is no picture of 16-bit distances")),
-        Err(e) => Err(DataError::input(path, format!("cannot be decoded: {e}"))),
+    match photo::as_stored(path)? {
+        DynamicImage::ImageLuma16(im) => Ok(im.into_raw()),
+        _ => Err(DataError::input(path, "is no picture of 16-bit distances")),
     }
 }
 

@@ -7,8 +7,8 @@ use diorama_geom::capture::ColorSpace;
 use diorama_geom::color::{srgb_from_linear, u16_from_unit};
 use diorama_geom::{Image, ImageU8};
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
-use std::io::Cursor;
+use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageReader, Limits};
+use std::io::{BufRead, Cursor, Seek};
 use std::path::Path;
 
 /// Limits on what a photograph may claim to be.
@@ -153,7 +153,11 @@ fn failed(path: &Path, limits: &PhotoLimits, e: image::ImageError) -> DataError 
     }
 }
 
-fn decoder<'a>(path: &Path, limits: &PhotoLimits, file: impl std::io::BufRead + std::io::Seek + 'a) -> Result<impl ImageDecoder + 'a> {
+/// A file, or its bytes: one type, so that decoders are built once.
+trait Encoded: BufRead + Seek {}
+impl<T: BufRead + Seek> Encoded for T {}
+
+fn decoder<'a>(path: &Path, limits: &PhotoLimits, file: Box<dyn Encoded + 'a>) -> Result<impl ImageDecoder + 'a> {
     let mut reader = ImageReader::new(file).with_guessed_format().map_err(DataError::io(path, "read"))?;
     let mut l = Limits::default();
     l.max_image_width = Some(limits.max_side);
@@ -190,8 +194,8 @@ pub fn header(path: &Path) -> Result<Header> {
     let (w, h, orientation, depth) = match jpeg::header(&mut file).map_err(DataError::io(path, "read"))? {
         Some(j) => (j.width, j.height, Orientation::from_exif(j.orientation).unwrap_or(Orientation::NoTransforms), Depth::Eight),
         None => {
-            std::io::Seek::rewind(&mut file).map_err(DataError::io(path, "read"))?;
-            let mut d = decoder(path, &limits, file)?;
+            file.rewind().map_err(DataError::io(path, "read"))?;
+            let mut d = decoder(path, &limits, Box::new(file))?;
             let (w, h) = d.dimensions();
             (w, h, d.orientation().unwrap_or(Orientation::NoTransforms), depth_of(d.color_type()))
         }
@@ -225,6 +229,13 @@ pub fn size(path: &Path) -> Result<(u32, u32)> {
     Ok(header(path)?.size)
 }
 
+/// Decodes a picture as its file holds it: not turned, its channels as they are.
+pub(crate) fn as_stored(path: &Path) -> Result<DynamicImage> {
+    let limits = PhotoLimits::default();
+    let bytes = std::fs::read(path).map_err(DataError::io(path, "read"))?;
+    DynamicImage::from_decoder(decoder(path, &limits, Box::new(Cursor::new(bytes)))?).map_err(|e| failed(path, &limits, e))
+}
+
 /// Decodes a photograph with all of its range.
 ///
 /// # Errors
@@ -238,7 +249,7 @@ pub fn load_full(path: &Path) -> Result<Photo> {
     // The decoder fills up with gray what a JPEG lacks.
     let bytes = if bytes.starts_with(&[0xff, 0xd8]) { jpeg::whole(&bytes).ok_or_else(|| ends_early(path))? } else { (&bytes[..]).into() };
     let is_exr = bytes.starts_with(&[0x76, 0x2f, 0x31, 0x01]);
-    let mut decoder = decoder(path, &limits, Cursor::new(&*bytes))?;
+    let mut decoder = decoder(path, &limits, Box::new(Cursor::new(&*bytes)))?;
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let mut im = DynamicImage::from_decoder(decoder).map_err(|e| failed(path, &limits, e))?;
     im.apply_orientation(orientation);
@@ -325,11 +336,10 @@ pub fn load_mask(path: &Path) -> Result<ImageU8> {
 
 /// Encodes a PNG in memory.
 pub fn encode_png(im: &ImageU8) -> Vec<u8> {
-    use image::ImageEncoder;
     let kind = match im.channels {
-        1 => image::ExtendedColorType::L8,
-        3 => image::ExtendedColorType::Rgb8,
-        _ => image::ExtendedColorType::Rgba8,
+        1 => ExtendedColorType::L8,
+        3 => ExtendedColorType::Rgb8,
+        _ => ExtendedColorType::Rgba8,
     };
     let mut out = Vec::new();
     let encoder = image::codecs::png::PngEncoder::new_with_quality(
@@ -348,35 +358,32 @@ pub fn save_png(path: &Path, im: &ImageU8) -> Result<()> {
 
 /// Writes linear light as EXR, atomically.
 pub fn save_exr(path: &Path, im: &Image) -> Result<()> {
-    crate::atomic::write(path, &encode_float(im, image::ImageFormat::OpenExr))
+    crate::atomic::write(path, &encode_exr(im))
 }
 
-/// Encodes floats in memory. EXR's colors are multiplied by alpha.
-pub(crate) fn encode_float(im: &Image, format: image::ImageFormat) -> Vec<u8> {
-    let (w, h) = (im.width as u32, im.height as u32);
-    let picture = if im.channels == 4 {
-        let data = im.data.chunks_exact(4).flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], p[3]]).collect();
-        DynamicImage::ImageRgba32F(image::ImageBuffer::from_raw(w, h, data).expect("as many values as pixels"))
+/// Encodes EXR in memory, its colors multiplied by alpha.
+pub(crate) fn encode_exr(im: &Image) -> Vec<u8> {
+    let (data, color) = if im.channels == 4 {
+        let straight = im.data.chunks_exact(4);
+        (straight.flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], p[3]]).collect(), ExtendedColorType::Rgba32F)
     } else {
-        DynamicImage::ImageRgb32F(image::ImageBuffer::from_raw(w, h, im.data.clone()).expect("as many values as pixels"))
+        (im.data.clone(), ExtendedColorType::Rgb32F)
     };
+    let bytes: Vec<u8> = data.iter().flat_map(|v: &f32| v.to_ne_bytes()).collect();
     let mut out = Cursor::new(Vec::new());
-    picture.write_to(&mut out, format).expect("a Vec takes any bytes");
+    let encoder = image::codecs::openexr::OpenExrEncoder::new(&mut out);
+    encoder.write_image(&bytes, im.width as u32, im.height as u32, color).expect("a Vec takes any bytes");
     out.into_inner()
 }
 
 /// Encodes a PNG of 16 bits in memory, of values in [0, 1].
 pub(crate) fn encode_png_16(im: &Image) -> Vec<u8> {
-    let (w, h) = (im.width as u32, im.height as u32);
-    let data = im.data.iter().map(|v| u16_from_unit(*v)).collect();
-    let picture = if im.channels == 4 {
-        DynamicImage::ImageRgba16(image::ImageBuffer::from_raw(w, h, data).expect("as many values as pixels"))
-    } else {
-        DynamicImage::ImageRgb16(image::ImageBuffer::from_raw(w, h, data).expect("as many values as pixels"))
-    };
-    let mut out = Cursor::new(Vec::new());
-    picture.write_to(&mut out, image::ImageFormat::Png).expect("a Vec takes any bytes");
-    out.into_inner()
+    let bytes: Vec<u8> = im.data.iter().flat_map(|v| u16_from_unit(*v).to_ne_bytes()).collect();
+    let color = if im.channels == 4 { ExtendedColorType::Rgba16 } else { ExtendedColorType::Rgb16 };
+    let mut out = Vec::new();
+    let encoder = image::codecs::png::PngEncoder::new(&mut out);
+    encoder.write_image(&bytes, im.width as u32, im.height as u32, color).expect("a Vec takes any bytes");
+    out
 }
 
 #[cfg(test)]

@@ -88,7 +88,7 @@ pub fn import(source: &Path, folder: &Path, stem: &str, max_side: u32) -> Result
     let (target, encoded) = match photo {
         Photo::Eight(image) => return write_as(&image, folder, stem, keeps_all),
         Photo::Sixteen(image) => (folder.join(format!("{stem}.png")), photo::encode_png_16(&image)),
-        Photo::Linear(image) => (folder.join(format!("{stem}.exr")), photo::encode_float(&image, image::ImageFormat::OpenExr)),
+        Photo::Linear(image) => (folder.join(format!("{stem}.exr")), photo::encode_exr(&image)),
     };
     atomic::write(&target, &encoded)?;
     Ok(target)
@@ -251,19 +251,20 @@ mod tests {
         let values: Vec<f32> = (0..32 * 24 * 3).map(|i| (i * 40_503 % 65_536) as f32 / 65_535.0).collect();
         let deep = Image { width: 32, height: 24, channels: 3, data: values };
         let light = Image { data: deep.data.iter().map(|v| v * 900.0).collect(), ..deep.clone() };
-        let encode = |format| {
-            let im = image::RgbImage::from_raw(32, 24, picture().data).unwrap();
+        let encode = |im: image::DynamicImage, format| {
             let mut bytes = std::io::Cursor::new(Vec::new());
-            image::DynamicImage::ImageRgb8(im).write_to(&mut bytes, format).unwrap();
+            im.write_to(&mut bytes, format).unwrap();
             bytes.into_inner()
         };
+        let eight = || image::RgbImage::from_raw(32, 24, picture().data).unwrap().into();
+        let floats = image::Rgb32FImage::from_raw(32, 24, light.data.clone()).unwrap().into();
         for (name, bytes, made) in [
             ("8.png", photo::encode_png(&picture()), "png"),
-            ("8.tiff", encode(image::ImageFormat::Tiff), "png"),
-            ("8.webp", encode(image::ImageFormat::WebP), "png"),
+            ("8.tiff", encode(eight(), image::ImageFormat::Tiff), "png"),
+            ("8.webp", encode(eight(), image::ImageFormat::WebP), "png"),
             ("16.png", photo::encode_png_16(&deep), "png"),
-            ("a.exr", photo::encode_float(&light, image::ImageFormat::OpenExr), "exr"),
-            ("a.hdr", photo::encode_float(&light, image::ImageFormat::Hdr), "exr"),
+            ("a.exr", photo::encode_exr(&light), "exr"),
+            ("a.hdr", encode(floats, image::ImageFormat::Hdr), "exr"),
         ] {
             let source = dir.path().join(name);
             std::fs::write(&source, bytes).unwrap();

@@ -114,11 +114,17 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
 fn print_seen_by(views: &[SeenBy], asked: usize, all: usize, folder: &Path) {
     let of = if asked < all { format!("of {asked} of the {all} training views, those") } else { "training views".into() };
     println!("{of} that see what a view shows, in percent of its light (maps in {}):", folder.display());
-    println!("{:>6}{:>6}{:>6}{:>6}{:>6}", "none", "1", "2", "3", "more");
+    println!("{:>6}{:>6}{:>6}{:>6}{:>6}  psnr where two or more see it", "none", "1", "2", "3", "more");
     for v in views {
         let shares: String = v.shares.iter().map(|s| format!("{:>6.1}", 100.0 * s)).collect();
         let sources: Vec<String> = v.sources.iter().map(|s| format!("{} {:.1}", s.name, 100.0 * s.share)).collect();
         let of_few = if sources.is_empty() { String::new() } else { format!("; what one or two see is of {}", sources.join(", ")) };
-        println!("{shares}  {}{of_few}", v.name);
+        let psnr = v.psnr_where_seen.map_or("-".into(), |p| format!("{p:.2}"));
+        println!("{shares}  {psnr:>5}  {}{of_few}", v.name);
+    }
+    let known: Vec<f64> = views.iter().filter_map(|v| v.psnr_where_seen).collect();
+    if !known.is_empty() {
+        let (mean, worst) = (known.iter().sum::<f64>() / known.len() as f64, known.iter().copied().fold(f64::INFINITY, f64::min));
+        println!("where two or more training views see it: psnr {mean:.2} dB (worst {worst:.2})");
     }
 }

@@ -3,6 +3,7 @@
 use super::evaluate::{ScoredView, admits};
 use super::held_out::spread;
 use super::model::ObjectModel;
+use diorama_engine::metrics;
 use diorama_engine::renderers::volume::Quality;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, Image, ImageU8, Pose, Reduction};
@@ -16,6 +17,8 @@ const VIEW_PX: u32 = 96;
 const SLACK: f64 = 0.1;
 /// Places that so many training views see are well explained.
 const MANY: usize = 4;
+/// One view alone tells no distance.
+const TWO: usize = 2;
 /// Colors of places that no, one, two, three, and [`MANY`] or more training views see; and of rays that end nowhere, or do not count.
 const COLORS: [[u8; 3]; MANY + 1] = [[90, 0, 110], [200, 30, 40], [240, 140, 30], [250, 220, 90], [60, 150, 90]];
 const NOWHERE: [u8; 3] = [40, 40, 40];
@@ -65,6 +68,8 @@ pub struct SeenBy {
     pub shares: [f64; MANY + 1],
     /// Mean squared error of the pixels in each class; none where a class is empty.
     pub errors: [Option<f64>; MANY + 1],
+    /// PSNR (dB) over the places that two or more training views see: how good the field is where it can know; none where there are none.
+    pub psnr_where_seen: Option<f64>,
     /// The training views that see most of what at most two of them see.
     pub sources: Vec<Source>,
 }
@@ -169,8 +174,10 @@ impl Tally {
         let all = self.light.iter().sum::<f64>().max(1e-300);
         self.of_few.sort_by(|a, b| b.1.total_cmp(&a.1));
         let sources = self.of_few.iter().take(NAMED).map(|(frame, light)| Source { name: name_of(*frame), share: light / all }).collect();
+        let (pixels, error) = (self.pixels[TWO..].iter().sum::<usize>(), self.errors[TWO..].iter().sum::<f64>());
         SeenBy {
             name: name.into(),
+            psnr_where_seen: (pixels > 0).then(|| metrics::psnr(error / pixels as f64)),
             shares: self.light.map(|l| l / all),
             errors: std::array::from_fn(|k| (self.pixels[k] > 0).then(|| self.errors[k] / self.pixels[k] as f64)),
             sources,
@@ -215,6 +222,10 @@ mod tests {
         let told = tally.told("held out", |i| format!("view {i}"));
         assert_eq!(told.shares, [0.25, 0.25, 0.5, 0.0, 0.0]);
         assert_eq!(told.errors.map(|e| e.map(|e| (e * 10.0).round())), [Some(5.0), Some(7.0), Some(2.0), None, None]);
+        assert!((told.psnr_where_seen.unwrap() - 6.9897).abs() < 1e-3, "{:?} of 0.1 and 0.3", told.psnr_where_seen);
+        let mut of_one = Tally::default();
+        of_one.add(&sights.seeing(DVec3::new(0.0, -3.0, 0.0), 9), 1.0, 0.7);
+        assert_eq!(of_one.told("held out", |i| i.to_string()).psnr_where_seen, None);
         let sources: Vec<(&str, f64)> = told.sources.iter().map(|s| (&s.name[..], s.share)).collect();
         assert_eq!(sources, [("view 3", 0.75), ("view 5", 0.5)], "the third camera has something before it");
     }
