@@ -1,26 +1,35 @@
-//! Folds functions whose machine code is equal, where Rust's own linker links: a twentieth of the program.
+//! Folds functions of equal machine code, where the linker that comes with Rust links: a twentieth of the program.
 
 use std::path::PathBuf;
 use std::process::Command;
 
+/// Where that linker is the usual one.
+const TARGET: &str = "x86_64-unknown-linux-gnu";
+
 fn main() {
     println!("cargo:rerun-if-changed=build.rs");
-    if let Some(lld) = lld() {
-        println!("cargo:rustc-link-arg-bins=-B{}", lld.display());
-        println!("cargo:rustc-link-arg-bins=-fuse-ld=lld");
-        println!("cargo:rustc-link-arg-bins=-Wl,--icf=all");
+    println!("cargo:rerun-if-env-changed=CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_LINKER");
+    let Some(folder) = linkers_folder() else { return };
+    // Rust promises no function an address of its own, and none of the C libraries here compares addresses of functions.
+    for argument in [&format!("-B{}", folder.display())[..], "-fuse-ld=lld", "-Wl,--icf=all"] {
+        println!("cargo:rustc-link-arg-bins={argument}");
     }
 }
 
-/// The folder of the linker that comes with Rust, on x86-64 Linux, where it is the usual one; none where another was chosen.
-fn lld() -> Option<PathBuf> {
-    let var = |name: &str| std::env::var(name).unwrap_or_default();
-    let target = "x86_64-unknown-linux-gnu";
-    let is_chosen = !var("RUSTC_LINKER").is_empty() || var("CARGO_ENCODED_RUSTFLAGS").contains("link");
-    if var("TARGET") != target || var("HOST") != target || is_chosen {
+/// The folder of the linker that comes with Rust; none for other targets, for debugging, or where another linker was chosen.
+fn linkers_folder() -> Option<PathBuf> {
+    let is = |name: &str, value: &str| std::env::var(name).is_ok_and(|v| v == value);
+    let names_linker = std::env::var("CARGO_ENCODED_RUSTFLAGS").is_ok_and(|flags| flags.contains("link"));
+    if !is("TARGET", TARGET)
+        || !is("HOST", TARGET)
+        || !is("PROFILE", "release")
+        || names_linker
+        || std::env::var_os("RUSTC_LINKER").is_some()
+    {
         return None;
     }
     let o = Command::new(std::env::var_os("RUSTC")?).args(["--print", "sysroot"]).output().ok()?;
-    let folder = PathBuf::from(String::from_utf8(o.stdout).ok()?.trim()).join("lib/rustlib").join(target).join("bin/gcc-ld");
-    folder.join("ld.lld").exists().then_some(folder)
+    let programs = PathBuf::from(String::from_utf8(o.stdout).ok()?.trim()).join("lib/rustlib").join(TARGET).join("bin");
+    let folder = programs.join("gcc-ld");
+    (folder.join("ld.lld").exists() && programs.join("rust-lld").exists()).then_some(folder)
 }

@@ -271,7 +271,7 @@ pub struct EvalArgs {
     /// Write each render beside its photograph into RUN/eval
     #[arg(long)]
     pub save_images: bool,
-    /// Tell how many training views see what each view shows; maps in RUN/eval: purple none, red 1, orange 2, yellow 3, green more, gray nothing
+    /// Tell how many training views see what each view shows, and the PSNR where two or more do; maps in RUN/eval: purple none, red 1, orange 2, yellow 3, green more, gray nothing
     #[arg(long)]
     pub explain: bool,
     #[arg(long)]

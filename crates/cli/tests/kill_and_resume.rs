@@ -61,7 +61,7 @@ fn kills_change_nothing() {
     let mut attempt = 0u64;
     while kills < wanted || inside_a_save == 0 {
         attempt += 1;
-        assert!(attempt < 12 * wanted, "{kills} kills, {inside_a_save} of them inside a save: the run is over too soon");
+        assert!(attempt < 12 * wanted, "{kills} kills of {wanted}, {inside_a_save} of them inside a save, in {attempt} attempts");
         let resume = killed.join("config.toml").exists();
         let mut child = start(&data, &killed, resume);
         let pause = whole.mul_f32(0.1 + 0.35 * rng.uniform(attempt));
@@ -74,20 +74,21 @@ fn kills_change_nothing() {
                 std::hint::spin_loop();
             }
         }
-        let finished = child.try_wait().unwrap().is_some();
+        let finished = child.try_wait().unwrap();
         child.kill().ok();
         child.wait().unwrap();
         let checkpoints = killed.join("checkpoints");
-        inside_a_save += checkpoints.join("latest.safetensors.partial").exists() as usize;
         if checkpoint::exists(&checkpoints) {
             checkpoint::load(&checkpoints).expect("the file on disk always loads");
         }
-        if finished {
+        if let Some(status) = finished {
+            assert!(status.success(), "{status}");
             // It ended by itself: begin again with the kills that are left.
             std::fs::remove_dir_all(&killed).unwrap();
             continue;
         }
         kills += 1;
+        inside_a_save += checkpoints.join("latest.safetensors.partial").exists() as usize;
     }
     println!("{kills} kills, {inside_a_save} of them inside a save");
     assert!(start(&data, &killed, killed.join("config.toml").exists()).wait().unwrap().success());

@@ -138,9 +138,11 @@ fn round_step(least: f64) -> f64 {
 /// # Errors
 /// When the file is no 16-bit PNG of one channel.
 pub fn read_png(path: &Path) -> Result<Vec<u16>> {
-    match photo::as_stored(path)? {
-        DynamicImage::ImageLuma16(im) => Ok(im.into_raw()),
-        _ => Err(DataError::input(path, "is no picture of 16-bit distances")),
+    let bytes = std::fs::read(path).map_err(DataError::io(path, "read"))?;
+    match photo::as_stored(&bytes) {
+        Ok(DynamicImage::ImageLuma16(im)) => Ok(im.into_raw()),
+        Ok(_) => Err(DataError::input(path, "is no picture of 16-bit distances")),
+        Err(e) => Err(DataError::input(path, format!("cannot be decoded: {e}"))),
     }
 }
 
@@ -209,6 +211,21 @@ mod tests {
             for (n, d) in read.iter().zip(f) {
                 assert!((*n as f64 * step - *d as f64).abs() <= 0.51 * step && (*n == 0) == (*d == 0.0), "{i}: {n} {d}");
             }
+        }
+    }
+
+    #[test]
+    fn what_holds_no_distances_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("depth16_0000.png");
+        let mut s = DepthSequence::new(dir.path(), DepthFormat::Png, true);
+        s.push(&map([0.0, 1.0, 2.0, 3.0])).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        let of_photograph = photo::encode_png(&diorama_geom::ImageU8 { width: 1, height: 1, channels: 3, data: vec![9; 3] });
+        for (bytes, why) in [(&whole[..whole.len() / 2], "decoded"), (&[][..], "decoded"), (&of_photograph, "16-bit distances")] {
+            std::fs::write(&path, bytes).unwrap();
+            let e = read_png(&path).unwrap_err();
+            assert!(e.is_input() && e.to_string().contains("depth16_0000.png") && e.to_string().contains(why), "{e}");
         }
     }
 

@@ -153,11 +153,11 @@ fn failed(path: &Path, limits: &PhotoLimits, e: image::ImageError) -> DataError 
     }
 }
 
-/// A file, or its bytes: one type, so that decoders are built once.
-trait Encoded: BufRead + Seek {}
-impl<T: BufRead + Seek> Encoded for T {}
+/// A picture's file, or its bytes: one type, so that decoders are compiled once.
+trait Source: BufRead + Seek {}
+impl<T: BufRead + Seek> Source for T {}
 
-fn decoder<'a>(path: &Path, limits: &PhotoLimits, file: Box<dyn Encoded + 'a>) -> Result<impl ImageDecoder + 'a> {
+fn decoder<'a>(path: &Path, limits: &PhotoLimits, file: Box<dyn Source + 'a>) -> Result<impl ImageDecoder + 'a> {
     let mut reader = ImageReader::new(file).with_guessed_format().map_err(DataError::io(path, "read"))?;
     let mut l = Limits::default();
     l.max_image_width = Some(limits.max_side);
@@ -230,10 +230,9 @@ pub fn size(path: &Path) -> Result<(u32, u32)> {
 }
 
 /// Decodes a picture as its file holds it: not turned, its channels as they are.
-pub(crate) fn as_stored(path: &Path) -> Result<DynamicImage> {
-    let limits = PhotoLimits::default();
-    let bytes = std::fs::read(path).map_err(DataError::io(path, "read"))?;
-    DynamicImage::from_decoder(decoder(path, &limits, Box::new(Cursor::new(bytes)))?).map_err(|e| failed(path, &limits, e))
+pub(crate) fn as_stored(bytes: &[u8]) -> image::ImageResult<DynamicImage> {
+    let source: Box<dyn Source + '_> = Box::new(Cursor::new(bytes));
+    ImageReader::new(source).with_guessed_format()?.decode()
 }
 
 /// Decodes a photograph with all of its range.
@@ -363,13 +362,13 @@ pub fn save_exr(path: &Path, im: &Image) -> Result<()> {
 
 /// Encodes EXR in memory, its colors multiplied by alpha.
 pub(crate) fn encode_exr(im: &Image) -> Vec<u8> {
-    let (data, color) = if im.channels == 4 {
-        let straight = im.data.chunks_exact(4);
-        (straight.flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], p[3]]).collect(), ExtendedColorType::Rgba32F)
+    let bytes = |v: f32| v.to_ne_bytes();
+    let (bytes, color): (Vec<u8>, _) = if im.channels == 4 {
+        let pixels = im.data.chunks_exact(4);
+        (pixels.flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], p[3]]).flat_map(bytes).collect(), ExtendedColorType::Rgba32F)
     } else {
-        (im.data.clone(), ExtendedColorType::Rgb32F)
+        (im.data.iter().copied().flat_map(bytes).collect(), ExtendedColorType::Rgb32F)
     };
-    let bytes: Vec<u8> = data.iter().flat_map(|v: &f32| v.to_ne_bytes()).collect();
     let mut out = Cursor::new(Vec::new());
     let encoder = image::codecs::openexr::OpenExrEncoder::new(&mut out);
     encoder.write_image(&bytes, im.width as u32, im.height as u32, color).expect("a Vec takes any bytes");

@@ -47,7 +47,10 @@ mod tests {
         }
         let booked: Vec<_> = s.seconds.iter().map(|s| (s.0, (s.1 * 1e6).round())).collect();
         assert_eq!(booked, [("a", 6000.0), ("b", 3000.0)]);
+        let begin = Instant::now();
+        let mut s = Stages { last: begin, seconds: Vec::new() };
         s.done("c");
-        assert_eq!((s.seconds[2].0, s.seconds[2].1.is_finite()), ("c", true));
+        assert!(s.last >= begin && s.last <= Instant::now());
+        assert_eq!(s.seconds, [("c", (s.last - begin).as_secs_f64())]);
     }
 }

@@ -125,6 +125,7 @@ fn print_seen_by(views: &[SeenBy], asked: usize, all: usize, folder: &Path) {
     let known: Vec<f64> = views.iter().filter_map(|v| v.psnr_where_seen).collect();
     if !known.is_empty() {
         let (mean, worst) = (known.iter().sum::<f64>() / known.len() as f64, known.iter().copied().fold(f64::INFINITY, f64::min));
-        println!("where two or more training views see it: psnr {mean:.2} dB (worst {worst:.2})");
+        let of = if known.len() < views.len() { format!(", in {} of {} views", known.len(), views.len()) } else { String::new() };
+        println!("where two or more training views see it: psnr {mean:.2} dB (worst {worst:.2}{of})");
     }
 }

@@ -17,8 +17,8 @@ const VIEW_PX: u32 = 96;
 const SLACK: f64 = 0.1;
 /// Places that so many training views see are well explained.
 const MANY: usize = 4;
-/// One view alone tells no distance.
-const TWO: usize = 2;
+/// Fewest views that tell a distance.
+const STEREO: usize = 2;
 /// Colors of places that no, one, two, three, and [`MANY`] or more training views see; and of rays that end nowhere, or do not count.
 const COLORS: [[u8; 3]; MANY + 1] = [[90, 0, 110], [200, 30, 40], [240, 140, 30], [250, 220, 90], [60, 150, 90]];
 const NOWHERE: [u8; 3] = [40, 40, 40];
@@ -68,7 +68,7 @@ pub struct SeenBy {
     pub shares: [f64; MANY + 1],
     /// Mean squared error of the pixels in each class; none where a class is empty.
     pub errors: [Option<f64>; MANY + 1],
-    /// PSNR (dB) over the places that two or more training views see: how good the field is where it can know; none where there are none.
+    /// PSNR (dB) over the pixels whose rays end on surfaces that two or more training views see; none where there are none.
     pub psnr_where_seen: Option<f64>,
     /// The training views that see most of what at most two of them see.
     pub sources: Vec<Source>,
@@ -162,7 +162,7 @@ impl Tally {
         self.light[class] += light;
         self.errors[class] += error;
         self.pixels[class] += 1;
-        for s in seeing.iter().filter(|_| seeing.len() <= 2) {
+        for s in seeing.iter().filter(|_| seeing.len() <= STEREO) {
             match self.of_few.iter_mut().find(|(frame, _)| *frame == s.frame) {
                 Some((_, sum)) => *sum += light,
                 None => self.of_few.push((s.frame, light)),
@@ -174,7 +174,7 @@ impl Tally {
         let all = self.light.iter().sum::<f64>().max(1e-300);
         self.of_few.sort_by(|a, b| b.1.total_cmp(&a.1));
         let sources = self.of_few.iter().take(NAMED).map(|(frame, light)| Source { name: name_of(*frame), share: light / all }).collect();
-        let (pixels, error) = (self.pixels[TWO..].iter().sum::<usize>(), self.errors[TWO..].iter().sum::<f64>());
+        let (pixels, error) = (self.pixels[STEREO..].iter().sum::<usize>(), self.errors[STEREO..].iter().sum::<f64>());
         SeenBy {
             name: name.into(),
             psnr_where_seen: (pixels > 0).then(|| metrics::psnr(error / pixels as f64)),
