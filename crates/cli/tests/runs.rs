@@ -296,9 +296,10 @@ fn eval_explains_how_many_training_views_see_what_a_view_shows() {
         assert!(shares.len() == 5 && (shares.iter().sum::<f64>() - 1.0).abs() < 1e-6, "{v}");
         // Cameras all around the still life look at its middle.
         assert!(shares[4] > 0.3, "{v}");
-        let whole = report["per_view"].as_array().unwrap().iter().find(|p| p["name"] == v["name"]).unwrap()["psnr"].as_f64().unwrap();
+        let errors = v["errors"].as_array().unwrap()[2..].iter().filter_map(|e| e.as_f64());
+        let (worst, best) = errors.fold((f64::INFINITY, 0.0f64), |(w, b), e| (w.min(-10.0 * e.log10()), b.max(-10.0 * e.log10())));
         let seen = v["psnr_where_seen"].as_f64().unwrap();
-        assert!((seen - whole).abs() < 3.0, "most of it is seen: {seen} of {whole}");
+        assert!(worst <= seen && seen <= best, "{worst} to {best}: {seen}");
         let map = photo::load(&run.join("eval").join(format!("{}.seen.png", v["name"].as_str().unwrap().replace('/', "_")))).unwrap();
         assert!(map.data.chunks_exact(map.channels).any(|p| p[..3] == [60, 150, 90]), "green where four or more see it");
     }
