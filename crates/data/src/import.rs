@@ -23,6 +23,18 @@ pub enum Format {
     Llff,
 }
 
+impl Format {
+    /// Its name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Format::Transforms => "transforms",
+            Format::Blender => "blender",
+            Format::Colmap => "colmap",
+            Format::Llff => "llff",
+        }
+    }
+}
+
 impl std::str::FromStr for Format {
     type Err = String;
 
@@ -121,13 +133,26 @@ pub fn import(data: &Path, options: &ImportOptions) -> Result<Capture> {
     };
     let imported = match format {
         Format::Transforms => {
-            transforms_json::read(&file.filter(|_| named).map_or_else(|| root.join("transforms.json"), Path::to_path_buf), root)?
+            transforms_json::read(&file.filter(|_| named).map_or_else(|| root.join("transforms.json"), Path::to_path_buf), root)
         }
-        Format::Blender => transforms_json::read_blender(root)?,
-        Format::Colmap => colmap::read(root)?,
-        Format::Llff => llff::read(root)?,
+        Format::Blender => transforms_json::read_blender(root),
+        Format::Colmap => colmap::read(root),
+        Format::Llff => llff::read(root),
     };
-    finish(data, root, imported, options)
+    let was_chosen = options.format.is_some() || named;
+    let capture = imported.and_then(|imported| finish(data, root, imported, options));
+    capture.map_err(|e| if was_chosen { e } else { beside_others(e, root, format) })
+}
+
+/// The error, with the other descriptions of the folder that may be read instead.
+fn beside_others(e: DataError, root: &Path, format: Format) -> DataError {
+    let others: Vec<String> = found(root).into_iter().filter(|f| *f != format).map(|f| format!("--format {}", f.name())).collect();
+    match e {
+        DataError::Input { path, message } if !others.is_empty() => {
+            DataError::Input { path, message: format!("{message}; or read what else is there: {}", others.join(", ")) }
+        }
+        e => e,
+    }
 }
 
 /// The folder that the paths of a capture lie in: the capture itself, the folder of its description, or what its zip
@@ -149,19 +174,25 @@ pub fn root(data: &Path) -> Result<PathBuf> {
     Ok(parent.unwrap_or(Path::new(".")).to_path_buf())
 }
 
+/// The descriptions that a folder holds, in the order of their ranks.
+fn found(root: &Path) -> Vec<Format> {
+    let holds = |name: &str| root.join(name).exists();
+    let all = [
+        (Format::Transforms, holds("transforms.json")),
+        (Format::Blender, holds("transforms_train.json")),
+        (Format::Colmap, colmap::find_model(root).is_some()),
+        (Format::Llff, holds("poses_bounds.npy")),
+    ];
+    all.into_iter().filter(|f| f.1).map(|f| f.0).collect()
+}
+
 /// The format of a folder.
 ///
 /// # Errors
 /// When there is none that can be read.
 pub fn detect(root: &Path) -> Result<Format> {
-    if root.join("transforms.json").exists() {
-        Ok(Format::Transforms)
-    } else if root.join("transforms_train.json").exists() {
-        Ok(Format::Blender)
-    } else if colmap::find_model(root).is_some() {
-        Ok(Format::Colmap)
-    } else if root.join("poses_bounds.npy").exists() {
-        Ok(Format::Llff)
+    if let Some(first) = found(root).first() {
+        Ok(*first)
     } else if root.join("config.toml").exists() && root.join("capture.json").exists() {
         Err(DataError::input(root, "is the folder of a run; give that of the photographs (diorama info RUN names it)"))
     } else {

@@ -76,6 +76,41 @@ fn transforms_json_wins_and_the_format_flag_overrides() {
 }
 
 #[test]
+fn a_description_that_cannot_be_read_names_the_others() {
+    let dir = tempfile::tempdir().unwrap();
+    let c = capture(dir.path());
+    colmap::write_text(&dir.path().join("sparse"), &c).unwrap();
+    let file = dir.path().join("transforms.json");
+    transforms_json::write(&file, dir.path(), &c, None).unwrap();
+    let elsewhere = std::fs::read_to_string(&file).unwrap().replace("images/", "/home/somebody/images/");
+    std::fs::write(&file, elsewhere).unwrap();
+    let error = |data: &Path, format| {
+        let e = import::import(data, &ImportOptions { format, ..ImportOptions::default() }).unwrap_err();
+        assert!(e.is_input());
+        e.to_string()
+    };
+    let e = error(dir.path(), None);
+    assert!(e.contains("leads out of the dataset folder") && e.ends_with("; or read what else is there: --format colmap"), "{e}");
+    for chosen in [error(dir.path(), Some(Format::Transforms)), error(&file, None)] {
+        assert!(!chosen.contains("--format"), "{chosen}");
+    }
+}
+
+#[test]
+fn photographs_that_a_model_does_not_hold_are_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut c = capture(dir.path());
+    let notes = |c: &Capture| {
+        colmap::write_text(&dir.path().join("sparse"), c).unwrap();
+        import::import(dir.path(), &ImportOptions { min_views: 1, ..ImportOptions::default() }).unwrap().notes
+    };
+    assert!(!notes(&c).iter().any(|n| n.contains("no pose")));
+    c.frames.retain(|f| !["images/a 1", "images/a 3"].contains(&&*f.name));
+    let told = notes(&c);
+    assert!(told.iter().any(|n| n.starts_with("2 photographs ") && n.ends_with("left out (a 1.png, a 3.png)")), "{told:?}");
+}
+
+#[test]
 fn blender_sets_keep_their_split_and_complete_extensions() {
     let dir = tempfile::tempdir().unwrap();
     for (name, n) in [("train", 3), ("test", 2)] {
