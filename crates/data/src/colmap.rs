@@ -2,13 +2,12 @@
 
 use crate::error::{self, DataError, Result};
 use crate::import::{self, Imported, locate};
-use crate::photo_import;
 use crate::sparse::Sparse;
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::DVec3;
 use diorama_geom::transform::rotation_from_quaternion;
 use diorama_geom::{Camera, Capture, Lens, Pose};
-use std::collections::{BTreeSet, HashMap, HashSet};
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 const LIMIT: u64 = 16 << 30;
@@ -218,22 +217,8 @@ pub fn read(root: &Path) -> Result<Imported> {
     }
     (out.points, out.agreement) = sparse.finish(&frame_of, &out.frames);
     out.model = Some(model);
-    out.notes.extend(without_pose(root, &out.frames));
+    out.notes.extend(import::without_pose(root, &out.frames)?);
     Ok(out)
-}
-
-/// A note that names the photographs beside those of a model that the model does not hold; none where there are none. The folder of
-/// the capture itself may hold other pictures.
-fn without_pose(root: &Path, frames: &[Frame]) -> Option<String> {
-    let known: HashSet<&Path> = frames.iter().map(|f| &*f.image).collect();
-    let folders: BTreeSet<&Path> = known.iter().filter_map(|i| i.parent()).filter(|f| *f != root && *f != root.join(".")).collect();
-    let beside = folders.into_iter().flat_map(|f| photo_import::list(f).unwrap_or_default());
-    let name = |p: PathBuf| p.file_name().map(|n| n.to_string_lossy().into_owned());
-    let unknown: Vec<String> = beside.filter(|p| !known.contains(&**p)).filter_map(name).collect();
-    let shown = unknown.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
-    let more = if unknown.len() > 3 { ", …" } else { "" };
-    (!unknown.is_empty())
-        .then(|| format!("{} photographs beside these have no pose in the model and are left out ({shown}{more})", unknown.len()))
 }
 
 /// A camera from a model's number, size and parameters.

@@ -4,10 +4,11 @@ use crate::archive::{self, ArchiveLimits};
 use crate::error::{DataError, Result};
 use crate::masks::{self, MaskOptions};
 use crate::split::{self, SplitRule};
-use crate::{colmap, llff, photo_check, sparse, transforms_json};
+use crate::{colmap, llff, photo_check, photo_import, sparse, transforms_json};
 use diorama_geom::capture::{Agreement, Frame, MaskMeaning, Split, focus_point};
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Capture, SceneBox, Similarity, SparsePoint};
+use std::collections::{BTreeSet, HashSet};
 use std::path::{Component, Path, PathBuf};
 
 /// Descriptions of a capture that can be read.
@@ -206,9 +207,7 @@ pub fn detect(root: &Path) -> Result<Format> {
 fn finish(data: &Path, root: &Path, mut imported: Imported, options: &ImportOptions) -> Result<Capture> {
     let mut notes = std::mem::take(&mut imported.notes);
     if !imported.missing.is_empty() {
-        let shown = imported.missing.iter().take(3).cloned().collect::<Vec<_>>().join(", ");
-        let more = if imported.missing.len() > 3 { ", …" } else { "" };
-        notes.push(format!("{} listed images do not exist and are skipped ({shown}{more})", imported.missing.len()));
+        notes.push(format!("{} listed images do not exist and are skipped ({})", imported.missing.len(), few(&imported.missing)));
     }
     let fitted = photo_check::fit(&mut imported.frames, options.skip_broken)?;
     sparse::keep(&mut imported.points, imported.agreement.as_mut(), &fitted.kept);
@@ -282,6 +281,28 @@ fn automatic_scene(frames: &[Frame]) -> SceneBox {
     let poses: Vec<_> = frames.iter().map(|f| f.world_from_camera).collect();
     let (center, distance) = focus_point(&poses);
     SceneBox { center, half: 0.5 * distance, aabb_scale: 8 }
+}
+
+/// The first three of these names.
+fn few(names: &[String]) -> String {
+    format!("{}{}", names[..names.len().min(3)].join(", "), if names.len() > 3 { ", …" } else { "" })
+}
+
+/// A note that names the photographs beside those of a model that the model does not hold; none where there are none. The folder of
+/// the capture itself may hold other pictures.
+///
+/// # Errors
+/// When a folder of photographs cannot be read.
+pub(crate) fn without_pose(root: &Path, frames: &[Frame]) -> Result<Option<String>> {
+    let known: HashSet<&Path> = frames.iter().map(|f| &*f.image).collect();
+    let folders: BTreeSet<&Path> = known.iter().filter_map(|i| i.parent()).filter(|f| *f != root && *f != root.join(".")).collect();
+    let mut unknown = Vec::new();
+    for folder in folders {
+        let beside = photo_import::found(folder)?.into_iter().filter(|p| !known.contains(&**p));
+        unknown.extend(beside.filter_map(|p| p.file_name().map(|n| n.to_string_lossy().into_owned())));
+    }
+    let note = |n: usize| format!("{n} photographs beside these have no pose in the model and are left out ({})", few(&unknown));
+    Ok((!unknown.is_empty()).then(|| note(unknown.len())))
 }
 
 /// Finds a file that a description names, inside `root` only; a missing extension is completed.

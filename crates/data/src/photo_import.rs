@@ -16,6 +16,15 @@ const JPEG_QUALITY: u8 = 96;
 /// # Errors
 /// When the folder cannot be read or holds none.
 pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
+    let found = found(folder)?;
+    if found.is_empty() {
+        return Err(DataError::input(folder, format!("holds no photographs ({}); give the folder they lie in", EXTENSIONS.join(", "))));
+    }
+    Ok(found)
+}
+
+/// [`list`], which may be empty.
+pub(crate) fn found(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = folder.read_dir().map_err(DataError::io(folder, "read"))?;
     let is_photo = |p: &PathBuf| {
         let hidden =
@@ -24,9 +33,6 @@ pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
         !hidden && p.is_file() && extension.is_some_and(|e| EXTENSIONS.contains(&&*e))
     };
     let mut found: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(is_photo).collect();
-    if found.is_empty() {
-        return Err(DataError::input(folder, format!("holds no photographs ({}); give the folder they lie in", EXTENSIONS.join(", "))));
-    }
     found.sort_by_cached_key(|p| natural(&p.file_name().unwrap_or_default().to_string_lossy()));
     Ok(found)
 }
