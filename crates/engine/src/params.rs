@@ -1,6 +1,7 @@
 //! Groups of parameters with their gradients, moments, rate and schedule, in buffers of our own.
 
 use diorama_kernels::ops::adam::{Adam, cpu as adam};
+use std::ops::Range;
 
 /// Parameters that share a rate. Sparse groups update touched lines only.
 #[derive(Clone, Debug)]
@@ -13,8 +14,10 @@ pub struct ParamGroup {
     /// Marks of touched lines; empty for a dense group.
     pub touched: Vec<u8>,
     pub adam: Adam,
-    /// A frozen group takes no step, and its gradient is not asked for.
+    /// A frozen group takes no step, and its gradient is not computed.
     pub frozen: bool,
+    /// Ranges that are trained; none: all. The others keep their values, and their gradients are not computed.
+    pub trained: Option<Vec<Range<usize>>>,
 }
 
 impl ParamGroup {
@@ -29,6 +32,7 @@ impl ParamGroup {
             touched: Vec::new(),
             adam,
             frozen: false,
+            trained: None,
         }
     }
 
@@ -49,7 +53,11 @@ impl ParamGroup {
         }
         let a = Adam { rate: self.adam.rate * rate_scale, ..self.adam };
         if self.touched.is_empty() {
-            adam::dense(&a, t, &mut self.values, &mut self.moment1, &mut self.moment2, &self.grads);
+            let all = [0..self.values.len()];
+            for r in self.trained.as_deref().unwrap_or(&all) {
+                let (values, grads) = (&mut self.values[r.clone()], &self.grads[r.clone()]);
+                adam::dense(&a, t, values, &mut self.moment1[r.clone()], &mut self.moment2[r.clone()], grads);
+            }
             self.grads.fill(0.0);
         } else {
             adam::sparse(&a, t, &mut self.values, &mut self.moment1, &mut self.moment2, &mut self.grads, &mut self.touched);
@@ -67,6 +75,7 @@ impl ParamGroup {
             touched: Vec::new(),
             adam: self.adam,
             frozen: true,
+            trained: None,
         }
     }
 
@@ -114,6 +123,15 @@ mod tests {
         g.grads = vec![1.0, -1.0];
         g.step(1, 1.0);
         assert!(g.values[0] < 1.0 && g.values[1] > 2.0);
+    }
+
+    #[test]
+    fn only_trained_ranges_move() {
+        let mut g = ParamGroup::dense("w", vec![1.0; 5], Adam { weight_decay: 0.1, ..Adam::default() });
+        g.trained = Some(vec![0..1, 3..5]);
+        g.grads = vec![1.0; 5];
+        g.step(1, 1.0);
+        assert!(g.values[1..3] == [1.0; 2] && [0, 3, 4].iter().all(|i| g.values[*i] < 1.0), "{:?}", g.values);
     }
 
     #[test]

@@ -1,9 +1,8 @@
 //! The `nerf` network equals the same weights in PyTorch. Runs where `DIORAMA_TORCH_PYTHON` names a Python
 //! that has torch and numpy.
 
-use diorama_engine::fields::{self, Batch, FieldBuffers};
+use diorama_engine::fields::{self, DensityQuery, FieldBuffers};
 use diorama_geom::contraction::Space;
-use diorama_kernels::ops::composite::Packed;
 use diorama_testkit::random;
 use std::path::Path;
 use std::process::Command;
@@ -34,21 +33,14 @@ fn nerf_forward_equals_pytorch() {
     }
     let mut sigma = vec![0.0; n];
     field.density(&model, &mut sigma);
-    let offsets: Vec<u32> = (0..=n as u32).collect();
-    let (t, dt, background) = (vec![0.0; n], vec![1e30; n], vec![0.0; n * 3]);
-    let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
     let mut buf = FieldBuffers::default();
-    field.render(&Batch { samples, positions: &model, dirs: &dirs, images: None, background: &background, near_scaling: 0.0 }, &mut buf);
+    let colors = field.outputs_at(&model, &dirs, &mut buf).to_vec();
     let dir = tempfile::tempdir().unwrap();
     // The points as the field saw them, after the way through model space.
     let seen: Vec<f32> = model.iter().map(|v| 2.0 * (v - 0.5)).collect();
-    for (name, values) in [
-        ("weights.f32", &field.weights.values),
-        ("points.f32", &seen),
-        ("dirs.f32", &dirs),
-        ("sigma.f32", &sigma),
-        ("rgb.f32", &buf.out.values),
-    ] {
+    for (name, values) in
+        [("weights.f32", &field.weights.values), ("points.f32", &seen), ("dirs.f32", &dirs), ("sigma.f32", &sigma), ("rgb.f32", &colors)]
+    {
         write(dir.path(), name, values);
     }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../benches/peers/nerf_forward.py");

@@ -1,6 +1,6 @@
 //! The four methods' fields (object.md, section 4).
 
-use super::{Appearance, DirectionCode, Encoding, Field};
+use super::{Appearance, DirectionCode, Encoder, Field, RayCodes};
 use crate::params::ParamGroup;
 use diorama_geom::contraction::Space;
 use diorama_geom::rng::Rng;
@@ -61,12 +61,10 @@ pub fn ngp(grid: HashGridConfig, space: Space, rate: f32, images: usize, dims: u
     let adam = Adam { rate, ..Adam::default() };
     Field {
         weights: ParamGroup::dense("weights", net.mlp.init(&Rng::new(seed, WEIGHTS)), adam),
-        table: Some(ParamGroup::sparse("table", table, adam)),
-        encoding: Encoding::Hash(grid),
-        directions: DirectionCode::SphericalHarmonics(4),
+        encoder: Encoder::Hash { grid, table: ParamGroup::sparse("table", table, adam) },
+        codes: RayCodes::new(DirectionCode::SphericalHarmonics(4), appearance),
         net,
         space,
-        appearance,
     }
 }
 
@@ -94,7 +92,8 @@ pub fn nerf(space: Space, rate: f32, images: usize, dims: usize, seed: u64, stre
         Head { layer: 8, channel: 0, activation: Activation::Softplus, shift: 0.0 },
         Head { layer: 11, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
     );
-    frequency_field(net, encoding, DirectionCode::Frequency(view), space, rate, appearance, seed.wrapping_add(stream << 32))
+    let codes = RayCodes::new(DirectionCode::Frequency(view), appearance);
+    frequency_field(net, encoding, codes, space, rate, seed.wrapping_add(stream << 32))
 }
 
 /// The report's primary network: sin and cos of position to 60 values, 4 fully connected layers of 256,
@@ -117,26 +116,16 @@ fn plain(encoding: Frequency, widths: &[usize], space: Space, rate: f32, seed: u
         Head { layer: last, channel: 3, activation: Activation::Softplus, shift: 0.0 },
         Head { layer: last, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
     );
-    frequency_field(net, encoding, DirectionCode::None, space, rate, None, seed)
+    frequency_field(net, encoding, RayCodes::new(DirectionCode::None, None), space, rate, seed)
 }
 
-fn frequency_field(
-    net: FieldNet,
-    encoding: Frequency,
-    directions: DirectionCode,
-    space: Space,
-    rate: f32,
-    appearance: Option<Appearance>,
-    seed: u64,
-) -> Field {
+fn frequency_field(net: FieldNet, encoding: Frequency, codes: RayCodes, space: Space, rate: f32, seed: u64) -> Field {
     let adam = Adam { rate, beta2: 0.999, epsilon: 1e-8, ..Adam::default() };
     Field {
         weights: ParamGroup::dense("weights", net.mlp.init(&Rng::new(seed, WEIGHTS)), adam),
-        table: None,
-        encoding: Encoding::Frequency(encoding),
-        directions,
+        encoder: Encoder::Frequency(encoding),
+        codes,
         net,
         space,
-        appearance,
     }
 }

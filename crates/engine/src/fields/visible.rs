@@ -3,11 +3,10 @@
 //! to nothing (nerfacc, Li et al. 2023, the alpha threshold). Rays advance in waves, each one marched,
 //! encoded and put through the density layers, so that hidden samples are not even encoded.
 
-use super::{Encoding, Field, FieldBuffers};
+use super::{Encoded, Field, FieldBuffers};
 use diorama_kernels::math;
 use diorama_kernels::ops::fused_mlp::Mlp;
 use diorama_kernels::ops::fused_mlp::cpu::{Activations, forward_block};
-use diorama_kernels::ops::hash_grid::{self, HashGrid};
 use diorama_kernels::ops::linear;
 use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched, OccupancyBits};
 use rayon::prelude::*;
@@ -56,8 +55,7 @@ struct Wave {
     light: Vec<f32>,
     marched: Marched,
     positions: Vec<f32>,
-    unit: Vec<f32>,
-    features: Vec<f32>,
+    encoded: Encoded,
     sigma: Vec<f32>,
     /// Opacities, or [`DROPPED`].
     alpha: Vec<f32>,
@@ -65,6 +63,14 @@ struct Wave {
     counts: Vec<u32>,
     /// Samples that stay, and where they go.
     kept: Vec<(u32, u32)>,
+}
+
+/// Samples that matter, packed, with their positions `[S, 3]` in model space and their encoding.
+#[derive(Clone, Debug, Default)]
+pub struct VisibleSamples {
+    pub samples: Marched,
+    pub positions: Vec<f32>,
+    pub encoded: Encoded,
 }
 
 /// Memory kept between calls.
@@ -100,26 +106,23 @@ impl VisibleBuffers {
 }
 
 impl Field {
-    /// Marches through occupied cells and keeps what [`Pruning`] leaves: packed samples and their positions.
-    /// Their encoding stays in `buf` for [`Field::train`] or [`Field::render`], which must come next.
-    /// A field without a hash grid keeps every sample.
-    #[allow(clippy::too_many_arguments)]
+    /// Marches through occupied cells and keeps what [`Pruning`] leaves. A field whose encoder has no table keeps every sample.
     pub fn visible(
         &self,
         grid: &OccupancyBits,
         rays: &MarchRays,
         config: &MarchConfig,
         pruning: Pruning,
-        samples: &mut Marched,
-        positions: &mut Vec<f32>,
+        out: &mut VisibleSamples,
         buf: &mut FieldBuffers,
     ) {
         let v = &mut buf.visible;
         v.used = 0;
-        let (Encoding::Hash(encoding), Some(table)) = (&self.encoding, &self.table) else {
+        let VisibleSamples { samples, positions, encoded } = out;
+        let Some((levels, f)) = self.encoder.levels() else {
             march::cpu::march(grid, rays, config, &mut v.march, samples);
             march::cpu::positions(rays, samples, positions);
-            return;
+            return self.encode(positions, encoded);
         };
         let net = self.density_net(self.net.mlp.precision);
         let (mut size, mut done) = (WAVE.0, 0);
@@ -141,13 +144,11 @@ impl Field {
             march::cpu::positions(&own, &wave.marched, &mut wave.positions);
             buf.stages.done("march");
             let n = wave.marched.t.len();
-            self.unit(&wave.positions, &mut wave.unit);
-            wave.features.resize(n * encoding.output_dims(), 0.0);
-            hash_grid::cpu::forward(encoding, &wave.unit, &table.values, &mut wave.features);
+            self.encode(&wave.positions, &mut wave.encoded);
             buf.stages.done("encode");
             wave.sigma.resize(n, 0.0);
             wave.alpha.resize(n, 0.0);
-            self.sigma(encoding, &net, &wave.features, &mut wave.sigma, &mut v.pool);
+            self.sigma(&net, &wave.encoded, &mut wave.sigma, &mut v.pool);
             buf.stages.done("density");
             wave.walk(pruning);
             buf.stages.done("prune");
@@ -156,7 +157,7 @@ impl Field {
         }
         let total = place(&mut v.waves[..v.used], &mut v.next, rays.jitter.len(), &mut samples.offsets);
         let waves = &v.waves[..v.used];
-        let (t, dt, unit) = (&mut samples.t, &mut samples.dt, &mut buf.unit);
+        let (t, dt, unit) = (&mut samples.t, &mut samples.dt, &mut encoded.unit);
         rayon::join(
             || {
                 gather(waves, 1, total, t, |w| &w.marched.t);
@@ -164,15 +165,14 @@ impl Field {
             },
             || {
                 gather(waves, 1, total, dt, |w| &w.marched.dt);
-                gather(waves, 3, total, unit, |w| &w.unit);
+                gather(waves, 3, total, unit, |w| &w.encoded.unit);
             },
         );
-        let f = encoding.config.features;
-        buf.features.resize(total * encoding.output_dims(), 0.0);
+        encoded.features.resize(total * levels * f, 0.0);
         if total > 0 {
-            buf.features.par_chunks_mut(total * f).enumerate().for_each(|(l, out)| {
+            encoded.features.par_chunks_mut(total * f).enumerate().for_each(|(l, out)| {
                 for w in waves {
-                    let level = &w.features[l * w.sigma.len() * f..];
+                    let level = &w.encoded.features[l * w.sigma.len() * f..];
                     for &(from, to) in &w.kept {
                         let (from, to) = (from as usize * f, to as usize * f);
                         out[to..to + f].copy_from_slice(&level[from..from + f]);
@@ -180,7 +180,6 @@ impl Field {
                 }
             });
         }
-        buf.encoded = true;
         buf.stages.done("prune");
     }
 
@@ -190,9 +189,9 @@ impl Field {
         Mlp { precision, ..Mlp::new(all.input_widths[..1].to_vec(), all.layers[..=self.net.density.layer].to_vec()) }
     }
 
-    /// Densities `[N]` of level-major features `[L, N, F]`.
-    pub(super) fn sigma(&self, grid: &HashGrid, mlp: &Mlp, features: &[f32], sigma: &mut [f32], pool: &mut Vec<(Vec<f32>, Activations)>) {
-        let (n, f, dims) = (sigma.len(), grid.config.features, grid.output_dims());
+    /// Densities `[N]` of encoded points, through the layers of [`Field::density_net`].
+    pub(super) fn sigma(&self, mlp: &Mlp, encoded: &Encoded, sigma: &mut [f32], pool: &mut Vec<(Vec<f32>, Activations)>) {
+        let (n, dims) = (sigma.len(), self.encoder.dims());
         let head = self.net.density;
         let width = mlp.layers[head.layer].width;
         let params = &self.weights.values[..mlp.params_len()];
@@ -204,12 +203,7 @@ impl Field {
             rows.resize(BLOCK * dims, 0.0);
             for (b, sigma) in sigma.chunks_mut(BLOCK).enumerate() {
                 let first = task * TASK + b * BLOCK;
-                for l in 0..dims / f {
-                    let part = &features[(l * n + first) * f..(l * n + first + sigma.len()) * f];
-                    for (row, v) in rows.chunks_exact_mut(dims).zip(part.chunks_exact(f)) {
-                        row[l * f..(l + 1) * f].copy_from_slice(v);
-                    }
-                }
+                self.encoder.rows(encoded, first, &mut rows[..sigma.len() * dims]);
                 forward_block(mlp, params, &[&rows[..sigma.len() * dims]], sigma.len(), acts);
                 for (s, o) in sigma.iter_mut().zip(acts.values[head.layer].chunks_exact(width)) {
                     *s = o[head.channel] + head.shift;
@@ -339,7 +333,7 @@ fn gather(waves: &[Wave], width: usize, total: usize, out: &mut Vec<f32>, of: im
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fields;
+    use crate::fields::{self, DensityQuery};
     use diorama_geom::contraction::Space;
     use diorama_geom::rng::Rng;
     use diorama_kernels::ops::hash_grid::HashGridConfig;
@@ -360,7 +354,7 @@ mod tests {
         let config = HashGridConfig { levels: 4, features: 2, log2_size: 10, base: 4, finest: 32 };
         let mut field = fields::ngp(config, Space::Cube(1.0), 1e-2, 0, 0, 1);
         let rng = Rng::new(3, 3);
-        let table = &mut field.table.as_mut().expect("a hash field").values;
+        let table = &mut field.encoder.table_mut().expect("a hash field").values;
         table.iter_mut().enumerate().for_each(|(i, v)| *v = rng.normal(i as u64) * 2.0);
         field.net.density.shift = 1.5;
         let mut grid = OccupancyBits::full(16, 1);
@@ -388,10 +382,10 @@ mod tests {
             MarchConfig { cone: 1.0 / 256.0, dt_min: 0.004, dt_max: 0.1, max_samples: 1000, ..MarchConfig::default() }
         }
 
-        fn visible(&self, pruning: Pruning) -> (Marched, Vec<f32>, FieldBuffers) {
-            let (mut samples, mut positions, mut buf) = Default::default();
-            self.field.visible(&self.grid, &self.rays(), &self.config(), pruning, &mut samples, &mut positions, &mut buf);
-            (samples, positions, buf)
+        fn visible(&self, pruning: Pruning) -> (VisibleSamples, FieldBuffers) {
+            let (mut out, mut buf) = Default::default();
+            self.field.visible(&self.grid, &self.rays(), &self.config(), pruning, &mut out, &mut buf);
+            (out, buf)
         }
 
         fn plain(&self) -> (Marched, Vec<f32>) {
@@ -405,16 +399,16 @@ mod tests {
     #[test]
     fn waves_without_pruning_equal_one_march() {
         let s = scene();
-        let (got, positions, buf) = s.visible(Pruning { stop: 0.0, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 });
+        let (VisibleSamples { samples: got, positions, encoded }, buf) =
+            s.visible(Pruning { stop: 0.0, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 });
         let (want, at) = s.plain();
         assert!(want.offsets.windows(2).any(|w| w[1] - w[0] > 3 * WAVE.0 as u32), "several waves are wanted");
         assert_eq!((&got.offsets, &got.t, &got.dt), (&want.offsets, &want.t, &want.dt));
         assert_eq!(positions, at);
-        let Encoding::Hash(grid) = &s.field.encoding else { unreachable!() };
-        let mut features = vec![0.0; buf.features.len()];
-        hash_grid::cpu::forward(grid, &buf.unit, &s.field.table.as_ref().expect("a hash field").values, &mut features);
+        let mut features = Vec::new();
+        s.field.encoder.forward(&encoded.unit, &mut features);
         // Groups of sixteen and what is left over round differently.
-        let off = buf.features.iter().zip(&features).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let off = encoded.features.iter().zip(&features).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(off < 1e-4, "{off}");
         assert_eq!(buf.visible.marched(), want.t.len());
     }
@@ -426,7 +420,7 @@ mod tests {
         let mut sigma = vec![0.0; all.t.len()];
         s.field.density(&at, &mut sigma);
         let pruning = Pruning { stop: 0.3, min_alpha: 0.0015, thin: 0.7, min_weight: 0.006 };
-        let (got, _, buf) = s.visible(pruning);
+        let (VisibleSamples { samples: got, .. }, buf) = s.visible(pruning);
         let mut want = Vec::new();
         for w in all.offsets.windows(2) {
             let mut light = 1.0;
@@ -454,8 +448,9 @@ mod tests {
             fields::ngp(HashGridConfig { levels: 4, features: 2, log2_size: 10, base: 4, finest: 32 }, Space::Cube(1.0), 1e-2, 0, 0, 1);
         let config = MarchConfig { cone: 0.0, dt_min: 0.0005, dt_max: 0.0005, max_samples: 1000, ..MarchConfig::default() };
         let pruning = Pruning { stop: 1e-4, min_alpha: 0.003, thin: 0.7, min_weight: 0.0 };
-        let (mut samples, mut positions, mut buf) = (Marched::default(), Vec::new(), FieldBuffers::default());
-        s.field.visible(&s.grid, &s.rays(), &config, pruning, &mut samples, &mut positions, &mut buf);
+        let (mut out, mut buf) = (VisibleSamples::default(), FieldBuffers::default());
+        s.field.visible(&s.grid, &s.rays(), &config, pruning, &mut out, &mut buf);
+        let samples = out.samples;
         assert!(samples.t.len() > 1000 && samples.t.len() == buf.visible.marched(), "{} of {}", samples.t.len(), buf.visible.marched());
     }
 }

@@ -1,7 +1,7 @@
 //! The parts of a training step on a device against what the CPU does.
 
 use super::GpuTracer;
-use crate::fields::{self, Batch, FieldBuffers};
+use crate::fields::{self, DensityQuery, FieldBuffers};
 use crate::losses::{ColorLoss, Photometric};
 use crate::renderers::supervised::Supervised;
 use crate::renderers::volume::{self, Accelerator, Quality, Sampling, Tracer};
@@ -554,7 +554,7 @@ fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     for (images, space) in [(0, contraction::Space::Cube(1.0)), (3, contraction::Space::Contracted(1.0))] {
         let mut f = fields::ngp(grid, space, 1e-2, images, if images > 0 { 4 } else { 0 }, 1);
         f.net.density.shift = 1.2;
-        f.table.iter_mut().for_each(|t| t.values.iter_mut().for_each(|v| *v *= 2e4));
+        f.encoder.table_mut().into_iter().for_each(|t| t.values.iter_mut().for_each(|v| *v *= 2e4));
         let occupancy = Occupancy::new(16, 1, false);
         for (quality, room) in [(Quality::Full, 1 << 17), (Quality::Full, 4096), (Quality::Fast, 1 << 17)] {
             let on_cpu = Tracer {
@@ -625,12 +625,9 @@ fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             field.density(&points, &mut sigma);
             table.close("view", "densities", &shape, &gpu.upload(&device.density(&points)?), &wide(&sigma))?;
             let dirs: Vec<f32> = points.chunks_exact(3).flat_map(unit).collect();
-            let (offsets, t, dt): (Vec<u32>, _, _) = ((0..=150).collect(), vec![0.0; 150], vec![1e30; 150]);
-            let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
-            let batch = Batch { samples, positions: &points, dirs: &dirs, images: None, background: &vec![0.0; 450], near_scaling: 0.0 };
             let mut buf = FieldBuffers::default();
-            field.render(&batch, &mut buf);
-            table.close("view", "own colors", &shape, &gpu.upload(&device.color(&points, &dirs)?), &wide(&buf.out.values))?;
+            let colors = wide(field.outputs_at(&points, &dirs, &mut buf));
+            table.close("view", "own colors", &shape, &gpu.upload(&device.color(&points, &dirs)?), &colors)?;
         }
     }
     Ok(())

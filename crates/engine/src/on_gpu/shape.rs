@@ -1,6 +1,6 @@
 //! What a field is on the device besides its parameters.
 
-use crate::fields::{DirectionCode, Encoding, Field};
+use crate::fields::{DirectionCode, Encoder as FieldEncoder, Field};
 use diorama_geom::contraction as geom;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::gpu::{Buffer, Gpu, Rows};
@@ -28,14 +28,15 @@ impl Shape {
     /// `moves` says whether gradients of positions will be asked for.
     pub fn new(gpu: &Gpu, field: &Field, moves: bool) -> Self {
         let arithmetic = if field.net.mlp.precision == Precision::F32 { Arithmetic::Exact } else { Arithmetic::Best };
-        let (encoder, per_level) = match &field.encoding {
-            Encoding::Hash(grid) => (Encoder::Hash(GpuHashGrid::new(gpu, grid)), grid.config.features),
-            Encoding::Frequency(f) => (Encoder::Frequency(*f), 0),
+        let (encoder, per_level) = match &field.encoder {
+            FieldEncoder::Hash { grid, .. } => (Encoder::Hash(GpuHashGrid::new(gpu, grid)), grid.config.features),
+            FieldEncoder::Frequency(f) => (Encoder::Frequency(*f), 0),
+            other => panic!("no GPU encodes positions by {other:?}"),
         };
         // The features' where there is a table or positions move, and the appearance codes'; directions have none.
         let mut wanted = vec![per_level > 0 || moves];
-        wanted.extend((field.directions.dims() > 0).then_some(false));
-        wanted.extend(field.appearance.as_ref().map(|_| true));
+        wanted.extend((field.codes.direction.dims() > 0).then_some(false));
+        wanted.extend(field.codes.appearance.as_ref().map(|_| true));
         let space = match (&encoder, field.space) {
             (Encoder::Hash(_), geom::Space::Contracted(edge)) => Space::Contracted(edge),
             (Encoder::Hash(_), geom::Space::Cube(edge)) => Space::Cube(edge),
@@ -43,7 +44,7 @@ impl Shape {
             (Encoder::Frequency(_), geom::Space::Cube(edge)) => Space::Centred(edge),
         };
         let net = GpuNet::new(gpu, &field.net, &field.density_net(Precision::F32), per_level, &wanted, arithmetic);
-        Shape { encoder, directions: field.directions, net, space }
+        Shape { encoder, directions: field.codes.direction, net, space }
     }
 
     /// Encoded points `[S, 3]` of the field's space; a hash grid reads its table.

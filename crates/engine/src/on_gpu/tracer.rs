@@ -34,9 +34,9 @@ impl Looks {
         let codes = |a: &Appearance| (gpu.upload(&[&a.group.values[..], &a.mean()].concat()), a.dims);
         Looks {
             shape: Shape::new(gpu, field, false),
-            table: field.table.as_ref().map(|t| gpu.upload(&t.values)),
+            table: field.encoder.table().map(|t| gpu.upload(&t.values)),
             weights: gpu.upload(&field.weights.values),
-            appearance: field.appearance.as_ref().map(codes),
+            appearance: field.codes.appearance.as_ref().map(codes),
         }
     }
 

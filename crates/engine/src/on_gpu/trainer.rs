@@ -102,18 +102,18 @@ impl GpuField {
     fn upload(gpu: &Gpu, field: &Field, moves: bool) -> Self {
         GpuField {
             shape: Shape::new(gpu, field, moves),
-            table: field.table.as_ref().map(|t| (GpuGroup::upload(gpu, t), gpu.zeros(t.values.len()))),
+            table: field.encoder.table().map(|t| (GpuGroup::upload(gpu, t), gpu.zeros(t.values.len()))),
             weights: GpuGroup::upload(gpu, &field.weights),
-            appearance: field.appearance.as_ref().map(|a| (GpuGroup::upload(gpu, &a.group), a.dims)),
+            appearance: field.codes.appearance.as_ref().map(|a| (GpuGroup::upload(gpu, &a.group), a.dims)),
         }
     }
 
     fn download(&self, gpu: &Gpu, field: &mut Field) -> Result<(), GpuError> {
-        if let (Some((own, _)), Some(t)) = (&self.table, &mut field.table) {
+        if let (Some((own, _)), Some(t)) = (&self.table, field.encoder.table_mut()) {
             own.download(gpu, t)?;
         }
         self.weights.download(gpu, &mut field.weights)?;
-        if let (Some((own, _)), Some(a)) = (&self.appearance, &mut field.appearance) {
+        if let (Some((own, _)), Some(a)) = (&self.appearance, &mut field.codes.appearance) {
             own.download(gpu, &mut a.group)?;
         }
         Ok(())

@@ -3,7 +3,7 @@
 //! little is computed behind opaque matter. Neighbouring samples of a ray that together weigh little share one color.
 
 use super::volume::Traced;
-use crate::fields::{Encoding, Field, Pruning};
+use crate::fields::{Encoder, Field, Pruning};
 use diorama_kernels::math;
 use diorama_kernels::ops::field_step::infer::{Codes, InferBuffers, Inference};
 use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched, OccupancyBits};
@@ -77,13 +77,13 @@ struct Colors {
 impl Blocks<'_> {
     /// Composites rays before black; none where the field is not one that can be evaluated this way.
     pub fn trace(&self, rays: &MarchRays, images: Option<&[u32]>) -> Option<Traced> {
-        let (Encoding::Hash(encoding), Some(table)) = (&self.field.encoding, &self.field.table) else { return None };
-        let inference = Inference::new(encoding, &table.values, &self.field.net, &self.field.weights.values)?;
+        let Encoder::Hash { grid, table } = &self.field.encoder else { return None };
+        let inference = Inference::new(grid, &table.values, &self.field.net, &self.field.weights.values)?;
         let (mut direction, mut appearance) = (Vec::new(), Vec::new());
-        self.field.ray_codes(rays.dirs, images, &mut direction, &mut appearance);
-        let codes: Vec<Codes> = [(&direction, self.field.directions.dims())]
+        self.field.codes.encode(rays.dirs, images, &mut direction, &mut appearance);
+        let codes: Vec<Codes> = [(&direction, self.field.codes.direction.dims())]
             .into_iter()
-            .chain(self.field.appearance.iter().map(|a| (&appearance, a.dims)))
+            .chain(self.field.codes.appearance.iter().map(|a| (&appearance, a.dims)))
             .filter(|c| c.1 > 0)
             .map(|(values, width)| (&values[..], width))
             .collect();
@@ -270,7 +270,7 @@ mod tests {
         let config = HashGridConfig { levels: 6, features: 2, log2_size: 12, base: 4, finest: 64 };
         let mut field = fields::ngp(config, space, 1e-2, images, if images > 0 { 4 } else { 0 }, 1);
         let rng = Rng::new(3, 3);
-        let table = &mut field.table.as_mut().expect("a hash field").values;
+        let table = &mut field.encoder.table_mut().expect("a hash field").values;
         table.iter_mut().enumerate().for_each(|(i, v)| *v = rng.normal(i as u64) * 0.7);
         field.net.density.shift = 2.0;
         field.net.mlp.precision = precision;
@@ -355,7 +355,7 @@ mod tests {
     #[test]
     fn sharing_makes_fewer_colors_and_loses_no_weight() {
         let f = field(Space::Cube(1.0), 0, Precision::F32);
-        let (Encoding::Hash(encoding), Some(table)) = (&f.encoding, &f.table) else { unreachable!() };
+        let Encoder::Hash { grid: encoding, table } = &f.encoder else { unreachable!() };
         let inference = Inference::new(encoding, &table.values, &f.net, &f.weights.values).expect("a field that splits");
         let mut s = Scratch::default();
         let (origins, dirs, near_far, jitter) = ([0.5, 0.5, -0.6], [0.0, 0.0, 1.0], [0.3, 4.0], [0.5]);

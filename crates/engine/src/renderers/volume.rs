@@ -3,7 +3,7 @@
 use super::blocks::{self, Blocks};
 use super::supervised::Unserved;
 use crate::background::LearnedBackground;
-use crate::fields::{Batch, Field, FieldBuffers, Pruning};
+use crate::fields::{Batch, Encoded, Field, FieldBuffers, Pruning, VisibleSamples};
 use crate::samplers::occupancy::Occupancy;
 use crate::samplers::{RayBatch, pixels, stratified};
 use diorama_geom::color::srgb_from_linear;
@@ -313,9 +313,10 @@ impl Tracer<'_> {
                         return self.before_backdrop(batch, out);
                     }
                 }
-                let (mut marched, mut positions) = (Marched::default(), Vec::new());
-                self.field.visible(&grid.bits, &rays, &march, self.pruning, &mut marched, &mut positions, buf);
-                self.composite(self.field, batch, &marched, &positions, buf);
+                let mut visible = VisibleSamples::default();
+                self.field.visible(&grid.bits, &rays, &march, self.pruning, &mut visible, buf);
+                let VisibleSamples { samples, positions, mut encoded } = visible;
+                self.composite(self.field, batch, &samples, &positions, &mut encoded, buf);
                 let mut out = taken(buf);
                 if self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0 {
                     out.make_up(&buf.visible.light(batch.len()), self.pruning.stop);
@@ -358,17 +359,27 @@ impl Tracer<'_> {
     fn evaluate(&self, field: &Field, batch: &RayBatch, marched: &Marched, buf: &mut FieldBuffers) {
         let rays =
             MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
-        let mut positions = Vec::new();
+        let (mut positions, mut encoded) = (Vec::new(), Encoded::default());
         march::cpu::positions(&rays, marched, &mut positions);
-        self.composite(field, batch, marched, &positions, buf);
+        field.encode(&positions, &mut encoded);
+        self.composite(field, batch, marched, &positions, &mut encoded, buf);
     }
 
-    fn composite(&self, field: &Field, batch: &RayBatch, marched: &Marched, positions: &[f32], buf: &mut FieldBuffers) {
-        let background = vec![0.0; batch.len() * 3];
+    fn composite(
+        &self,
+        field: &Field,
+        batch: &RayBatch,
+        marched: &Marched,
+        positions: &[f32],
+        encoded: &mut Encoded,
+        buf: &mut FieldBuffers,
+    ) {
+        let background = vec![0.0; batch.len() * field.net.channels()];
         let images = self.appearance.map(|i| vec![i; batch.len()]);
         let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
-        let b = Batch { samples, positions, dirs: &batch.dirs, images: images.as_deref(), background: &background, near_scaling: 0.0 };
-        field.render(&b, buf);
+        let (dirs, images, background) = (&batch.dirs[..], images.as_deref(), &background[..]);
+        let b = Batch { samples, positions, dirs, images, given: &[], background, near_scaling: 0.0 };
+        field.render(&b, encoded, buf);
     }
 }
 

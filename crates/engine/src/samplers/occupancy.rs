@@ -1,7 +1,7 @@
 //! The occupancy grid (instant-ngp, section E.2): decayed maxima of sampled densities per cell, and the
 //! bits that marching reads.
 
-use crate::fields::Field;
+use crate::fields::DensityQuery;
 use diorama_geom::Lens;
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
@@ -135,7 +135,7 @@ impl Occupancy {
 
     /// Samples the field at `count` random points of the cells that a camera sees, folds in what was
     /// recorded and refreshes the bits. Blocks of `block³` cells share one point (1 once the field has settled).
-    pub fn update(&mut self, field: &Field, rng: &Rng, counter: u64, count: usize, block: usize) {
+    pub fn update(&mut self, field: &dyn DensityQuery, rng: &Rng, counter: u64, count: usize, block: usize) {
         if self.live.is_empty() {
             return;
         }
@@ -243,7 +243,7 @@ impl<'a> Sight<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fields;
+    use crate::fields::{self, Field};
     use diorama_geom::contraction::Space;
     use diorama_geom::{Camera, Pose};
     use diorama_kernels::ops::hash_grid::HashGridConfig;

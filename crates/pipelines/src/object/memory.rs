@@ -206,7 +206,7 @@ mod tests {
         let needs = of_training(&c, &capture, PixelFormat::Unorm8, 9 << 10);
         assert_eq!(needs.of("batch"), 9 << 20);
         let m = ObjectModel::new(c, capture, false).unwrap();
-        let table = m.field.table.as_ref().unwrap().values.len() as f64 * 28.0;
+        let table = m.field.encoder.table().unwrap().values.len() as f64 * 28.0;
         let counted = needs.of("parameters") as f64;
         assert!((0.9..1.1).contains(&(counted / table)), "{counted} for {table}");
         let cells = m.occupancy.as_ref().unwrap().density.len() as u64;

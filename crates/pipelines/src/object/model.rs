@@ -4,7 +4,7 @@ use super::config::{Background, Config, Method};
 use crate::error::{PipelineError, Result};
 use diorama_data::checkpoint::{Checkpoint, Entry};
 use diorama_engine::background::LearnedBackground;
-use diorama_engine::fields::{self, Batch, Field, FieldBuffers};
+use diorama_engine::fields::{self, DensityQuery, Field, FieldBuffers};
 use diorama_engine::losses::ColorLoss;
 use diorama_engine::params::ParamGroup;
 use diorama_engine::renderers::supervised::{Supervised, Unserved};
@@ -20,7 +20,6 @@ use diorama_geom::glam::DVec3;
 use diorama_geom::{Capture, Pose, Similarity};
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::adam::Adam;
-use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
@@ -204,7 +203,7 @@ impl ObjectModel {
         let precision = if model.config.field.precision == "auto" { Precision::Bf16 } else { Precision::F32 };
         for f in model.fields_mut() {
             f.weights.adam.weight_decay = decay;
-            f.table.iter_mut().for_each(|t| t.adam.weight_decay = table_decay);
+            f.encoder.table_mut().into_iter().for_each(|t| t.adam.weight_decay = table_decay);
             f.net.mlp.precision = precision;
             let color = f.net.color_mut();
             (color.activation, color.shift) = color_head(is_linear);
@@ -503,20 +502,8 @@ impl FieldQuery for ObjectModel {
         }
         let mut buf = FieldBuffers::default();
         for ((p, d), out) in points_in_world.chunks(CHUNK).zip(directions.chunks(CHUNK)).zip(rgb_srgb.chunks_mut(CHUNK)) {
-            let n = p.len();
-            let offsets: Vec<u32> = (0..=n as u32).collect();
-            // One sample per ray, so long that it is opaque: the colour is the field's own.
-            let (t, dt) = (vec![0.0; n], vec![1e30f32; n]);
-            let batch = Batch {
-                samples: Packed { offsets: &offsets, t: &t, dt: &dt },
-                positions: &self.model_points(p),
-                dirs: d.as_flattened(),
-                images: None,
-                background: &vec![0.0; n * 3],
-                near_scaling: 0.0,
-            };
-            self.field.render(&batch, &mut buf);
-            out.as_flattened_mut().copy_from_slice(&buf.out.values);
+            let own = self.field.outputs_at(&self.model_points(p), d.as_flattened(), &mut buf);
+            out.as_flattened_mut().copy_from_slice(own);
         }
         self.encode(rgb_srgb);
     }

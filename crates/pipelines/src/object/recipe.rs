@@ -16,7 +16,7 @@ use crate::error::{PipelineError, Result};
 use diorama_data::checkpoint;
 use diorama_data::photo_check;
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
-use diorama_engine::fields::{Batch, Field, FieldBuffers, Pruning};
+use diorama_engine::fields::{Batch, Field, FieldBuffers, Loss, Pruning, VisibleSamples};
 use diorama_engine::losses::{self, Photometric};
 use diorama_engine::params::Schedule;
 use diorama_engine::samplers::pixels::{self, DrawOptions, Observation, PixelSource};
@@ -29,7 +29,7 @@ use diorama_geom::rng::Rng;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::distortion;
 use diorama_kernels::ops::linear::Activation;
-use diorama_kernels::ops::march::{self, MarchRays, Marched};
+use diorama_kernels::ops::march::{self, MarchRays};
 use diorama_kernels::ops::pixel_gather;
 use diorama_kernels::ops::ray_generation::{self, CORRECTION, PosedCamera};
 use std::path::Path;
@@ -260,7 +260,7 @@ fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'stat
 fn settle_exposure(model: ObjectModel, photographs: &mut Photographs, known: &[Observation]) -> Result<(ObjectModel, Option<String>)> {
     let gains = exposure_spread::measure(photographs, &model, known);
     let (model, note) = exposure_spread::settle_codes(model, gains.as_deref())?;
-    let Some(gains) = gains.filter(|_| model.field.appearance.is_some()) else {
+    let Some(gains) = gains.filter(|_| model.field.codes.appearance.is_some()) else {
         return Ok((model, note));
     };
     exposure_spread::to_the_mean(&gains).into_iter().enumerate().for_each(|(i, by)| photographs.0.brighten(i, by));
@@ -345,9 +345,8 @@ impl PixelSource for Photographs {
 struct Buffers {
     batch: RayBatch,
     background: Vec<f32>,
-    marched: Marched,
-    fine: Marched,
-    positions: Vec<f32>,
+    visible: VisibleSamples,
+    guide: VisibleSamples,
     d_positions: Vec<f32>,
     field: FieldBuffers,
 }
@@ -502,22 +501,21 @@ impl<'a> Trainer<'a> {
         };
         let pruning = Pruning { stop: s.stop, min_alpha: s.min_alpha, thin, min_weight: 0.0 };
         let march = grid.march_config(s.max_samples).stretched(stretch(step));
-        m.field.visible(&grid.bits, &rays, &march, pruning, &mut b.marched, &mut b.positions, &mut b.field);
+        m.field.visible(&grid.bits, &rays, &march, pruning, &mut b.visible, &mut b.field);
         b.field.visible.seen().for_each(|(cells, sigma)| grid.record(cells, sigma));
         self.marched += b.field.visible.marched() as u64;
-        let per_ray = b.marched.t.len() as f64 / b.batch.len() as f64;
+        let per_ray = b.visible.samples.t.len() as f64 / b.batch.len() as f64;
         m.samples_per_ray = if step == 0 { per_ray } else { 0.9 * m.samples_per_ray + 0.1 * per_ray };
         let loss = train_field(
             &mut m.field,
             &terms,
             &b.batch,
-            &b.marched,
-            &b.positions,
+            &mut b.visible,
             &b.background,
             &mut b.field,
             m.corrections.is_some().then_some(&mut b.d_positions),
         );
-        (loss, b.marched.t.len() as u64)
+        (loss, b.visible.samples.t.len() as u64)
     }
 
     /// The same on a GPU, which reports after some steps what they came to on average.
@@ -551,11 +549,11 @@ impl<'a> Trainer<'a> {
         let m = &mut self.model;
         let terms = m.terms(step);
         let rng = Rng::new(m.config.seed, COARSE);
-        stratified::stratified(&b.batch, m.config.sampling.samples, Some((rng, first)), &mut b.marched);
-        positions(&b.batch, &b.marched, &mut b.positions);
+        stratified::stratified(&b.batch, m.config.sampling.samples, Some((rng, first)), &mut b.visible.samples);
+        encode(&m.field, &b.batch, &mut b.visible);
         let d = m.corrections.is_some().then_some(&mut b.d_positions);
-        let loss = train_field(&mut m.field, &terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
-        (loss, b.marched.t.len() as u64)
+        let loss = train_field(&mut m.field, &terms, &b.batch, &mut b.visible, &b.background, &mut b.field, d);
+        (loss, b.visible.samples.t.len() as u64)
     }
 
     /// Stratified samples through the coarse field, then more where it found matter through the fine one.
@@ -563,15 +561,16 @@ impl<'a> Trainer<'a> {
         let b = &mut self.buffers;
         let m = &mut self.model;
         let (n, more, terms) = (m.config.sampling.samples, m.config.sampling.importance, m.terms(step));
-        stratified::stratified(&b.batch, n, Some((Rng::new(m.config.seed, COARSE), first)), &mut b.fine);
-        positions(&b.batch, &b.fine, &mut b.positions);
+        stratified::stratified(&b.batch, n, Some((Rng::new(m.config.seed, COARSE), first)), &mut b.guide.samples);
         let coarse = m.coarse.as_mut().expect("nerf has a coarse field");
-        let coarse_loss = train_field(coarse, &terms, &b.batch, &b.fine, &b.positions, &b.background, &mut b.field, None);
-        stratified::refine(&b.fine, &b.field.out.weights, n, more, Some((Rng::new(m.config.seed, FINE), first)), &mut b.marched);
-        positions(&b.batch, &b.marched, &mut b.positions);
+        encode(coarse, &b.batch, &mut b.guide);
+        let coarse_loss = train_field(coarse, &terms, &b.batch, &mut b.guide, &b.background, &mut b.field, None);
+        let (guide, fine) = (&b.guide.samples, &mut b.visible.samples);
+        stratified::refine(guide, &b.field.out.weights, n, more, Some((Rng::new(m.config.seed, FINE), first)), fine);
+        encode(&m.field, &b.batch, &mut b.visible);
         let d = m.corrections.is_some().then_some(&mut b.d_positions);
-        let loss = train_field(&mut m.field, &terms, &b.batch, &b.marched, &b.positions, &b.background, &mut b.field, d);
-        (coarse_loss + loss, (b.fine.t.len() + b.marched.t.len()) as u64)
+        let loss = train_field(&mut m.field, &terms, &b.batch, &mut b.visible, &b.background, &mut b.field, d);
+        (coarse_loss + loss, (b.guide.samples.t.len() + b.visible.samples.t.len()) as u64)
     }
 
     /// Squared error of the step's colours, and what the error map learns from it.
@@ -604,8 +603,9 @@ impl<'a> Trainer<'a> {
         let rays = b.batch.len();
         let (mut d_origins, mut d_dirs) = (vec![0.0; rays * 3], vec![0.0; rays * 3]);
         for r in 0..rays {
-            for i in b.marched.offsets[r] as usize..b.marched.offsets[r + 1] as usize {
-                let t = b.marched.t[i] + 0.5 * b.marched.dt[i];
+            let s = &b.visible.samples;
+            for i in s.offsets[r] as usize..s.offsets[r + 1] as usize {
+                let t = s.t[i] + 0.5 * s.dt[i];
                 for k in 0..3 {
                     d_origins[r * 3 + k] += b.d_positions[i * 3 + k];
                     d_dirs[r * 3 + k] += t * b.d_positions[i * 3 + k];
@@ -624,9 +624,11 @@ fn stretch(step: u64) -> f32 {
     most.powf(1.0 - step.min(until) as f32 / until as f32)
 }
 
-fn positions(batch: &RayBatch, marched: &Marched, out: &mut Vec<f32>) {
+/// Positions of samples along their rays, and their encoding.
+fn encode(field: &Field, batch: &RayBatch, out: &mut VisibleSamples) {
     let rays = MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
-    march::cpu::positions(&rays, marched, out);
+    march::cpu::positions(&rays, &out.samples, &mut out.positions);
+    field.encode(&out.positions, &mut out.encoded);
 }
 
 #[allow(clippy::too_many_arguments)]
@@ -634,12 +636,12 @@ fn train_field(
     field: &mut Field,
     terms: &Terms,
     batch: &RayBatch,
-    marched: &Marched,
-    positions: &[f32],
+    on: &mut VisibleSamples,
     background: &[f32],
     buffers: &mut FieldBuffers,
     d_positions: Option<&mut Vec<f32>>,
 ) -> f64 {
+    let marched = &on.samples;
     let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
     let (mut starts, mut lengths) = (Vec::new(), Vec::new());
     let spread = if terms.distortion > 0.0 && field.is_unbounded() {
@@ -652,8 +654,9 @@ fn train_field(
     let relative = if field.net.color().activation == Activation::TruncatedExp { losses::RELATIVE } else { 0.0 };
     let Terms { color, distortion, depth, alpha, near_scaling } = *terms;
     let loss = Photometric { batch, samples: spread, background, color, relative, distortion, alpha, depth, along: samples };
-    let b = Batch { samples, positions, dirs: &batch.dirs, images: Some(&batch.images), background, near_scaling };
-    field.train(&b, &loss, buffers, d_positions);
+    let (dirs, images) = (&batch.dirs[..], Some(&batch.images[..]));
+    let b = Batch { samples, positions: &on.positions, dirs, images, given: &[], background, near_scaling };
+    field.train(&b, &mut on.encoded, Loss::Rays(&loss), buffers, d_positions);
     buffers.out.loss
 }
 

@@ -18,8 +18,9 @@ pub mod step;
 #[cfg(test)]
 mod tests;
 
-use super::frequency::Frequency;
+use super::frequency::{self, Frequency};
 use super::fused_mlp::{Head, Mlp};
+use super::triangle_wave;
 
 pub use step::{StepBuffers, StepInput, StepOutput, run};
 
@@ -79,7 +80,40 @@ pub enum Positions<'a> {
     /// Level-major features `[L, S, F]` of a hash grid; replaced by their gradients in a backward pass.
     Features { data: &'a mut [f32], levels: usize, width: usize },
     /// Positions `[S, 3]`, encoded in the block. Gradients `[S, 3]` are written where asked for.
-    Encoded { encoding: Frequency, points: &'a [f32], d_points: Option<&'a mut [f32]> },
+    Encoded { encoding: BlockEncoding, points: &'a [f32], d_points: Option<&'a mut [f32]> },
+}
+
+/// An encoding without parameters, which is computed inside the block.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum BlockEncoding {
+    Frequency(Frequency),
+    TriangleWave { bands: usize },
+}
+
+impl BlockEncoding {
+    /// Numbers per position.
+    pub fn output_dims(&self) -> usize {
+        match self {
+            BlockEncoding::Frequency(f) => f.output_dims(),
+            BlockEncoding::TriangleWave { bands } => 3 * bands,
+        }
+    }
+
+    /// Points `[N, 3]` to rows `[N, output_dims]`.
+    pub fn forward(&self, points: &[f32], out: &mut [f32]) {
+        match self {
+            BlockEncoding::Frequency(f) => frequency::cpu::forward(f, points, out),
+            BlockEncoding::TriangleWave { bands } => triangle_wave::cpu::forward(3, *bands, points, out),
+        }
+    }
+
+    /// Gradient of the points, overwritten.
+    pub fn backward(&self, points: &[f32], d: &[f32], d_points: &mut [f32]) {
+        match self {
+            BlockEncoding::Frequency(f) => frequency::cpu::backward(f, points, d, d_points),
+            BlockEncoding::TriangleWave { bands } => triangle_wave::cpu::backward(3, *bands, points, d, d_points),
+        }
+    }
 }
 
 /// A code shared by all samples of a ray, for example encoded direction or appearance embedding.

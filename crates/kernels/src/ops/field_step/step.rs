@@ -2,9 +2,8 @@
 //! parameter gradients apart and groups are added in order, so results do not depend on threads.
 
 use super::disjoint::Disjoint;
-use super::{FieldNet, Positions, RayCode, RayGradient, RayLoss, RayOutput};
+use super::{BlockEncoding, FieldNet, Positions, RayCode, RayGradient, RayLoss, RayOutput};
 use crate::ops::composite::{Packed, cpu as composite};
-use crate::ops::frequency;
 use crate::ops::fused_mlp::Head;
 use crate::ops::fused_mlp::cpu::{Activations, Prepared, backward_block, forward_block};
 use crate::ops::linear::cpu::slope_from_output;
@@ -73,7 +72,7 @@ struct Group {
 /// Per-ray and per-sample arrays that blocks write to.
 struct Shared<'a> {
     features: Option<(Disjoint<'a>, usize, usize)>,
-    encoded: Option<(frequency::Frequency, &'a [f32], Option<Disjoint<'a>>)>,
+    encoded: Option<(BlockEncoding, &'a [f32], Option<Disjoint<'a>>)>,
     codes: Vec<(&'a [f32], usize, Option<Disjoint<'a>>)>,
     values: Disjoint<'a>,
     opacity: Disjoint<'a>,
@@ -307,7 +306,7 @@ fn gather_inputs(input: &StepInput, shared: &Shared, rays: std::ops::Range<usize
         }
     }
     if let Some((encoding, points, _)) = &shared.encoded {
-        frequency::cpu::forward(encoding, &points[s0 * 3..(s0 + n) * 3], &mut group.inputs[0]);
+        encoding.forward(&points[s0 * 3..(s0 + n) * 3], &mut group.inputs[0]);
     }
     for (c, (values, width, _)) in shared.codes.iter().enumerate() {
         let mut rows = group.inputs[1 + c].chunks_exact_mut(*width);
@@ -389,7 +388,7 @@ fn backward(input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::
     if let Some((encoding, points, Some(d_points))) = &shared.encoded {
         // SAFETY: this block's samples.
         let d = unsafe { d_points.part(s0 * 3..(s0 + n) * 3) };
-        frequency::cpu::backward(encoding, &points[s0 * 3..(s0 + n) * 3], &group.d_inputs[0], d);
+        encoding.backward(&points[s0 * 3..(s0 + n) * 3], &group.d_inputs[0], d);
     }
     for (c, (_, width, gradient)) in shared.codes.iter().enumerate() {
         let Some(gradient) = gradient else { continue };

@@ -121,7 +121,7 @@ fn fused_equals_composed_with_encoded_positions() {
     let loss = Linear::new(70, 3, n);
     let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
     let input = StepInput { net: &net, params: &params, samples: p, background: &bg, near_scaling: 0.0 };
-    let positions = Positions::Encoded { encoding, points: &points, d_points: Some(&mut d_points) };
+    let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: Some(&mut d_points) };
     run(&input, positions, &mut [], Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
     let rows = frequency::reference::forward(&encoding, &wide(&points));
     let want = reference::step(&net, &wide(&params), &p, &[&rows], &wide(&bg), &loss.wide());
@@ -168,7 +168,7 @@ fn near_samples_learn_with_the_square_of_their_distance() {
     let gradient = |near_scaling: f32| {
         let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
         let input = StepInput { net: &net, params: &params, samples: s.packed(), background: &bg, near_scaling };
-        let positions = Positions::Encoded { encoding, points: &points, d_points: Some(&mut d_points) };
+        let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: Some(&mut d_points) };
         run(&input, positions, &mut [], Some(&Linear::new(20, 3, n)), &mut StepBuffers::default(), &mut out, &mut d_params);
         d_points
     };
@@ -271,7 +271,7 @@ fn run_many(loss: &dyn RayLoss, net: &FieldNet, rays: usize) -> (StepOutput, Vec
     let (mut out, mut d_params, mut d_code) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; code.len()]);
     let input = StepInput { net, params: &params, samples: s.packed(), background: &bg, near_scaling: 0.0 };
     let mut codes = [RayCode { values: &code, width: 36, gradient: Some(&mut d_code) }];
-    let positions = Positions::Encoded { encoding, points: &points, d_points: None };
+    let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: None };
     run(&input, positions, &mut codes, Some(loss), &mut StepBuffers::default(), &mut out, &mut d_params);
     (out, d_params, d_code)
 }
@@ -314,4 +314,26 @@ fn injected_gradients_are_those_of_the_loss_that_gave_them() {
     let d = RayGradients { values: own.0.color.clone(), opacity: own.0.opacity.clone(), depth: own.0.depth.clone() };
     let (out, got, got_code) = run_many(&InjectedGradients(&d), &net, rays);
     assert_eq!((got, got_code, out.loss), (want, want_code, 0.0));
+}
+
+#[test]
+fn triangle_waves_are_encoded_in_the_step() {
+    use crate::ops::triangle_wave::reference as wave;
+    let (bands, s) = (4, scene(50, 3));
+    let (p, n) = (s.packed(), s.t.len());
+    let net = FieldNet::of_color(
+        Mlp::chain(vec![12], &[24, 8], true),
+        Head { layer: 1, channel: 3, activation: Activation::Softplus, shift: 0.0 },
+        Head { layer: 1, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    );
+    let (points, params, bg) = (random(n * 3, 5), net.mlp.init(&Rng::new(1, 1)), random(150, 9));
+    let loss = Linear::new(50, 3, n);
+    let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
+    let input = StepInput { net: &net, params: &params, samples: p, background: &bg, near_scaling: 0.0 };
+    let positions = Positions::Encoded { encoding: BlockEncoding::TriangleWave { bands }, points: &points, d_points: Some(&mut d_points) };
+    run(&input, positions, &mut [], Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
+    let rows = wave::forward(bands, &wide(&points));
+    let want = reference::step(&net, &wide(&params), &p, &[&rows], &wide(&bg), &loss.wide());
+    assert_close("values", &out.values, &want.out.color, 1e-4);
+    assert_close("d points", &d_points, &wave::backward(bands, &wide(&points), &want.d_inputs[0]), 1e-4);
 }
