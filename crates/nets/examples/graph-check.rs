@@ -22,7 +22,7 @@ fn check(name: &str) -> Result<bool, String> {
     if !gpu.shares_memory() {
         return Err(format!("device {name}: burn's own kernels share memory among units, which this device cannot"));
     }
-    let rows = diorama_graph::check::run(&gpu);
+    let rows = diorama_nets::bridge::check::run(&gpu);
     for row in &rows {
         if let Some(fault) = &row.fault {
             println!("WRONG {} {} ({}): {fault}", row.op, row.result, row.shape);

@@ -1,8 +1,8 @@
 //! Features at the corners of sparse voxels in burn's graph.
 
-use crate::bridge::{In, Out, SliceOp, apply_one};
 #[cfg(feature = "gpu")]
-use crate::on_gpu::{Ahead, DeviceOp, OnDevice};
+use super::{DeviceKernels, DeviceOutputs, OnDevice};
+use super::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
 use burn::tensor::Tensor;
 #[cfg(feature = "gpu")]
 use diorama_kernels::gpu::{Buffer, Gpu};
@@ -24,17 +24,34 @@ impl CornerOp {
 }
 
 impl SliceOp for CornerOp {
-    fn forward(&self, i: &[In]) -> Vec<Out> {
-        let (s, c) = (i[0].shape[0], i[1].shape[1]);
-        let mut out = vec![0.0; s * c];
-        cpu::forward(&self.corners(), i[0].data, i[1].data, c, &mut out);
-        vec![(out, vec![s, c])]
+    fn name(&self) -> &'static str {
+        "corner grid"
     }
-    fn backward(&self, i: &[In], d: &[Option<&[f32]>]) -> Vec<Option<Vec<f32>>> {
-        let Some(d) = d[0] else { return vec![None, None] };
-        let (mut du, mut dt) = (vec![0.0; i[0].data.len()], vec![0.0; i[1].data.len()]);
-        cpu::backward(&self.corners(), i[0].data, i[1].data, i[1].shape[1], d, &mut du, &mut dt);
-        vec![Some(du), Some(dt)]
+
+    fn check(&self, shapes: &[&[usize]]) -> Result<(), OpError> {
+        expect_inputs(self.name(), shapes, 2)?;
+        expect_shape(self.name(), "local", shapes[0], &[Some(self.voxel.len()), Some(3)])?;
+        expect_shape(self.name(), "table", shapes[1], &[None, None])
+    }
+
+    fn forward(&self, x: &[Values], _: &[bool]) -> Forward {
+        let (s, c) = (x[0].shape()[0], x[1].shape()[1]);
+        let mut out = ValuesMut::zeros(&[s, c]);
+        cpu::forward(&self.corners(), &x[0], &x[1], c, &mut out);
+        Forward::one(out.freeze(), Kept::of(x))
+    }
+
+    fn backward(&self, kept: &Kept, d: &[Option<Values>], _: &[bool]) -> Vec<Option<Values>> {
+        let Some(d) = &d[0] else { return vec![None, None] };
+        let [local, table] = [&kept.values[0], &kept.values[1]];
+        let (mut du, mut dt) = (ValuesMut::zeros(local.shape()), ValuesMut::zeros(table.shape()));
+        cpu::backward(&self.corners(), local, table, table.shape()[1], d, &mut du, &mut dt);
+        vec![Some(du.freeze()), Some(dt.freeze())]
+    }
+
+    #[cfg(feature = "gpu")]
+    fn on_device(&self) -> Option<&dyn DeviceKernels> {
+        Some(self)
     }
 }
 
@@ -42,21 +59,21 @@ impl SliceOp for CornerOp {
 ///
 /// # Shapes
 /// local: positions within the voxel in [0, 1], `[S, 3]`; table: `[rows, C]`; result: `[S, C]`.
-pub fn trilinear_corner_grid(corners: Corners, local: Tensor<2>, table: Tensor<2>) -> Tensor<2> {
+pub fn trilinear_corner_grid(corners: Corners, local: Tensor<2>, table: Tensor<2>) -> Result<Tensor<2>, OpError> {
     let op = CornerOp { rows: corners.rows.into(), voxel: corners.voxel.into() };
     apply_one(op, vec![local.into_dispatch(), table.into_dispatch()])
 }
 
 #[cfg(feature = "gpu")]
-impl DeviceOp for CornerOp {
-    fn ahead(&self, gpu: &Gpu, i: &[OnDevice]) -> Ahead {
+impl DeviceKernels for CornerOp {
+    fn forward_on(&self, gpu: &Gpu, i: &[OnDevice]) -> DeviceOutputs {
         let c = i[1].shape[1];
         let corners = GpuCorners::upload(gpu, &self.corners());
         let out = corners.forward(gpu, &i[0].data, &i[1].data, c);
-        Ahead { outputs: vec![(out, vec![i[0].shape[0], c])], kept: vec![corners.rows, corners.voxel] }
+        DeviceOutputs { outputs: vec![(out, vec![i[0].shape[0], c])], kept: vec![corners.rows, corners.voxel] }
     }
 
-    fn back(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
+    fn backward_on(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let Some(d) = &d[0] else { return vec![None, None] };
         let corners = GpuCorners { rows: kept[0].clone(), voxel: kept[1].clone() };
         let d_table = gpu.zeros(i[1].data.len());
@@ -68,7 +85,7 @@ impl DeviceOp for CornerOp {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::values;
+    use crate::read_values;
     use burn::tensor::{Device, TensorData};
     use diorama_kernels::ops::trilinear_corner_grid::reference;
     use diorama_testkit::{assert_close, random, random_unit, wide};
@@ -82,9 +99,9 @@ mod tests {
         let device = Device::flex().autodiff();
         let ut = Tensor::<2>::from_data(TensorData::new(u.clone(), [4, 3]), &device).require_grad();
         let tt = Tensor::<2>::from_data(TensorData::new(t.clone(), [12, 3]), &device).require_grad();
-        let grads = trilinear_corner_grid(k, ut.clone(), tt.clone()).sum().backward();
+        let grads = trilinear_corner_grid(k, ut.clone(), tt.clone()).unwrap().sum().backward();
         let (du, dt) = reference::backward(&k, &wide(&u), &wide(&t), 3, &[1.0; 12]);
-        assert_close("positions", &values(ut.grad(&grads).unwrap()), &du, 1e-4);
-        assert_close("table", &values(tt.grad(&grads).unwrap()), &dt, 1e-4);
+        assert_close("positions", &read_values(ut.grad(&grads).unwrap()), &du, 1e-4);
+        assert_close("table", &read_values(tt.grad(&grads).unwrap()), &dt, 1e-4);
     }
 }
