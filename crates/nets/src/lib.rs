@@ -4,5 +4,9 @@
 //! burn keeps the graph of a step and runs on GPUs; on the CPU every op that costs time is one of `diorama-kernels`.
 
 pub mod bridge;
+pub mod param;
+pub mod train;
+pub mod weights;
 
 pub use bridge::{OpError, read_values};
+pub use param::{Kind, Mode, Module, Param, Visitor};

@@ -21,3 +21,4 @@ pub mod spherical_harmonics;
 pub mod ssim;
 pub mod triangle_wave;
 pub mod trilinear_corner_grid;
+pub mod weight_step;
