@@ -2,6 +2,7 @@
 
 pub mod adam;
 pub mod composite;
+pub mod conv2d;
 pub mod depth_loss;
 pub mod distortion;
 pub mod frequency;
