@@ -16,3 +16,4 @@ pub mod ops;
 pub mod probe;
 pub mod scatter_max;
 pub mod simd;
+pub mod tasks;

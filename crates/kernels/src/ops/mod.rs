@@ -1,5 +1,6 @@
 //! One folder per op.
 
+pub mod activation;
 pub mod adam;
 pub mod composite;
 pub mod depth_loss;
