@@ -5,6 +5,7 @@ pub mod adam;
 pub mod composite;
 pub mod depth_loss;
 pub mod distortion;
+pub mod dropout;
 pub mod frequency;
 pub mod fused_mlp;
 pub mod hash_grid;
