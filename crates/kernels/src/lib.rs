@@ -16,4 +16,5 @@ pub mod ops;
 pub mod probe;
 pub mod scatter_max;
 pub mod simd;
+mod sums;
 pub mod tasks;

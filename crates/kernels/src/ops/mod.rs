@@ -19,6 +19,7 @@ pub mod ray_aabb;
 pub mod ray_generation;
 pub mod sample_pdf;
 pub mod scan;
+pub mod softmax;
 pub mod spherical_harmonics;
 pub mod ssim;
 pub mod triangle_wave;
