@@ -6,6 +6,7 @@ pub mod composite;
 pub mod depth_loss;
 pub mod distortion;
 pub mod dropout;
+pub mod embedding;
 pub mod frequency;
 pub mod fused_mlp;
 pub mod hash_grid;
