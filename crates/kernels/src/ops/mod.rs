@@ -15,6 +15,7 @@ pub mod march;
 pub mod marching_cubes;
 pub mod marching_tetrahedra;
 pub mod ngp_field;
+pub mod norm;
 pub mod pixel_gather;
 pub mod ray_aabb;
 pub mod ray_generation;
