@@ -1,10 +1,13 @@
 //! One folder per op.
 
+pub mod activation;
 pub mod adam;
 pub mod composite;
 pub mod conv2d;
 pub mod depth_loss;
 pub mod distortion;
+pub mod dropout;
+pub mod embedding;
 pub mod frequency;
 pub mod fused_mlp;
 pub mod hash_grid;
@@ -13,11 +16,13 @@ pub mod march;
 pub mod marching_cubes;
 pub mod marching_tetrahedra;
 pub mod ngp_field;
+pub mod norm;
 pub mod pixel_gather;
 pub mod ray_aabb;
 pub mod ray_generation;
 pub mod sample_pdf;
 pub mod scan;
+pub mod softmax;
 pub mod spherical_harmonics;
 pub mod ssim;
 pub mod triangle_wave;
