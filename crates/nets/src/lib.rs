@@ -4,6 +4,8 @@
 //! burn keeps the graph of a step and runs on GPUs; on the CPU every op that costs time is one of `diorama-kernels`.
 
 pub mod bridge;
+pub mod layers;
+pub mod ops;
 pub mod param;
 pub mod train;
 pub mod weights;
