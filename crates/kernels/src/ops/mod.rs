@@ -19,6 +19,7 @@ pub mod norm;
 pub mod pixel_gather;
 pub mod ray_aabb;
 pub mod ray_generation;
+pub mod resample;
 pub mod sample_pdf;
 pub mod scan;
 pub mod softmax;
