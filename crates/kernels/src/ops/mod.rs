@@ -17,6 +17,7 @@ pub mod marching_tetrahedra;
 pub mod ngp_field;
 pub mod norm;
 pub mod pixel_gather;
+pub mod pool;
 pub mod ray_aabb;
 pub mod ray_generation;
 pub mod resample;
