@@ -9,6 +9,7 @@ pub mod dropout;
 pub mod embedding;
 pub mod frequency;
 pub mod fused_mlp;
+pub mod grid_sample;
 pub mod hash_grid;
 pub mod linear;
 pub mod march;
