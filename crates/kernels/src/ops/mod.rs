@@ -2,6 +2,7 @@
 
 pub mod activation;
 pub mod adam;
+pub mod attention;
 pub mod composite;
 pub mod depth_loss;
 pub mod distortion;
