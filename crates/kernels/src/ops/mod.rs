@@ -30,3 +30,6 @@ pub mod spherical_harmonics;
 pub mod ssim;
 pub mod triangle_wave;
 pub mod trilinear_corner_grid;
+
+#[cfg(test)]
+mod torch_cases;
