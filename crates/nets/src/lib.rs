@@ -5,6 +5,7 @@
 
 pub mod bridge;
 pub mod layers;
+pub mod modules;
 pub mod ops;
 pub mod param;
 pub mod train;

@@ -1,12 +1,12 @@
 //! A training step whose shapes are known allocates no memory for tensors. Alone in its process, because the pool is shared.
 
 use burn::tensor::{Device, Tensor, TensorData};
+use diorama_nets::OpError;
 use diorama_nets::bridge::pool;
 use diorama_nets::layers::{BatchNorm, Init, LayerNorm, Linear};
 use diorama_nets::ops::{self, Activation, Error};
 use diorama_nets::param::{Mode, Module, Visitor};
 use diorama_nets::train::{Gradients, Optimizer, Rule};
-use diorama_nets::OpError;
 use diorama_testkit::random;
 
 struct Net {

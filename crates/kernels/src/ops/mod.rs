@@ -2,6 +2,7 @@
 
 pub mod activation;
 pub mod adam;
+pub mod attention;
 pub mod composite;
 pub mod conv2d;
 pub mod depth_loss;
@@ -10,6 +11,7 @@ pub mod dropout;
 pub mod embedding;
 pub mod frequency;
 pub mod fused_mlp;
+pub mod grid_sample;
 pub mod hash_grid;
 pub mod linear;
 pub mod march;
@@ -19,8 +21,10 @@ pub mod mean_error;
 pub mod ngp_field;
 pub mod norm;
 pub mod pixel_gather;
+pub mod pool;
 pub mod ray_aabb;
 pub mod ray_generation;
+pub mod resample;
 pub mod sample_pdf;
 pub mod scan;
 pub mod softmax;
@@ -30,3 +34,6 @@ pub mod sum;
 pub mod triangle_wave;
 pub mod trilinear_corner_grid;
 pub mod weight_step;
+
+#[cfg(test)]
+mod torch_cases;

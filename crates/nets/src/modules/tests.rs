@@ -1,0 +1,1 @@
+//! Networks against what PyTorch computes with the same weights.
