@@ -35,9 +35,9 @@ pub fn read(path: &Path, wanted: &dyn Fn(&str) -> bool) -> Result<Vec<NamedArray
     let read = match head {
         _ if !known => Err("it is empty or can hardly be read".to_string()),
         [b'P', b'K', 3, 4] => torch::from_zip(file, size, wanted),
-        // Every pickle of protocol 2 begins so; in a safetensors file this would be a header of at least 640 bytes whose length
-        // ends in 0x0280, which the magic number below tells apart.
-        [0x80, 2, 0x8a, 0x0a] => torch::from_legacy(file, size, wanted),
+        // Pickles of the magic number begin so, from protocol 4 on in a frame; in a safetensors file this would be the length of a
+        // header, which the magic number tells apart.
+        [0x80, 2 | 3, 0x8a, 0x0a] | [0x80, 4 | 5, 0x95, _] => torch::from_legacy(file, size, wanted),
         _ => from_safetensors(path, wanted),
     };
     read.map_err(|e| DataError::input(path, format!("cannot be read as weights: {e}")))

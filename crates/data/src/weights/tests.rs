@@ -124,6 +124,16 @@ fn transposed_tensors_are_put_in_rows() {
 }
 
 #[test]
+fn later_protocols_are_read_too() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.pth");
+    let old = legacy(&entry(b'w', 1, 0, [1, 1], [1, 1]), &[7.0]);
+    let framed = [&b"\x80\x04\x95\x0d\0\0\0\0\0\0\0"[..], &old[2..]].concat();
+    std::fs::write(&path, framed).unwrap();
+    assert_eq!(read(&path, &|_| true).unwrap(), [NamedArray::new("w", &[1, 1], vec![7.0])]);
+}
+
+#[test]
 fn hostile_files_get_one_line_and_no_memory() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.pth");
