@@ -12,4 +12,6 @@ pub mod train;
 pub mod weights;
 
 pub use bridge::{OpError, read_values};
+/// burn's tensors, for rooms that do not name burn themselves.
+pub use burn::tensor::{Device, Tensor, TensorData};
 pub use param::{Kind, Mode, Module, Param, Visitor};

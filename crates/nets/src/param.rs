@@ -103,10 +103,9 @@ impl Param {
         if mode == Mode::Eval || s.frozen || self.kind == Kind::Statistic {
             return Tensor::<1>::from_dispatch(s.value.clone()).reshape(shape);
         }
-        let value = &s.value;
-        let leaf = s
-            .leaf
-            .get_or_insert_with(|| Tensor::<1>::from_dispatch(value.clone()).reshape(shape).autodiff().require_grad().into_dispatch());
+        let State { value, leaf, .. } = &mut *s;
+        let track = || Tensor::<1>::from_dispatch(value.clone()).reshape(shape).autodiff().require_grad().into_dispatch();
+        let leaf = leaf.get_or_insert_with(track);
         Tensor::from_dispatch(leaf.clone())
     }
 

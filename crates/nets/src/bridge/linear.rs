@@ -1,8 +1,8 @@
 //! A fully connected layer in burn's graph.
 
-use super::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
 #[cfg(feature = "gpu")]
 use super::{DeviceKernels, DeviceOutputs, OnDevice};
+use super::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
 use burn::tensor::Tensor;
 #[cfg(feature = "gpu")]
 use diorama_kernels::gpu::{Buffer, Gpu, Rows};
@@ -16,6 +16,17 @@ struct LinearOp {
     bias: BiasKind,
 }
 
+impl LinearOp {
+    /// Rows of x, its width, and that of the result.
+    fn size(x: &[usize], weight: &[usize]) -> (usize, usize, usize) {
+        (x[..x.len() - 1].iter().product(), weight[0], weight[1])
+    }
+
+    fn result(x: &[usize], width: usize) -> Vec<usize> {
+        x[..x.len() - 1].iter().copied().chain([width]).collect()
+    }
+}
+
 impl SliceOp for LinearOp {
     fn name(&self) -> &'static str {
         "linear"
@@ -24,27 +35,39 @@ impl SliceOp for LinearOp {
     fn check(&self, shapes: &[&[usize]]) -> Result<(), OpError> {
         expect_inputs(self.name(), shapes, if self.bias == BiasKind::None { 2 } else { 3 })?;
         expect_shape(self.name(), "weight", shapes[1], &[None, None])?;
-        expect_shape(self.name(), "x", shapes[0], &[None, Some(shapes[1][0])])?;
-        let rows = if self.bias == BiasKind::PerRow { shapes[0][0] } else { 1 };
-        shapes.get(2).map_or(Ok(()), |b| expect_shape(self.name(), "bias", b, &[Some(rows), Some(shapes[1][1])]))
+        if shapes[0].last() != Some(&shapes[1][0]) {
+            return Err(OpError::shape(self.name(), "x", shapes[0], format!("[…, {}]", shapes[1][0])));
+        }
+        let (m, _, n) = Self::size(shapes[0], shapes[1]);
+        let Some(bias) = shapes.get(2) else { return Ok(()) };
+        let rows = if self.bias == BiasKind::PerRow { m } else { 1 };
+        if bias.last() == Some(&n) && bias.iter().product::<usize>() == rows * n {
+            return Ok(());
+        }
+        Err(OpError::shape(self.name(), "bias", bias, format!("[{n}] or a row of {n} for each of {m} rows")))
     }
 
     fn forward(&self, x: &[Values], wanted: &[bool]) -> Forward {
-        let (m, k, n) = (x[0].shape()[0], x[1].shape()[0], x[1].shape()[1]);
-        let mut out = ValuesMut::any(&[m, n]);
+        let (m, k, n) = Self::size(x[0].shape(), x[1].shape());
+        let mut out = ValuesMut::any(&Self::result(x[0].shape(), n));
         let bias = x.get(2).map_or(&[][..], |b| &b[..]);
         cpu::forward(m, k, n, &x[0], &x[1], bias, self.bias, self.activation, &mut out);
         let out = out.freeze();
-        let kept = if wanted.contains(&true) { Kept::of(&[x[0].clone(), x[1].clone(), out.clone()]) } else { Kept::default() };
-        Forward::one(out, kept)
+        if !wanted.contains(&true) {
+            return Forward::one(out, Kept::default());
+        }
+        let mut kept = vec![x[0].clone(), x[1].clone(), out.clone()];
+        // Of the bias its shape alone is needed.
+        kept.extend(x.get(2).cloned());
+        Forward::one(out, Kept::of(&kept))
     }
 
     fn backward(&self, kept: &Kept, d: &[Option<Values>], wanted: &[bool]) -> Vec<Option<Values>> {
         let Some(d) = &d[0] else { return vec![None; wanted.len()] };
         let [x, w, out] = [&kept.values[0], &kept.values[1], &kept.values[2]];
-        let (m, k, n) = (x.shape()[0], w.shape()[0], w.shape()[1]);
-        let bias_rows = [(BiasKind::None, 0), (BiasKind::Shared, 1)].iter().find(|b| b.0 == self.bias).map_or(m, |b| b.1);
-        let (mut dx, mut dw, mut db) = (ValuesMut::any(&[m, k]), ValuesMut::any(&[k, n]), ValuesMut::any(&[bias_rows, n]));
+        let (m, k, n) = Self::size(x.shape(), w.shape());
+        let bias_shape = kept.values.get(3).map_or(&[0][..], |b| b.shape());
+        let (mut dx, mut dw, mut db) = (ValuesMut::any(x.shape()), ValuesMut::any(w.shape()), ValuesMut::any(bias_shape));
         cpu::backward(m, k, n, x, w, self.bias, self.activation, out, d, &mut dx, &mut dw, &mut db);
         let mut all = vec![Some(dx.freeze()), Some(dw.freeze()), Some(db.freeze())];
         all.truncate(wanted.len());
@@ -72,19 +95,32 @@ pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<2>>, activati
     apply_one(LinearOp { activation, bias: kind }, inputs)
 }
 
+/// The layer on the last axis of a tensor of any rank, with a shared bias `[N]`.
+pub(crate) fn linear_of_rows<const D: usize>(
+    x: Tensor<D>,
+    weight: Tensor<2>,
+    bias: Option<Tensor<1>>,
+    activation: Activation,
+) -> Result<Tensor<D>, OpError> {
+    let kind = if bias.is_some() { BiasKind::Shared } else { BiasKind::None };
+    let mut inputs = vec![x.into_dispatch(), weight.into_dispatch()];
+    inputs.extend(bias.map(|b| b.into_dispatch()));
+    apply_one(LinearOp { activation, bias: kind }, inputs)
+}
+
 #[cfg(feature = "gpu")]
 impl DeviceKernels for LinearOp {
     fn forward_on(&self, gpu: &Gpu, i: &[OnDevice]) -> DeviceOutputs {
-        let (m, size) = (i[0].shape[0], (i[1].shape[0], i[1].shape[1]));
+        let (m, k, n) = Self::size(&i[0].shape, &i[1].shape);
         let (rows, bias) = (Rows::all(gpu, m), i.get(2).map(|b| &b.data));
-        let out = kernels::forward(gpu, &rows, size, &i[0].data, &i[1].data, bias, self.bias, self.activation);
-        DeviceOutputs { outputs: vec![(out.clone(), vec![m, size.1])], kept: vec![out] }
+        let out = kernels::forward(gpu, &rows, (k, n), &i[0].data, &i[1].data, bias, self.bias, self.activation);
+        DeviceOutputs { outputs: vec![(out.clone(), Self::result(&i[0].shape, n))], kept: vec![out] }
     }
 
     fn backward_on(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let Some(d) = &d[0] else { return vec![None; i.len()] };
-        let (rows, size) = (Rows::all(gpu, i[0].shape[0]), (i[1].shape[0], i[1].shape[1]));
-        let g = kernels::backward(gpu, &rows, size, &i[0].data, &i[1].data, self.bias, self.activation, &kept[0], d);
+        let (m, k, n) = Self::size(&i[0].shape, &i[1].shape);
+        let g = kernels::backward(gpu, &Rows::all(gpu, m), (k, n), &i[0].data, &i[1].data, self.bias, self.activation, &kept[0], d);
         vec![Some(g.x), Some(g.w), g.bias]
     }
 }

@@ -12,6 +12,7 @@ mod frequency;
 mod fused_mlp;
 mod graph;
 mod hash_grid;
+mod linear;
 #[cfg(feature = "gpu")]
 mod on_gpu;
 pub mod pool;
@@ -29,6 +30,8 @@ pub use error::{OpError, expect_inputs, expect_shape};
 pub use frequency::frequency;
 pub use fused_mlp::fused_mlp;
 pub use hash_grid::hash_grid;
+pub use linear::linear;
+pub(crate) use linear::linear_of_rows;
 #[cfg(feature = "gpu")]
 pub use on_gpu::{DeviceKernels, DeviceOutputs, OnDevice, tensors};
 pub use pool::{Indices, IndicesMut, Values, ValuesMut};
