@@ -47,9 +47,10 @@ def randomize(net):
 
 
 def fixture(folder, name, net, inputs, run):
-    """Outputs in evaluation, then in training, with the inputs' gradients of a weighted sum."""
+    """Outputs in evaluation, then in training, with the inputs' gradients of a weighted sum; numbers of 32 bits, computed in 64."""
     randomize(net)
-    out = {f"net.{k}": v.clone() for k, v in net.state_dict().items() if v.dtype == torch.float32}
+    net, inputs = net.double(), [t.double() for t in inputs]
+    out = {f"net.{k}": v.clone() for k, v in net.state_dict().items() if v.dtype == torch.float64}
     out |= {f"in.{i}": t for i, t in enumerate(inputs)}
     net.eval()
     with torch.no_grad():
@@ -59,7 +60,7 @@ def fixture(folder, name, net, inputs, run):
     leaves = [t.clone().requires_grad_() for t in inputs]
     results = run(net, *leaves)
     torch.manual_seed(5)
-    weights = [torch.randn_like(t) for t in results]
+    weights = [torch.randn(t.shape).double() for t in results]
     sum((t * w).sum() for t, w in zip(results, weights)).backward()
     out |= {f"train.{i}": t for i, t in enumerate(results)}
     out |= {f"weight.{i}": t for i, t in enumerate(weights)}
@@ -191,8 +192,8 @@ def main(folder):
     torch.manual_seed(1)
     one = lambda net, *x: [net(*x)]  # noqa: E731
     image = lambda n, h, w, c=3: torch.randn(n, c, h, w)  # noqa: E731
-    fixture(folder, "resnet18_fpn", ResNetFpn(BasicBlock, [2, 2, 2, 2], 2, 4), [image(2, 33, 20)], lambda net, x: net(x))
-    fixture(folder, "resnet50_fpn", ResNetFpn(Bottleneck, [3, 4, 6, 3], 1, 2), [image(2, 33, 20)], lambda net, x: net(x))
+    fixture(folder, "resnet18_fpn", ResNetFpn(BasicBlock, [2, 2, 2, 2], 2, 2), [image(2, 33, 20)], lambda net, x: net(x))
+    fixture(folder, "resnet50_fpn", ResNetFpn(Bottleneck, [1, 2, 1, 1], 1, 2), [image(2, 33, 33)], lambda net, x: net(x))
     fixture(folder, "unet", UNet(3, 2, 4, 2, 2), [image(2, 16, 12)], one)
 
     cfg = [1 << min(i, 3) for i in range(5)]

@@ -4,8 +4,7 @@
 //! them, which the optimizer drops before it writes.
 
 use crate::bridge::Values;
-use burn::backend::flex::FlexTensor;
-use burn::backend::{BackendTensor, DispatchTensor, DispatchTensorKind, TensorMetadata};
+use burn::backend::{BackendTensor, DispatchAutodiffContext, DispatchTensor, DispatchTensorKind, TensorMetadata};
 use burn::tensor::{Device, Tensor, TensorData};
 use diorama_geom::NamedArray;
 use diorama_geom::rng::Rng;
@@ -139,6 +138,19 @@ impl Param {
         s.value = Tensor::<1>::from_data(TensorData::new(values, [n]), &device).into_dispatch();
     }
 
+    /// Replaces the numbers by a function of them, where they are.
+    pub(crate) fn replace(&self, new: impl FnOnce(Tensor<1>) -> Tensor<1>) {
+        let mut s = self.lock();
+        s.value = new(Tensor::from_dispatch(s.value.clone())).into_dispatch();
+    }
+
+    /// Numbers where the parameter's are.
+    pub(crate) fn beside(&self, values: Vec<f32>) -> Tensor<1> {
+        let device = Tensor::<1>::from_dispatch(self.lock().value.clone()).device();
+        let n = values.len();
+        Tensor::from_data(TensorData::new(values, [n]), &device)
+    }
+
     /// Shows the numbers, without a copy where they lie on the CPU.
     pub fn read<T>(&self, read: impl FnOnce(&[f32]) -> T) -> T {
         let s = self.lock();
@@ -170,20 +182,14 @@ impl Param {
 
 /// The numbers of a tensor on the CPU without a copy where they lie row by row.
 pub(crate) fn values_of(tensor: DispatchTensor) -> Values {
-    match tensor.kind {
+    match Tensor::<1>::from_dispatch(tensor).inner().into_dispatch().kind {
         DispatchTensorKind::Flex(BackendTensor::Float(t)) => Values::of(&t),
         kind => {
             let shape: Vec<usize> = kind.shape().iter().copied().collect();
-            let t = DispatchTensor { kind, autodiff: tensor.autodiff };
+            let t = DispatchTensor { kind, autodiff: DispatchAutodiffContext::Disabled };
             Values::from_vec(crate::read_values(Tensor::<1>::from_dispatch(t).reshape([shape.iter().product::<usize>()])), &shape)
         }
     }
-}
-
-/// A tensor of burn's of numbers of ours.
-pub(crate) fn tensor_of<const D: usize>(values: Values) -> Tensor<D> {
-    let t: FlexTensor = values.into_tensor();
-    Tensor::from_primitive::<burn::backend::Flex>(t)
 }
 
 /// Collects parameters with their full names, as `layer1.0.conv1.weight`.

@@ -16,8 +16,8 @@ pub enum Layout {
     Transposed,
 }
 
-/// One line of a key map: names that begin with `theirs` continue with `ours` instead. `*` stands for any one segment between dots,
-/// which is taken over.
+/// One line of a key map: names that begin with `theirs` continue with `ours` instead. `*` stands for anything within one
+/// segment between dots, which is taken over.
 #[derive(Clone, Copy, Debug)]
 pub struct Rule {
     pub theirs: &'static str,
@@ -66,16 +66,17 @@ fn renamed(rule: &Rule, name: &str) -> Option<String> {
     }
     let mut stars = Vec::new();
     for (s, p) in segments.iter().zip(&pattern) {
-        match *p {
-            "*" => stars.push(*s),
-            p if p == *s => {}
-            _ => return None,
+        match p.split_once('*') {
+            Some((before, after)) => stars.push(s.strip_prefix(before)?.strip_suffix(after)?),
+            None if p == s => {}
+            None => return None,
         }
     }
     let mut stars = stars.into_iter();
     let ours = rule.ours.split('.').filter(|s| !s.is_empty());
-    let mut out: Vec<&str> = ours.map(|s| if s == "*" { stars.next().unwrap_or("*") } else { s }).collect();
-    out.extend(&segments[pattern.len()..]);
+    let mut filled = |s: &str| if s.contains('*') { s.replacen('*', stars.next().unwrap_or_default(), 1) } else { s.to_string() };
+    let mut out: Vec<String> = ours.map(&mut filled).collect();
+    out.extend(segments[pattern.len()..].iter().map(|s| s.to_string()));
     Some(out.join("."))
 }
 

@@ -106,7 +106,7 @@ fn a_run_goes_on_from_a_checkpoint_bit_for_bit() {
     let resumed = Net::new(2);
     let mut resumed_steps = optimizer(&resumed);
     load(&resumed, &saved, &KeyMap::PLAIN, Strictness::AllowUnexpected).unwrap();
-    resumed_steps.restore(&saved).unwrap();
+    resumed_steps.restore(&resumed, &saved).unwrap();
     resumed.steps(&mut resumed_steps, 5);
     assert_eq!(param::arrays(&whole), param::arrays(&resumed));
     assert_eq!(steps.state(), resumed_steps.state());

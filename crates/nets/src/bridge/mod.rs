@@ -89,6 +89,11 @@ pub trait SliceOp: Debug + Send + Sync + 'static {
     /// one, or whose gradient is not `wanted`.
     fn backward(&self, kept: &Kept, d_outputs: &[Option<Values>], wanted: &[bool]) -> Vec<Option<Values>>;
 
+    /// The op by burn's own ops, which record their own graph: for devices where it has no kernels.
+    fn by_burn(&self, _: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        None
+    }
+
     /// The op's kernels on GPUs, where it has them.
     #[cfg(feature = "gpu")]
     fn on_device(&self) -> Option<&dyn DeviceKernels> {
@@ -179,7 +184,7 @@ fn apply_shared(op: OpRef, inputs: Vec<DispatchTensor>) -> Result<Vec<DispatchTe
         #[cfg(feature = "gpu")]
         DispatchTensorKind::Cube(_) if op.on_device().is_some() => apply_on::<burn_cubecl::CubeBackend>(op, inputs),
         #[allow(unreachable_patterns)]
-        _ => Err(OpError::NoKernels { op: name }),
+        _ => op.by_burn(&inputs).ok_or(OpError::NoKernels { op: name }),
     }
 }
 

@@ -1,6 +1,8 @@
 //! Scaled dot product attention.
 
+use super::by_burn;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
+use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::attention::{Attention, cpu};
 use std::cell::RefCell;
@@ -10,9 +12,9 @@ thread_local! {
     static SCRATCH: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
 }
 
-#[derive(Debug)]
-struct AttentionOp {
-    causal: bool,
+#[derive(Clone, Debug)]
+pub(super) struct AttentionOp {
+    pub(super) causal: bool,
 }
 
 impl AttentionOp {
@@ -54,6 +56,10 @@ impl SliceOp for AttentionOp {
         let [mut dq, mut dk, mut dv] = [q, k, v].map(|t| ValuesMut::any(t.shape()));
         SCRATCH.with_borrow_mut(|scratch| cpu::backward(&a, &saved, &mut dq, &mut dk, &mut dv, scratch));
         vec![Some(dq.freeze()), Some(dk.freeze()), Some(dv.freeze())]
+    }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::attention(x, self.causal))
     }
 }
 

@@ -1,7 +1,9 @@
 //! Convolution and transposed convolution of images, with bias and activation.
 
 use super::Activation;
+use super::by_burn;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
+use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::conv2d::{self, Conv2d, Gradients, Images};
 
@@ -52,10 +54,22 @@ pub(super) fn fused(activation: Activation) -> Option<conv2d::Activation> {
     })
 }
 
-#[derive(Debug)]
-struct ConvOp {
-    settings: Conv,
-    activation: conv2d::Activation,
+/// The same activation by its general name.
+pub(super) fn unfused(activation: conv2d::Activation) -> Activation {
+    match activation {
+        conv2d::Activation::None => Activation::None,
+        conv2d::Activation::Relu => Activation::Relu,
+        conv2d::Activation::LeakyRelu(slope) => Activation::LeakyRelu(slope),
+        conv2d::Activation::Sigmoid => Activation::Sigmoid,
+        conv2d::Activation::Tanh => Activation::Tanh,
+        conv2d::Activation::Silu => Activation::Silu,
+    }
+}
+
+#[derive(Clone, Debug)]
+pub(super) struct ConvOp {
+    pub(super) settings: Conv,
+    pub(super) activation: conv2d::Activation,
 }
 
 impl ConvOp {
@@ -85,7 +99,7 @@ pub(super) fn check_conv(op: &'static str, s: &Conv, shapes: &[&[usize]], transp
     if s.groups == 0 || s.stride.contains(&0) || s.dilation.contains(&0) {
         return Err(OpError::settings(op, "groups, stride and dilation are at least 1"));
     }
-    if x[1] % s.groups != 0 {
+    if !x[1].is_multiple_of(s.groups) {
         return Err(OpError::settings(op, format!("{} channels do not divide into {} groups", x[1], s.groups)));
     }
     let out = if transposed {
@@ -93,7 +107,7 @@ pub(super) fn check_conv(op: &'static str, s: &Conv, shapes: &[&[usize]], transp
         w[1] * s.groups
     } else {
         expect_shape(op, "weight", w, &[None, Some(x[1] / s.groups), None, None])?;
-        if w[0] % s.groups != 0 {
+        if !w[0].is_multiple_of(s.groups) {
             return Err(OpError::settings(op, format!("{} channels do not divide into {} groups", w[0], s.groups)));
         }
         for axis in 0..2 {
@@ -165,6 +179,10 @@ impl SliceOp for ConvOp {
         let values = kept.values.get(2).map_or(&d[..], |k| &k[..]);
         conv2d::cpu::backward(&conv, &images, x, w, values, d, out.destinations());
         out.freeze(wanted.len())
+    }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::conv2d(x, &self.settings, unfused(self.activation)))
     }
 }
 

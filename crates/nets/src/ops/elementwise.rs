@@ -1,13 +1,15 @@
 //! Activations, sums of branches, and tensors that several layers read.
 
 use super::Activation;
+use super::by_burn;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply, apply_one, expect_inputs, expect_shape};
+use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::activation::cpu as activations;
 use diorama_kernels::ops::sum::cpu as sums;
 
-#[derive(Debug)]
-struct ActivationOp(Activation);
+#[derive(Clone, Debug)]
+pub(super) struct ActivationOp(pub(super) Activation);
 
 impl SliceOp for ActivationOp {
     fn name(&self) -> &'static str {
@@ -32,6 +34,10 @@ impl SliceOp for ActivationOp {
             dx.freeze()
         })]
     }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::activation(x, self.0))
+    }
 }
 
 /// `f(x)`, element by element.
@@ -39,9 +45,9 @@ pub fn activation<const D: usize>(x: Tensor<D>, f: Activation) -> Result<Tensor<
     if f == Activation::None { Ok(x) } else { apply_one(ActivationOp(f), vec![x.into_dispatch()]) }
 }
 
-#[derive(Debug)]
-struct SumOp {
-    relu: bool,
+#[derive(Clone, Debug)]
+pub(super) struct SumOp {
+    pub(super) relu: bool,
 }
 
 impl SliceOp for SumOp {
@@ -75,6 +81,10 @@ impl SliceOp for SumOp {
         );
         vec![Some(both.clone()), Some(both)]
     }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::sum(x, self.relu))
+    }
 }
 
 /// `a + b` of one shape.
@@ -87,8 +97,8 @@ pub fn add_relu<const D: usize>(a: Tensor<D>, b: Tensor<D>) -> Result<Tensor<D>,
     apply_one(SumOp { relu: true }, vec![a.into_dispatch(), b.into_dispatch()])
 }
 
-#[derive(Debug)]
-struct ForkOp(usize);
+#[derive(Clone, Debug)]
+pub(super) struct ForkOp(pub(super) usize);
 
 impl SliceOp for ForkOp {
     fn name(&self) -> &'static str {
@@ -112,6 +122,10 @@ impl SliceOp for ForkOp {
         let mut parts = d.iter().flatten();
         vec![parts.next().cloned().map(|first| parts.fold(first, sum))]
     }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(vec![x[0].clone(); self.0])
+    }
 }
 
 /// `N` readers of a tensor, whose memory they share; where no gradient is recorded, nothing is.
@@ -124,8 +138,8 @@ pub fn fork<const N: usize, const D: usize>(x: Tensor<D>) -> Result<[Tensor<D>; 
 }
 
 /// Scale and shift per image and channel.
-#[derive(Debug)]
-struct ModulateOp;
+#[derive(Clone, Debug)]
+pub(super) struct ModulateOp;
 
 impl SliceOp for ModulateOp {
     fn name(&self) -> &'static str {
@@ -167,6 +181,10 @@ impl SliceOp for ModulateOp {
             (ds_slice[plane], dt_slice[plane]) = (along as f32, sum as f32);
         }
         vec![Some(dx.freeze()), Some(ds.freeze()), Some(dt.freeze())]
+    }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::modulate(x))
     }
 }
 

@@ -1,13 +1,15 @@
 //! Rows of a table by index.
 
+use super::by_burn;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
+use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::embedding::cpu;
 use std::sync::Arc;
 
-#[derive(Debug)]
-struct EmbeddingOp {
-    indices: Arc<[i64]>,
+#[derive(Clone, Debug)]
+pub(super) struct EmbeddingOp {
+    pub(super) indices: Arc<[i64]>,
 }
 
 impl SliceOp for EmbeddingOp {
@@ -39,6 +41,10 @@ impl SliceOp for EmbeddingOp {
             cpu::backward(shape[0], shape[1], &self.indices, d, &mut table);
             table.freeze()
         })]
+    }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::embedding(x, &self.indices))
     }
 }
 

@@ -1,13 +1,15 @@
 //! Copies between layouts: channels of several images together, rows of tokens, heads of attention.
 
+use super::by_burn;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply, apply_one, expect_inputs, expect_shape};
+use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use rayon::prelude::*;
 
 /// Images of one size, one after the other along the channels.
-#[derive(Debug)]
-struct ConcatOp {
-    channels: Vec<usize>,
+#[derive(Clone, Debug)]
+pub(super) struct ConcatOp {
+    pub(super) channels: Vec<usize>,
 }
 
 impl SliceOp for ConcatOp {
@@ -53,6 +55,10 @@ impl SliceOp for ConcatOp {
         };
         self.channels.iter().zip(wanted).map(|(c, w)| part(*c, *w)).collect()
     }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::concat(x))
+    }
 }
 
 /// Joins images along their channels.
@@ -65,12 +71,12 @@ pub fn concat_channels(images: Vec<Tensor<4>>) -> Result<Tensor<4>, OpError> {
 }
 
 /// `[A, B, C, D]` to `[A, C, B, D]`: the inner swap that all of the layouts below are.
-#[derive(Debug)]
-struct SwapOp {
-    from: [usize; 4],
+#[derive(Clone, Debug)]
+pub(super) struct SwapOp {
+    pub(super) from: [usize; 4],
     /// Shape of the result.
-    to: Vec<usize>,
-    back: Vec<usize>,
+    pub(super) to: Vec<usize>,
+    pub(super) back: Vec<usize>,
 }
 
 fn swap(from: [usize; 4], x: &[f32], out: &mut [f32]) {
@@ -120,6 +126,10 @@ impl SliceOp for SwapOp {
             dx.freeze()
         })]
     }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::swap(x, self.from, &self.to))
+    }
 }
 
 /// A row of channels per pixel.
@@ -140,7 +150,7 @@ pub fn to_tokens(x: Tensor<4>) -> Result<Tensor<3>, OpError> {
 /// When the width does not divide by the heads.
 pub fn heads(x: Tensor<3>, heads: usize) -> Result<Tensor<3>, OpError> {
     let [n, t, width] = x.dims();
-    if heads == 0 || width % heads != 0 {
+    if heads == 0 || !width.is_multiple_of(heads) {
         return Err(OpError::settings("heads", format!("a width of {width} does not divide into {heads} heads")));
     }
     let k = width / heads;
@@ -156,7 +166,7 @@ pub fn heads(x: Tensor<3>, heads: usize) -> Result<Tensor<3>, OpError> {
 /// When the batch does not divide by the heads.
 pub fn merge_heads(x: Tensor<3>, heads: usize) -> Result<Tensor<3>, OpError> {
     let [batch, t, k] = x.dims();
-    if heads == 0 || batch % heads != 0 {
+    if heads == 0 || !batch.is_multiple_of(heads) {
         return Err(OpError::settings("merge heads", format!("a batch of {batch} does not divide into {heads} heads")));
     }
     let n = batch / heads;
@@ -164,9 +174,9 @@ pub fn merge_heads(x: Tensor<3>, heads: usize) -> Result<Tensor<3>, OpError> {
 }
 
 /// Joint queries, keys and values to one tensor each, by head.
-#[derive(Debug)]
-struct SplitOp {
-    heads: usize,
+#[derive(Clone, Debug)]
+pub(super) struct SplitOp {
+    pub(super) heads: usize,
 }
 
 impl SplitOp {
@@ -190,7 +200,7 @@ impl SliceOp for SplitOp {
     fn check(&self, shapes: &[&[usize]]) -> Result<(), OpError> {
         expect_inputs(self.name(), shapes, 1)?;
         expect_shape(self.name(), "x", shapes[0], &[None, None, None])?;
-        if self.heads == 0 || shapes[0][2] % (3 * self.heads) != 0 {
+        if self.heads == 0 || !shapes[0][2].is_multiple_of(3 * self.heads) {
             let message = format!("a width of {} does not divide into queries, keys and values of {} heads", shapes[0][2], self.heads);
             return Err(OpError::settings(self.name(), message));
         }
@@ -219,6 +229,10 @@ impl SliceOp for SplitOp {
         });
         vec![Some(out.freeze())]
     }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::split_heads(x, self.heads))
+    }
 }
 
 /// Queries, keys and values by head of their joint projection.
@@ -231,8 +245,8 @@ pub fn split_heads(x: Tensor<3>, heads: usize) -> Result<[Tensor<3>; 3], OpError
 }
 
 /// A class token before the others, and an embedding of places added to all.
-#[derive(Debug)]
-struct ClassTokenOp;
+#[derive(Clone, Debug)]
+pub(super) struct ClassTokenOp;
 
 impl SliceOp for ClassTokenOp {
     fn name(&self) -> &'static str {
@@ -271,6 +285,10 @@ impl SliceOp for ClassTokenOp {
             places.iter_mut().zip(d).for_each(|(p, d)| *p += d);
         }
         vec![Some(tokens.freeze()), Some(class.freeze()), Some(places.freeze())]
+    }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::class_token(x))
     }
 }
 

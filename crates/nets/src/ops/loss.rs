@@ -1,6 +1,8 @@
 //! Losses, and the softmax that classifiers end with.
 
+use super::by_burn;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
+use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::mean_error::{self, Error};
 use diorama_kernels::ops::softmax::{Targets, cpu};
@@ -9,9 +11,9 @@ use std::sync::Arc;
 /// A class that no row has.
 const NO_CLASS: i64 = i64::MIN;
 
-#[derive(Debug)]
-struct SoftmaxOp {
-    logarithm: bool,
+#[derive(Clone, Debug)]
+pub(super) struct SoftmaxOp {
+    pub(super) logarithm: bool,
 }
 
 impl SliceOp for SoftmaxOp {
@@ -49,6 +51,10 @@ impl SliceOp for SoftmaxOp {
             dx.freeze()
         })]
     }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::softmax(x, self.logarithm))
+    }
 }
 
 /// `eˣ / Σ eˣ` along the last axis.
@@ -61,10 +67,10 @@ pub fn log_softmax<const D: usize>(x: Tensor<D>) -> Result<Tensor<D>, OpError> {
     apply_one(SoftmaxOp { logarithm: true }, vec![x.into_dispatch()])
 }
 
-#[derive(Debug)]
-struct CrossEntropyOp {
-    classes: Arc<[i64]>,
-    smoothing: f32,
+#[derive(Clone, Debug)]
+pub(super) struct CrossEntropyOp {
+    pub(super) classes: Arc<[i64]>,
+    pub(super) smoothing: f32,
 }
 
 impl CrossEntropyOp {
@@ -106,6 +112,10 @@ impl SliceOp for CrossEntropyOp {
             dx.freeze()
         })]
     }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::cross_entropy(x, &self.classes, self.smoothing))
+    }
 }
 
 /// Mean cross entropy of logits with a class per row; `smoothing` spreads that share of a target over all classes.
@@ -116,8 +126,8 @@ pub fn cross_entropy(logits: Tensor<2>, classes: &[i64], smoothing: f32) -> Resu
     apply_one(CrossEntropyOp { classes: classes.into(), smoothing }, vec![logits.into_dispatch()])
 }
 
-#[derive(Debug)]
-struct MeanErrorOp(Error);
+#[derive(Clone, Debug)]
+pub(super) struct MeanErrorOp(pub(super) Error);
 
 impl SliceOp for MeanErrorOp {
     fn name(&self) -> &'static str {
@@ -145,6 +155,10 @@ impl SliceOp for MeanErrorOp {
             out.freeze()
         };
         vec![wanted[0].then(|| gradient(d[0])), wanted[1].then(|| gradient(-d[0]))]
+    }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::mean_error(x, self.0))
     }
 }
 

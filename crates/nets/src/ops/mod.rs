@@ -4,6 +4,7 @@
 //! memory instead of burn's.
 
 mod attention;
+mod by_burn;
 mod conv;
 mod elementwise;
 mod embedding;

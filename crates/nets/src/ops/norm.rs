@@ -1,8 +1,10 @@
 //! Normalization: batch, group (instance with as many groups as channels), and layer.
 
 use super::Activation;
+use super::by_burn;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
 use crate::param::{Mode, Param};
+use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::norm::{LayerNorm, Norm, Over, cpu, layer, update_running};
 use std::cell::RefCell;
@@ -39,14 +41,18 @@ thread_local! {
 type Found = Arc<Mutex<Option<(Values, Values)>>>;
 
 /// Inputs: x, scale, shift; with given statistics mean and variance, too.
-#[derive(Debug)]
-struct NormOp {
-    over: Over,
-    settings: NormSettings,
-    found: Found,
+#[derive(Clone, Debug)]
+pub(super) struct NormOp {
+    pub(super) over: Over,
+    pub(super) settings: NormSettings,
+    pub(super) found: Found,
 }
 
 impl NormOp {
+    pub(super) fn new(over: Over, settings: NormSettings) -> NormOp {
+        NormOp { over, settings, found: Found::default() }
+    }
+
     fn norm<'a>(&self, shape: &[usize], scale: &'a [f32], shift: &'a [f32]) -> Norm<'a> {
         Norm {
             over: self.over,
@@ -75,7 +81,7 @@ impl SliceOp for NormOp {
             return Err(OpError::shape(self.name(), "x", shapes[0], "[N, C, …]"));
         }
         if let Over::Groups(groups) = self.over
-            && (groups == 0 || shapes[0][1] % groups != 0)
+            && (groups == 0 || !shapes[0][1].is_multiple_of(groups))
         {
             return Err(OpError::settings(self.name(), format!("{} channels do not divide into {groups} groups", shapes[0][1])));
         }
@@ -112,6 +118,18 @@ impl SliceOp for NormOp {
         all.resize(wanted.len(), None);
         all
     }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        if let Over::Groups(groups) = self.over {
+            return Some(by_burn::group_norm(x, groups, self.settings.epsilon, self.settings.activation));
+        }
+        let mut out = by_burn::batch_norm(x, self.settings.epsilon, self.settings.activation);
+        if self.over == Over::Batch {
+            let mut found = out.split_off(1).into_iter().map(crate::param::values_of);
+            *self.found.lock().expect("no other holder panicked") = found.next().zip(found.next());
+        }
+        Some(out)
+    }
 }
 
 /// Batch normalization of images or rows with an activation: by the batch's statistics in training, which move the running ones,
@@ -128,7 +146,8 @@ pub fn batch_norm<const D: usize>(
     mode: Mode,
 ) -> Result<Tensor<D>, OpError> {
     let over = if mode == Mode::Train { Over::Batch } else { Over::Given };
-    let found = Found::default();
+    let op = NormOp::new(over, settings);
+    let found = op.found.clone();
     let count = x.dims().iter().enumerate().filter(|(i, _)| *i != 1).map(|(_, n)| n).product();
     let mut inputs = vec![x.into_dispatch(), scale.into_dispatch(), shift.into_dispatch()];
     if over == Over::Given {
@@ -136,7 +155,7 @@ pub fn batch_norm<const D: usize>(
     } else if count < 2 {
         return Err(OpError::settings("batch norm", "a batch of one number per channel has no variance"));
     }
-    let out = apply_one(NormOp { over, settings, found: found.clone() }, inputs)?;
+    let out = apply_one(op, inputs)?;
     if let Some((mean, variance)) = found.lock().expect("no other holder panicked").take() {
         running.mean.write(|m| running.variance.write(|v| update_running(count, running.momentum, &mean, &variance, m, v)));
     }
@@ -154,12 +173,11 @@ pub fn group_norm<const D: usize>(
     groups: usize,
     settings: NormSettings,
 ) -> Result<Tensor<D>, OpError> {
-    let op = NormOp { over: Over::Groups(groups), settings, found: Found::default() };
-    apply_one(op, vec![x.into_dispatch(), scale.into_dispatch(), shift.into_dispatch()])
+    apply_one(NormOp::new(Over::Groups(groups), settings), vec![x.into_dispatch(), scale.into_dispatch(), shift.into_dispatch()])
 }
 
-#[derive(Debug)]
-struct LayerNormOp(NormSettings);
+#[derive(Clone, Debug)]
+pub(super) struct LayerNormOp(pub(super) NormSettings);
 
 impl LayerNormOp {
     fn norm<'a>(&self, scale: &'a [f32], shift: &'a [f32]) -> LayerNorm<'a> {
@@ -198,6 +216,10 @@ impl SliceOp for LayerNormOp {
         let gradients = cpu::Gradients { x: &mut dx, scale: &mut ds, shift: &mut dt };
         SCRATCH.with_borrow_mut(|scratch| layer::backward(&norm, x, mean, variance, d, gradients, scratch));
         vec![Some(dx.freeze()), Some(ds.freeze()), Some(dt.freeze())]
+    }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::layer_norm(x, self.0.epsilon, self.0.activation))
     }
 }
 

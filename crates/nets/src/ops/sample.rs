@@ -1,6 +1,8 @@
 //! Changes of images' sizes: pooling, resampling, pixel shuffle, sampling at a grid.
 
+use super::by_burn;
 use crate::bridge::{Forward, IndicesMut, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
+use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::grid_sample::{self, GridSample, Mode, Outside};
 use diorama_kernels::ops::pool::{Pool, cpu as pools};
@@ -27,8 +29,8 @@ fn check_pool(op: &'static str, pool: &Pool, shape: &[usize]) -> Result<(), OpEr
     Ok(())
 }
 
-#[derive(Debug)]
-struct MaxPoolOp(Pool);
+#[derive(Clone, Debug)]
+pub(super) struct MaxPoolOp(pub(super) Pool);
 
 impl SliceOp for MaxPoolOp {
     fn name(&self) -> &'static str {
@@ -60,6 +62,10 @@ impl SliceOp for MaxPoolOp {
             dx.freeze()
         })]
     }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::max_pool(x, &self.0))
+    }
 }
 
 /// Largest values of windows.
@@ -70,8 +76,8 @@ pub fn max_pool(x: Tensor<4>, pool: Pool) -> Result<Tensor<4>, OpError> {
     apply_one(MaxPoolOp(pool), vec![x.into_dispatch()])
 }
 
-#[derive(Debug)]
-struct GlobalAverageOp;
+#[derive(Clone, Debug)]
+pub(super) struct GlobalAverageOp;
 
 impl SliceOp for GlobalAverageOp {
     fn name(&self) -> &'static str {
@@ -96,6 +102,10 @@ impl SliceOp for GlobalAverageOp {
             pools::global_average_backward(h * w, d, &mut dx);
             dx.freeze()
         })]
+    }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::global_average(x))
     }
 }
 
@@ -187,8 +197,8 @@ pub fn average_pool(x: Tensor<4>, pool: Pool, count_padding: bool) -> Result<Ten
     apply_one(ResampleOp { name: "average pool", table }, vec![x.into_dispatch()])
 }
 
-#[derive(Debug)]
-struct ShuffleOp(usize);
+#[derive(Clone, Debug)]
+pub(super) struct ShuffleOp(pub(super) usize);
 
 /// Calls `visit` with the place in the many channels and that in the large image.
 fn shuffled(r: usize, [n, c, h, w]: [usize; 4], mut visit: impl FnMut(usize, usize)) {
@@ -210,7 +220,7 @@ impl SliceOp for ShuffleOp {
 
     fn check(&self, shapes: &[&[usize]]) -> Result<(), OpError> {
         expect_images(self.name(), shapes)?;
-        if self.0 == 0 || shapes[0][1] % (self.0 * self.0) != 0 {
+        if self.0 == 0 || !shapes[0][1].is_multiple_of(self.0 * self.0) {
             return Err(OpError::settings(self.name(), format!("{} channels for a factor of {}", shapes[0][1], self.0)));
         }
         Ok(())
@@ -235,6 +245,10 @@ impl SliceOp for ShuffleOp {
             shuffled(r, [s[0], s[1], h, w], |small, large| to[small] = from[large]);
             dx.freeze()
         })]
+    }
+
+    fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
+        Some(by_burn::pixel_shuffle(x, self.0))
     }
 }
 

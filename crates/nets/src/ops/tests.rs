@@ -152,3 +152,55 @@ fn the_pool_is_told_about_every_buffer() {
     let after = pool::figures();
     assert!(after.fresh + after.reused > before.fresh + before.reused);
 }
+
+/// What our kernels give and what burn's ops give, of an output and of the gradients of all inputs.
+fn assert_by_burn(op: impl crate::bridge::SliceOp + Clone, shapes: &[&[usize]]) {
+    use crate::bridge::apply;
+    use burn::backend::ops::FloatTensorOps;
+    let run = |by_burn: bool| {
+        let leaves: Vec<Tensor<1>> = shapes.iter().enumerate().map(|(i, s)| leaf([s.iter().product()], 30 + i as u64)).collect();
+        let shaped = |(t, s): (&Tensor<1>, &&[usize])| {
+            burn::backend::Dispatch::float_reshape(t.clone().into_dispatch(), burn::tensor::Shape::from(s.to_vec()))
+        };
+        let inputs: Vec<_> = leaves.iter().zip(shapes).map(shaped).collect();
+        let outputs = if by_burn { op.by_burn(&inputs).unwrap() } else { apply(op.clone(), inputs).unwrap() };
+        let out = Tensor::<1>::from_dispatch(outputs.into_iter().next().unwrap());
+        let n: usize = out.shape().iter().product();
+        let out = out.reshape([n]);
+        let grads = weighed(out.clone(), 60).backward();
+        let mut all = vec![read_values(out)];
+        all.extend(leaves.iter().map(|l| l.grad(&grads).map_or(Vec::new(), read_values)));
+        all
+    };
+    for (i, (ours, theirs)) in run(false).into_iter().zip(run(true)).enumerate() {
+        assert_close(&format!("{} result {i}", op.name()), &ours, &wide(&theirs), 1e-4);
+    }
+}
+
+#[test]
+fn burns_own_ops_give_the_same() {
+    let image: &[usize] = &[2, 4, 6, 5];
+    let f = Activation::Silu;
+    assert_by_burn(elementwise::ActivationOp(Activation::Gelu), &[image]);
+    assert_by_burn(elementwise::SumOp { relu: true }, &[image, image]);
+    assert_by_burn(elementwise::ModulateOp, &[image, &[2, 4], &[2, 4]]);
+    let settings = NormSettings { activation: f, ..NormSettings::default() };
+    assert_by_burn(norm::NormOp::new(diorama_kernels::ops::norm::Over::Batch, settings), &[image, &[4], &[4]]);
+    assert_by_burn(norm::NormOp::new(diorama_kernels::ops::norm::Over::Groups(2), settings), &[image, &[4], &[4]]);
+    assert_by_burn(norm::LayerNormOp(settings), &[&[3, 7, 5], &[5], &[5]]);
+    assert_by_burn(loss::SoftmaxOp { logarithm: true }, &[&[3, 7]]);
+    assert_by_burn(loss::SoftmaxOp { logarithm: false }, &[&[3, 7]]);
+    assert_by_burn(loss::CrossEntropyOp { classes: [2, 0, 6].into(), smoothing: 0.1 }, &[&[3, 7]]);
+    for kind in [Error::Squared, Error::Absolute, Error::Huber(0.3)] {
+        assert_by_burn(loss::MeanErrorOp(kind), &[image, image]);
+    }
+    assert_by_burn(sample::MaxPoolOp(Pool { kernel: [3; 2], stride: [2; 2], padding: [1; 2], ceil_mode: false }), &[image]);
+    assert_by_burn(sample::GlobalAverageOp, &[image]);
+    assert_by_burn(sample::ShuffleOp(2), &[image]);
+    assert_by_burn(join::ConcatOp { channels: vec![4, 3] }, &[image, &[2, 3, 6, 5]]);
+    assert_by_burn(join::SplitOp { heads: 2 }, &[&[2, 5, 18]]);
+    assert_by_burn(join::ClassTokenOp, &[&[2, 5, 4], &[1, 1, 4], &[1, 6, 4]]);
+    assert_by_burn(attention::AttentionOp { causal: false }, &[&[3, 5, 4], &[3, 6, 4], &[3, 6, 4]]);
+    assert_by_burn(attention::AttentionOp { causal: true }, &[&[3, 5, 4], &[3, 5, 4], &[3, 5, 4]]);
+    assert_by_burn(embedding::EmbeddingOp { indices: [1, 3, 1].into() }, &[&[4, 3]]);
+}

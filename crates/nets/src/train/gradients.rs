@@ -1,18 +1,26 @@
 //! Gradients of a network's weights, in the order in which it tells them.
 
-use crate::bridge::Values;
+use crate::bridge::{Values, ValuesMut};
 use crate::param::{self, Module};
 use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
+use diorama_kernels::ops::sum::cpu as sums;
 use rayon::prelude::*;
 
 /// Numbers of which one sum is made at a time; fixed, so that sums do not depend on threads.
 const CHUNK: usize = 1 << 14;
 
+/// A gradient where its weight is.
+#[derive(Clone, Debug)]
+pub(super) enum Gradient {
+    Cpu(Values),
+    Device(Tensor<1>),
+}
+
 /// The gradients of one step; `None` for parameters that are frozen, statistics, or did not take part.
 #[derive(Debug)]
 pub struct Gradients {
-    values: Vec<Option<Values>>,
+    values: Vec<Option<Gradient>>,
     scale: f32,
     limit: f32,
 }
@@ -26,7 +34,9 @@ impl Gradients {
                 // The rank of a tensor is a matter of its type alone.
                 Tensor::<1>::from_dispatch(leaf).grad_remove(&mut found)
             });
-            values.push(gradient.map(|g| param::values_of(g.into_dispatch())));
+            values.push(gradient.map(|g| {
+                if p.is_on_cpu() { Gradient::Cpu(param::values_of(g.into_dispatch())) } else { Gradient::Device(g.reshape([p.len()])) }
+            }));
         });
         Gradients { values, scale: 1.0, limit: f32::INFINITY }
     }
@@ -41,20 +51,29 @@ impl Gradients {
         assert!(!clipped(self) && !clipped(other), "clip the sum");
         for (a, b) in self.values.iter_mut().zip(&other.values) {
             let sum = match (&*a, b) {
-                (Some(x), Some(y)) => {
-                    let mut out = crate::bridge::ValuesMut::any(x.shape());
-                    out.iter_mut().zip(&x[..]).zip(&y[..]).for_each(|((o, x), y)| *o = x + y);
-                    Some(out.freeze())
+                (Some(Gradient::Cpu(x)), Some(Gradient::Cpu(y))) => {
+                    let mut out = ValuesMut::any(x.shape());
+                    sums::forward(x, y, false, &mut out);
+                    Some(Gradient::Cpu(out.freeze()))
                 }
+                (Some(Gradient::Device(x)), Some(Gradient::Device(y))) => Some(Gradient::Device(x.clone() + y.clone())),
                 (None, Some(y)) => Some(y.clone()),
-                _ => continue,
+                (_, None) => continue,
+                _ => unreachable!("a weight is in one place"),
             };
             *a = sum;
         }
     }
 
     /// The gradient of the network's parameter number `i`, before clipping.
-    pub fn get(&self, i: usize) -> Option<&Values> {
+    pub fn get(&self, i: usize) -> Option<Values> {
+        self.values[i].as_ref().map(|g| match g {
+            Gradient::Cpu(v) => v.clone(),
+            Gradient::Device(t) => param::values_of(t.clone().into_dispatch()),
+        })
+    }
+
+    pub(super) fn at(&self, i: usize) -> Option<&Gradient> {
         self.values[i].as_ref()
     }
 
@@ -69,7 +88,11 @@ impl Gradients {
 
     /// The root of the sum of all squares, clipping included only as a scale.
     pub fn norm(&self) -> f32 {
-        let of = |v: &Values| -> f64 {
+        let of = |g: &Gradient| -> f64 {
+            let v = match g {
+                Gradient::Cpu(v) => v,
+                Gradient::Device(t) => return crate::read_values((t.clone() * t.clone()).sum())[0] as f64,
+            };
             let parts: Vec<f64> = v.par_chunks(CHUNK).map(|c| c.iter().map(|g| (*g as f64) * (*g as f64)).sum()).collect();
             parts.iter().sum()
         };

@@ -7,6 +7,7 @@ pub mod augment;
 mod ema;
 mod gradients;
 pub mod loader;
+mod on_device;
 mod optimizer;
 mod schedule;
 #[cfg(test)]

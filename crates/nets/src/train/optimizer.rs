@@ -1,6 +1,7 @@
 //! Optimizers that step a network's weights in place, with rates, decay and freezing by groups of names.
 
-use super::gradients::Gradients;
+use super::gradients::{Gradient, Gradients};
+use super::on_device::{self, DeviceMoments};
 use crate::bridge::pool;
 use crate::param::{self, Kind, Module};
 use diorama_geom::NamedArray;
@@ -48,9 +49,12 @@ struct Moments {
     name: String,
     first: Vec<f32>,
     second: Vec<f32>,
+    /// Instead of these where the weight is on a GPU.
+    device: DeviceMoments,
     rate_scale: f32,
     weight_decay: f32,
     stepped: bool,
+    len: usize,
 }
 
 /// An optimizer and its state for one network.
@@ -73,11 +77,13 @@ impl Optimizer {
                 p.set_frozen(true);
             }
             let stepped = p.kind() == Kind::Weight && !group.is_some_and(|g| g.frozen);
-            let zeros = |wanted: bool| if stepped && wanted { vec![0.0; p.len()] } else { Vec::new() };
+            let zeros = |wanted: bool| if stepped && wanted && p.is_on_cpu() { vec![0.0; p.len()] } else { Vec::new() };
             slots.push(Moments {
                 name: name.to_string(),
                 first: zeros(rule.moments() >= 1),
                 second: zeros(rule.moments() >= 2),
+                device: DeviceMoments::default(),
+                len: p.len(),
                 rate_scale: group.map_or(1.0, |g| g.rate_scale),
                 weight_decay: group.and_then(|g| g.weight_decay).unwrap_or(weight_decay),
                 stepped,
@@ -111,11 +117,14 @@ impl Optimizer {
         let (rule, rate, t) = (self.rule, self.rate * rate_scale, self.steps);
         let slots = &mut self.slots;
         param::visit(module, &mut |_, p| {
-            let (m, g) = (&mut slots[i], gradients.get(i));
+            let (m, g) = (&mut slots[i], gradients.at(i));
             i += 1;
             let (Some(g), true) = (g, m.stepped && !p.is_frozen()) else { return };
             let step = weight_step::Step { rule, rate: rate * m.rate_scale, weight_decay: m.weight_decay, t, scale, limit };
-            p.write(|w| cpu::step(&step, w, &mut m.first, &mut m.second, g));
+            match g {
+                Gradient::Cpu(g) => p.write(|w| cpu::step(&step, w, &mut m.first, &mut m.second, g)),
+                Gradient::Device(g) => p.replace(|w| on_device::step(&step, w, &mut m.device, g.clone())),
+            }
         });
         drop(gradients);
         pool::end_step();
@@ -127,9 +136,10 @@ impl Optimizer {
         let count = [(self.steps & 0xff_ffff) as f32, (self.steps >> 24) as f32];
         let mut out = vec![NamedArray::new("optimizer.steps", &[2], count.to_vec())];
         for m in &self.slots {
-            for (which, values) in [("first", &m.first), ("second", &m.second)] {
+            for (which, values, device) in [("first", &m.first, &m.device.first), ("second", &m.second, &m.device.second)] {
+                let values = device.as_ref().map_or_else(|| values.clone(), |d| crate::read_values(d.clone()));
                 if !values.is_empty() {
-                    out.push(NamedArray::new(format!("optimizer.{which}.{}", m.name), &[values.len()], values.clone()));
+                    out.push(NamedArray::new(format!("optimizer.{which}.{}", m.name), &[values.len()], values));
                 }
             }
         }
@@ -140,30 +150,34 @@ impl Optimizer {
     ///
     /// # Errors
     /// When an array is missing or has another length; nothing is changed then.
-    pub fn restore(&mut self, arrays: &[NamedArray]) -> Result<(), StateError> {
+    pub fn restore(&mut self, module: &dyn Module, arrays: &[NamedArray]) -> Result<(), StateError> {
         let find = |name: &str, len: usize| match arrays.iter().find(|a| a.name == name) {
             None => Err(StateError(format!("{name} is missing"))),
             Some(a) if a.values.len() != len => Err(StateError(format!("{name} has {} numbers, expected {len}", a.values.len()))),
             Some(a) => Ok(&a.values),
         };
         let count = find("optimizer.steps", 2)?;
+        let steps = count[0] as u64 | (count[1] as u64) << 24;
+        // Before the first step there are no moments on devices.
+        let moments = if steps == 0 { 0 } else { self.rule.moments() };
         let mut found = Vec::new();
-        for m in &self.slots {
-            for (which, values) in [("first", &m.first), ("second", &m.second)] {
-                if !values.is_empty() {
-                    found.push(find(&format!("optimizer.{which}.{}", m.name), values.len())?);
-                }
+        for m in self.slots.iter().filter(|m| m.stepped) {
+            for which in ["first", "second"].into_iter().take(moments) {
+                found.push(find(&format!("optimizer.{which}.{}", m.name), m.len)?);
             }
         }
-        self.steps = count[0] as u64 | (count[1] as u64) << 24;
+        self.steps = steps;
         let mut found = found.into_iter();
-        for m in &mut self.slots {
-            for values in [&mut m.first, &mut m.second] {
-                if !values.is_empty() {
-                    values.copy_from_slice(found.next().expect("found above"));
-                }
+        let mut slots = self.slots.iter_mut();
+        param::visit(module, &mut |_, p| {
+            let Some(m) = slots.next().filter(|m| m.stepped) else { return };
+            let on_cpu = [&mut m.first, &mut m.second];
+            let on_device = [&mut m.device.first, &mut m.device.second];
+            for (cpu, device) in on_cpu.into_iter().zip(on_device).take(moments) {
+                let values = found.next().expect("found above");
+                if p.is_on_cpu() { cpu.copy_from_slice(values) } else { *device = Some(p.beside(values.clone())) }
             }
-        }
+        });
         Ok(())
     }
 }

@@ -100,12 +100,12 @@ fn a_resumed_run_is_the_same_bit_for_bit() {
         let mut o2 = Optimizer::new(&resumed, rule, 1e-2, 1e-3, &[]);
         let mut average2 = Ema::new(&resumed, 0.99);
         crate::weights::load(&resumed, &saved, &crate::weights::KeyMap::PLAIN, crate::weights::Strictness::AllowUnexpected).unwrap();
-        o2.restore(&saved).unwrap();
+        o2.restore(&resumed, &saved).unwrap();
         assert!(average2.restore(&saved));
         go(&resumed, &mut o2, &mut average2);
         assert_eq!(param::arrays(&whole), param::arrays(&resumed), "{rule:?}");
         assert_eq!((o.state(), average.state()), (o2.state(), average2.state()));
-        assert!(o2.restore(&saved[..3]).is_err());
+        assert!(o2.restore(&resumed, &saved[..3]).is_err());
     }
 }
 
@@ -170,7 +170,7 @@ fn gradients_of_two_halves_add_up() {
     a.add(&b);
     for i in 0..4 {
         let want: Vec<f64> = sum.get(i).unwrap().iter().map(|v| *v as f64).collect();
-        diorama_testkit::assert_close("sum", a.get(i).unwrap(), &want, 1e-5);
+        diorama_testkit::assert_close("sum", &a.get(i).unwrap(), &want, 1e-5);
     }
 }
 
