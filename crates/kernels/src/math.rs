@@ -80,6 +80,33 @@ multiversion! {
 }
 
 multiversion! {
+    /// `x ← tanh x`
+    pub fn tanh_in_place(values: &mut [f32]) {
+        values.iter_mut().for_each(|v| {
+            let rest = one_minus_exp_neg(2.0 * v.abs());
+            *v = (rest / (2.0 - rest)).copysign(*v);
+        });
+    }
+}
+
+multiversion! {
+    /// `x ← x / (1 + e⁻ˣ)`
+    pub fn silu_in_place(values: &mut [f32]) {
+        values.iter_mut().for_each(|v| *v /= 1.0 + exp(-*v));
+    }
+}
+
+multiversion! {
+    /// `d ← d · silu'(x)`
+    pub fn silu_backward(x: &[f32], d: &mut [f32]) {
+        for (d, x) in d.iter_mut().zip(x) {
+            let s = 1.0 / (1.0 + exp(-*x));
+            *d *= s * (1.0 + x * (1.0 - s));
+        }
+    }
+}
+
+multiversion! {
     /// Opacities `1 − e^(−σ δ)`.
     pub fn alphas(sigma: &[f32], dt: &[f32], out: &mut [f32]) {
         for ((o, s), d) in out.iter_mut().zip(sigma).zip(dt) {

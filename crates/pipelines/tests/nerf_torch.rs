@@ -47,7 +47,7 @@ fn nerf_forward_equals_pytorch() {
         ("points.f32", &seen),
         ("dirs.f32", &dirs),
         ("sigma.f32", &sigma),
-        ("rgb.f32", &buf.out.rgb),
+        ("rgb.f32", &buf.out.values),
     ] {
         write(dir.path(), name, values);
     }

@@ -13,7 +13,7 @@ use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::fused_mlp;
 use diorama_kernels::ops::hash_grid::{self, HashGrid};
-use diorama_kernels::ops::ngp_field::{self, FieldNet, Positions, RayCode, RayLoss, StepBuffers, StepInput, StepOutput};
+use diorama_kernels::ops::field_step::{self, FieldNet, Positions, RayCode, RayLoss, StepBuffers, StepInput, StepOutput};
 use diorama_kernels::ops::{frequency, linear, spherical_harmonics};
 use rayon::prelude::*;
 
@@ -187,7 +187,7 @@ impl Field {
             (Encoding::Frequency(f), _) => Positions::Encoded { encoding: *f, points: &buf.unit, d_points: None },
             (Encoding::Hash(_), None) => unreachable!("a hash field has a table"),
         };
-        ngp_field::run(&input, positions, &mut codes, None, &mut buf.step, &mut buf.out, &mut []);
+        field_step::run(&input, positions, &mut codes, None, &mut buf.step, &mut buf.out, &mut []);
         drop(codes);
         (buf.direction, buf.appearance) = (direction, appearance);
     }
@@ -225,7 +225,7 @@ impl Field {
                     buf.stages.done("encode");
                 }
                 let positions = Positions::Features { data: &mut buf.features, levels: grid.levels.len(), width: grid.config.features };
-                ngp_field::run(&input, positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut self.weights.grads);
+                field_step::run(&input, positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut self.weights.grads);
                 buf.stages.done("network");
                 if !table.frozen {
                     hash_grid::cpu::backward(grid, &buf.unit, &buf.features, &mut table.grads, Some(&mut table.touched));
@@ -242,7 +242,7 @@ impl Field {
                 own.resize(if wanted { batch.positions.len() } else { 0 }, 0.0);
                 let d_points = wanted.then_some(&mut own[..]);
                 let positions = Positions::Encoded { encoding: *f, points: &buf.unit, d_points };
-                ngp_field::run(&input, positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut self.weights.grads);
+                field_step::run(&input, positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut self.weights.grads);
                 if let Some(d) = d_positions {
                     self.unit_backward(batch.positions, &mut own);
                     *d = own;
@@ -262,7 +262,7 @@ impl Field {
 
     /// Densities `[N]` (per unit of model space) at model points `[N, 3]`.
     pub fn density(&self, model: &[f32], sigma: &mut [f32]) {
-        let head = self.net.sigma;
+        let head = self.net.density;
         let mlp = self.density_net(Precision::F32);
         let params = &self.weights.values[..mlp.params_len()];
         let width = mlp.layers[head.layer].width;

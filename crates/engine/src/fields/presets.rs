@@ -5,11 +5,11 @@ use crate::params::ParamGroup;
 use diorama_geom::contraction::Space;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::adam::Adam;
+use diorama_kernels::ops::field_step::FieldNet;
 use diorama_kernels::ops::frequency::Frequency;
-use diorama_kernels::ops::fused_mlp::{Layer, Mlp, Source};
+use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
 use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
 use diorama_kernels::ops::linear::Activation;
-use diorama_kernels::ops::ngp_field::{FieldNet, Head};
 
 /// Output layers are padded to a whole vector; unused channels get no gradient.
 const PADDED: usize = 16;
@@ -27,7 +27,7 @@ fn appearance(images: usize, dims: usize, seed: u64) -> Option<Appearance> {
 }
 
 fn layer(inputs: Vec<Source>, width: usize, relu: bool, bias: bool) -> Layer {
-    Layer { inputs, width, relu, bias }
+    Layer::new(inputs, width, if relu { Activation::Relu } else { Activation::None }, bias)
 }
 
 /// Inputs of the view-dependent part: direction code, then appearance code.
@@ -51,11 +51,11 @@ pub fn ngp(grid: HashGridConfig, space: Space, rate: f32, images: usize, dims: u
         layer(vec![L(2)], 64, true, false),
         layer(vec![L(3)], PADDED, false, false),
     ];
-    let net = FieldNet {
-        mlp: Mlp::new(widths, layers),
-        sigma: Head { layer: 1, channel: 0, activation: Activation::TruncatedExp, shift: 0.0 },
-        rgb: Head { layer: 4, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
-    };
+    let net = FieldNet::of_color(
+        Mlp::new(widths, layers),
+        Head { layer: 1, channel: 0, activation: Activation::TruncatedExp, shift: 0.0 },
+        Head { layer: 4, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    );
     let table_rng = Rng::new(seed, TABLE);
     let table = (0..grid.params_len()).map(|i| (table_rng.uniform(i as u64) * 2.0 - 1.0) * 1e-4).collect();
     let adam = Adam { rate, ..Adam::default() };
@@ -89,11 +89,11 @@ pub fn nerf(space: Space, rate: f32, images: usize, dims: usize, seed: u64, stre
     layers.push(layer(vec![L(7)], 256, false, true));
     layers.push(layer([L(9)].into_iter().chain(ray_inputs(1, codes)).collect(), 128, true, true));
     layers.push(layer(vec![L(10)], PADDED, false, true));
-    let net = FieldNet {
-        mlp: Mlp::new(widths, layers),
-        sigma: Head { layer: 8, channel: 0, activation: Activation::Softplus, shift: 0.0 },
-        rgb: Head { layer: 11, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
-    };
+    let net = FieldNet::of_color(
+        Mlp::new(widths, layers),
+        Head { layer: 8, channel: 0, activation: Activation::Softplus, shift: 0.0 },
+        Head { layer: 11, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    );
     frequency_field(net, encoding, DirectionCode::Frequency(view), space, rate, appearance, seed.wrapping_add(stream << 32))
 }
 
@@ -112,11 +112,11 @@ pub fn baseline(space: Space, rate: f32, seed: u64) -> Field {
 
 fn plain(encoding: Frequency, widths: &[usize], space: Space, rate: f32, seed: u64) -> Field {
     let last = widths.len() - 1;
-    let net = FieldNet {
-        mlp: Mlp::chain(vec![encoding.output_dims()], widths, true),
-        sigma: Head { layer: last, channel: 3, activation: Activation::Softplus, shift: 0.0 },
-        rgb: Head { layer: last, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
-    };
+    let net = FieldNet::of_color(
+        Mlp::chain(vec![encoding.output_dims()], widths, true),
+        Head { layer: last, channel: 3, activation: Activation::Softplus, shift: 0.0 },
+        Head { layer: last, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    );
     frequency_field(net, encoding, DirectionCode::None, space, rate, None, seed)
 }
 

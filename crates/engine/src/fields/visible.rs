@@ -187,13 +187,13 @@ impl Field {
     /// The layers up to the density head, which read positions alone; their parameters come first.
     pub fn density_net(&self, precision: diorama_kernels::gemm::Precision) -> Mlp {
         let all = &self.net.mlp;
-        Mlp { precision, ..Mlp::new(all.input_widths[..1].to_vec(), all.layers[..=self.net.sigma.layer].to_vec()) }
+        Mlp { precision, ..Mlp::new(all.input_widths[..1].to_vec(), all.layers[..=self.net.density.layer].to_vec()) }
     }
 
     /// Densities `[N]` of level-major features `[L, N, F]`.
     pub(super) fn sigma(&self, grid: &HashGrid, mlp: &Mlp, features: &[f32], sigma: &mut [f32], pool: &mut Vec<(Vec<f32>, Activations)>) {
         let (n, f, dims) = (sigma.len(), grid.config.features, grid.output_dims());
-        let head = self.net.sigma;
+        let head = self.net.density;
         let width = mlp.layers[head.layer].width;
         let params = &self.weights.values[..mlp.params_len()];
         let tasks = n.div_ceil(TASK);
@@ -362,7 +362,7 @@ mod tests {
         let rng = Rng::new(3, 3);
         let table = &mut field.table.as_mut().expect("a hash field").values;
         table.iter_mut().enumerate().for_each(|(i, v)| *v = rng.normal(i as u64) * 2.0);
-        field.net.sigma.shift = 1.5;
+        field.net.density.shift = 1.5;
         let mut grid = OccupancyBits::full(16, 1);
         grid.fill_with(|i| rng.uniform((1 << 20) + i as u64) > 0.3);
         let mut s = Scene { field, grid, origins: Vec::new(), dirs: Vec::new(), near_far: Vec::new(), jitter: Vec::new() };

@@ -3,7 +3,7 @@
 use crate::samplers::RayBatch;
 use diorama_geom::color::srgb_from_linear;
 use diorama_kernels::ops::composite::Packed;
-use diorama_kernels::ops::ngp_field::{RayGradient, RayLoss, RayOutput};
+use diorama_kernels::ops::field_step::{RayGradient, RayLoss, RayOutput};
 use diorama_kernels::ops::{depth_loss, distortion};
 
 /// How a colour difference counts.
@@ -83,10 +83,10 @@ impl RayLoss for Photometric<'_> {
         let scale = 1.0 / self.batch.len() as f32;
         let mut loss = 0.0f32;
         for k in 0..3 {
-            let by = if self.relative > 0.0 { 1.0 / (out.rgb[k].max(0.0) + self.relative) } else { 1.0 };
-            let (value, slope) = self.color.at(by * (out.rgb[k] - target[k]));
+            let by = if self.relative > 0.0 { 1.0 / (out.values[k].max(0.0) + self.relative) } else { 1.0 };
+            let (value, slope) = self.color.at(by * (out.values[k] - target[k]));
             loss += value / 3.0;
-            g.rgb[k] = by * slope * scale / 3.0;
+            g.values[k] = by * slope * scale / 3.0;
         }
         if self.alpha > 0.0 {
             let d = out.opacity - self.batch.target[r * 4 + 3];
@@ -130,10 +130,10 @@ mod tests {
             let (distortion, alpha, depth) = (0.0, 0.0, 0.0);
             let p = Photometric { batch: &batch, samples, background, color, relative: 1e-6, distortion, alpha, depth, along: samples };
             let run = |r: usize, v: f32| {
-                let mut w = [0.0];
-                let out = RayOutput { rgb: [v; 3], opacity: 1.0, depth: 1.0, weights: &[1.0], first: 0 };
-                let mut g = RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut w };
-                (p.ray(r, &out, &mut g), g.rgb[0])
+                let (mut w, mut d) = ([0.0], [0.0; 3]);
+                let out = RayOutput { values: &[v; 3], opacity: 1.0, depth: 1.0, weights: &[1.0], first: 0 };
+                let loss = p.ray(r, &out, &mut RayGradient { values: &mut d, opacity: 0.0, depth: 0.0, weights: &mut w });
+                (loss, d[0])
             };
             let ((dark, d_dark), (light, d_light)) = (run(0, 0.022), run(1, 44.0));
             assert!((dark - light).abs() < 1e-3 * light, "{dark} {light}");
@@ -151,9 +151,9 @@ mod tests {
         let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
         let run = |batch: &RayBatch, distortion: f32, alpha: f32, color: ColorLoss, depth: f32| {
             let p = Photometric { batch, samples, background: &[1.0; 3], color, relative: 0.0, distortion, alpha, depth, along: samples };
-            let mut w = [0.0; 2];
-            let out = RayOutput { rgb: [0.5, 0.5, 0.5], opacity: 0.9, depth: 1.0, weights: &[0.4, 0.5], first: 0 };
-            p.ray(0, &out, &mut RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut w })
+            let (mut w, mut d) = ([0.0; 2], [0.0; 3]);
+            let out = RayOutput { values: &[0.5, 0.5, 0.5], opacity: 0.9, depth: 1.0, weights: &[0.4, 0.5], first: 0 };
+            p.ray(0, &out, &mut RayGradient { values: &mut d, opacity: 0.0, depth: 0.0, weights: &mut w })
         };
         let base = run(&batch, 0.0, 0.0, ColorLoss::Mse, 0.0);
         assert!(run(&batch, 0.1, 0.0, ColorLoss::Mse, 0.0) > base && run(&batch, 0.0, 0.1, ColorLoss::Mse, 0.0) > base);

@@ -18,14 +18,14 @@ use diorama_kernels::gpu::{Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::composite::{Composited, Packed, cpu as composite, reference};
 use diorama_kernels::ops::distortion;
+use diorama_kernels::ops::field_step::gpu as field;
+use diorama_kernels::ops::field_step::gpu::loss::{self, Figures, SUMS, Target, Terms};
+use diorama_kernels::ops::field_step::{RayGradient, RayLoss, RayOutput};
 use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuRays, Space};
 use diorama_kernels::ops::march::{MarchRays, Marched};
-use diorama_kernels::ops::ngp_field::gpu as field;
-use diorama_kernels::ops::ngp_field::gpu::loss::{self, Figures, SUMS, Target, Terms};
-use diorama_kernels::ops::ngp_field::{RayGradient, RayLoss, RayOutput};
 use diorama_kernels::ops::pixel_gather;
 use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, CELLS, GpuPhotographs};
@@ -453,15 +453,15 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             for r in 0..rays {
                 let rgb = [0, 1, 2].map(|k: usize| out.color[r * 3 + k]);
                 let o = RayOutput {
-                    rgb,
+                    values: &rgb,
                     opacity: out.opacity[r],
                     depth: out.depth[r],
                     weights: &out.weights[p.range(r)],
                     first: p.range(r).start,
                 };
-                let mut g = RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut d_weights[p.range(r)] };
+                let values = &mut d_color[r * 3..r * 3 + 3];
+                let mut g = RayGradient { values, opacity: 0.0, depth: 0.0, weights: &mut d_weights[p.range(r)] };
                 value += photometric.ray(r, &o, &mut g);
-                d_color[r * 3..r * 3 + 3].copy_from_slice(&g.rgb);
                 d_opacity[r] = g.opacity;
                 let target = photometric.target(r);
                 if !target[0].is_nan() {
@@ -553,7 +553,7 @@ fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         PosedCamera { camera: Camera::pinhole(12, 10, 0.6), pose: Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z) };
     for (images, space) in [(0, contraction::Space::Cube(1.0)), (3, contraction::Space::Contracted(1.0))] {
         let mut f = fields::ngp(grid, space, 1e-2, images, if images > 0 { 4 } else { 0 }, 1);
-        f.net.sigma.shift = 1.2;
+        f.net.density.shift = 1.2;
         f.table.iter_mut().for_each(|t| t.values.iter_mut().for_each(|v| *v *= 2e4));
         let occupancy = Occupancy::new(16, 1, false);
         for (quality, room) in [(Quality::Full, 1 << 17), (Quality::Full, 4096), (Quality::Fast, 1 << 17)] {
@@ -630,7 +630,7 @@ fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let batch = Batch { samples, positions: &points, dirs: &dirs, images: None, background: &vec![0.0; 450], near_scaling: 0.0 };
             let mut buf = FieldBuffers::default();
             field.render(&batch, &mut buf);
-            table.close("view", "own colors", &shape, &gpu.upload(&device.color(&points, &dirs)?), &wide(&buf.out.rgb))?;
+            table.close("view", "own colors", &shape, &gpu.upload(&device.color(&points, &dirs)?), &wide(&buf.out.values))?;
         }
     }
     Ok(())

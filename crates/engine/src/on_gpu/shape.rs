@@ -4,10 +4,10 @@ use crate::fields::{DirectionCode, Encoding, Field};
 use diorama_geom::contraction as geom;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::gpu::{Buffer, Gpu, Rows};
+use diorama_kernels::ops::field_step::gpu::{Arithmetic, GpuNet};
 use diorama_kernels::ops::frequency::Frequency;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::march::gpu::Space;
-use diorama_kernels::ops::ngp_field::gpu::{Arithmetic, GpuNet};
 use diorama_kernels::ops::{frequency, spherical_harmonics};
 
 enum Encoder {

@@ -8,10 +8,10 @@ use crate::samplers::RayBatch;
 use crate::samplers::occupancy::Occupancy;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
+use diorama_kernels::ops::field_step::gpu as field;
 use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays};
-use diorama_kernels::ops::ngp_field::gpu as field;
 use diorama_kernels::ops::sample_pdf::gpu::strata;
 
 /// Samples that there is room for, and where the CPU plays the device.

@@ -10,13 +10,13 @@ use diorama_geom::rng::Rng;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::gpu::GpuPacked;
+use diorama_kernels::ops::field_step::gpu as field;
+use diorama_kernels::ops::field_step::gpu::loss::{self, SUMS, Target, Terms};
 use diorama_kernels::ops::linear::{self, Activation, BiasKind};
 use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuRays};
-use diorama_kernels::ops::ngp_field::gpu as field;
-use diorama_kernels::ops::ngp_field::gpu::loss::{self, SUMS, Target, Terms};
 use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, Drawn, GpuPhotographs};
 use diorama_kernels::ops::ray_generation::PosedCamera;
@@ -138,7 +138,7 @@ impl GpuField {
         let codes: Vec<&Buffer> = direction.iter().chain(&appearance).collect();
         let (g, errors, composited) = if !on.wants_weights {
             let at = net.evaluate(gpu, weights, packed, &on.features, &codes, true);
-            let (d, errors) = loss::composite_and_loss(gpu, s.terms, packed, &at.sigma, &at.rgb, on.target, s.near_scaling, on.figures);
+            let (d, errors) = loss::composite_and_loss(gpu, s.terms, packed, &at.sigma, &at.outputs, on.target, s.near_scaling, on.figures);
             (net.gradients(gpu, weights, packed, &at, &d), errors, None)
         } else {
             let background = on.target.background;

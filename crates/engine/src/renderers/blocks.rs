@@ -5,8 +5,8 @@
 use super::volume::Traced;
 use crate::fields::{Encoding, Field, Pruning};
 use diorama_kernels::math;
+use diorama_kernels::ops::field_step::infer::{Codes, InferBuffers, Inference};
 use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched, OccupancyBits};
-use diorama_kernels::ops::ngp_field::infer::{Codes, InferBuffers, Inference};
 use rayon::prelude::*;
 use std::cell::RefCell;
 
@@ -272,7 +272,7 @@ mod tests {
         let rng = Rng::new(3, 3);
         let table = &mut field.table.as_mut().expect("a hash field").values;
         table.iter_mut().enumerate().for_each(|(i, v)| *v = rng.normal(i as u64) * 0.7);
-        field.net.sigma.shift = 2.0;
+        field.net.density.shift = 2.0;
         field.net.mlp.precision = precision;
         field
     }

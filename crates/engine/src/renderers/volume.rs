@@ -425,7 +425,7 @@ fn between(view: &mut View, stride: usize, tolerance: f32, wanted: &mut Vec<u32>
 
 fn taken(buf: &mut FieldBuffers) -> Traced {
     let o = &mut buf.out;
-    Traced { rgb: std::mem::take(&mut o.rgb), opacity: std::mem::take(&mut o.opacity), depth: std::mem::take(&mut o.depth) }
+    Traced { rgb: std::mem::take(&mut o.values), opacity: std::mem::take(&mut o.opacity), depth: std::mem::take(&mut o.depth) }
 }
 
 #[cfg(test)]
@@ -441,7 +441,7 @@ mod tests {
     fn waves_equal_one_long_march() {
         let grid = HashGridConfig { levels: 3, features: 2, log2_size: 10, base: 4, finest: 16 };
         let mut field = fields::ngp(grid, Space::Cube(1.0), 1e-2, 0, 0, 1);
-        field.net.sigma.shift = 1.2;
+        field.net.density.shift = 1.2;
         let occupancy = Occupancy::new(16, 1, false);
         let pose = Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z);
         let camera = PosedCamera { camera: Camera::pinhole(12, 10, 0.6), pose };
@@ -477,7 +477,7 @@ mod tests {
         tracer.evaluate(&field, &batch, &marched, &mut buf);
         for r in 0..120 {
             for k in 0..3 {
-                let want = buf.out.rgb[r * 3 + k] + (1.0 - buf.out.opacity[r]) * [0.2, 0.5, 0.9][k];
+                let want = buf.out.values[r * 3 + k] + (1.0 - buf.out.opacity[r]) * [0.2, 0.5, 0.9][k];
                 assert!((view.rgb.data[r * 3 + k] - want).abs() < 2e-3, "{r} {} {want}", view.rgb.data[r * 3 + k]);
             }
         }
@@ -487,7 +487,7 @@ mod tests {
     fn the_clip_box_hides_what_lies_outside() {
         let grid = HashGridConfig { levels: 2, features: 2, log2_size: 8, base: 4, finest: 8 };
         let mut field = fields::ngp(grid, Space::Cube(1.0), 1e-2, 0, 0, 1);
-        field.net.sigma.shift = 6.0;
+        field.net.density.shift = 6.0;
         let occupancy = Occupancy::new(16, 1, false);
         let pose = Pose::look_at(DVec3::new(0.5, -1.5, 0.5), DVec3::splat(0.5), DVec3::Z);
         let camera = PosedCamera { camera: Camera::pinhole(9, 9, 0.8), pose };
@@ -582,7 +582,7 @@ mod tests {
     fn a_fast_view_is_close_to_a_full_one() {
         let grid = HashGridConfig { levels: 3, features: 2, log2_size: 10, base: 4, finest: 16 };
         let mut field = fields::ngp(grid, Space::Cube(1.0), 1e-2, 0, 0, 1);
-        field.net.sigma.shift = 3.0;
+        field.net.density.shift = 3.0;
         let occupancy = Occupancy::new(16, 1, false);
         let pose = Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z);
         let camera = PosedCamera { camera: Camera::pinhole(40, 32, 0.6), pose };

@@ -258,12 +258,12 @@ mod tests {
         let mut o = Occupancy::new(16, 1, false);
         let mut f = field();
         // A field of density e^-20 everywhere.
-        f.net.sigma.shift = -20.0;
+        f.net.density.shift = -20.0;
         for i in 0..60 {
             o.update(&f, &Rng::new(1, 1), i, 4096, 1);
         }
         assert!(o.density.iter().all(|d| *d < 1.0));
-        f.net.sigma.shift = 5.0;
+        f.net.density.shift = 5.0;
         for i in 0..10 {
             o.update(&f, &Rng::new(1, 1), i, 4096, 1);
         }

@@ -7,14 +7,14 @@ use super::{Buffer, Gpu, GpuError, Rows};
 use crate::device::Api;
 use crate::ops::adam::{self, Adam};
 use crate::ops::composite::{self, Composited, Packed, gpu::GpuComposited, gpu::GpuPacked};
+use crate::ops::field_step::gpu::{Arithmetic, GpuNet};
+use crate::ops::field_step::{self, FieldNet, Output};
 use crate::ops::fused_mlp::gpu::fused::{self, Element, Fused};
-use crate::ops::fused_mlp::{self, Layer, Mlp, Source};
+use crate::ops::fused_mlp::{self, Head, Layer, Mlp, Source};
 use crate::ops::hash_grid::{self, HashGrid, HashGridConfig, gpu::GpuHashGrid};
 use crate::ops::linear::{self, Activation, BiasKind};
 use crate::ops::march::{self, MarchConfig, MarchRays, OccupancyBits, gpu::Space};
 use crate::ops::marching_cubes::CaseTable;
-use crate::ops::ngp_field::gpu::{Arithmetic, GpuNet};
-use crate::ops::ngp_field::{self, FieldNet, Head};
 use crate::ops::ray_generation::{self, PosedCamera, gpu::GpuCameras};
 use crate::ops::trilinear_corner_grid::{self, Corners, gpu::GpuCorners};
 use crate::ops::{
@@ -280,7 +280,9 @@ fn layers(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 
 /// Skip connections, split heads and biases.
 fn branched() -> Mlp {
-    let layer = |inputs: Vec<Source>, width, relu, bias| Layer { inputs, width, relu, bias };
+    let layer = |inputs: Vec<Source>, width, relu: bool, bias| {
+        Layer::new(inputs, width, if relu { Activation::Relu } else { Activation::None }, bias)
+    };
     Mlp::new(
         vec![9, 5],
         vec![
@@ -292,8 +294,28 @@ fn branched() -> Mlp {
     )
 }
 
+/// Every activation, modulated layers and a frozen one.
+fn modulated() -> Mlp {
+    let curved = [Activation::LeakyRelu, Activation::Softplus, Activation::Sigmoid, Activation::Tanh, Activation::Silu];
+    let by = |inputs, width, activation| Layer { modulation: Some(1), ..Layer::new(inputs, width, activation, true) };
+    let mut layers: Vec<Layer> = curved
+        .iter()
+        .enumerate()
+        .map(|(j, a)| Layer::new(vec![if j == 0 { Source::Input(0) } else { Source::Layer(j - 1) }], 9, *a, true))
+        .collect();
+    layers.push(by(vec![Source::Layer(4)], 8, Activation::Silu));
+    layers.push(Layer { frozen: true, ..Layer::new(vec![Source::Layer(5)], 11, Activation::Relu, true) });
+    layers.push(Layer::new(vec![Source::Layer(6), Source::Input(0)], 4, Activation::None, true));
+    Mlp::new(vec![9, 17], layers)
+}
+
+/// As wide as networks of fields become.
+fn wide_chain() -> Mlp {
+    Mlp::chain(vec![60], &[384, 512, 16], true)
+}
+
 fn networks(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
-    for mlp in [Mlp::chain(vec![32], &[64, 64, 16], false), branched()] {
+    for mlp in [Mlp::chain(vec![32], &[64, 64, 16], false), branched(), modulated(), wide_chain()] {
         for n in [0, 1, 259] {
             let shape = format!("N={n} {} layers", mlp.layers.len());
             let params = mlp.init(&Rng::new(3, 1));
@@ -306,7 +328,7 @@ fn networks(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let wide_inputs: Vec<Vec<f64>> = inputs.iter().map(|i| wide(i)).collect();
             let wide_refs: Vec<&[f64]> = wide_inputs.iter().map(|i| &i[..]).collect();
             let want = fused_mlp::reference::forward(&mlp, &wide(&params), &wide_refs, n);
-            table.close("fused MLP", "forward", &shape, values.last().expect("layers"), want.last().expect("layers"))?;
+            table.close("fused MLP", "forward", &shape, values.layers.last().expect("layers"), want.last().expect("layers"))?;
             let seeds = d.iter().map(|d| Some(gpu.upload(d))).collect();
             let (dp, di) = fused_mlp::gpu::backward(gpu, &mlp, &p, &refs, &values, &Rows::all(gpu, n), seeds);
             let wide_d: Vec<Vec<f64>> = d.iter().map(|d| wide(d)).collect();
@@ -691,30 +713,50 @@ fn images(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 /// A density network and a colour network that also reads two codes, as instant-ngp's.
 fn field_net(features: usize) -> FieldNet {
     use Source::{Input, Layer as L};
-    let layer = |inputs: Vec<Source>, width, relu| Layer { inputs, width, relu, bias: false };
+    let layer =
+        |inputs: Vec<Source>, width, relu: bool| Layer::new(inputs, width, if relu { Activation::Relu } else { Activation::None }, false);
     let layers = vec![
         layer(vec![Input(0)], 32, true),
         layer(vec![L(0)], 16, false),
         layer(vec![L(1), Input(1), Input(2)], 32, true),
         layer(vec![L(2)], 3, false),
     ];
-    FieldNet {
-        mlp: Mlp::new(vec![features, 16, 5], layers),
-        sigma: Head { layer: 1, channel: 2, activation: Activation::TruncatedExp, shift: 0.5 },
-        rgb: Head { layer: 3, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
-    }
+    FieldNet::of_color(
+        Mlp::new(vec![features, 16, 5], layers),
+        Head { layer: 1, channel: 2, activation: Activation::TruncatedExp, shift: 0.5 },
+        Head { layer: 3, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    )
+}
+
+/// The same with eleven channels more, of a layer of their own and of the color's.
+fn field_with_labels(features: usize) -> FieldNet {
+    let mut net = field_net(features);
+    let mut layers = net.mlp.layers.clone();
+    layers.push(Layer::new(vec![Source::Layer(1)], 10, Activation::None, true));
+    net.mlp = Mlp::new(net.mlp.input_widths.clone(), layers);
+    let head = |layer, channel, activation| Head { layer, channel, activation, shift: 0.1 };
+    net.outputs.push(Output { head: head(4, 0, Activation::None), channels: 10 });
+    net.outputs.push(Output { head: head(3, 2, Activation::Tanh), channels: 1 });
+    net
 }
 
 fn fields(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     let (levels, per_level) = (4, 2);
-    let net = field_net(levels * per_level);
+    for net in [field_net(levels * per_level), field_with_labels(levels * per_level)] {
+        field(gpu, table, &net, (levels, per_level))?;
+    }
+    Ok(())
+}
+
+fn field(gpu: &Gpu, table: &mut Table, net: &FieldNet, (levels, per_level): (usize, usize)) -> Result<(), GpuError> {
+    let c = net.channels();
     let params = net.mlp.init(&Rng::new(1, 1));
     for rays in [0, 1, 90] {
         let scene = Rays::new(rays);
         let (p, s) = (scene.packed(), scene.t.len());
         let features = random(s * levels * per_level, 6);
         let codes = [random(rays * 16, 7), random(rays * 5, 8)];
-        let (background, d) = (random(rays * 3, 9), [random(rays * 3, 1), random(rays, 2), random(rays, 3), random(s, 4)]);
+        let (background, d) = (random(rays * c, 9), [random(rays * c, 1), random(rays, 2), random(rays, 3), random(s, 4)]);
         let rows: Vec<f64> = (0..s)
             .flat_map(|i| (0..levels * per_level).map(move |k| (i, k)))
             .map(|(i, k)| features[(k / per_level * s + i) * per_level + k % per_level] as f64)
@@ -725,21 +767,21 @@ fn fields(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let (first, second) = (spread(&codes[0], 16), spread(&codes[1], 5));
         let [color, depth, opacity, weights] = d.each_ref().map(|v| wide(v));
         let wide_d = Composited { color, depth, opacity, weights };
-        let want = ngp_field::reference::step(&net, &wide(&params), &p, &[&rows, &first, &second], &wide(&background), &wide_d);
+        let want = field_step::reference::step(net, &wide(&params), &p, &[&rows, &first, &second], &wide(&background), &wide_d);
 
         let up = |v: &[f32]| gpu.upload(v);
         let (on_gpu, pg, fg, bg) = (GpuPacked::upload(gpu, &p), up(&params), up(&features), up(&background));
         let (ca, cb) = (up(&codes[0]), up(&codes[1]));
-        let density = Mlp::new(net.mlp.input_widths[..1].to_vec(), net.mlp.layers[..=net.sigma.layer].to_vec());
+        let density = Mlp::new(net.mlp.input_widths[..1].to_vec(), net.mlp.layers[..=net.density.layer].to_vec());
         for (arithmetic, precise) in [(Arithmetic::Layers, "layers"), (Arithmetic::Exact, "one launch"), (Arithmetic::Best, "tensor cores")]
         {
-            let on_gpu_net = GpuNet::new(gpu, &net, &density, per_level, &[true; 3], arithmetic);
+            let on_gpu_net = GpuNet::new(gpu, net, &density, per_level, &[true; 3], arithmetic);
             let element = on_gpu_net.element();
             if matches!((arithmetic, element), (Arithmetic::Exact, None) | (Arithmetic::Best, None | Some(Element::F32))) {
                 // The device has no way but those before.
                 continue;
             }
-            let shape = format!("R={rays} S={s} {precise}");
+            let shape = format!("R={rays} S={s} C={c} {precise}");
             let features = on_gpu_net.features(gpu, &on_gpu.rows(), fg.clone());
             let mut close = |result, got: &Buffer, want: &[f64]| {
                 let got = gpu.read(got)?;

@@ -95,11 +95,14 @@ mod tests {
     use burn::tensor::{Device, TensorData};
     use diorama_geom::rng::Rng;
     use diorama_kernels::ops::fused_mlp::{Layer, Source, reference};
+    use diorama_kernels::ops::linear::Activation;
     use diorama_testkit::{assert_close, random, wide};
 
     /// A network with two inputs, a skip connection and a split head.
     fn network() -> Mlp {
-        let layer = |inputs: Vec<Source>, width, relu, bias| Layer { inputs, width, relu, bias };
+        let layer = |inputs: Vec<Source>, width, relu: bool, bias| {
+            Layer::new(inputs, width, if relu { Activation::Relu } else { Activation::None }, bias)
+        };
         use Source::{Input, Layer as L};
         Mlp::new(
             vec![5, 3],

@@ -35,6 +35,10 @@ impl SliceOp for LinearOp {
     fn check(&self, shapes: &[&[usize]]) -> Result<(), OpError> {
         expect_inputs(self.name(), shapes, if self.bias == BiasKind::None { 2 } else { 3 })?;
         expect_shape(self.name(), "weight", shapes[1], &[None, None])?;
+        if !self.activation.is_monotonic() {
+            let message = format!("{:?} needs its input backward; make it a layer of its own", self.activation);
+            return Err(OpError::settings(self.name(), message));
+        }
         if shapes[0].last() != Some(&shapes[1][0]) {
             return Err(OpError::shape(self.name(), "x", shapes[0], format!("[…, {}]", shapes[1][0])));
         }

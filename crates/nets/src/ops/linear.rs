@@ -19,6 +19,7 @@ pub fn linear<const D: usize>(
         Activation::None => Some(Fused::None),
         Activation::Relu => Some(Fused::Relu),
         Activation::Sigmoid => Some(Fused::Sigmoid),
+        Activation::Tanh => Some(Fused::Tanh),
         _ => None,
     };
     let out = linear_of_rows(x, weight, bias, fused.unwrap_or(Fused::None))?;

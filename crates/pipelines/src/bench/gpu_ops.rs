@@ -11,12 +11,12 @@ use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::composite::gpu::{self as composite, GpuGradients, GpuPacked};
+use diorama_kernels::ops::field_step::gpu::loss::{self, Figures, SUMS, Target, Terms};
+use diorama_kernels::ops::field_step::gpu::{Arithmetic, GpuNet};
 use diorama_kernels::ops::fused_mlp::gpu::fused::Element;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
 use diorama_kernels::ops::linear::{self, Activation, BiasKind};
-use diorama_kernels::ops::ngp_field::gpu::loss::{self, Figures, SUMS, Target, Terms};
-use diorama_kernels::ops::ngp_field::gpu::{Arithmetic, GpuNet};
 use diorama_kernels::ops::spherical_harmonics;
 
 /// Samples per ray.

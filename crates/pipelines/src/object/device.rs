@@ -321,8 +321,8 @@ mod running {
     use diorama_engine::samplers::pixels::Observation;
     use diorama_geom::rng::Rng;
     use diorama_kernels::gpu::{Gpu, GpuError};
+    use diorama_kernels::ops::field_step::gpu::loss;
     use diorama_kernels::ops::march::gpu::prune::Limits;
-    use diorama_kernels::ops::ngp_field::gpu::loss;
     use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, GpuPhotographs};
 
     /// Most steps between which the device is not asked how they went.

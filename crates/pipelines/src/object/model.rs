@@ -199,14 +199,15 @@ impl ObjectModel {
         let decay = model.config.optim.weight_decay;
         let table_decay = model.config.optim.table_decay.or(if model.field.is_unbounded() { TABLE_DECAY } else { 0.0 });
         if model.config.method == Method::Ngp && model.field.is_unbounded() {
-            model.field.net.sigma.shift = INITIAL_DENSITY.ln();
+            model.field.net.density.shift = INITIAL_DENSITY.ln();
         }
         let precision = if model.config.field.precision == "auto" { Precision::Bf16 } else { Precision::F32 };
         for f in model.fields_mut() {
             f.weights.adam.weight_decay = decay;
             f.table.iter_mut().for_each(|t| t.adam.weight_decay = table_decay);
             f.net.mlp.precision = precision;
-            (f.net.rgb.activation, f.net.rgb.shift) = color_head(is_linear);
+            let color = f.net.color_mut();
+            (color.activation, color.shift) = color_head(is_linear);
         }
         Ok(model)
     }
@@ -252,7 +253,7 @@ impl ObjectModel {
     /// Density per inner cube, a little below what the field starts from: what is denser is trained on however short its
     /// step, else a field could lose all of its samples before it has learned anything.
     pub fn thin(&self) -> f32 {
-        0.7 * self.field.net.sigma.shift.exp()
+        0.7 * self.field.net.density.shift.exp()
     }
 
     /// What counts at a training step, and how much.
@@ -515,7 +516,7 @@ impl FieldQuery for ObjectModel {
                 near_scaling: 0.0,
             };
             self.field.render(&batch, &mut buf);
-            out.as_flattened_mut().copy_from_slice(&buf.out.rgb);
+            out.as_flattened_mut().copy_from_slice(&buf.out.values);
         }
         self.encode(rgb_srgb);
     }

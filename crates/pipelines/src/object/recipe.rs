@@ -584,7 +584,7 @@ impl<'a> Trainer<'a> {
                 continue;
             }
             let want = [0, 1, 2].map(|k| t[k] * t[3] + b.background[r * 3 + k] * (1.0 - t[3]));
-            let got = [0, 1, 2].map(|k| b.field.out.rgb[r * 3 + k]);
+            let got = [0, 1, 2].map(|k| b.field.out.values[r * 3 + k]);
             let e = losses::squared_error(got, want, is_linear);
             sum += e as f64;
             n += 1;
@@ -649,7 +649,7 @@ fn train_field(
         samples
     };
     // Linear light has a color head of its own.
-    let relative = if field.net.rgb.activation == Activation::TruncatedExp { losses::RELATIVE } else { 0.0 };
+    let relative = if field.net.color().activation == Activation::TruncatedExp { losses::RELATIVE } else { 0.0 };
     let Terms { color, distortion, depth, alpha, near_scaling } = *terms;
     let loss = Photometric { batch, samples: spread, background, color, relative, distortion, alpha, depth, along: samples };
     let b = Batch { samples, positions, dirs: &batch.dirs, images: Some(&batch.images), background, near_scaling };

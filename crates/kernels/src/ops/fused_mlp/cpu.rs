@@ -1,7 +1,9 @@
 //! One block of rows at a time; [`forward_block`] and [`backward_block`] are what fused ops call.
 
-use super::{Mlp, Source};
+use super::{Layer, Mlp, Source};
 use crate::gemm::{self, Init, View, gemm};
+use crate::ops::linear::Activation;
+use crate::ops::linear::cpu::{activate, scale_by_slope};
 use rayon::prelude::*;
 
 /// Rows per block of the stand-alone op.
@@ -30,20 +32,38 @@ impl Prepared {
 pub struct Activations {
     pub values: Vec<Vec<f32>>,
     pub grads: Vec<Vec<f32>>,
+    /// Products before the activation, of layers whose slope needs them.
+    pre: Vec<Vec<f32>>,
+    /// What modulated layers read, side by side and scaled.
+    scaled: Vec<Vec<f32>>,
     seeded: Vec<bool>,
+    /// Whether a gradient is wanted of a layer's output: something below it is trained, or an input that is asked for.
+    wanted: Vec<bool>,
+    input_seeded: Vec<bool>,
+    d_scaled: Vec<f32>,
 }
 
 impl Activations {
     fn fit(&mut self, mlp: &Mlp, n: usize) {
-        self.values.resize_with(mlp.layers.len(), Vec::new);
-        self.grads.resize_with(mlp.layers.len(), Vec::new);
+        let layers = mlp.layers.len();
+        for v in [&mut self.values, &mut self.grads, &mut self.pre, &mut self.scaled] {
+            v.resize_with(layers, Vec::new);
+        }
         self.seeded.clear();
-        self.seeded.resize(mlp.layers.len(), false);
+        self.seeded.resize(layers, false);
+        let grow = |v: &mut Vec<f32>, len: usize| {
+            if v.len() < len {
+                v.resize(len, 0.0);
+            }
+        };
         for (j, layer) in mlp.layers.iter().enumerate() {
-            let len = n * layer.width;
-            if self.values[j].len() < len {
-                self.values[j].resize(len, 0.0);
-                self.grads[j].resize(len, 0.0);
+            grow(&mut self.values[j], n * layer.width);
+            grow(&mut self.grads[j], n * layer.width);
+            if !layer.activation.is_monotonic() {
+                grow(&mut self.pre[j], n * layer.width);
+            }
+            if layer.modulation.is_some() {
+                grow(&mut self.scaled[j], n * mlp.fan_in(j));
             }
         }
     }
@@ -52,6 +72,18 @@ impl Activations {
     pub fn seed(&mut self, layer: usize) -> &mut [f32] {
         self.seeded[layer] = true;
         &mut self.grads[layer]
+    }
+
+    /// Marks the layers whose gradient leads to a trained layer or to an input that is asked for.
+    fn mark_wanted(&mut self, mlp: &Mlp, is_asked: impl Fn(usize) -> bool) {
+        self.wanted.clear();
+        for layer in &mlp.layers {
+            let below = layer.inputs.iter().any(|s| match *s {
+                Source::Input(i) => is_asked(i),
+                Source::Layer(i) => self.wanted[i],
+            });
+            self.wanted.push(!layer.frozen || below || layer.modulation.is_some_and(&is_asked));
+        }
     }
 }
 
@@ -62,31 +94,69 @@ impl Activations {
 pub fn forward_block(mlp: &Mlp, params: &[f32], inputs: &[&[f32]], n: usize, acts: &mut Activations) {
     acts.fit(mlp, n);
     for (j, layer) in mlp.layers.iter().enumerate() {
-        let width = layer.width;
+        let (width, is_relu) = (layer.width, layer.activation == Activation::Relu);
         let (before, rest) = acts.values.split_at_mut(j);
         let out = &mut rest[0][..n * width];
         let mut at = mlp.offsets[j];
         let bias = at + mlp.fan_in(j) * width;
-        for (q, s) in layer.inputs.iter().enumerate() {
-            let k = mlp.source_width(*s);
-            let x = match *s {
-                Source::Input(i) => inputs[i],
-                Source::Layer(i) => &before[i],
-            };
-            let init = match (q, layer.bias) {
-                (0, true) => Init::Bias(&params[bias..bias + width]),
-                (0, false) => Init::Zero,
-                _ => Init::Accumulate,
-            };
-            let last = q + 1 == layer.inputs.len();
-            gemm(mlp.precision, n, width, k, View::rows(x, k), &params[at..], width, out, width, init, layer.relu && last);
-            at += k * width;
+        let start = if layer.bias { Init::Bias(&params[bias..bias + width]) } else { Init::Zero };
+        if let Some(m) = layer.modulation {
+            let k = mlp.fan_in(j);
+            let x = &mut acts.scaled[j][..n * k];
+            join(mlp, layer, inputs, before, x);
+            scale_rows(x, k, inputs[m], k + width);
+            gemm(mlp.precision, n, width, k, View::rows(x, k), &params[at..], width, out, width, start, false);
+            for (o, row) in out.chunks_exact_mut(width).zip(inputs[m].chunks_exact(k + width)) {
+                o.iter_mut().zip(&row[k..]).for_each(|(o, b)| *o += b);
+            }
+        } else {
+            for (q, s) in layer.inputs.iter().enumerate() {
+                let k = mlp.source_width(*s);
+                let init = if q == 0 { start } else { Init::Accumulate };
+                let relu = is_relu && q + 1 == layer.inputs.len();
+                let x = read(*s, inputs, before);
+                gemm(mlp.precision, n, width, k, View::rows(x, k), &params[at..], width, out, width, init, relu);
+                at += k * width;
+            }
+        }
+        if !layer.activation.is_monotonic() {
+            acts.pre[j][..n * width].copy_from_slice(out);
+        }
+        if !is_relu || layer.modulation.is_some() {
+            activate(layer.activation, out);
         }
     }
 }
 
+fn read<'a>(s: Source, inputs: &[&'a [f32]], values: &'a [Vec<f32>]) -> &'a [f32] {
+    match s {
+        Source::Input(i) => inputs[i],
+        Source::Layer(i) => &values[i],
+    }
+}
+
+/// What a layer reads, side by side, `[n, K]`.
+fn join(mlp: &Mlp, layer: &Layer, inputs: &[&[f32]], values: &[Vec<f32>], out: &mut [f32]) {
+    let total: usize = layer.inputs.iter().map(|s| mlp.source_width(*s)).sum();
+    let mut first = 0;
+    for s in &layer.inputs {
+        let k = mlp.source_width(*s);
+        for (o, x) in out.chunks_exact_mut(total).zip(read(*s, inputs, values).chunks_exact(k)) {
+            o[first..first + k].copy_from_slice(x);
+        }
+        first += k;
+    }
+}
+
+/// Scales rows of length `k` by those of a code with rows `stride` apart.
+fn scale_rows(x: &mut [f32], k: usize, code: &[f32], stride: usize) {
+    for (x, code) in x.chunks_exact_mut(k).zip(code.chunks_exact(stride)) {
+        x.iter_mut().zip(code).for_each(|(x, a)| *x *= a);
+    }
+}
+
 /// Adds parameter gradients to `d_params` and overwrites those inputs' gradients that are asked for.
-/// Gradients of layer outputs enter through [`Activations::seed`].
+/// Gradients of layer outputs enter through [`Activations::seed`]. Frozen layers and what lies below them alone are skipped.
 ///
 /// # Shapes
 /// inputs and d_inputs: `[n, K_i]`; d_params: `[params_len]`.
@@ -99,58 +169,115 @@ pub fn backward_block(
     d_params: &mut [f32],
     d_inputs: &mut [Option<&mut [f32]>],
 ) {
-    let mut input_seeded = [false; 8];
+    acts.mark_wanted(mlp, |i| d_inputs[i].is_some());
+    acts.input_seeded.clear();
+    acts.input_seeded.resize(inputs.len(), false);
     for (j, layer) in mlp.layers.iter().enumerate().rev() {
-        if !acts.seeded[j] {
+        if !acts.seeded[j] || !acts.wanted[j] {
             continue;
         }
         let width = layer.width;
-        let (before, rest) = acts.grads.split_at_mut(j);
-        let g = &mut rest[0][..n * width];
-        if layer.relu {
-            for (g, v) in g.iter_mut().zip(&acts.values[j]) {
-                *g = if *v > 0.0 { *g } else { 0.0 };
+        let g = &mut acts.grads[j][..n * width];
+        scale_by_slope(layer.activation, &acts.pre[j], &acts.values[j], g);
+        if !layer.frozen && layer.bias {
+            let at = mlp.offsets[j + 1] - width;
+            let d_bias = &mut d_params[at..at + width];
+            for row in g.chunks_exact(width) {
+                d_bias.iter_mut().zip(row).for_each(|(b, g)| *b += g);
             }
         }
-        let total = mlp.fan_in(j);
-        let wt = &prepared.transposed[j];
+        let block = Block { mlp, prepared, inputs, n };
+        match layer.modulation {
+            Some(m) => block.backward_modulated(j, m, acts, d_params, d_inputs),
+            None => block.backward_layer(j, acts, d_params, d_inputs),
+        }
+    }
+}
+
+/// What the backward pass of a block of rows reads.
+#[derive(Clone, Copy)]
+struct Block<'a> {
+    mlp: &'a Mlp,
+    prepared: &'a Prepared,
+    inputs: &'a [&'a [f32]],
+    n: usize,
+}
+
+impl Block<'_> {
+    /// One layer whose gradient before the activation is in `acts.grads`.
+    fn backward_layer(&self, j: usize, acts: &mut Activations, d_params: &mut [f32], d_inputs: &mut [Option<&mut [f32]>]) {
+        let (mlp, n, layer) = (self.mlp, self.n, &self.mlp.layers[j]);
+        let (precision, width, total) = (mlp.precision, layer.width, mlp.fan_in(j));
+        let (before, rest) = acts.grads.split_at_mut(j);
+        let g = &rest[0][..n * width];
+        let wt = &self.prepared.transposed[j];
         let (mut at, mut first) = (mlp.offsets[j], 0);
         for s in &layer.inputs {
             let k = mlp.source_width(*s);
-            let x: &[f32] = match *s {
-                Source::Input(i) => inputs[i],
-                Source::Layer(i) => &acts.values[i],
-            };
-            gemm(
-                mlp.precision,
-                k,
-                width,
-                n,
-                View::transposed(x, k),
-                g,
-                width,
-                &mut d_params[at..at + k * width],
-                width,
-                Init::Accumulate,
-                false,
-            );
+            if !layer.frozen {
+                let x = View::transposed(read(*s, self.inputs, &acts.values), k);
+                gemm(precision, k, width, n, x, g, width, &mut d_params[at..at + k * width], width, Init::Accumulate, false);
+            }
             let (target, seeded) = match *s {
-                Source::Input(i) => (d_inputs[i].as_deref_mut(), &mut input_seeded[i]),
-                Source::Layer(i) => (Some(&mut before[i][..]), &mut acts.seeded[i]),
+                Source::Input(i) => (d_inputs[i].as_deref_mut(), &mut acts.input_seeded[i]),
+                Source::Layer(i) => (acts.wanted[i].then_some(&mut before[i][..]), &mut acts.seeded[i]),
             };
             if let Some(target) = target {
                 let init = if *seeded { Init::Accumulate } else { Init::Zero };
-                gemm(mlp.precision, n, k, width, View::rows(g, width), &wt[first..], total, target, k, init, false);
+                gemm(precision, n, k, width, View::rows(g, width), &wt[first..], total, target, k, init, false);
                 *seeded = true;
             }
             at += k * width;
             first += k;
         }
-        if layer.bias {
-            let d_bias = &mut d_params[at..at + width];
-            for row in g.chunks_exact(width) {
-                d_bias.iter_mut().zip(row).for_each(|(b, g)| *b += g);
+    }
+
+    /// The same for a layer that input `m` modulates.
+    fn backward_modulated(&self, j: usize, m: usize, acts: &mut Activations, d_params: &mut [f32], d_inputs: &mut [Option<&mut [f32]>]) {
+        let (mlp, n, layer) = (self.mlp, self.n, &self.mlp.layers[j]);
+        let (precision, width, total, at) = (mlp.precision, layer.width, mlp.fan_in(j), mlp.offsets[j]);
+        let (before, rest) = acts.grads.split_at_mut(j);
+        let g = &rest[0][..n * width];
+        if !layer.frozen {
+            let x = View::transposed(&acts.scaled[j], total);
+            let d_weight = &mut d_params[at..at + total * width];
+            gemm(precision, total, width, n, x, g, width, d_weight, width, Init::Accumulate, false);
+        }
+        // Of the scaled rows; that of the rows themselves after another scaling.
+        acts.d_scaled.resize(n * total, 0.0);
+        let d = &mut acts.d_scaled[..];
+        gemm(precision, n, total, width, View::rows(g, width), &self.prepared.transposed[j], total, d, total, Init::Zero, false);
+        if let Some(d_code) = d_inputs[m].as_deref_mut() {
+            let x = &mut acts.scaled[j][..n * total];
+            join(mlp, layer, self.inputs, &acts.values, x);
+            let is_first = !std::mem::replace(&mut acts.input_seeded[m], true);
+            let rows =
+                d_code.chunks_exact_mut(total + width).zip(x.chunks_exact(total)).zip(d.chunks_exact(total)).zip(g.chunks_exact(width));
+            for (((code, x), d), g) in rows {
+                if is_first {
+                    code.fill(0.0);
+                }
+                let (scale, shift) = code.split_at_mut(total);
+                scale.iter_mut().zip(x).zip(d).for_each(|((c, x), d)| *c += x * d);
+                shift.iter_mut().zip(g).for_each(|(c, g)| *c += g);
             }
+        }
+        scale_rows(d, total, self.inputs[m], total + width);
+        let mut first = 0;
+        for s in &layer.inputs {
+            let k = mlp.source_width(*s);
+            let (target, seeded) = match *s {
+                Source::Input(i) => (d_inputs[i].as_deref_mut(), &mut acts.input_seeded[i]),
+                Source::Layer(i) => (acts.wanted[i].then_some(&mut before[i][..]), &mut acts.seeded[i]),
+            };
+            if let Some(target) = target {
+                let is_first = !std::mem::replace(seeded, true);
+                for (t, d) in target.chunks_exact_mut(k).zip(d.chunks_exact(total)) {
+                    let d = &d[first..first + k];
+                    if is_first { t.copy_from_slice(d) } else { t.iter_mut().zip(d).for_each(|(t, d)| *t += d) }
+                }
+            }
+            first += k;
         }
     }
 }

@@ -8,25 +8,54 @@ use crate::ops::linear::gpu::{self as linear, Part};
 use crate::ops::linear::{Activation, BiasKind};
 use cubecl::prelude::*;
 
-/// Outputs `[N, width]` of every layer.
-pub fn forward(gpu: &Gpu, mlp: &Mlp, params: &Buffer, inputs: &[&Buffer], rows: &Rows) -> Vec<Buffer> {
-    let mut values: Vec<Buffer> = Vec::new();
+/// Activations of a network for the way back.
+pub struct Values {
+    /// Outputs `[N, width]` of every layer.
+    pub layers: Vec<Buffer>,
+    /// Inputs of the activations whose slope needs them.
+    pre: Vec<Option<Buffer>>,
+}
+
+/// Runs all layers.
+pub fn forward(gpu: &Gpu, mlp: &Mlp, params: &Buffer, inputs: &[&Buffer], rows: &Rows) -> Values {
+    let mut values = Values { layers: Vec::new(), pre: Vec::new() };
     for (j, layer) in mlp.layers.iter().enumerate() {
-        let x = joined(gpu, mlp, j, inputs, &values, rows);
-        let size = (mlp.fan_in(j), layer.width);
+        let x = joined(gpu, mlp, j, inputs, &values.layers, rows);
+        let (k, n) = (mlp.fan_in(j), layer.width);
         let (w, bias) = parts(mlp, j, params);
-        values.push(linear::forward_part(gpu, rows, size, &x, w, bias, kind(mlp, j), activation(mlp, j)));
+        if layer.modulation.is_none() && layer.activation.is_monotonic() {
+            values.layers.push(linear::forward_part(gpu, rows, (k, n), &x, w, bias, kind(mlp, j), layer.activation));
+            values.pre.push(None);
+            continue;
+        }
+        let x = layer.modulation.map_or(x.clone(), |m| {
+            let scaled = gpu.empty(rows.most * k);
+            multiply(gpu, rows, k, (&x, k, 0), (inputs[m], k + n, 0), (&scaled, k, 0), false);
+            scaled
+        });
+        let out = linear::forward_part(gpu, rows, (k, n), &x, w, bias, kind(mlp, j), Activation::None);
+        if let Some(m) = layer.modulation {
+            columns(gpu, rows, n, (inputs[m], k + n, k), (&out, n, 0), true);
+        }
+        values.pre.push((!layer.activation.is_monotonic()).then(|| {
+            let pre = gpu.empty(out.len());
+            gpu.copy(&out, &pre);
+            pre
+        }));
+        linear::finish(gpu, &out, rows, n, None, BiasKind::None, layer.activation);
+        values.layers.push(out);
     }
     values
 }
 
-/// Gradients of the parameters and of each input, given those of layers' outputs; none where a layer's is zero.
+/// Gradients of the parameters (0 of frozen layers) and of each input, given those of layers' outputs; none where a layer's
+/// is zero.
 pub fn backward(
     gpu: &Gpu,
     mlp: &Mlp,
     params: &Buffer,
     inputs: &[&Buffer],
-    values: &[Buffer],
+    values: &Values,
     rows: &Rows,
     mut d: Vec<Option<Buffer>>,
 ) -> (Buffer, Vec<Buffer>) {
@@ -34,13 +63,30 @@ pub fn backward(
     let d_inputs: Vec<Buffer> = inputs.iter().map(|i| gpu.zeros(i.len())).collect();
     for (j, layer) in mlp.layers.iter().enumerate().rev() {
         let Some(d_out) = d[j].take() else { continue };
-        let x = joined(gpu, mlp, j, inputs, values, rows);
-        let k = mlp.fan_in(j);
+        let plain = joined(gpu, mlp, j, inputs, &values.layers, rows);
+        let (k, n) = (mlp.fan_in(j), layer.width);
+        let x = layer.modulation.map_or(plain.clone(), |m| {
+            let scaled = gpu.empty(rows.most * k);
+            multiply(gpu, rows, k, (&plain, k, 0), (inputs[m], k + n, 0), (&scaled, k, 0), false);
+            scaled
+        });
         let (w, _) = parts(mlp, j, params);
-        let g = linear::before_activation(gpu, rows, layer.width, activation(mlp, j), &values[j], &d_out);
-        let d_x = linear::backward_part(gpu, rows, (k, layer.width), &x, w, &g, Part { buffer: &d_params, at: mlp.offsets[j] });
-        if layer.bias {
-            linear::sum_rows_part(gpu, rows, layer.width, &g, Part { buffer: &d_params, at: mlp.offsets[j] + k * layer.width });
+        let basis = values.pre[j].as_ref().unwrap_or(&values.layers[j]);
+        let g = linear::before_activation(gpu, rows, n, layer.activation, basis, &d_out);
+        let mut d_x = if layer.frozen {
+            linear::input_gradient(gpu, rows, (k, n), w, &g)
+        } else {
+            if layer.bias {
+                linear::sum_rows_part(gpu, rows, n, &g, Part { buffer: &d_params, at: mlp.offsets[j] + k * n });
+            }
+            linear::backward_part(gpu, rows, (k, n), &x, w, &g, Part { buffer: &d_params, at: mlp.offsets[j] })
+        };
+        if let Some(m) = layer.modulation {
+            multiply(gpu, rows, k, (&d_x, k, 0), (&plain, k, 0), (&d_inputs[m], k + n, 0), true);
+            columns(gpu, rows, n, (&g, n, 0), (&d_inputs[m], k + n, k), true);
+            let of_rows = gpu.empty(rows.most * k);
+            multiply(gpu, rows, k, (&d_x, k, 0), (inputs[m], k + n, 0), (&of_rows, k, 0), false);
+            d_x = of_rows;
         }
         let mut at = 0;
         for s in &layer.inputs {
@@ -58,10 +104,6 @@ pub fn backward(
 
 fn kind(mlp: &Mlp, j: usize) -> BiasKind {
     if mlp.layers[j].bias { BiasKind::Shared } else { BiasKind::None }
-}
-
-fn activation(mlp: &Mlp, j: usize) -> Activation {
-    if mlp.layers[j].relu { Activation::Relu } else { Activation::None }
 }
 
 fn parts<'a>(mlp: &Mlp, j: usize, params: &'a Buffer) -> (Part<'a>, Option<Part<'a>>) {
@@ -113,6 +155,75 @@ pub(crate) fn columns(gpu: &Gpu, rows: &Rows, width: usize, from: (&Buffer, usiz
             to.2 as u32,
             add,
         );
+    }
+}
+
+/// Multiplies `width` columns of two matrices, each given as (buffer, width, first column), into those of a third, or adds the
+/// products to them.
+fn multiply(
+    gpu: &Gpu,
+    rows: &Rows,
+    width: usize,
+    a: (&Buffer, usize, usize),
+    b: (&Buffer, usize, usize),
+    to: (&Buffer, usize, usize),
+    add: bool,
+) {
+    if rows.most * width == 0 {
+        return;
+    }
+    let (live, at) = rows.arg();
+    // SAFETY: units past the rows stop; the columns lie within the matrices.
+    unsafe {
+        product::launch_unchecked(
+            &gpu.client,
+            units(rows.most * width),
+            CubeDim::new_1d(CUBE),
+            live,
+            a.0.arg(),
+            b.0.arg(),
+            to.0.arg(),
+            at,
+            width as u32,
+            a.1 as u32,
+            a.2 as u32,
+            b.1 as u32,
+            b.2 as u32,
+            to.1 as u32,
+            to.2 as u32,
+            add,
+        );
+    }
+}
+
+#[cube(launch_unchecked)]
+fn product(
+    live: &[u32],
+    a: &[f32],
+    b: &[f32],
+    to: &mut [f32],
+    at: u32,
+    width: u32,
+    a_width: u32,
+    a_at: u32,
+    b_width: u32,
+    b_at: u32,
+    to_width: u32,
+    to_at: u32,
+    #[comptime] add: bool,
+) {
+    let i = ABSOLUTE_POS;
+    if i >= live[at as usize] as usize * width as usize {
+        terminate!();
+    }
+    let row = i / width as usize;
+    let col = i % width as usize;
+    let v = a[row * a_width as usize + a_at as usize + col] * b[row * b_width as usize + b_at as usize + col];
+    let at = row * to_width as usize + to_at as usize + col;
+    if comptime!(add) {
+        to[at] += v;
+    } else {
+        to[at] = v;
     }
 }
 

@@ -9,6 +9,7 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
+use super::linear::Activation;
 use crate::gemm::Precision;
 use diorama_geom::rng::Rng;
 
@@ -19,13 +20,35 @@ pub enum Source {
     Layer(usize),
 }
 
-/// One layer: `y = relu?(concat(inputs) W + b?)`.
+/// One layer: `y = act(concat(inputs) W + b)`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layer {
     pub inputs: Vec<Source>,
     pub width: usize,
-    pub relu: bool,
+    pub activation: Activation,
     pub bias: bool,
+    /// Network input `[α, β]` of width `K + N` that modulates the layer (Hao et al. 2021, GANcraft):
+    /// `y = act((α ⊙ concat(inputs)) W + b + β)`.
+    pub modulation: Option<usize>,
+    /// A frozen layer's parameters get no gradient.
+    pub frozen: bool,
+}
+
+impl Layer {
+    /// A trained layer without modulation.
+    pub fn new(inputs: Vec<Source>, width: usize, activation: Activation, bias: bool) -> Layer {
+        Layer { inputs, width, activation, bias, modulation: None, frozen: false }
+    }
+}
+
+/// An output of a network: `channels` that begin at `channel` of a layer, with an activation of their own.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Head {
+    pub layer: usize,
+    pub channel: usize,
+    pub activation: Activation,
+    /// Added before the activation.
+    pub shift: f32,
 }
 
 /// A network. Parameters of layer `j` lie at `offsets[j]`: the weight `[K, N]` row-major, then the bias `[N]`.
@@ -40,7 +63,7 @@ pub struct Mlp {
 
 impl Mlp {
     /// # Panics
-    /// When a layer reads an input or layer that does not come before it.
+    /// When a layer reads an input or layer that does not come before it, or a modulation of another width.
     pub fn new(input_widths: Vec<usize>, layers: Vec<Layer>) -> Mlp {
         let mut mlp = Mlp { input_widths, layers, offsets: vec![0], precision: Precision::F32 };
         for j in 0..mlp.layers.len() {
@@ -51,22 +74,25 @@ impl Mlp {
                 };
                 assert!(ok, "layer {j} reads {s:?}, which does not come before it");
             }
-            let size = mlp.fan_in(j) * mlp.layers[j].width + mlp.bias_len(j);
-            mlp.offsets.push(mlp.offsets[j] + size);
+            let (k, n) = (mlp.fan_in(j), mlp.layers[j].width);
+            if let Some(i) = mlp.layers[j].modulation {
+                let width = mlp.input_widths.get(i).copied().unwrap_or(0);
+                assert_eq!(width, k + n, "layer {j} of {k} x {n} is modulated by input {i}");
+            }
+            mlp.offsets.push(mlp.offsets[j] + k * n + mlp.bias_len(j));
         }
         mlp
     }
 
-    /// A chain of ReLU layers with a linear last layer, without biases (instant-ngp's small networks).
+    /// A chain of ReLU layers with a linear last layer (instant-ngp's small networks are such, without biases).
     pub fn chain(input_widths: Vec<usize>, widths: &[usize], bias: bool) -> Mlp {
         let layers = widths
             .iter()
             .enumerate()
-            .map(|(j, &width)| Layer {
-                inputs: if j == 0 { (0..input_widths.len()).map(Source::Input).collect() } else { vec![Source::Layer(j - 1)] },
-                width,
-                relu: j + 1 < widths.len(),
-                bias,
+            .map(|(j, &width)| {
+                let inputs = if j == 0 { (0..input_widths.len()).map(Source::Input).collect() } else { vec![Source::Layer(j - 1)] };
+                let activation = if j + 1 < widths.len() { Activation::Relu } else { Activation::None };
+                Layer::new(inputs, width, activation, bias)
             })
             .collect();
         Mlp::new(input_widths, layers)
@@ -93,17 +119,30 @@ impl Mlp {
         self.offsets[self.layers.len()]
     }
 
+    /// Ranges of parameters that are trained, in order; neighbors are joined.
+    pub fn trained(&self) -> Vec<std::ops::Range<usize>> {
+        let mut out: Vec<std::ops::Range<usize>> = Vec::new();
+        for (_, at) in self.layers.iter().zip(self.offsets.windows(2)).filter(|(l, _)| !l.frozen) {
+            match out.last_mut() {
+                Some(last) if last.end == at[0] => last.end = at[1],
+                _ => out.push(at[0]..at[1]),
+            }
+        }
+        out
+    }
+
     /// Multiply-adds per row, forward.
     pub fn macs(&self) -> usize {
         (0..self.layers.len()).map(|j| self.fan_in(j) * self.layers[j].width).sum()
     }
 
-    /// Weights uniform in `±√(6 / fan_in)` (He et al. 2015) before a ReLU, `±√(3 / fan_in)` else; biases 0.
+    /// Weights uniform in `±√(6 / fan_in)` before a rectifier (He et al. 2015), `±√(3 / fan_in)` else; biases 0.
     pub fn init(&self, rng: &Rng) -> Vec<f32> {
         let mut params = vec![0.0; self.params_len()];
         for (j, layer) in self.layers.iter().enumerate() {
             let k = self.fan_in(j);
-            let bound = ((if layer.relu { 6.0 } else { 3.0 }) / k as f32).sqrt();
+            let rectifies = matches!(layer.activation, Activation::Relu | Activation::LeakyRelu | Activation::Silu);
+            let bound = ((if rectifies { 6.0 } else { 3.0 }) / k as f32).sqrt();
             for i in self.offsets[j]..self.offsets[j] + k * layer.width {
                 params[i] = (rng.uniform(i as u64) * 2.0 - 1.0) * bound;
             }

@@ -1,10 +1,16 @@
 use super::*;
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
-/// A chain, and a network with two inputs, a skip connection and a split head.
+/// A chain, a network with two inputs, a skip connection and a split head, one with every activation, and a modulated one
+/// with a frozen layer.
 fn nets() -> Vec<Mlp> {
-    let layer = |inputs: Vec<Source>, width, relu, bias| Layer { inputs, width, relu, bias };
+    let layer = |inputs: Vec<Source>, width, relu: bool, bias| {
+        Layer::new(inputs, width, if relu { Activation::Relu } else { Activation::None }, bias)
+    };
     use Source::{Input, Layer as L};
+    let curved = [Activation::LeakyRelu, Activation::Softplus, Activation::Sigmoid, Activation::Tanh, Activation::Silu];
+    let curved = curved.iter().enumerate().map(|(j, a)| Layer::new(vec![if j == 0 { Input(0) } else { L(j - 1) }], 19, *a, true));
+    let modulated = |inputs, width, activation| Layer { modulation: Some(1), ..Layer::new(inputs, width, activation, true) };
     vec![
         Mlp::chain(vec![32], &[64, 16], false),
         Mlp::new(
@@ -14,6 +20,16 @@ fn nets() -> Vec<Mlp> {
                 layer(vec![Input(0), L(0)], 17, true, true),
                 layer(vec![L(1)], 1, false, true),
                 layer(vec![L(1), Input(1), L(2)], 4, false, false),
+            ],
+        ),
+        Mlp::new(vec![6], curved.collect()),
+        Mlp::new(
+            vec![7, 17],
+            vec![
+                modulated(vec![Input(0)], 10, Activation::Silu),
+                Layer { frozen: true, ..layer(vec![L(0)], 12, true, true) },
+                modulated(vec![L(0)], 7, Activation::LeakyRelu),
+                layer(vec![L(1), L(2), Input(0)], 5, false, true),
             ],
         ),
     ]
@@ -50,22 +66,51 @@ fn matches_the_reference_both_ways() {
 
 #[test]
 fn reference_gradients_match_central_differences() {
-    let mlp = &nets()[1];
-    let params = wide(&mlp.init(&Rng::new(3, 2)));
-    let (a, b) = (wide(&random(10, 1)), wide(&random(6, 2)));
-    let seeds: Vec<Vec<f64>> = mlp.layers.iter().map(|l| wide(&random(2 * l.width, 5))).collect();
-    let loss = |p: &[f64], a: &[f64], b: &[f64]| {
-        let v = reference::forward(mlp, p, &[a, b], 2);
-        v.iter().flatten().zip(seeds.iter().flatten()).map(|(v, d)| v * d).sum::<f64>()
-    };
-    let (dp, di) = reference::backward(mlp, &params, &[&a, &b], 2, &seeds);
-    assert_gradient("params", &dp, &params, 1e-5, |p| loss(p, &a, &b));
-    assert_gradient("first input", &di[0], &a, 1e-5, |x| loss(&params, x, &b));
-    assert_gradient("second input", &di[1], &b, 1e-5, |x| loss(&params, &a, x));
+    for mlp in nets() {
+        let params = wide(&mlp.init(&Rng::new(3, 2)));
+        let inputs: Vec<Vec<f64>> = mlp.input_widths.iter().map(|k| wide(&random(2 * k, *k as u64))).collect();
+        let views: Vec<&[f64]> = inputs.iter().map(|v| &v[..]).collect();
+        let seeds: Vec<Vec<f64>> = mlp.layers.iter().map(|l| wide(&random(2 * l.width, 5))).collect();
+        let loss = |p: &[f64], x: &[&[f64]]| {
+            let v = reference::forward(&mlp, p, x, 2);
+            v.iter().flatten().zip(seeds.iter().flatten()).map(|(v, d)| v * d).sum::<f64>()
+        };
+        let (dp, di) = reference::backward(&mlp, &params, &views, 2, &seeds);
+        for range in mlp.trained() {
+            let with = |p: &[f64]| [&params[..range.start], p, &params[range.end..]].concat();
+            assert_gradient("params", &dp[range.clone()], &params[range.clone()], 1e-5, |p| loss(&with(p), &views));
+        }
+        for (i, d) in di.iter().enumerate() {
+            assert_gradient("input", d, &inputs[i], 1e-5, |x| {
+                let mut views = views.clone();
+                views[i] = x;
+                loss(&params, &views)
+            });
+        }
+    }
+}
+
+#[test]
+fn frozen_layers_have_no_gradient_and_what_lies_below_them_still_has() {
+    let mlp = &nets()[3];
+    let (frozen, n) = (mlp.offsets[1]..mlp.offsets[2], 40);
+    assert_eq!(mlp.trained(), [0..frozen.start, frozen.end..mlp.params_len()]);
+    let (x, code, params) = (random(n * 7, 1), random(n * 17, 2), mlp.init(&Rng::new(1, 2)));
+    let (mut dp, mut di) = (vec![0.0; params.len()], [vec![0.0; x.len()], vec![0.0; code.len()]]);
+    cpu::backward(mlp, &params, &[&x, &code], n, &random(n * 5, 3), &mut dp, &mut di);
+    assert!(dp[frozen.clone()].iter().all(|d| *d == 0.0));
+    assert!(dp[..frozen.start].iter().filter(|d| **d != 0.0).count() > frozen.start / 2);
+    // Where nothing below is trained or asked for, the pass ends.
+    let mut all = mlp.clone();
+    all.layers[..3].iter_mut().for_each(|l| l.frozen = true);
+    dp.fill(0.0);
+    cpu::backward(&all, &params, &[&x, &code], n, &random(n * 5, 3), &mut dp, &mut di);
+    let last = all.offsets[3];
+    assert!(dp[..last].iter().all(|d| *d == 0.0) && dp[last..].iter().all(|d| *d != 0.0));
 }
 
 #[test]
 #[should_panic(expected = "does not come before")]
 fn a_layer_cannot_read_ahead() {
-    Mlp::new(vec![1], vec![Layer { inputs: vec![Source::Layer(0)], width: 1, relu: false, bias: false }]);
+    Mlp::new(vec![1], vec![Layer::new(vec![Source::Layer(0)], 1, Activation::None, false)]);
 }

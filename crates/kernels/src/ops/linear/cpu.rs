@@ -1,6 +1,6 @@
 //! Blocks of rows through the small matrix product; weight gradients per block group, added in order.
 
-use super::{Activation, BiasKind};
+use super::{Activation, BiasKind, LEAK};
 use crate::gemm::{self, Init, Precision, View, gemm};
 use crate::math;
 use rayon::prelude::*;
@@ -22,10 +22,27 @@ pub fn activate(a: Activation, values: &mut [f32]) {
         Activation::Sigmoid => math::sigmoid_in_place(values),
         Activation::Softplus => values.iter_mut().for_each(|v| *v = v.max(0.0) + (-v.abs()).exp().ln_1p()),
         Activation::TruncatedExp => math::exp_in_place(values),
+        Activation::LeakyRelu => values.iter_mut().for_each(|v| *v = v.max(LEAK as f32 * *v)),
+        Activation::Tanh => math::tanh_in_place(values),
+        Activation::Silu => math::silu_in_place(values),
     }
 }
 
-/// Slope of an activation from its output.
+/// Multiplies gradients `d` of an activation's outputs by its slopes: from the outputs `y`, or where those do not tell from the
+/// inputs `x`.
+pub fn scale_by_slope(a: Activation, x: &[f32], y: &[f32], d: &mut [f32]) {
+    match a {
+        Activation::None => {}
+        Activation::Relu => d.iter_mut().zip(y).for_each(|(d, y)| *d = if *y > 0.0 { *d } else { 0.0 }),
+        Activation::Silu => math::silu_backward(x, d),
+        a => d.iter_mut().zip(y).for_each(|(d, y)| *d *= slope_from_output(a, *y)),
+    }
+}
+
+/// Slope of a monotonic activation from its output.
+///
+/// # Panics
+/// When the activation is not monotonic.
 #[inline(always)]
 pub fn slope_from_output(a: Activation, y: f32) -> f32 {
     match a {
@@ -34,6 +51,15 @@ pub fn slope_from_output(a: Activation, y: f32) -> f32 {
         Activation::Sigmoid => y * (1.0 - y),
         Activation::Softplus => 1.0 - (-y).exp(),
         Activation::TruncatedExp => y.min(3_269_017.4),
+        Activation::LeakyRelu => {
+            if y > 0.0 {
+                1.0
+            } else {
+                LEAK as f32
+            }
+        }
+        Activation::Tanh => 1.0 - y * y,
+        Activation::Silu => panic!("the slope of SiLU is no function of its output"),
     }
 }
 

@@ -21,6 +21,9 @@ pub(crate) fn code(a: Activation) -> u32 {
         Activation::Sigmoid => 2,
         Activation::Softplus => 3,
         Activation::TruncatedExp => 4,
+        Activation::LeakyRelu => 5,
+        Activation::Tanh => 6,
+        Activation::Silu => 7,
     }
 }
 
@@ -166,7 +169,8 @@ pub fn forward(
     forward_part(gpu, rows, size, x, w.into(), bias.map(Part::from), kind, a)
 }
 
-fn finish(gpu: &Gpu, out: &Buffer, rows: &Rows, n: usize, bias: Option<Part>, kind: BiasKind, a: Activation) {
+/// Adds a bias and activates, in place.
+pub(crate) fn finish(gpu: &Gpu, out: &Buffer, rows: &Rows, n: usize, bias: Option<Part>, kind: BiasKind, a: Activation) {
     if out.is_empty() || (kind == BiasKind::None && a == Activation::None) {
         return;
     }
@@ -259,7 +263,7 @@ pub fn backward(
     Gradients { x: d_x, w: d_w, bias }
 }
 
-/// `d_out · act'`.
+/// `d_out · act'`, from the activated output; for SiLU from its input.
 pub(crate) fn before_activation(gpu: &Gpu, rows: &Rows, n: usize, a: Activation, out: &Buffer, d_out: &Buffer) -> Buffer {
     let g = gpu.empty(out.len());
     if !out.is_empty() {
@@ -284,8 +288,13 @@ pub(crate) fn before_activation(gpu: &Gpu, rows: &Rows, n: usize, a: Activation,
 }
 
 /// Gradient of x; that of the weight is written where `d_w` says.
-pub(crate) fn backward_part(gpu: &Gpu, rows: &Rows, (k, n): (usize, usize), x: &Buffer, w: Part, g: &Buffer, d_w: Part) -> Buffer {
-    outer(gpu, rows, (k, n), x, g, d_w);
+pub(crate) fn backward_part(gpu: &Gpu, rows: &Rows, size: (usize, usize), x: &Buffer, w: Part, g: &Buffer, d_w: Part) -> Buffer {
+    outer(gpu, rows, size, x, g, d_w);
+    input_gradient(gpu, rows, size, w, g)
+}
+
+/// Gradient of x alone.
+pub(crate) fn input_gradient(gpu: &Gpu, rows: &Rows, (k, n): (usize, usize), w: Part, g: &Buffer) -> Buffer {
     let d_x = gpu.empty(rows.most * k);
     product(gpu, true, rows, (n, k), g, w, (&d_x).into());
     d_x
@@ -549,6 +558,21 @@ pub(crate) fn apply(x: f32, #[comptime] activation: u32) -> f32 {
     if comptime!(activation == 4) {
         y = x.exp();
     }
+    if comptime!(activation == 5) {
+        let leaked: f32 = 0.2f32 * x;
+        y = max(x, leaked);
+    }
+    if comptime!(activation == 6) {
+        let twice: f32 = -2.0f32 * x.abs();
+        let e: f32 = twice.exp();
+        y = (1.0 - e) / (1.0 + e);
+        if x < 0.0 {
+            y = -y;
+        }
+    }
+    if comptime!(activation == 7) {
+        y = x / (1.0 + (-x).exp());
+    }
     y
 }
 
@@ -597,7 +621,7 @@ fn pick(
     out[i] = apply(values[i / c * width as usize + first as usize + i % c] + shift, activation);
 }
 
-/// The activation's slope, from the activated output.
+/// The activation's slope, from the activated output; that of SiLU from its input.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube]
 pub(crate) fn slope(y: f32, #[comptime] activation: u32) -> f32 {
@@ -616,10 +640,22 @@ pub(crate) fn slope(y: f32, #[comptime] activation: u32) -> f32 {
     if comptime!(activation == 4) {
         slope = min(y, 3_269_017.5);
     }
+    if comptime!(activation == 5) {
+        if y <= 0.0 {
+            slope = 0.2;
+        }
+    }
+    if comptime!(activation == 6) {
+        slope = 1.0 - y * y;
+    }
+    if comptime!(activation == 7) {
+        let s: f32 = 1.0 / (1.0 + (-y).exp());
+        slope = s * (1.0 + y * (1.0 - s));
+    }
     slope
 }
 
-/// `d_out · act'` from the activated output.
+/// `d_out · act'`, as [`slope`] gives it.
 #[cube(launch_unchecked)]
 fn chain(live: &[u32], out: &[f32], d_out: &[f32], g: &mut [f32], at: u32, n: u32, #[comptime] activation: u32) {
     let i = ABSOLUTE_POS;

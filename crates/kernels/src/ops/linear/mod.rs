@@ -17,6 +17,21 @@ pub enum Activation {
     Softplus,
     /// `eˣ`, whose gradient is taken at `min(x, 15)` (instant-ngp).
     TruncatedExp,
+    /// `max(x, 0.2 x)`
+    LeakyRelu,
+    Tanh,
+    /// `x / (1 + e⁻ˣ)` (Elfwing et al. 2018)
+    Silu,
+}
+
+/// Slope of [`Activation::LeakyRelu`] below 0.
+pub const LEAK: f64 = 0.2;
+
+impl Activation {
+    /// Whether the slope is a function of the output; else it needs the input.
+    pub fn is_monotonic(self) -> bool {
+        self != Activation::Silu
+    }
 }
 
 /// What is added before the activation.

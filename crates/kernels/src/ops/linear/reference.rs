@@ -1,6 +1,6 @@
 //! Plain loops in f64.
 
-use super::{Activation, BiasKind};
+use super::{Activation, BiasKind, LEAK};
 
 /// Value of an activation.
 pub fn activate(a: Activation, x: f64) -> f64 {
@@ -10,6 +10,9 @@ pub fn activate(a: Activation, x: f64) -> f64 {
         Activation::Sigmoid => 1.0 / (1.0 + (-x).exp()),
         Activation::Softplus => x.max(0.0) + (-x.abs()).exp().ln_1p(),
         Activation::TruncatedExp => x.exp(),
+        Activation::LeakyRelu => x.max(LEAK * x),
+        Activation::Tanh => x.tanh(),
+        Activation::Silu => x / (1.0 + (-x).exp()),
     }
 }
 
@@ -24,6 +27,18 @@ pub fn slope(a: Activation, x: f64) -> f64 {
         }
         Activation::Softplus => activate(Activation::Sigmoid, x),
         Activation::TruncatedExp => x.min(15.0).exp(),
+        Activation::LeakyRelu => {
+            if x > 0.0 {
+                1.0
+            } else {
+                LEAK
+            }
+        }
+        Activation::Tanh => 1.0 - x.tanh().powi(2),
+        Activation::Silu => {
+            let s = activate(Activation::Sigmoid, x);
+            s * (1.0 + x * (1.0 - s))
+        }
     }
 }
 

@@ -1,7 +1,15 @@
 use super::*;
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
-const ALL: [Activation; 5] = [Activation::None, Activation::Relu, Activation::Sigmoid, Activation::Softplus, Activation::TruncatedExp];
+const ALL: [Activation; 7] = [
+    Activation::None,
+    Activation::Relu,
+    Activation::Sigmoid,
+    Activation::Softplus,
+    Activation::TruncatedExp,
+    Activation::LeakyRelu,
+    Activation::Tanh,
+];
 const KINDS: [BiasKind; 3] = [BiasKind::None, BiasKind::Shared, BiasKind::PerRow];
 
 fn bias_len(kind: BiasKind, m: usize, n: usize) -> usize {
@@ -39,7 +47,7 @@ fn matches_the_reference_both_ways() {
 #[test]
 fn reference_gradients_match_central_differences() {
     let (m, k, n) = (2, 3, 2);
-    for a in ALL {
+    for a in ALL.into_iter().chain([Activation::Silu]) {
         let (x, w, b, d) = (wide(&random(6, 1)), wide(&random(6, 2)), wide(&random(4, 3)), wide(&random(4, 4)));
         let (dx, dw, db) = reference::backward(m, k, n, &x, &w, &b, BiasKind::PerRow, a, &d);
         let loss = |x: &[f64], w: &[f64], b: &[f64]| {

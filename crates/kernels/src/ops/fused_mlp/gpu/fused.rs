@@ -11,11 +11,9 @@ mod ahead;
 mod back;
 mod plan;
 
-use super::super::Mlp;
+use super::super::{Head, Mlp};
 use crate::device::Api;
 use crate::gpu::{Buffer, CUBE, Gpu, Rows, has_cuda_headers, units};
-use crate::ops::ngp_field::Head;
-
 use cubecl::ir::{ElemType, FloatKind};
 use cubecl::prelude::*;
 use half::{bf16, f16};

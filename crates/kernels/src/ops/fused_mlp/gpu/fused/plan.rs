@@ -1,9 +1,9 @@
 //! How the layers of a network lie in memory: packed weights, a tile's activations and gradients, what is kept.
 
 use super::BLOCK;
-use crate::ops::fused_mlp::{Mlp, Source};
+use crate::ops::fused_mlp::{Head, Mlp, Source};
+use crate::ops::linear::Activation;
 use crate::ops::linear::gpu::code;
-use crate::ops::ngp_field::Head;
 
 /// Most inputs and heads.
 const INPUTS: usize = 3;
@@ -123,7 +123,8 @@ impl Columns {
 }
 
 impl Plan {
-    /// Plans layers up to the last that a head needs; none where the network is too large or reads too much.
+    /// Plans layers up to the last that a head needs; none where the network is too large, reads too much, is modulated, frozen in part
+    /// or has activations other than ReLU.
     pub fn new(mlp: &Mlp, heads: &[(Head, usize)], per_level: usize, wanted: &[bool]) -> Option<Plan> {
         let count = heads.iter().map(|(h, _)| h.layer + 1).max()?;
         let n_inputs = mlp.input_widths.len();
@@ -169,7 +170,11 @@ impl Plan {
             let read = !readers(Source::Layer(j)).is_empty();
             let p = padded(l.width);
             let column = read.then(|| forward.take(p));
-            let keeps = read || l.relu;
+            let relu = l.activation == Activation::Relu;
+            if l.modulation.is_some() || l.frozen || !(relu || l.activation == Activation::None) {
+                return None;
+            }
+            let keeps = read || relu;
             let place = keeps.then_some(kept);
             kept += if keeps { p } else { 0 };
             if at > MOST_WIDTH || p > MOST_WIDTH || l.inputs.iter().enumerate().any(|(i, s)| l.inputs[..i].contains(s)) {
@@ -181,7 +186,7 @@ impl Plan {
                 width: l.width,
                 padded: p,
                 rows: at,
-                relu: l.relu,
+                relu,
                 weight,
                 bias: l.bias.then_some((mlp.offsets[j] + mlp.fan_in(j) * l.width, 0)),
                 column,

@@ -2,12 +2,12 @@
 
 pub mod loss;
 
-use super::{FieldNet, Head};
+use super::FieldNet;
 use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Rows, Swap, units};
 use crate::ops::composite::gpu::{self as composite, GpuComposited, GpuGradients, GpuPacked};
 use crate::ops::fused_mlp::gpu::fused::{Element, Fused, Kept, tensor_element};
 use crate::ops::fused_mlp::gpu::{self as mlp, columns};
-use crate::ops::fused_mlp::{Mlp, reference};
+use crate::ops::fused_mlp::{Head, Mlp, reference};
 use crate::ops::linear::gpu as linear;
 use crate::ops::linear::reference::{activate, slope};
 use crate::ops::march::gpu::prune::Pruned;
@@ -45,8 +45,8 @@ impl GpuNet {
             _ => Element::F32,
         };
         let both = |element| {
-            let whole = Fused::new(gpu, &net.mlp, &[(net.sigma, 1), (net.rgb, 3)], per_level, wanted, element)?;
-            let part = Fused::new(gpu, density, &[(net.sigma, 1)], per_level, &wanted[..1], element)?;
+            let whole = Fused::new(gpu, &net.mlp, &net.heads().collect::<Vec<_>>(), per_level, wanted, element)?;
+            let part = Fused::new(gpu, density, &[(net.density, 1)], per_level, &wanted[..1], element)?;
             Some([whole, part])
         };
         let mut fused = if arithmetic == Arithmetic::Layers { None } else { both(element) };
@@ -86,7 +86,7 @@ impl GpuNet {
             Some([_, part]) => part.forward(gpu, params, &[features], rows, false).heads.remove(0),
             None => {
                 let values = mlp::forward(gpu, &self.density, params, &[features], rows);
-                head(gpu, &self.net, self.net.sigma, &values, rows, 1)
+                head(gpu, &self.net, self.net.density, &values, rows, 1)
             }
         }
     }
@@ -104,23 +104,38 @@ impl GpuNet {
             inputs.push(per_sample);
         }
         let refs: Vec<&Buffer> = inputs.iter().collect();
-        let (values, sigma, rgb) = match &self.fused {
+        let (values, sigma, outputs) = match &self.fused {
             Some([whole, _]) => {
                 let kept = whole.forward(gpu, params, &refs, &rows, keep);
-                let (sigma, rgb) = (kept.heads[0].clone(), kept.heads[1].clone());
-                (Values::Kept(kept), sigma, rgb)
+                let (sigma, outputs) = (kept.heads[0].clone(), kept.heads[1].clone());
+                (Values::Kept(kept), sigma, outputs)
             }
             None => {
                 let values = mlp::forward(gpu, &self.net.mlp, params, &refs, &rows);
-                let sigma = head(gpu, &self.net, self.net.sigma, &values, &rows, 1);
-                let rgb = head(gpu, &self.net, self.net.rgb, &values, &rows, 3);
-                (Values::Layers(values), sigma, rgb)
+                let sigma = head(gpu, &self.net, self.net.density, &values, &rows, 1);
+                let outputs = self.side_by_side(gpu, &values, &rows);
+                (Values::Layers(values), sigma, outputs)
             }
         };
-        Evaluated { inputs, values, sigma, rgb }
+        Evaluated { inputs, values, sigma, outputs }
     }
 
-    /// [`GpuNet::evaluate`], composited on a background `[R, 3]`.
+    /// Activated channels of all outputs, `[S, C]`.
+    fn side_by_side(&self, gpu: &Gpu, values: &mlp::Values, rows: &Rows) -> Buffer {
+        if let [only] = &self.net.outputs[..] {
+            return head(gpu, &self.net, only.head, values, rows, only.channels);
+        }
+        let c = self.net.channels();
+        let (out, mut first) = (gpu.empty(rows.most * c), 0);
+        for o in &self.net.outputs {
+            let own = head(gpu, &self.net, o.head, values, rows, o.channels);
+            columns(gpu, rows, o.channels, (&own, o.channels, 0), (&out, c, first), false);
+            first += o.channels;
+        }
+        out
+    }
+
+    /// [`GpuNet::evaluate`], composited on a background `[R, C]`.
     #[allow(clippy::too_many_arguments)]
     pub fn forward(
         &self,
@@ -133,7 +148,7 @@ impl GpuNet {
         keep: bool,
     ) -> GpuStep {
         let at = self.evaluate(gpu, params, p, features, codes, keep);
-        let out = composite::forward(gpu, p, &at.sigma, &at.rgb, 3, background);
+        let out = composite::forward(gpu, p, &at.sigma, &at.outputs, self.net.channels(), background);
         GpuStep { out, at }
     }
 
@@ -149,8 +164,20 @@ impl GpuNet {
             }
             (_, Values::Layers(values)) => {
                 let mut seeds: Vec<Option<Buffer>> = net.mlp.layers.iter().map(|_| None).collect();
-                for (h, channels, out, d) in [(net.sigma, 1, &at.sigma, &g.sigma), (net.rgb, 3, &at.rgb, &g.features)] {
-                    let slope = linear::before_activation(gpu, &rows, channels, h.activation, out, d);
+                let (c, mut first) = (net.channels(), 0);
+                for (i, (h, channels)) in net.heads().enumerate() {
+                    let own = |all: &Buffer| {
+                        let part = gpu.empty(rows.most * channels);
+                        columns(gpu, &rows, channels, (all, c, first), (&part, channels, 0), false);
+                        part
+                    };
+                    let (out, d) = match i {
+                        0 => (at.sigma.clone(), g.sigma.clone()),
+                        _ if channels == c => (at.outputs.clone(), g.features.clone()),
+                        _ => (own(&at.outputs), own(&g.features)),
+                    };
+                    first += if i == 0 { 0 } else { channels };
+                    let slope = linear::before_activation(gpu, &rows, channels, h.activation, &out, &d);
                     let width = net.mlp.layers[h.layer].width;
                     let seed = seeds[h.layer].get_or_insert_with(|| gpu.zeros(rows.most * width));
                     columns(gpu, &rows, channels, (&slope, channels, 0), (seed, width, h.channel), true);
@@ -187,7 +214,7 @@ impl GpuNet {
         d: &GpuComposited,
         near_scaling: f32,
     ) -> GpuStepGradients {
-        let g = composite::backward(gpu, p, &step.at.rgb, 3, background, &step.out, d);
+        let g = composite::backward(gpu, p, &step.at.outputs, self.net.channels(), background, &step.out, d);
         if near_scaling > 0.0 {
             soften(gpu, p, &g.sigma, &g.features, near_scaling);
         }
@@ -206,14 +233,14 @@ fn agrees(gpu: &Gpu, net: &FieldNet, whole: &Fused, per_level: usize) -> bool {
     let wide = |v: &[f32]| v.iter().map(|v| *v as f64).collect::<Vec<f64>>();
     let (mlp, params) = (&net.mlp, net.mlp.init(&Rng::new(1, 0)));
     let inputs: Vec<Vec<f32>> = mlp.input_widths.iter().enumerate().map(|(i, w)| noise(ROWS * w, 1 + i as u64)).collect();
-    let d = [noise(ROWS, 11), noise(ROWS * 3, 12)];
+    let d: Vec<Vec<f32>> = net.heads().enumerate().map(|(i, (_, channels))| noise(ROWS * channels, 11 + i as u64)).collect();
 
     let wide_inputs: Vec<Vec<f64>> = inputs.iter().map(|v| wide(v)).collect();
     let refs: Vec<&[f64]> = wide_inputs.iter().map(|v| &v[..]).collect();
     let values = reference::forward(mlp, &wide(&params), &refs, ROWS);
     let mut seeds: Vec<Vec<f64>> = mlp.layers.iter().map(|l| vec![0.0; ROWS * l.width]).collect();
     let mut heads = Vec::new();
-    for (h, channels, d) in [(net.sigma, 1, &d[0]), (net.rgb, 3, &d[1])] {
+    for ((h, channels), d) in net.heads().zip(&d) {
         let width = mlp.layers[h.layer].width;
         heads.push(
             (0..ROWS * channels)
@@ -236,7 +263,15 @@ fn agrees(gpu: &Gpu, net: &FieldNet, whole: &Fused, per_level: usize) -> bool {
     }
     let refs: Vec<&Buffer> = on_gpu.iter().collect();
     let kept = whole.forward(gpu, &params, &refs, &rows, true);
-    let (got, _) = whole.backward(gpu, &params, &refs, &kept, &rows, &[&up(&d[0]), &up(&d[1])], HALF_SCALE);
+    let (got, _) = whole.backward(
+        gpu,
+        &params,
+        &refs,
+        &kept,
+        &rows,
+        &d.iter().map(|d| up(d)).collect::<Vec<_>>().iter().collect::<Vec<_>>(),
+        HALF_SCALE,
+    );
     let energy = |v: &mut dyn Iterator<Item = f64>| v.map(|x| x * x).sum::<f64>().sqrt();
     let close = |got: &Buffer, want: &[f64]| {
         gpu.read(got).is_ok_and(|got| {
@@ -253,15 +288,15 @@ const HALF_SCALE: f32 = 64.0;
 /// Activations on the way forward.
 enum Values {
     Kept(Kept),
-    Layers(Vec<Buffer>),
+    Layers(mlp::Values),
 }
 
-/// Densities `[S]` and colours `[S, 3]`, and what a backward pass needs beside them.
+/// Densities `[S]` and outputs `[S, C]`, and what a backward pass needs beside them.
 pub struct Evaluated {
     inputs: Vec<Buffer>,
     values: Values,
     pub sigma: Buffer,
-    pub rgb: Buffer,
+    pub outputs: Buffer,
 }
 
 /// What a backward pass needs of the forward one.
@@ -281,8 +316,8 @@ pub struct GpuStepGradients {
 }
 
 /// Activated channels of a layer, `[S, channels]`.
-fn head(gpu: &Gpu, net: &FieldNet, h: Head, values: &[Buffer], rows: &Rows, channels: usize) -> Buffer {
-    linear::head(gpu, rows, (&values[h.layer], net.mlp.layers[h.layer].width, h.channel), channels, h.shift, h.activation)
+fn head(gpu: &Gpu, net: &FieldNet, h: Head, values: &mlp::Values, rows: &Rows, channels: usize) -> Buffer {
+    linear::head(gpu, rows, (&values.layers[h.layer], net.mlp.layers[h.layer].width, h.channel), channels, h.shift, h.activation)
 }
 
 /// Rows `[R, width]` of `table` `[N, width]` named by `index` `[R]`.

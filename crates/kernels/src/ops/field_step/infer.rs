@@ -2,16 +2,16 @@
 //! blocks of samples that stay in cache. On CPUs with bf16 tiles, features and activations stay in tile form from the
 //! table to the color.
 
-use super::{FieldNet, Head};
+use super::{FieldNet, Output};
 #[cfg(target_arch = "x86_64")]
 use crate::amx::Line;
 #[cfg(target_arch = "x86_64")]
 use crate::amx_chain::Chain;
 use crate::gemm::Precision;
 use crate::ops::fused_mlp::cpu::{Activations, forward_block};
-use crate::ops::fused_mlp::{Layer, Mlp, Source};
+use crate::ops::fused_mlp::{Head, Layer, Mlp, Source};
 use crate::ops::hash_grid::{self, HashGrid};
-use crate::ops::linear;
+use crate::ops::linear::{self, Activation};
 
 /// Rows per block of a network that runs layer by layer.
 const BLOCK: usize = 256;
@@ -50,11 +50,12 @@ pub struct InferBuffers {
 pub type Codes<'a> = (&'a [f32], usize);
 
 impl<'a> Inference<'a> {
-    /// None where color reads more than the outputs of the density head's layer and codes of rays.
+    /// None where color reads more than the outputs of the density head's layer and codes of rays, or is not all that is composited.
     pub fn new(grid: &'a HashGrid, table: &'a [f32], net: &'a FieldNet, params: &'a [f32]) -> Option<Self> {
         let all = &net.mlp;
-        let cut = net.sigma.layer + 1;
-        if net.rgb.layer < cut || net.rgb.layer + 1 != all.layers.len() {
+        let cut = net.density.layer + 1;
+        let &[Output { head: rgb, channels: 3 }] = &net.outputs[..] else { return None };
+        if rgb.layer < cut || rgb.layer + 1 != all.layers.len() || all.layers.iter().any(|l| l.modulation.is_some()) {
             return None;
         }
         let density = Mlp::new(all.input_widths[..1].to_vec(), all.layers[..cut].to_vec());
@@ -80,8 +81,8 @@ impl<'a> Inference<'a> {
         Some(Inference {
             grid,
             table,
-            sigma: net.sigma,
-            rgb: Head { layer: net.rgb.layer - cut, ..net.rgb },
+            sigma: net.density,
+            rgb: Head { layer: rgb.layer - cut, ..rgb },
             density,
             color,
             #[cfg(target_arch = "x86_64")]
@@ -218,7 +219,7 @@ impl Part<'_> {
         let inputs: Vec<Source> = (0..self.mlp.input_widths.len()).map(Source::Input).collect();
         let plain = |(j, l): (usize, &Layer)| {
             let reads = if j == 0 { l.inputs == inputs } else { l.inputs == [Source::Layer(j - 1)] };
-            reads && !l.bias && l.relu == (j < last)
+            reads && !l.bias && l.activation == if j < last { Activation::Relu } else { Activation::None }
         };
         if !self.mlp.layers.iter().enumerate().all(plain) {
             return None;

@@ -2,11 +2,12 @@
 //! parameter gradients apart and groups are added in order, so results do not depend on threads.
 
 use super::disjoint::Disjoint;
-use super::{FieldNet, Head, Positions, RayCode, RayGradient, RayLoss, RayOutput};
+use super::{FieldNet, Positions, RayCode, RayGradient, RayLoss, RayOutput};
 use crate::ops::composite::{Packed, cpu as composite};
 use crate::ops::frequency;
+use crate::ops::fused_mlp::Head;
 use crate::ops::fused_mlp::cpu::{Activations, Prepared, backward_block, forward_block};
-use crate::ops::linear::Activation;
+use crate::ops::linear::cpu::slope_from_output;
 use rayon::prelude::*;
 
 /// Samples per block: activations of a 64-wide network stay in L2 with room to spare.
@@ -22,7 +23,7 @@ pub struct StepInput<'a> {
     /// `[params_len]`
     pub params: &'a [f32],
     pub samples: Packed<'a>,
-    /// `[R, 3]`
+    /// What stands behind every output, `[R, C]`.
     pub background: &'a [f32],
     /// Distance `D` within which gradients of samples are scaled by `(t / D)²`, so that space close to a
     /// camera, which few rays share, learns no faster than the rest (Philip and Deschaintre 2023); 0: none.
@@ -32,15 +33,15 @@ pub struct StepInput<'a> {
 /// What a step gives per ray and per sample.
 #[derive(Clone, Debug, Default)]
 pub struct StepOutput {
-    /// `[R, 3]`, background included.
-    pub rgb: Vec<f32>,
+    /// `[R, C]`, background included.
+    pub values: Vec<f32>,
     /// `[R]`
     pub opacity: Vec<f32>,
     /// `Σ w t`, `[R]`
     pub depth: Vec<f32>,
     /// `[S]`
     pub weights: Vec<f32>,
-    /// `[R, 3]`, zero without a loss.
+    /// `[R, C]`, zero without a loss.
     pub d_background: Vec<f32>,
     pub loss: f64,
 }
@@ -58,10 +59,13 @@ struct Group {
     inputs: Vec<Vec<f32>>,
     d_inputs: Vec<Vec<f32>>,
     sigma: Vec<f32>,
-    rgb: Vec<f32>,
+    /// Outputs side by side, `[n, C]`.
+    values: Vec<f32>,
     d_sigma: Vec<f32>,
-    d_rgb: Vec<f32>,
+    d_values: Vec<f32>,
+    /// Gradients of one ray's weights and outputs.
     g: Vec<f32>,
+    d_ray: Vec<f32>,
     d_params: Vec<f32>,
     loss: f64,
 }
@@ -71,7 +75,7 @@ struct Shared<'a> {
     features: Option<(Disjoint<'a>, usize, usize)>,
     encoded: Option<(frequency::Frequency, &'a [f32], Option<Disjoint<'a>>)>,
     codes: Vec<(&'a [f32], usize, Option<Disjoint<'a>>)>,
-    rgb: Disjoint<'a>,
+    values: Disjoint<'a>,
     opacity: Disjoint<'a>,
     depth: Disjoint<'a>,
     weights: Disjoint<'a>,
@@ -91,12 +95,13 @@ pub fn run(
     out: &mut StepOutput,
     d_params: &mut [f32],
 ) {
-    let (r, s) = (input.samples.rays(), input.samples.samples());
+    let (r, s, c) = (input.samples.rays(), input.samples.samples(), input.net.channels());
     let mlp = &input.net.mlp;
-    assert!(input.background.len() == r * 3 && input.params.len() == mlp.params_len(), "ngp field: shapes");
-    assert_eq!(codes.len() + 1, mlp.input_widths.len(), "ngp field: codes");
-    for (v, n) in [(&mut out.rgb, r * 3), (&mut out.opacity, r), (&mut out.depth, r), (&mut out.weights, s), (&mut out.d_background, r * 3)]
-    {
+    assert!(input.background.len() == r * c && input.params.len() == mlp.params_len(), "field: shapes");
+    assert_eq!(codes.len() + 1, mlp.input_widths.len(), "field: codes");
+    assert!(c > 0 && input.net.heads().all(|(h, _)| h.activation.is_monotonic()), "field: heads");
+    let StepOutput { values, opacity, depth, weights, d_background, .. } = &mut *out;
+    for (v, n) in [(values, r * c), (opacity, r), (depth, r), (weights, s), (d_background, r * c)] {
         v.resize(n, 0.0);
     }
     let shared = Shared {
@@ -105,11 +110,11 @@ pub fn run(
         codes: codes
             .iter_mut()
             .map(|c| {
-                assert_eq!(c.values.len(), r * c.width, "ngp field: code");
+                assert_eq!(c.values.len(), r * c.width, "field: code");
                 (c.values, c.width, c.gradient.as_mut().map(|g| Disjoint::new(g)))
             })
             .collect(),
-        rgb: Disjoint::new(&mut out.rgb),
+        values: Disjoint::new(&mut out.values),
         opacity: Disjoint::new(&mut out.opacity),
         depth: Disjoint::new(&mut out.depth),
         weights: Disjoint::new(&mut out.weights),
@@ -117,11 +122,11 @@ pub fn run(
     };
     let shared = match positions {
         Positions::Features { data, levels, width } => {
-            assert_eq!(data.len(), levels * s * width, "ngp field: features");
+            assert_eq!(data.len(), levels * s * width, "field: features");
             Shared { features: Some((Disjoint::new(data), levels, width)), ..shared }
         }
         Positions::Encoded { encoding, points, d_points } => {
-            assert_eq!(points.len(), s * 3, "ngp field: points");
+            assert_eq!(points.len(), s * 3, "field: points");
             Shared { encoded: Some((encoding, points, d_points.map(Disjoint::new))), ..shared }
         }
     };
@@ -187,68 +192,99 @@ fn run_block(
     let p = &input.samples;
     let net = input.net;
     let (s0, s1) = (p.offsets[rays.start] as usize, p.offsets[rays.end] as usize);
-    let n = s1 - s0;
+    let (n, c) = (s1 - s0, net.channels());
     gather_inputs(input, shared, rays.clone(), s0, n, group);
     let inputs: Vec<&[f32]> = group.inputs.iter().map(|v| &v[..]).collect();
     forward_block(&net.mlp, input.params, &inputs, n, &mut group.acts);
     group.sigma.resize(n, 0.0);
-    group.rgb.resize(n * 3, 0.0);
-    read_head(net, net.sigma, 1, n, &group.acts, &mut group.sigma);
-    read_head(net, net.rgb, 3, n, &group.acts, &mut group.rgb);
+    group.values.resize(n * c, 0.0);
+    read_head(net, net.density, n, &group.acts, (&mut group.sigma, 1, 0, 1));
+    let mut first = 0;
+    for o in &net.outputs {
+        read_head(net, o.head, n, &group.acts, (&mut group.values, c, first, o.channels));
+        first += o.channels;
+    }
     group.d_sigma.resize(n, 0.0);
-    group.d_rgb.resize(n * 3, 0.0);
+    group.d_values.resize(n * c, 0.0);
+    // With the number of channels known, the loops over them are unrolled.
+    match c {
+        3 => composite_block(input, shared, rays.clone(), loss, group, 3),
+        _ => composite_block(input, shared, rays.clone(), loss, group, c),
+    }
+    if loss.is_some() {
+        backward(input, shared, prepared, rays, s0, n, group);
+    }
+}
+
+/// Composites a block's rays; with a loss, also gives the gradients of its samples' densities and outputs.
+#[inline(always)]
+fn composite_block(
+    input: &StepInput,
+    shared: &Shared,
+    rays: std::ops::Range<usize>,
+    loss: Option<&dyn RayLoss>,
+    group: &mut Group,
+    c: usize,
+) {
+    let p = &input.samples;
+    let (s0, s1) = (p.offsets[rays.start] as usize, p.offsets[rays.end] as usize);
     // SAFETY (all parts below): blocks own disjoint ranges of rays and therefore of samples.
     let weights = unsafe { shared.weights.part(s0..s1) };
-    for r in rays.clone() {
+    for r in rays {
         let span = p.range(r);
         let own = span.start - s0..span.end - s0;
         let w = &mut weights[own.clone()];
         let dt = &p.dt[span.clone()];
         let t_out = composite::ray_weights(&group.sigma[own.clone()], dt, w);
-        let bg = &input.background[r * 3..r * 3 + 3];
-        let mut rgb = [t_out * bg[0], t_out * bg[1], t_out * bg[2]];
+        let bg = &input.background[r * c..r * c + c];
+        // SAFETY: ray r belongs to this block alone.
+        let out = unsafe { shared.values.part(r * c..r * c + c) };
+        for k in 0..c {
+            out[k] = t_out * bg[k];
+        }
         let mut depth = 0.0;
         for (j, i) in span.clone().enumerate() {
             depth += w[j] * (p.t[i] + 0.5 * dt[j]);
-            for k in 0..3 {
-                rgb[k] += w[j] * group.rgb[(own.start + j) * 3 + k];
+            for k in 0..c {
+                out[k] += w[j] * group.values[(own.start + j) * c + k];
             }
         }
         // SAFETY: ray r belongs to this block alone.
         unsafe {
-            shared.rgb.part(r * 3..r * 3 + 3).copy_from_slice(&rgb);
             shared.opacity.part(r..r + 1)[0] = 1.0 - t_out;
             shared.depth.part(r..r + 1)[0] = depth;
         }
         let Some(loss) = loss else { continue };
         group.g.clear();
         group.g.resize(span.len(), 0.0);
-        let output = RayOutput { rgb, opacity: 1.0 - t_out, depth, weights: w, first: span.start };
-        let mut grad = RayGradient { rgb: [0.0; 3], opacity: 0.0, depth: 0.0, weights: &mut group.g };
+        group.d_ray.clear();
+        group.d_ray.resize(c, 0.0);
+        let output = RayOutput { values: out, opacity: 1.0 - t_out, depth, weights: w, first: span.start };
+        let mut grad = RayGradient { values: &mut group.d_ray, opacity: 0.0, depth: 0.0, weights: &mut group.g };
         group.loss += loss.ray(r, &output, &mut grad);
-        let RayGradient { rgb: d, opacity: d_opacity, depth: d_depth, .. } = grad;
+        let (d_opacity, d_depth) = (grad.opacity, grad.depth);
+        let d = &group.d_ray[..c];
         for (j, i) in span.clone().enumerate() {
-            let at = (own.start + j) * 3;
-            let c = &group.rgb[at..at + 3];
-            group.g[j] += d[0] * c[0] + d[1] * c[1] + d[2] * c[2] + d_depth * (p.t[i] + 0.5 * dt[j]);
-            for k in 0..3 {
-                group.d_rgb[at + k] = w[j] * d[k];
+            let at = (own.start + j) * c;
+            let values = &group.values[at..at + c];
+            let sum = (1..c).fold(d[0] * values[0], |sum, k| sum + d[k] * values[k]);
+            group.g[j] += sum + d_depth * (p.t[i] + 0.5 * dt[j]);
+            for k in 0..c {
+                group.d_values[at + k] = w[j] * d[k];
             }
         }
-        let g_out = d[0] * bg[0] + d[1] * bg[1] + d[2] * bg[2] - d_opacity;
+        let g_out = (1..c).fold(d[0] * bg[0], |sum, k| sum + d[k] * bg[k]) - d_opacity;
         composite::ray_sigma_gradient(&group.sigma[own.clone()], dt, w, t_out, &group.g, g_out, &mut group.d_sigma[own.clone()]);
         for (j, i) in span.clone().enumerate() {
             let reach = (p.t[i] + 0.5 * dt[j]) / input.near_scaling;
             if reach < 1.0 {
                 group.d_sigma[own.start + j] *= reach * reach;
-                group.d_rgb[(own.start + j) * 3..][..3].iter_mut().for_each(|d| *d *= reach * reach);
+                group.d_values[(own.start + j) * c..][..c].iter_mut().for_each(|d| *d *= reach * reach);
             }
         }
         // SAFETY: ray r belongs to this block alone.
-        unsafe { shared.d_background.part(r * 3..r * 3 + 3) }.copy_from_slice(&d.map(|d| d * t_out));
-    }
-    if loss.is_some() {
-        backward(input, shared, prepared, rays, s0, n, group);
+        let d_background = unsafe { shared.d_background.part(r * c..r * c + c) };
+        d_background.iter_mut().zip(d).for_each(|(b, d)| *b = d * t_out);
     }
 }
 
@@ -283,28 +319,32 @@ fn gather_inputs(input: &StepInput, shared: &Shared, rays: std::ops::Range<usize
     }
 }
 
-/// Activated channels of a head, `[n, channels]`.
-fn read_head(net: &FieldNet, head: Head, channels: usize, n: usize, acts: &Activations, out: &mut [f32]) {
+/// Some columns of a matrix: values, row length, first column, columns.
+type Columns<T> = (T, usize, usize, usize);
+
+/// Activated channels of a head.
+fn read_head(net: &FieldNet, head: Head, n: usize, acts: &Activations, (out, stride, first, channels): Columns<&mut [f32]>) {
     let width = net.mlp.layers[head.layer].width;
-    for (o, v) in out.chunks_exact_mut(channels).zip(acts.values[head.layer].chunks_exact(width)).take(n) {
+    for (o, v) in out.chunks_exact_mut(stride).zip(acts.values[head.layer].chunks_exact(width)).take(n) {
         for k in 0..channels {
-            o[k] = v[head.channel + k] + head.shift;
+            o[first + k] = v[head.channel + k] + head.shift;
         }
     }
-    crate::ops::linear::cpu::activate(head.activation, out);
+    if channels == stride {
+        return crate::ops::linear::cpu::activate(head.activation, out);
+    }
+    for o in out.chunks_exact_mut(stride) {
+        crate::ops::linear::cpu::activate(head.activation, &mut o[first..first + channels]);
+    }
 }
 
 /// Adds the gradient of a head's channels to its layer's gradient.
-fn write_head(net: &FieldNet, head: Head, channels: usize, out: &[f32], d: &[f32], acts: &mut Activations) {
+fn write_head(net: &FieldNet, head: Head, acts: &mut Activations, out: &[f32], (d, stride, first, channels): Columns<&[f32]>) {
     let width = net.mlp.layers[head.layer].width;
-    let slope = |y: f32| match head.activation {
-        Activation::None => 1.0,
-        a => crate::ops::linear::cpu::slope_from_output(a, y),
-    };
     let g = acts.seed(head.layer);
-    for ((g, y), d) in g.chunks_exact_mut(width).zip(out.chunks_exact(channels)).zip(d.chunks_exact(channels)) {
+    for ((g, y), d) in g.chunks_exact_mut(width).zip(out.chunks_exact(stride)).zip(d.chunks_exact(stride)) {
         for k in 0..channels {
-            g[head.channel + k] += slope(y[k]) * d[k];
+            g[head.channel + k] += slope_from_output(head.activation, y[first + k]) * d[first + k];
         }
     }
 }
@@ -312,12 +352,17 @@ fn write_head(net: &FieldNet, head: Head, channels: usize, out: &[f32], d: &[f32
 fn backward(input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::ops::Range<usize>, s0: usize, n: usize, group: &mut Group) {
     let net = input.net;
     let widths = &net.mlp.input_widths;
-    for head in [net.sigma, net.rgb] {
+    let c = net.channels();
+    for (head, _) in net.heads() {
         let len = n * net.mlp.layers[head.layer].width;
         group.acts.seed(head.layer)[..len].fill(0.0);
     }
-    write_head(net, net.sigma, 1, &group.sigma, &group.d_sigma, &mut group.acts);
-    write_head(net, net.rgb, 3, &group.rgb, &group.d_rgb, &mut group.acts);
+    write_head(net, net.density, &mut group.acts, &group.sigma, (&group.d_sigma, 1, 0, 1));
+    let mut first = 0;
+    for o in &net.outputs {
+        write_head(net, o.head, &mut group.acts, &group.values, (&group.d_values, c, first, o.channels));
+        first += o.channels;
+    }
     group.d_inputs.resize_with(widths.len(), Vec::new);
     for (v, w) in group.d_inputs.iter_mut().zip(widths) {
         v.resize(n * w, 0.0);

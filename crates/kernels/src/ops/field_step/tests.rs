@@ -3,6 +3,7 @@ use crate::ops::composite::{Composited, Packed, tests::scene};
 use crate::ops::frequency;
 use crate::ops::fused_mlp::{Layer, Source};
 use crate::ops::hash_grid::{HashGrid, HashGridConfig, cpu as hash, reference as hash_reference};
+use crate::ops::linear::Activation;
 use diorama_geom::rng::Rng;
 use diorama_testkit::{assert_close, random, random_unit, wide};
 
@@ -15,8 +16,8 @@ struct Linear {
 }
 
 impl Linear {
-    fn new(rays: usize, samples: usize) -> Self {
-        Linear { color: random(rays * 3, 1), depth: random(rays, 2), opacity: random(rays, 3), weights: random(samples, 4) }
+    fn new(rays: usize, channels: usize, samples: usize) -> Self {
+        Linear { color: random(rays * channels, 1), depth: random(rays, 2), opacity: random(rays, 3), weights: random(samples, 4) }
     }
     fn wide(&self) -> Composited<f64> {
         Composited { color: wide(&self.color), depth: wide(&self.depth), opacity: wide(&self.opacity), weights: wide(&self.weights) }
@@ -25,27 +26,29 @@ impl Linear {
 
 impl RayLoss for Linear {
     fn ray(&self, r: usize, out: &RayOutput, g: &mut RayGradient) -> f64 {
-        g.rgb.copy_from_slice(&self.color[r * 3..r * 3 + 3]);
+        let c = out.values.len();
+        g.values.copy_from_slice(&self.color[r * c..(r + 1) * c]);
         g.depth = self.depth[r];
         g.opacity = self.opacity[r];
         let n = g.weights.len();
         g.weights.copy_from_slice(&self.weights[out.first..out.first + n]);
         let mut loss = (out.depth * g.depth + out.opacity * g.opacity) as f64;
-        loss += out.rgb.iter().zip(&g.rgb).map(|(a, b)| (a * b) as f64).sum::<f64>();
+        loss += out.values.iter().zip(g.values.iter()).map(|(a, b)| (a * b) as f64).sum::<f64>();
         loss + out.weights.iter().zip(g.weights.iter()).map(|(a, b)| (a * b) as f64).sum::<f64>()
     }
 }
 
 fn ngp_net(features: usize) -> FieldNet {
-    let l = |inputs: Vec<Source>, width, relu| Layer { inputs, width, relu, bias: false };
+    let l =
+        |inputs: Vec<Source>, width, relu: bool| Layer::new(inputs, width, if relu { Activation::Relu } else { Activation::None }, false);
     use Source::{Input, Layer as L};
     let layers =
         vec![l(vec![Input(0)], 32, true), l(vec![L(0)], 16, false), l(vec![L(1), Input(1), Input(2)], 32, true), l(vec![L(2)], 16, false)];
-    FieldNet {
-        mlp: Mlp::new(vec![features, 16, 5], layers),
-        sigma: Head { layer: 1, channel: 0, activation: Activation::TruncatedExp, shift: 0.5 },
-        rgb: Head { layer: 3, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
-    }
+    FieldNet::of_color(
+        Mlp::new(vec![features, 16, 5], layers),
+        Head { layer: 1, channel: 0, activation: Activation::TruncatedExp, shift: 0.5 },
+        Head { layer: 3, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    )
 }
 
 fn expand(p: &Packed, code: &[f32], width: usize) -> Vec<f64> {
@@ -69,7 +72,7 @@ fn fused_equals_composed_with_hash_features_codes_and_all_gradients() {
         let (sh, emb, bg) = (random(rays * 16, 7), random(rays * 5, 8), random(rays * 3, 9));
         let mut features = vec![0.0; n * grid.output_dims()];
         hash::forward(&grid, &points, &table, &mut features);
-        let loss = Linear::new(rays, n);
+        let loss = Linear::new(rays, 3, n);
         let (mut d_sh, mut d_emb) = (vec![9.0; sh.len()], vec![9.0; emb.len()]);
         let mut d_params = vec![0.0; params.len()];
         let mut out = StepOutput::default();
@@ -84,7 +87,7 @@ fn fused_equals_composed_with_hash_features_codes_and_all_gradients() {
         let inputs = [rows, expand(&p, &sh, 16), expand(&p, &emb, 5)];
         let views: Vec<&[f64]> = inputs.iter().map(|v| &v[..]).collect();
         let want = reference::step(&net, &wide(&params), &p, &views, &wide(&bg), &loss.wide());
-        assert_close("rgb", &out.rgb, &want.out.color, 1e-4);
+        assert_close("rgb", &out.values, &want.out.color, 1e-4);
         assert_close("depth", &out.depth, &want.out.depth, 1e-4);
         assert_close("opacity", &out.opacity, &want.out.opacity, 1e-4);
         assert_close("weights", &out.weights, &want.out.weights, 1e-4);
@@ -105,24 +108,24 @@ fn fused_equals_composed_with_hash_features_codes_and_all_gradients() {
 #[test]
 fn fused_equals_composed_with_encoded_positions() {
     let encoding = Frequency { dims: 3, bands: 4, include_input: true, pi: true, window: None };
-    let net = FieldNet {
-        mlp: Mlp::chain(vec![encoding.output_dims()], &[48, 48, 16], true),
-        sigma: Head { layer: 2, channel: 3, activation: Activation::Softplus, shift: -1.0 },
-        rgb: Head { layer: 2, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
-    };
+    let net = FieldNet::of_color(
+        Mlp::chain(vec![encoding.output_dims()], &[48, 48, 16], true),
+        Head { layer: 2, channel: 3, activation: Activation::Softplus, shift: -1.0 },
+        Head { layer: 2, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    );
     let s = scene(70, 13);
     let (p, n) = (s.packed(), s.t.len());
     let points = random(n * 3, 5);
     let params = net.mlp.init(&Rng::new(1, 1));
     let bg = random(210, 9);
-    let loss = Linear::new(70, n);
+    let loss = Linear::new(70, 3, n);
     let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
     let input = StepInput { net: &net, params: &params, samples: p, background: &bg, near_scaling: 0.0 };
     let positions = Positions::Encoded { encoding, points: &points, d_points: Some(&mut d_points) };
     run(&input, positions, &mut [], Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
     let rows = frequency::reference::forward(&encoding, &wide(&points));
     let want = reference::step(&net, &wide(&params), &p, &[&rows], &wide(&bg), &loss.wide());
-    assert_close("rgb", &out.rgb, &want.out.color, 1e-4);
+    assert_close("rgb", &out.values, &want.out.color, 1e-4);
     assert_close("d params", &d_params, &want.d_params, 1e-4);
     assert_close("d points", &d_points, &frequency::reference::backward(&encoding, &wide(&points), &want.d_inputs[0]), 1e-4);
 }
@@ -138,14 +141,14 @@ fn the_result_does_not_depend_on_the_thread_count() {
             let mut features = random(n * 8, 5);
             let params = net.mlp.init(&Rng::new(1, 1));
             let (sh, emb, bg) = (random(3200, 7), random(1000, 8), random(600, 9));
-            let loss = Linear::new(200, n);
+            let loss = Linear::new(200, 3, n);
             let mut d_params = vec![0.0; params.len()];
             let mut out = StepOutput::default();
             let input = StepInput { net: &net, params: &params, samples: s.packed(), background: &bg, near_scaling: 0.0 };
             let mut codes = [RayCode { values: &sh, width: 16, gradient: None }, RayCode { values: &emb, width: 5, gradient: None }];
             let positions = Positions::Features { data: &mut features, levels: 4, width: 2 };
             run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
-            (d_params, out.rgb, out.loss.to_bits())
+            (d_params, out.values, out.loss.to_bits())
         })
     };
     assert_eq!(run_with(1), run_with(3));
@@ -154,11 +157,11 @@ fn the_result_does_not_depend_on_the_thread_count() {
 #[test]
 fn near_samples_learn_with_the_square_of_their_distance() {
     let encoding = Frequency { dims: 3, bands: 2, include_input: true, pi: true, window: None };
-    let net = FieldNet {
-        mlp: Mlp::chain(vec![encoding.output_dims()], &[32, 16], true),
-        sigma: Head { layer: 1, channel: 3, activation: Activation::Softplus, shift: -1.0 },
-        rgb: Head { layer: 1, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
-    };
+    let net = FieldNet::of_color(
+        Mlp::chain(vec![encoding.output_dims()], &[32, 16], true),
+        Head { layer: 1, channel: 3, activation: Activation::Softplus, shift: -1.0 },
+        Head { layer: 1, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
+    );
     let s = scene(20, 3);
     let n = s.t.len();
     let (points, bg, params) = (random(n * 3, 5), random(60, 9), net.mlp.init(&Rng::new(1, 1)));
@@ -166,7 +169,7 @@ fn near_samples_learn_with_the_square_of_their_distance() {
         let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
         let input = StepInput { net: &net, params: &params, samples: s.packed(), background: &bg, near_scaling };
         let positions = Positions::Encoded { encoding, points: &points, d_points: Some(&mut d_points) };
-        run(&input, positions, &mut [], Some(&Linear::new(20, n)), &mut StepBuffers::default(), &mut out, &mut d_params);
+        run(&input, positions, &mut [], Some(&Linear::new(20, 3, n)), &mut StepBuffers::default(), &mut out, &mut d_params);
         d_points
     };
     let plain = gradient(0.0);
@@ -234,4 +237,81 @@ fn inference_in_two_parts_equals_the_whole_network() {
     let grid = HashGrid::new(HashGridConfig { levels: 4, features: 2, log2_size: 9, base: 4, finest: 64 });
     let (table, params) = (vec![0.0; grid.params_len()], vec![0.0; net.mlp.params_len()]);
     assert!(Inference::new(&grid, &table, &net, &params).is_none());
+}
+
+/// Density and color of one trunk, 40 label channels of another layer, a modulated layer and a frozen one.
+fn many_outputs(features: usize) -> FieldNet {
+    use Source::{Input, Layer as L};
+    let mlp = Mlp::new(
+        vec![features, 36],
+        vec![
+            Layer::new(vec![Input(0)], 24, Activation::Relu, true),
+            Layer { modulation: Some(1), ..Layer::new(vec![L(0)], 12, Activation::LeakyRelu, false) },
+            Layer { frozen: true, ..Layer::new(vec![L(1)], 6, Activation::None, true) },
+            Layer::new(vec![L(0)], 40, Activation::None, true),
+        ],
+    );
+    let head = |layer, channel, activation| Head { layer, channel, activation, shift: 0.1 };
+    FieldNet {
+        mlp,
+        density: head(0, 3, Activation::Softplus),
+        outputs: vec![
+            Output { head: head(2, 1, Activation::Sigmoid), channels: 3 },
+            Output { head: head(3, 0, Activation::None), channels: 40 },
+        ],
+    }
+}
+
+/// Runs a field of many outputs on frequency-encoded positions.
+fn run_many(loss: &dyn RayLoss, net: &FieldNet, rays: usize) -> (StepOutput, Vec<f32>, Vec<f32>) {
+    let encoding = Frequency { dims: 3, bands: 2, include_input: true, pi: true, window: None };
+    let s = scene(rays, 3);
+    let points = random(s.t.len() * 3, 5);
+    let (params, code, bg) = (net.mlp.init(&Rng::new(1, 1)), random(rays * 36, 7), random(rays * 43, 9));
+    let (mut out, mut d_params, mut d_code) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; code.len()]);
+    let input = StepInput { net, params: &params, samples: s.packed(), background: &bg, near_scaling: 0.0 };
+    let mut codes = [RayCode { values: &code, width: 36, gradient: Some(&mut d_code) }];
+    let positions = Positions::Encoded { encoding, points: &points, d_points: None };
+    run(&input, positions, &mut codes, Some(loss), &mut StepBuffers::default(), &mut out, &mut d_params);
+    (out, d_params, d_code)
+}
+
+#[test]
+fn any_number_of_outputs_is_composited_and_differentiated() {
+    let encoding = Frequency { dims: 3, bands: 2, include_input: true, pi: true, window: None };
+    let net = many_outputs(encoding.output_dims());
+    for rays in [0, 1, 80] {
+        let s = scene(rays, 3);
+        let (p, n) = (s.packed(), s.t.len());
+        let loss = Linear::new(rays, 43, n);
+        let (out, d_params, d_code) = run_many(&loss, &net, rays);
+        let rows = frequency::reference::forward(&encoding, &wide(&random(n * 3, 5)));
+        let (code, bg) = (random(rays * 36, 7), random(rays * 43, 9));
+        let inputs = [rows, expand(&p, &code, 36)];
+        let views: Vec<&[f64]> = inputs.iter().map(|v| &v[..]).collect();
+        let want = reference::step(&net, &wide(&net.mlp.init(&Rng::new(1, 1))), &p, &views, &wide(&bg), &loss.wide());
+        assert_close("values", &out.values, &want.out.color, 1e-4);
+        assert_close("d background", &out.d_background, &want.d_background, 1e-4);
+        assert_close("d params", &d_params, &want.d_params, 1e-4);
+        assert_close("d code", &d_code, &fold(&p, &want.d_inputs[1], 36), 1e-4);
+    }
+}
+
+#[test]
+fn injected_gradients_are_those_of_the_loss_that_gave_them() {
+    struct WithoutWeights(Linear);
+    impl RayLoss for WithoutWeights {
+        fn ray(&self, r: usize, out: &RayOutput, g: &mut RayGradient) -> f64 {
+            let loss = self.0.ray(r, out, g);
+            g.weights.fill(0.0);
+            loss
+        }
+    }
+    let net = many_outputs(15);
+    let (rays, samples) = (80, scene(80, 3).t.len());
+    let own = WithoutWeights(Linear::new(rays, 43, samples));
+    let (_, want, want_code) = run_many(&own, &net, rays);
+    let d = RayGradients { values: own.0.color.clone(), opacity: own.0.opacity.clone(), depth: own.0.depth.clone() };
+    let (out, got, got_code) = run_many(&InjectedGradients(&d), &net, rays);
+    assert_eq!((got, got_code, out.loss), (want, want_code, 0.0));
 }

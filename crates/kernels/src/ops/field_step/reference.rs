@@ -1,8 +1,8 @@
 //! The composition of the references of the network, its heads and compositing, in f64.
 
-use super::{FieldNet, Head};
+use super::FieldNet;
 use crate::ops::composite::{self, Composited, Packed};
-use crate::ops::fused_mlp::reference as mlp;
+use crate::ops::fused_mlp::{Head, reference as mlp};
 use crate::ops::linear::reference::{activate, slope};
 
 /// Per-ray results and the gradients of a linear loss.
@@ -21,21 +21,32 @@ fn head(net: &FieldNet, h: Head, channels: usize, values: &[Vec<f64>], s: usize,
     (0..s * channels).map(|e| f(values[h.layer][e / channels * width + h.channel + e % channels] + h.shift as f64)).collect()
 }
 
-/// Forward, then backward for the loss `Σ d · out` over colour, depth, opacity and weights.
+/// Forward, then backward for the loss `Σ d · out` over outputs, depth, opacity and weights.
 pub fn step(net: &FieldNet, params: &[f64], p: &Packed, inputs: &[&[f64]], background: &[f64], d: &Composited<f64>) -> Step {
     let s = p.samples();
     let values = mlp::forward(&net.mlp, params, inputs, s);
-    let sigma = head(net, net.sigma, 1, &values, s, |x| activate(net.sigma.activation, x));
-    let rgb = head(net, net.rgb, 3, &values, s, |x| activate(net.rgb.activation, x));
-    let out = composite::reference::forward(p, &sigma, &rgb, 3, background);
-    let (ds, dc, d_background) = composite::reference::backward(p, &sigma, &rgb, 3, background, d);
+    let sigma = head(net, net.density, 1, &values, s, |x| activate(net.density.activation, x));
+    let c = net.channels();
+    let (mut outputs, mut first) = (vec![0.0; s * c], 0);
+    for o in &net.outputs {
+        let own = head(net, o.head, o.channels, &values, s, |x| activate(o.head.activation, x));
+        for (e, v) in own.into_iter().enumerate() {
+            outputs[e / o.channels * c + first + e % o.channels] = v;
+        }
+        first += o.channels;
+    }
+    let out = composite::reference::forward(p, &sigma, &outputs, c, background);
+    let (ds, dc, d_background) = composite::reference::backward(p, &sigma, &outputs, c, background, d);
     let mut seeds: Vec<Vec<f64>> = net.mlp.layers.iter().map(|l| vec![0.0; s * l.width]).collect();
-    for (h, channels, g) in [(net.sigma, 1, &ds), (net.rgb, 3, &dc)] {
+    let mut first = 0;
+    for (i, (h, channels)) in net.heads().enumerate() {
         let slopes = head(net, h, channels, &values, s, |x| slope(h.activation, x));
         let width = net.mlp.layers[h.layer].width;
         for e in 0..s * channels {
-            seeds[h.layer][e / channels * width + h.channel + e % channels] += g[e] * slopes[e];
+            let g = if i == 0 { ds[e] } else { dc[e / channels * c + first + e % channels] };
+            seeds[h.layer][e / channels * width + h.channel + e % channels] += g * slopes[e];
         }
+        first += if i == 0 { 0 } else { channels };
     }
     let (d_params, d_inputs) = mlp::backward(&net.mlp, params, inputs, s, &seeds);
     Step { out, sigma, d_params, d_inputs, d_background }
