@@ -385,7 +385,10 @@ fn splat_seeds() -> Vec<Vec<u8>> {
 
 fn load_weights(data: &[u8]) {
     let path = file("weights.pth", data);
-    let _ = weights::read(&path, &|_| true);
+    let Ok(arrays) = weights::read(&path, &|_| true) else { return };
+    let numbers: usize = arrays.iter().map(|a| a.values.len()).sum();
+    assert!(numbers <= data.len(), "{numbers} numbers of {} bytes", data.len());
+    assert!(arrays.iter().all(|a| a.shape.iter().product::<usize>() == a.values.len()), "arrays are as large as their shapes say");
 }
 
 /// What PyTorch wrote in both of its formats, and a safetensors file.

@@ -59,7 +59,7 @@ fn gpu_check(devices: &str) -> bool {
     let with_graph = features != "native";
     let mut build = vec!["build", "--release", "--package", "diorama", "--bin", "diorama"];
     if with_graph {
-        build.extend(["--package", "diorama-graph", "--example", "graph-check", "--no-default-features", "--features", &features]);
+        build.extend(["--package", "diorama-nets", "--example", "graph-check", "--no-default-features", "--features", &features]);
     }
     if !step("build", cargo(&build)) {
         return false;

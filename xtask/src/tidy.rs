@@ -7,13 +7,13 @@ use std::path::{Path, PathBuf};
 const IMPORTS: [(&str, &[&str]); 11] = [
     ("geom", &[]),
     ("kernels", &["geom"]),
-    ("graph", &["geom", "kernels"]),
+    ("nets", &["geom", "kernels"]),
     ("engine", &["geom", "kernels"]),
     ("mesh", &["geom", "kernels"]),
     ("data", &["geom"]),
     ("scenes", &["geom", "mesh"]),
-    ("pipelines", &["geom", "kernels", "engine", "mesh", "data", "scenes"]),
-    ("cli", &["geom", "kernels", "engine", "mesh", "data", "scenes", "pipelines", "viewer"]),
+    ("pipelines", &["geom", "kernels", "engine", "nets", "mesh", "data", "scenes"]),
+    ("cli", &["geom", "kernels", "engine", "nets", "mesh", "data", "scenes", "pipelines", "viewer"]),
     ("testkit", &["geom"]),
     ("viewer", &["geom"]),
 ];
@@ -22,8 +22,8 @@ const MAX_LINES: usize = 800;
 const MAX_BYTES: u64 = 2 << 20;
 const BANNED: [&str; 6] = ["utils", "common", "helpers", "misc", "manager", "legacy"];
 const UNSAFE: [&str; 2] = ["crates/kernels/", "crates/data/"];
-/// The room that burn is for. The program is built without it, because it takes a minute to compile.
-const BURN: &str = "graph";
+/// The room that burn is for: no other names it, so that the others build beside it.
+const BURN: &str = "nets";
 /// Dependencies under another name in the sources, and those that are listed for their features alone.
 const NAMED_ELSE: [(&str, &str); 2] = [("kamadak-exif", "exif"), ("cubecl-native", "")];
 
@@ -122,7 +122,7 @@ fn check_manifests(root: &Path, files: &[PathBuf], breaches: &mut Vec<String>) {
         let sources = files.iter().filter(|f| f.starts_with(folder) && f.extension().is_some_and(|e| e == "rs"));
         let code: String = sources.filter_map(|f| std::fs::read_to_string(f).ok()).collect();
         for dependency in dependencies(&text) {
-            if ["burn", "burn-cubecl", "diorama-graph"].contains(&dependency) && !name.starts_with(&format!("crates/{BURN}/")) {
+            if ["burn", "burn-cubecl"].contains(&dependency) && !name.starts_with(&format!("crates/{BURN}/")) {
                 breaches.push(format!("{name}: {dependency} is for {BURN} only"));
             }
             let known = NAMED_ELSE.iter().find(|(d, _)| *d == dependency).map(|(_, n)| n.to_string());
@@ -212,7 +212,7 @@ mod tests {
         let mut b = Vec::new();
         check_manifests(&dir, &[manifest, source], &mut b);
         std::fs::remove_dir_all(&dir).unwrap();
-        assert_eq!(b, ["crates/mesh/Cargo.toml: burn is for graph only", "crates/mesh/Cargo.toml: serde is not used"]);
+        assert_eq!(b, ["crates/mesh/Cargo.toml: burn is for nets only", "crates/mesh/Cargo.toml: serde is not used"]);
     }
 
     #[test]

@@ -421,6 +421,25 @@ fn fault_18_pickles_are_not_read() {
     fails(&diorama(&["eval", run.to_str().unwrap()]), 2, &["latest.safetensors"]);
 }
 
+/// Weights are read from pickles, but nothing in them runs.
+#[test]
+fn fault_18_weights_that_would_run_a_program_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let (file, owned) = (dir.path().join("weights.pth"), dir.path().join("owned"));
+    let command = format!("touch {}", owned.display());
+    // What torch.save wrote before 1.6: a magic number, a version, the system, and then a call instead of names and tensors.
+    let mut bytes =
+        b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.\x80\x02M\xe9\x03.\x80\x02}.\x80\x02}X\x01\0\0\0wcposix\nsystem\nX"
+            .to_vec();
+    bytes.extend((command.len() as u32).to_le_bytes());
+    bytes.extend(command.as_bytes());
+    bytes.extend(b"\x85Rs.\x80\x02].");
+    std::fs::write(&file, bytes).unwrap();
+    let run = good().run.to_str().unwrap();
+    fails(&diorama(&["eval", run, "--device", "cpu", "--lpips", file.to_str().unwrap()]), 2, &["weights.pth", "would run posix.system"]);
+    assert!(!owned.exists());
+}
+
 #[test]
 fn fault_19_hostile_pages_slow_clients_and_huge_frames() {
     let mut child = program()

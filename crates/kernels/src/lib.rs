@@ -16,3 +16,6 @@ pub mod ops;
 pub mod probe;
 pub mod scatter_max;
 pub mod simd;
+mod sums;
+pub mod tasks;
+pub mod tile;

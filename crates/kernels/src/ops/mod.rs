@@ -1,23 +1,39 @@
 //! One folder per op.
 
+pub mod activation;
 pub mod adam;
+pub mod attention;
 pub mod composite;
+pub mod conv2d;
 pub mod depth_loss;
 pub mod distortion;
+pub mod dropout;
+pub mod embedding;
 pub mod field_step;
 pub mod frequency;
 pub mod fused_mlp;
+pub mod grid_sample;
 pub mod hash_grid;
 pub mod linear;
 pub mod march;
 pub mod marching_cubes;
 pub mod marching_tetrahedra;
+pub mod mean_error;
+pub mod norm;
 pub mod pixel_gather;
+pub mod pool;
 pub mod ray_aabb;
 pub mod ray_generation;
+pub mod resample;
 pub mod sample_pdf;
 pub mod scan;
+pub mod softmax;
 pub mod spherical_harmonics;
 pub mod ssim;
+pub mod sum;
 pub mod triangle_wave;
 pub mod trilinear_corner_grid;
+pub mod weight_step;
+
+#[cfg(test)]
+mod torch_cases;

@@ -1,0 +1,60 @@
+//! Blocks of elements, one loop per function and instruction set.
+
+use super::Activation;
+use super::functions::{Function, with_function};
+use crate::math::multiversion;
+use crate::tasks::{self, Parts};
+
+/// Elements per task.
+const BLOCK: usize = 1 << 14;
+
+multiversion! {
+    /// `out = f(x)` on this thread.
+    pub(crate) fn forward_block(a: Activation, x: &[f32], out: &mut [f32]) {
+        with_function!(a, f => out.iter_mut().zip(x).for_each(|(o, x)| *o = f.value(*x)))
+    }
+}
+
+multiversion! {
+    /// `values ← f(values)` on this thread.
+    pub(crate) fn forward_in_place(a: Activation, values: &mut [f32]) {
+        with_function!(a, f => values.iter_mut().for_each(|v| *v = f.value(*v)))
+    }
+}
+
+multiversion! {
+    /// `dx = d · f′(x)` on this thread.
+    pub(crate) fn backward_block(a: Activation, x: &[f32], d: &[f32], dx: &mut [f32]) {
+        with_function!(a, f => dx.iter_mut().zip(x).zip(d).for_each(|((o, x), d)| *o = d * f.slope(*x)))
+    }
+}
+
+multiversion! {
+    /// `values ← d · f′(values)` on this thread.
+    pub(crate) fn backward_in_place(a: Activation, d: &[f32], values: &mut [f32]) {
+        with_function!(a, f => values.iter_mut().zip(d).for_each(|(v, d)| *v = d * f.slope(*v)))
+    }
+}
+
+/// `out = f(x)`; slices of one length.
+pub fn forward(a: Activation, x: &[f32], out: &mut [f32]) {
+    assert_eq!(x.len(), out.len(), "activation: shapes");
+    let (n, parts) = (x.len(), Parts::new(out));
+    tasks::run(n.div_ceil(BLOCK), n, |i| {
+        // SAFETY: each task has a chunk of its own.
+        let out = unsafe { parts.chunk(i, BLOCK) };
+        forward_block(a, &x[i * BLOCK..i * BLOCK + out.len()], out);
+    });
+}
+
+/// `dx = d · f′(x)`; slices of one length.
+pub fn backward(a: Activation, x: &[f32], d: &[f32], dx: &mut [f32]) {
+    assert!(x.len() == dx.len() && d.len() == dx.len(), "activation: shapes");
+    let (n, parts) = (x.len(), Parts::new(dx));
+    tasks::run(n.div_ceil(BLOCK), n, |i| {
+        // SAFETY: each task has a chunk of its own.
+        let dx = unsafe { parts.chunk(i, BLOCK) };
+        let span = i * BLOCK..i * BLOCK + dx.len();
+        backward_block(a, &x[span.clone()], &d[span], dx);
+    });
+}

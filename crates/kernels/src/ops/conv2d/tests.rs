@@ -1,0 +1,136 @@
+use super::*;
+use crate::simd::{Level, with_level};
+use diorama_testkit::{assert_close, assert_gradient, random, wide};
+
+fn conv(i: usize, o: usize, kernel: [usize; 2]) -> Conv2d {
+    Conv2d { kernel, ..Conv2d::new(i, o, 1) }
+}
+
+/// Every kind of layer with images of odd sizes.
+fn cases() -> Vec<(Conv2d, Images)> {
+    let images = |batch, height, width| Images { batch, height, width };
+    let same = |c: Conv2d| Conv2d { padding: [c.kernel[0] / 2, c.kernel[1] / 2], ..c };
+    vec![
+        (conv(3, 4, [1, 1]), images(0, 4, 4)),
+        (conv(1, 1, [1, 1]), images(1, 1, 1)),
+        (conv(5, 7, [1, 1]), images(2, 3, 5)),
+        (conv(40, 33, [1, 1]), images(3, 9, 11)),
+        (conv(8, 8, [3, 3]), images(1, 3, 3)),
+        (same(conv(3, 5, [3, 3])), images(2, 1, 1)),
+        (same(conv(16, 20, [3, 3])), images(2, 19, 67)),
+        (same(conv(70, 9, [3, 3])), images(1, 40, 41)),
+        (same(conv(24, 17, [3, 3])), images(5, 5, 6)),
+        (same(conv(4, 6, [5, 3])), images(1, 13, 9)),
+        (same(conv(3, 10, [7, 7])), images(1, 20, 23)),
+        (Conv2d { stride: [2, 2], ..same(conv(3, 10, [7, 7])) }, images(2, 21, 30)),
+        (Conv2d { stride: [2, 2], ..same(conv(18, 12, [3, 3])) }, images(2, 17, 18)),
+        (Conv2d { stride: [2, 2], ..conv(6, 9, [1, 1]) }, images(2, 7, 8)),
+        (Conv2d { stride: [3, 2], padding: [2, 0], ..conv(5, 4, [2, 5]) }, images(2, 14, 15)),
+        (Conv2d { stride: [1, 4], padding: [1, 3], ..conv(2, 3, [4, 4]) }, images(1, 6, 21)),
+        (Conv2d { dilation: [2, 3], padding: [2, 3], ..conv(6, 8, [3, 3]) }, images(2, 12, 25)),
+        (Conv2d { dilation: [2, 2], stride: [2, 2], padding: [1, 4], ..conv(6, 5, [3, 4]) }, images(2, 12, 13)),
+        (Conv2d { padding: [4, 5], ..conv(2, 3, [2, 2]) }, images(1, 2, 3)),
+        (Conv2d { groups: 3, ..same(conv(12, 9, [3, 3])) }, images(2, 11, 19)),
+        (Conv2d { groups: 2, stride: [2, 2], ..same(conv(40, 20, [3, 3])) }, images(1, 16, 15)),
+        (Conv2d { groups: 6, ..same(conv(6, 6, [3, 3])) }, images(2, 13, 37)),
+        (Conv2d { groups: 6, ..same(conv(6, 12, [5, 5])) }, images(1, 9, 8)),
+        (Conv2d { groups: 7, stride: [2, 2], ..same(conv(7, 7, [3, 3])) }, images(3, 20, 33)),
+        (Conv2d { groups: 4, dilation: [3, 2], padding: [3, 1], ..conv(4, 4, [3, 3]) }, images(1, 15, 40)),
+    ]
+}
+
+const ACTIVATIONS: [Activation; 6] =
+    [Activation::None, Activation::Relu, Activation::LeakyRelu(0.2), Activation::Sigmoid, Activation::Tanh, Activation::Silu];
+
+/// Random tensors of a layer: x, weights of variance 1 / fan-in, bias, gradient of the outputs.
+fn tensors(c: &Conv2d, images: &Images) -> [Vec<f32>; 4] {
+    let fan = (c.channels_in / c.groups * c.taps()) as f32;
+    let mut w = random(c.weights_len(), 2);
+    w.iter_mut().for_each(|w| *w /= fan.sqrt());
+    let outputs = images.batch * c.channels_out * c.output(images).pixels();
+    [random(images.batch * c.channels_in * images.pixels(), 1), w, random(c.channels_out, 3), random(outputs, 4)]
+}
+
+fn check(c: &Conv2d, images: &Images, biased: bool) {
+    let what = format!("{c:?} on {images:?}");
+    let [x, w, b, d] = tensors(c, images);
+    let b = if biased { b } else { Vec::new() };
+    let wides = [wide(&x), wide(&w), wide(&b), wide(&d)];
+    let (mut out, mut before) = (vec![9.0; d.len()], vec![9.0; d.len()]);
+    cpu::forward(c, images, &x, &w, &b, &mut out, Some(&mut before));
+    assert_close(&format!("out of {what}"), &out, &reference::forward(c, images, &wides[0], &wides[1], &wides[2]), 1e-4);
+    let linear = Conv2d { activation: Activation::None, ..*c };
+    assert_close(&format!("before of {what}"), &before, &reference::forward(&linear, images, &wides[0], &wides[1], &wides[2]), 1e-4);
+    let (rx, rw, rb) = reference::backward(c, images, &wides[0], &wides[1], &wides[2], &wides[3]);
+    let (mut dx, mut dw, mut db) = (vec![9.0; x.len()], vec![9.0; w.len()], vec![9.0; c.channels_out]);
+    let kept = if c.activation.needs_input() { &before } else { &out };
+    let gradients = Gradients { input: Some(&mut dx), weights: Some(&mut dw), bias: Some(&mut db) };
+    cpu::backward(c, images, &x, &w, kept, &d, gradients);
+    assert_close(&format!("input's gradient of {what}"), &dx, &rx, 1e-4);
+    assert_close(&format!("weights' gradient of {what}"), &dw, &rw, 1e-4);
+    assert_close(&format!("bias' gradient of {what}"), &db, &rb, 1e-4);
+}
+
+#[test]
+fn every_shape_matches_the_reference_on_every_level() {
+    for level in Level::available() {
+        with_level(level, || {
+            for (c, images) in cases() {
+                check(&c, &images, true);
+            }
+        });
+    }
+}
+
+#[test]
+fn every_activation_matches_the_reference_on_every_level() {
+    for level in Level::available() {
+        with_level(level, || {
+            for activation in ACTIVATIONS {
+                let c = Conv2d { activation, padding: [1; 2], ..Conv2d::new(5, 11, 3) };
+                check(&c, &Images { batch: 2, height: 9, width: 14 }, false);
+                let c = Conv2d { groups: 5, channels_out: 5, ..c };
+                check(&c, &Images { batch: 2, height: 9, width: 14 }, true);
+            }
+        });
+    }
+}
+
+#[test]
+fn reference_gradients_match_central_differences() {
+    for activation in ACTIVATIONS {
+        let c = Conv2d { groups: 2, stride: [2, 1], padding: [1, 0], dilation: [1, 2], activation, ..conv(4, 2, [3, 2]) };
+        let images = Images { batch: 2, height: 4, width: 5 };
+        let [x, w, b, d] = tensors(&c, &images).map(|v| wide(&v));
+        let (dx, dw, db) = reference::backward(&c, &images, &x, &w, &b, &d);
+        let loss =
+            |x: &[f64], w: &[f64], b: &[f64]| reference::forward(&c, &images, x, w, b).iter().zip(&d).map(|(a, b)| a * b).sum::<f64>();
+        assert_gradient("x", &dx, &x, 1e-6, |x| loss(x, &w, &b));
+        assert_gradient("w", &dw, &w, 1e-6, |w| loss(&x, w, &b));
+        assert_gradient("b", &db, &b, 1e-6, |b| loss(&x, &w, b));
+    }
+}
+
+#[test]
+fn results_do_not_depend_on_the_number_of_threads() {
+    let c = Conv2d { padding: [1; 2], ..Conv2d::new(20, 24, 3) };
+    let images = Images { batch: 3, height: 21, width: 50 };
+    let [x, w, b, d] = tensors(&c, &images);
+    let run = |threads: usize| {
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(|| {
+            let (mut out, mut dx, mut dw, mut db) = (vec![0.0; d.len()], vec![0.0; x.len()], vec![0.0; w.len()], vec![0.0; b.len()]);
+            cpu::forward(&c, &images, &x, &w, &b, &mut out, None);
+            let gradients = Gradients { input: Some(&mut dx), weights: Some(&mut dw), bias: Some(&mut db) };
+            cpu::backward(&c, &images, &x, &w, &out, &d, gradients);
+            [out, dx, dw, db].concat().iter().map(|v| v.to_bits()).collect::<Vec<_>>()
+        })
+    };
+    let one = run(1);
+    assert!(one == run(2) && one == run(5));
+}
+
+#[test]
+#[should_panic(expected = "a kernel that covers 3 pixels on an image of 2")]
+fn a_kernel_must_fit() {
+    Conv2d::new(1, 1, 3).output(&Images { batch: 1, height: 2, width: 9 });
+}

@@ -1,0 +1,311 @@
+//! Register tiles: `C += Σ_k A[·, k] B[k, ·]`, both operands read where they lie through a table of offsets.
+//!
+//! Convolutions and large matrix products walk their outputs in such tiles. The walk itself is ordinary code: only
+//! the tile, and the copies that feed it, are compiled per instruction set and reached through [`Kernel`].
+
+use crate::simd::{self, Lane, Level, Plain};
+
+/// What a tile's sum is added to.
+#[derive(Clone, Copy)]
+pub enum Start {
+    Zero,
+    /// What `c` holds.
+    Accumulate,
+    /// One value per row.
+    Bias(*const f32),
+}
+
+/// Operands of one tile: `c[r, j] = start + Σ_k a[r · row + offsets[k].0] · b[j · vector + offsets[k].1 ..]`.
+pub struct Tile<'a> {
+    pub a: *const f32,
+    /// Floats between rows of A.
+    pub row: usize,
+    pub b: *const f32,
+    /// Floats between neighboring vectors of B.
+    pub vector: usize,
+    /// Per term of the sum, where A and B stand.
+    pub offsets: &'a [(u32, u32)],
+    pub c: *mut f32,
+    pub c_row: usize,
+    pub c_vector: usize,
+    pub start: Start,
+}
+
+/// A run of pixels that is contiguous in the input, in a tile and in the output.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Segment {
+    pub from: usize,
+    /// Offset in the tile.
+    pub at: usize,
+    pub len: usize,
+    /// Offset in the output of the first channel.
+    pub to: usize,
+}
+
+/// Copies of pixels into a panel `[offsets.len(), width]`.
+pub struct Pack<'a> {
+    pub from: *const f32,
+    pub offsets: &'a [(u32, u32)],
+    pub segments: &'a [Segment],
+    pub panel: *mut f32,
+    pub width: usize,
+    /// Whether nothing may be read beyond a segment; else whole vectors are, also where they reach beyond.
+    pub exact: bool,
+}
+
+type TileFn = unsafe fn(&Tile);
+
+/// Most rows and vectors of any level's tile.
+pub const MOST_ROWS: usize = 8;
+pub const MOST_VECTORS: usize = 3;
+
+/// The tiles of one instruction set.
+pub struct Kernel {
+    /// Floats per vector.
+    pub lanes: usize,
+    /// Rows of the largest tile.
+    pub rows: usize,
+    /// Vectors per row of the largest tile.
+    pub vectors: usize,
+    tiles: [[TileFn; MOST_VECTORS]; MOST_ROWS],
+    pack: unsafe fn(&Pack),
+}
+
+impl Kernel {
+    /// Floats per row of the largest tile.
+    pub fn width(&self) -> usize {
+        self.lanes * self.vectors
+    }
+
+    /// Computes a tile of `rows` by `vectors`.
+    ///
+    /// # Safety
+    /// All that the operands address must exist; `rows` and `vectors` are at least 1 and at most the kernel's.
+    pub unsafe fn run(&self, rows: usize, vectors: usize, tile: &Tile) {
+        // SAFETY: as the caller vouches.
+        unsafe { self.tiles[rows - 1][vectors - 1](tile) }
+    }
+
+    /// Copies pixels, row after row of the panel.
+    ///
+    /// # Safety
+    /// All that the segments address must exist, and a vector more of it unless `exact`; the panel has room for a vector more.
+    pub unsafe fn pack(&self, pack: &Pack) {
+        // SAFETY: as the caller vouches.
+        unsafe { (self.pack)(pack) }
+    }
+}
+
+#[inline(always)]
+unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(t: &Tile) {
+    // SAFETY: `Kernel::run` states what must exist.
+    unsafe {
+        let mut acc = [[L::splat(0.0); NR]; MR];
+        if let Start::Bias(bias) = t.start {
+            for (r, row) in acc.iter_mut().enumerate() {
+                *row = [L::splat(*bias.add(r)); NR];
+            }
+        }
+        let (row, vector) = (t.row, t.vector);
+        for &(a, b) in t.offsets {
+            let (ap, bp) = (t.a.add(a as usize), t.b.add(b as usize));
+            let mut bv = [L::splat(0.0); NR];
+            for (q, v) in bv.iter_mut().enumerate() {
+                *v = L::load(bp.add(q * vector));
+            }
+            for (r, sums) in acc.iter_mut().enumerate() {
+                let av = L::splat(*ap.add(r * row));
+                for q in 0..NR {
+                    sums[q] = L::fma(av, bv[q], sums[q]);
+                }
+            }
+        }
+        let one = L::splat(1.0);
+        for (r, sums) in acc.iter().enumerate() {
+            for (q, v) in sums.iter().enumerate() {
+                let c = t.c.add(r * t.c_row + q * t.c_vector);
+                let v = if matches!(t.start, Start::Accumulate) { L::fma(*v, one, L::load(c)) } else { *v };
+                L::store(c, v);
+            }
+        }
+    }
+}
+
+#[inline(always)]
+unsafe fn pack<L: Lane>(p: &Pack) {
+    // SAFETY: `Kernel::pack` states what must exist.
+    unsafe {
+        let mut panel = p.panel;
+        for &(_, offset) in p.offsets {
+            let from = p.from.add(offset as usize);
+            for s in p.segments {
+                let (from, to) = (from.add(s.from), panel.add(s.at));
+                let mut i = 0;
+                while i + L::N <= s.len {
+                    L::store(to.add(i), L::load(from.add(i)));
+                    i += L::N;
+                }
+                if p.exact {
+                    while i < s.len {
+                        *to.add(i) = *from.add(i);
+                        i += 1;
+                    }
+                } else if i < s.len {
+                    // What is too much is overwritten by the next segment or row.
+                    L::store(to.add(i), L::load(from.add(i)));
+                }
+            }
+            panel = panel.add(p.width);
+        }
+    }
+}
+
+macro_rules! kernel {
+    ($name:ident, $lane:ty, $rows:literal, $vectors:literal, [$($m:literal)*], $(#[$target:meta])*) => {
+        mod $name {
+            use super::*;
+
+            $(#[$target])*
+            unsafe fn of<const MR: usize, const NR: usize>(t: &Tile) {
+                // SAFETY: compiled for the set; the rest as `Kernel::run` states.
+                unsafe { tile::<$lane, MR, NR>(t) }
+            }
+
+            $(#[$target])*
+            unsafe fn copy(p: &Pack) {
+                // SAFETY: compiled for the set; the rest as `Kernel::pack` states.
+                unsafe { pack::<$lane>(p) }
+            }
+
+            pub static KERNEL: Kernel = Kernel {
+                lanes: <$lane as Lane>::N,
+                rows: $rows,
+                vectors: $vectors,
+                tiles: [$([of::<$m, 1>, of::<$m, 2>, of::<$m, 3>]),*],
+                pack: copy,
+            };
+        }
+    };
+}
+
+#[cfg(target_arch = "x86_64")]
+kernel!(avx512, simd::Avx512, 8, 3, [1 2 3 4 5 6 7 8], #[target_feature(enable = "avx512f,avx512dq,avx512bw,avx512vl,avx2,fma")]);
+#[cfg(target_arch = "x86_64")]
+kernel!(avx2, simd::Avx2, 4, 3, [1 2 3 4 4 4 4 4], #[target_feature(enable = "avx2,fma")]);
+#[cfg(target_arch = "aarch64")]
+kernel!(neon, simd::Neon, 8, 3, [1 2 3 4 5 6 7 8],);
+kernel!(portable, Plain, 4, 1, [1 2 3 4 4 4 4 4],);
+
+/// The kernel of a level.
+pub fn kernel(level: Level) -> &'static Kernel {
+    match level {
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx512 => &avx512::KERNEL,
+        #[cfg(target_arch = "x86_64")]
+        Level::Avx2 => &avx2::KERNEL,
+        #[cfg(target_arch = "aarch64")]
+        Level::Neon => &neon::KERNEL,
+        _ => &portable::KERNEL,
+    }
+}
+
+/// A pointer that threads share; each writes only its own part.
+#[derive(Clone, Copy)]
+pub struct Shared(pub *mut f32);
+
+// SAFETY: whoever uses it keeps the parts of threads apart.
+unsafe impl Send for Shared {}
+// SAFETY: as above.
+unsafe impl Sync for Shared {}
+
+impl Shared {
+    /// The pointer `offset` floats further on.
+    ///
+    /// # Safety
+    /// It lies inside the slice that the pointer was made of.
+    pub unsafe fn at(&self, offset: usize) -> *mut f32 {
+        // SAFETY: as the caller vouches.
+        unsafe { self.0.add(offset) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diorama_testkit::{assert_close, random};
+
+    #[test]
+    fn every_tile_of_every_level_matches_plain_loops() {
+        for level in Level::available() {
+            let kernel = kernel(level);
+            for rows in 1..=kernel.rows {
+                for vectors in 1..=kernel.vectors {
+                    matches_plain_loops(kernel, rows, vectors);
+                }
+            }
+        }
+    }
+
+    fn matches_plain_loops(kernel: &Kernel, rows: usize, vectors: usize) {
+        let (terms, n) = (7, vectors * kernel.lanes);
+        let (a, b, bias) = (random(rows * terms, 1), random(terms * n, 2), random(rows, 3));
+        let offsets: Vec<(u32, u32)> = (0..terms).rev().map(|k| (k as u32, (k * n) as u32)).collect();
+        for start in [Start::Zero, Start::Accumulate, Start::Bias(bias.as_ptr())] {
+            let mut c = vec![3.0; rows * n];
+            let want: Vec<f64> = (0..rows * n)
+                .map(|e| {
+                    let (r, j) = (e / n, e % n);
+                    let before = match start {
+                        Start::Zero => 0.0,
+                        Start::Accumulate => 3.0,
+                        Start::Bias(_) => bias[r] as f64,
+                    };
+                    before + (0..terms).map(|k| a[r * terms + k] as f64 * b[k * n + j] as f64).sum::<f64>()
+                })
+                .collect();
+            let (lanes, c_row) = (kernel.lanes, n);
+            let t = Tile {
+                a: a.as_ptr(),
+                row: terms,
+                b: b.as_ptr(),
+                vector: lanes,
+                offsets: &offsets,
+                c: c.as_mut_ptr(),
+                c_row,
+                c_vector: lanes,
+                start,
+            };
+            // SAFETY: all operands have the tile's size.
+            unsafe { kernel.run(rows, vectors, &t) };
+            assert_close("tile", &c, &want, 1e-5);
+        }
+    }
+
+    #[test]
+    fn panels_hold_segments_one_after_the_other() {
+        for level in Level::available() {
+            for exact in [false, true] {
+                let kernel = kernel(level);
+                let from: Vec<f32> = (0..200).map(|i| i as f32).collect();
+                let segments = [Segment { from: 3, at: 0, len: 5, to: 0 }, Segment { from: 40, at: 5, len: 20, to: 0 }];
+                let mut panel = vec![-1.0; 2 * 25 + kernel.lanes];
+                let pack = Pack {
+                    from: from.as_ptr(),
+                    offsets: &[(0, 0), (9, 100)],
+                    segments: &segments,
+                    panel: panel.as_mut_ptr(),
+                    width: 25,
+                    exact,
+                };
+                // SAFETY: the source goes on for more than a vector after each segment, and so does the panel.
+                unsafe { kernel.pack(&pack) };
+                for k in 0..2 {
+                    for i in 0..25 {
+                        let want = k * 100 + if i < 5 { 3 + i } else { 35 + i };
+                        assert_eq!(panel[k * 25 + i], want as f32, "{k} {i}");
+                    }
+                }
+            }
+        }
+    }
+}
