@@ -12,7 +12,8 @@ use diorama_engine::renderers::volume::Quality;
 use diorama_engine::train::Event;
 use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
-use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewLayer, ViewRequest, ViewScene, ViewSource, ViewStatus};
+use diorama_geom::view_controls::ViewLayer;
+use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewRequest, ViewScene, ViewSource, ViewStatus};
 use diorama_geom::{Camera, ImageU8, Similarity};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -186,8 +187,8 @@ impl RunView {
     pub fn hear(&self, event: &Event) {
         let Ok(mut s) = self.status.lock() else { return };
         match event {
-            &Event::Progress { step, seconds, loss, psnr, rays_per_s, .. } => {
-                *s = ViewStatus { step, seconds, loss, psnr, rays_per_s, running: true, held_out: s.held_out };
+            &Event::Progress { step, seconds, progress, loss, psnr, rays_per_s, .. } => {
+                *s = ViewStatus { step, seconds, loss, psnr, rays_per_s, progress, running: true, held_out: s.held_out };
             }
             Event::Evaluated { psnr, views, .. } => {
                 s.held_out = Some(*psnr);
@@ -205,6 +206,18 @@ impl RunView {
     }
 }
 
+/// The pictures that [`render::picture`] draws, by the names that [`Layer`] is read from.
+fn layers() -> Vec<ViewLayer> {
+    let dark_to_light = [[0; 3], [255; 3]];
+    vec![
+        ViewLayer::new("rgb", "Color"),
+        ViewLayer::new("depth", "Depth").with_scale(&[[255; 3], [26; 3]], "near", "far", ""),
+        ViewLayer::new("normal", "Normals").with_classes(&[("x", [255, 128, 128]), ("y", [128, 255, 128]), ("z", [128, 128, 255])]),
+        ViewLayer::new("opacity", "Opacity").with_scale(&dark_to_light, "0", "1", ""),
+        ViewLayer::new("occupancy", "Occupancy").with_scale(&dark_to_light, "empty", "most cells", ""),
+    ]
+}
+
 impl ViewSource for RunView {
     fn scene(&self) -> ViewScene {
         let m = self.model();
@@ -217,6 +230,10 @@ impl ViewSource for RunView {
         ViewScene {
             name: self.folder.file_name().unwrap_or_default().to_string_lossy().into_owned(),
             frames,
+            layers: layers(),
+            controls: Vec::new(),
+            note: String::new(),
+            is_run: true,
             focus: focus.to_array(),
             distance,
             world_from_capture: m.capture.world_from_capture,
@@ -239,13 +256,7 @@ impl ViewSource for RunView {
         self.looked.store(true, Ordering::Relaxed);
         let m = self.model();
         let posed = m.to_model(r.camera, &r.world_from_camera);
-        let layer = match r.layer {
-            ViewLayer::Rgb => Layer::Rgb,
-            ViewLayer::Depth => Layer::Depth,
-            ViewLayer::Normal => Layer::Normal,
-            ViewLayer::Opacity => Layer::Opacity,
-            ViewLayer::Occupancy => Layer::Occupancy,
-        };
+        let layer = r.layer.parse::<Layer>()?;
         let picture = render::picture(&m, &posed, layer, r.clip, Quality::Fast);
         Self::tell(m.check_device().map(|()| picture))
     }
