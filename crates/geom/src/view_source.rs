@@ -83,6 +83,16 @@ pub struct ViewStatus {
     pub running: bool,
 }
 
+/// A point of the training's curve.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ViewPoint {
+    pub step: u64,
+    /// PSNR of training pixels, in dB.
+    pub psnr: Option<f64>,
+    /// PSNR of held-out pixels, in dB.
+    pub held_out: Option<f64>,
+}
+
 /// A mesh to be made.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MeshRequest {
@@ -98,6 +108,11 @@ pub trait ViewSource: Send + Sync {
     fn scene(&self) -> ViewScene;
 
     fn status(&self) -> ViewStatus;
+
+    /// The training's curve so far, oldest first; empty where nothing was trained.
+    fn history(&self) -> Vec<ViewPoint> {
+        Vec::new()
+    }
 
     /// Frames whose views lie behind fog, as far as is known.
     fn behind_fog(&self) -> Vec<usize> {

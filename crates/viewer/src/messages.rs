@@ -186,6 +186,10 @@ pub enum Tell {
         progress: f64,
         running: bool,
     },
+    /// The training's curve so far, oldest first: step, PSNR in dB, and PSNR of held-out pixels.
+    History {
+        points: Vec<(f64, Option<f64>, Option<f64>)>,
+    },
     /// Photographs, by their number, that the field shows through fog.
     Fog {
         frames: Vec<u32>,

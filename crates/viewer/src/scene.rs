@@ -2,8 +2,11 @@
 
 use crate::messages::{Choice, Class, Control, Input, Layer, Legend, Photograph, Tell, Value};
 use diorama_geom::view_controls::{self as geom, ControlInput, ControlValue, ControlValues, ViewControl, ViewLayer};
-use diorama_geom::view_source::ViewScene;
+use diorama_geom::view_source::{ViewPoint, ViewScene};
 use std::collections::BTreeMap;
+
+/// Training values of a curve that the page is told, about.
+const MOST_POINTS: usize = 400;
 
 /// The scene as the page is told of it.
 pub fn tell(s: &ViewScene) -> Tell {
@@ -65,6 +68,14 @@ fn control(c: &ViewControl) -> Control {
     Control { id: c.id.clone(), label: c.label.clone(), help: c.help.clone(), layers: c.layers.clone(), input }
 }
 
+/// The curve as the page is told of it: of many training values every n-th, of held-out values all.
+pub fn history(points: &[ViewPoint]) -> Tell {
+    let nth = points.len().div_ceil(MOST_POINTS).max(1);
+    let finite = |v: Option<f64>| v.filter(|v| v.is_finite());
+    let shown = points.iter().enumerate().filter(|(i, p)| i % nth == 0 || p.held_out.is_some() || i + 1 == points.len());
+    Tell::History { points: shown.map(|(_, p)| (p.step as f64, finite(p.psnr), finite(p.held_out))).collect() }
+}
+
 /// Values that a page gives, checked against the source's controls.
 ///
 /// # Errors
@@ -94,5 +105,20 @@ pub fn with_layer(id: &str) -> ViewScene {
         crop: None,
         measured: None,
         path: None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_curves_are_thinned_and_keep_what_was_held_out() {
+        let point = |i: u64| ViewPoint { step: i, psnr: Some(i as f64), held_out: (i == 777).then_some(20.0) };
+        let Tell::History { points } = history(&(0..4000).map(point).collect::<Vec<_>>()) else { panic!("no curve") };
+        assert!((400..500).contains(&points.len()), "{}", points.len());
+        assert!(points.contains(&(777.0, Some(777.0), Some(20.0))) && points.last() == Some(&(3999.0, Some(3999.0), None)));
+        let infinite = [ViewPoint { step: 1, psnr: Some(f64::INFINITY), held_out: None }];
+        assert_eq!(history(&infinite), Tell::History { points: vec![(1.0, None, None)] });
     }
 }

@@ -57,6 +57,7 @@ impl Session<'_> {
             return self.fail(why);
         }
         self.send(&scene::tell(&self.scene))?;
+        self.send(&scene::history(&self.shared.source.history()))?;
         let mut news = Instant::now() - NEWS;
         let (mut last, mut foggy) = (None, Vec::new());
         while !self.shared.stop.load(Ordering::Relaxed) {

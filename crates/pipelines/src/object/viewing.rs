@@ -4,7 +4,7 @@ use super::export::{self, ExportOptions, Size};
 use super::held_out;
 use super::model::ObjectModel;
 use super::render::{self, Layer};
-use super::run_folder::{RunSummary, read_summary};
+use super::run_folder::{RunSummary, read_rows, read_summary};
 use crate::error::{PipelineError, Result};
 use diorama_data::camera_path_json;
 use diorama_data::{DataError, atomic, photo};
@@ -13,7 +13,7 @@ use diorama_engine::train::Event;
 use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
 use diorama_geom::view_controls::ViewLayer;
-use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewRequest, ViewScene, ViewSource, ViewStatus};
+use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewPoint, ViewRequest, ViewScene, ViewSource, ViewStatus};
 use diorama_geom::{Camera, ImageU8, Similarity};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -142,7 +142,9 @@ impl RunView {
     pub fn new(folder: &Path, model: ObjectModel, running: bool) -> Result<Arc<RunView>> {
         let RunSummary { behind_fog: names, psnr_held_out: held_out, .. } = read_summary(folder)?.unwrap_or_default();
         let origin = model.origin;
-        let status = ViewStatus { step: origin.step, seconds: origin.seconds, running, held_out, ..ViewStatus::default() };
+        let last = read_rows(folder).into_iter().rev().find(|r| r.psnr.is_some() && !running).unwrap_or_default();
+        let (loss, psnr) = (last.loss.unwrap_or_default(), last.psnr.unwrap_or_default());
+        let status = ViewStatus { step: origin.step, seconds: origin.seconds, loss, psnr, running, held_out, ..ViewStatus::default() };
         let behind_fog = (0..model.capture.frames.len()).filter(|i| names.contains(&model.capture.frames[*i].name)).collect();
         Ok(Arc::new(RunView {
             saved: Mutex::new(Saved::read(folder, &model.capture.world_from_capture)?),
@@ -246,6 +248,11 @@ impl ViewSource for RunView {
 
     fn status(&self) -> ViewStatus {
         self.status.lock().map(|s| *s).unwrap_or_default()
+    }
+
+    fn history(&self) -> Vec<ViewPoint> {
+        let point = |r: &super::run_folder::Row| ViewPoint { step: r.step, psnr: r.psnr, held_out: r.val_psnr };
+        read_rows(&self.folder).iter().map(point).collect()
     }
 
     fn behind_fog(&self) -> Vec<usize> {

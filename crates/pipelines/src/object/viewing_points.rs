@@ -81,7 +81,7 @@ impl PointsView {
         let (focus, distance) = focus_point(&poses);
         let name = of.canonicalize().unwrap_or(of.to_path_buf()).file_name().unwrap_or_default().to_string_lossy().into_owned();
         let note = match splats.len() {
-            0 => "there are no points to show yet; train the data set to see more",
+            0 => "This data set has no points: only its cameras can be shown until it is trained.",
             _ => "",
         };
         let scene = ViewScene {

@@ -50,6 +50,7 @@ class App {
       document.body.dataset.saved = t.what;
     });
     input("frusta").addEventListener("change", () => this.showFrusta(input("frusta").checked));
+    this.stage.controls.addEventListener("start", () => this.frames.leave());
     onClick("tool-home", () => this.navigation.goHome());
     onClick("tool-frusta", () => this.showFrusta(!input("frusta").checked));
     onClick("tool-crop", () => this.toggleCrop());
@@ -82,12 +83,12 @@ class App {
     element("name").textContent = element("name").title = t.name;
     document.title = `${t.name} – diorama`;
     document.body.dataset.run = String(t.is_run);
-    element("note").textContent = t.note;
+    element("note-text").textContent = t.note;
     element("note").hidden = t.note === "";
     this.layers.set(t.layers);
     this.controls.set(t.controls);
     this.stage.showPhotographs(t.photographs, t.distance * 0.05);
-    this.frames.set(t.photographs);
+    this.frames.set(t.photographs, !again);
     this.exporter.set(t.world_from_capture);
     this.navigation.set(t.focus, t.distance, t.photographs[0], !again);
     if (!again) {

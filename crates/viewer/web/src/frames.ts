@@ -12,6 +12,8 @@ export class Frames {
   private photographs: Photograph[] = [];
   private foggy = new Set<number>();
   private current = -1;
+  /** Whether the camera has left the current photograph. */
+  private away = false;
   private sight: IntersectionObserver | null = null;
 
   constructor(private readonly connection: Connection, private readonly lookFrom: (p: Photograph) => void) {
@@ -21,15 +23,24 @@ export class Frames {
       img.addEventListener("load", () => URL.revokeObjectURL(img.src), { once: true });
       img.src = URL.createObjectURL(blob);
     });
+    // A wheel without a second axis moves the strip sideways.
+    element("photographs").addEventListener("wheel", (e) => {
+      if (e.deltaX === 0 && element("photographs").scrollWidth > element("photographs").clientWidth) {
+        e.preventDefault();
+        element("photographs").scrollLeft += e.deltaY;
+      }
+    }, { passive: false });
     connection.on("fog", (t) => {
       this.foggy = new Set(t.frames);
       this.mark();
     });
   }
 
-  set(photographs: Photograph[]): void {
+  /** Takes a scene's photographs; `home`: the camera stands where the first was taken. */
+  set(photographs: Photograph[], home: boolean): void {
     this.photographs = photographs;
-    this.current = -1;
+    if (home || this.current >= photographs.length) this.current = photographs.length > 0 ? 0 : -1;
+    this.away = !home;
     const some = Math.ceil(photographs.length / MOST);
     const place = element("photographs");
     place.replaceChildren(...photographs.flatMap((p, i) => {
@@ -52,13 +63,20 @@ export class Frames {
   /** Goes to the next photograph, or with -1 to the one before. */
   step(by: number): void {
     const n = this.photographs.length;
-    if (n > 0) this.choose(this.current < 0 ? (by > 0 ? 0 : n - 1) : (this.current + by + n) % n);
+    if (n > 0) this.choose((this.current + by + n) % n);
+  }
+
+  /** The camera stands where no photograph was taken. */
+  leave(): void {
+    if (this.away) return;
+    this.away = true;
+    this.mark();
   }
 
   private choose(i: number): void {
     const p = this.photographs[i];
     if (!p) return;
-    this.current = i;
+    [this.current, this.away] = [i, false];
     this.mark();
     element("photographs").querySelector(`[data-frame="${i}"]`)?.scrollIntoView({ block: "nearest", inline: "nearest" });
     this.lookFrom(p);
@@ -70,7 +88,7 @@ export class Frames {
       const frame = Number(b.dataset.frame);
       const p = this.photographs[frame];
       b.classList.toggle("fog", this.foggy.has(frame));
-      b.setAttribute("aria-pressed", String(frame === this.current));
+      b.setAttribute("aria-pressed", String(frame === this.current && !this.away));
       b.title = (p?.name ?? "") + (p?.held_out ? " (held out)" : "") + (this.foggy.has(frame) ? " (behind fog)" : "");
     }
     element("fog-key").hidden = this.foggy.size === 0;

@@ -42,7 +42,7 @@ held_out: number | null, rays_per_s: number,
 /**
  * 0 to 1.
  */
-progress: number, running: boolean, } | { "kind": "fog", frames: Array<number>, } | { "kind": "working", what: string, percent: number, } | { "kind": "exported", file: string, glb: boolean, 
+progress: number, running: boolean, } | { "kind": "history", points: Array<[number, number | null, number | null]>, } | { "kind": "fog", frames: Array<number>, } | { "kind": "working", what: string, percent: number, } | { "kind": "exported", file: string, glb: boolean, 
 /**
  * Metres of the mesh per unit of the capture.
  */

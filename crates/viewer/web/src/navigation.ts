@@ -9,6 +9,8 @@ import { writes } from "./shortcuts";
 
 /** Milliseconds of a smooth way. */
 const WAY = 450;
+/** Largest field of view in degrees, as the slider has it. */
+const WIDEST = 110;
 const FLYING = "wasdqe";
 
 export class Navigation {
@@ -43,7 +45,7 @@ export class Navigation {
     // Cameras right before the eye would hide everything.
     this.stage.camera.near = distance * 0.1;
     this.stage.camera.far = distance * 50;
-    if (first) this.home = { matrix: matrixOf(first.pose), fov: degrees(first.fov_y) };
+    if (first) this.home = this.keyOf(first);
     else {
       const eye = new THREE.Vector3(...focus).addScaledVector(new THREE.Vector3(1, -1, 0.6).normalize(), distance);
       const turn = new THREE.Matrix4().lookAt(eye, new THREE.Vector3(...focus), new THREE.Vector3(0, 0, 1));
@@ -66,7 +68,7 @@ export class Navigation {
   }
 
   lookFrom(p: Photograph): void {
-    this.goTo({ matrix: matrixOf(p.pose), fov: degrees(p.fov_y) });
+    this.goTo(this.keyOf(p));
   }
 
   /** Looks at the middle of the scene, from where the camera is. */
@@ -115,6 +117,12 @@ export class Navigation {
     this.way = null;
     this.stage.fly(...by, (this.distance / 3) * seconds);
     this.moved();
+  }
+
+  /** Where a photograph was taken, with a field of view that shows all of it in a window of any shape. */
+  private keyOf(p: Photograph): Key {
+    const wider = Math.max(1, p.aspect / this.stage.camera.aspect);
+    return { matrix: matrixOf(p.pose), fov: Math.min(WIDEST, degrees(2 * Math.atan(Math.tan(p.fov_y / 2) * wider))) };
   }
 
   private setFov(fov: number): void {

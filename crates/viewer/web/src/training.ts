@@ -5,7 +5,7 @@ import { element, svg } from "./dom";
 
 interface Point {
   step: number;
-  psnr: number;
+  psnr: number | null;
   heldOut: number | null;
 }
 
@@ -19,6 +19,10 @@ export class Training {
   /** `running` tells whether the field changes. */
   constructor(connection: Connection, private readonly running: (on: boolean) => void) {
     connection.on("status", (t) => this.show(t));
+    connection.on("history", (t) => {
+      this.points = t.points.map(([step, psnr, heldOut]) => ({ step, psnr, heldOut }));
+      this.draw();
+    });
   }
 
   private show(t: Told<"status">): void {
@@ -49,30 +53,32 @@ export class Training {
 
   private add(t: Told<"status">): void {
     const last = this.points.at(-1);
+    if (!t.running || t.psnr <= 0 || t.step === last?.step) return;
     // Another run begins anew.
     if (last && t.step < last.step) this.points = [];
-    if (t.psnr > 0 && t.step !== last?.step) this.points.push({ step: t.step, psnr: t.psnr, heldOut: t.held_out });
-    if (this.points.length > MOST) this.points = this.points.filter((_, i) => i % 2 === 0 || i === this.points.length - 1);
-    element("curve").hidden = this.points.length < 2;
-    if (this.points.length > 1) this.draw();
+    const before = this.points.filter((p) => p.heldOut !== null).at(-1)?.heldOut ?? null;
+    this.points.push({ step: t.step, psnr: t.psnr, heldOut: t.held_out === before ? null : t.held_out });
+    if (this.points.length > MOST) this.points = this.points.filter((p, i) => i % 2 === 0 || p.heldOut !== null || i === this.points.length - 1);
+    this.draw();
   }
 
   private draw(): void {
-    const [first, last] = [this.points[0]!, this.points.at(-1)!];
-    const values = this.points.flatMap((p) => [p.psnr, ...(p.heldOut === null ? [] : [p.heldOut])]);
+    const values = this.points.flatMap((p) => [p.psnr, p.heldOut]).filter((v) => v !== null);
+    element("curve").hidden = values.length < 2;
+    const [first, last] = [this.points[0], this.points.at(-1)];
+    if (!first || !last || values.length < 2) return;
     const [low, high] = [Math.min(...values), Math.max(...values)];
-    const x = (p: Point) => 2 + ((WIDTH - 4) * (p.step - first.step)) / Math.max(1, last.step - first.step);
-    const y = (v: number) => HEIGHT - 4 - ((HEIGHT - 8) * (v - low)) / Math.max(0.1, high - low);
-    const line = (name: string, of: (p: Point) => number | null) => {
-      const places = this.points.flatMap((p) => {
-        const v = of(p);
-        return v === null ? [] : [`${x(p).toFixed(1)},${y(v).toFixed(1)}`];
-      });
-      return svg("polyline", { class: name, points: places.join(" ") });
-    };
-    const curve = element<SVGElement>("curve-lines");
-    curve.replaceChildren(line("psnr", (p) => p.psnr), line("held-out", (p) => p.heldOut));
-    element("curve-low").textContent = `${low.toFixed(1)} dB`;
+    const x = (p: Point) => 5 + ((WIDTH - 10) * (p.step - first.step)) / Math.max(1, last.step - first.step);
+    const y = (v: number) => HEIGHT - 6 - ((HEIGHT - 12) * (v - low)) / Math.max(0.1, high - low);
+    const places = (of: (p: Point) => number | null) => this.points.flatMap((p) => {
+      const v = of(p);
+      return v === null ? [] : [[x(p).toFixed(1), y(v).toFixed(1)] as const];
+    });
+    const line = (name: string, at: (readonly [string, string])[]) => svg("polyline", { class: name, points: at.map((p) => p.join()).join(" ") });
+    const held = places((p) => p.heldOut);
+    const dots = held.map(([cx, cy]) => svg("circle", { class: "held-out", cx, cy, r: 2.4 }));
+    element<SVGElement>("curve-lines").replaceChildren(line("psnr", places((p) => p.psnr)), line("held-out", held), ...dots);
+    element("curve-low").textContent = low.toFixed(1);
     element("curve-high").textContent = `${high.toFixed(1)} dB`;
   }
 }
