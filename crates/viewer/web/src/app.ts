@@ -130,7 +130,9 @@ class App {
 
   private resized(): void {
     const { clientWidth, clientHeight } = element("stage");
+    const { aspect } = this.stage.camera;
     this.stage.resize(clientWidth, clientHeight);
+    if (this.stage.camera.aspect !== aspect) this.navigation.keepShown(aspect);
     this.touch();
   }
 

@@ -119,6 +119,13 @@ export class Navigation {
     this.moved();
   }
 
+  /** After the window has another shape: what its shorter side showed is shown still. `aspect`: as it was. */
+  keepShown(aspect: number): void {
+    const { camera } = this.stage;
+    const half = Math.tan((camera.fov * Math.PI) / 360) * (Math.min(1, aspect) / Math.min(1, camera.aspect));
+    this.setFov(Math.min(WIDEST, degrees(2 * Math.atan(half))));
+  }
+
   /** Where a photograph was taken, with a field of view that shows all of it in a window of any shape. */
   private keyOf(p: Photograph): Key {
     const wider = Math.max(1, p.aspect / this.stage.camera.aspect);

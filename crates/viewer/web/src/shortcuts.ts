@@ -42,6 +42,8 @@ export class Shortcuts {
     if (this.dialog.open) return;
     // A focused button takes Space for itself.
     if (key === " " && e.target instanceof HTMLElement && e.target.closest("button, summary, a")) return;
+    // Arrows move a slider or the choice of a layer.
+    if (key.startsWith("arrow") && e.target instanceof HTMLElement && e.target.matches("input, [role=radio]")) return;
     const found = this.list.find((s) => s.act && s.keys.includes(key));
     if (!found) return;
     e.preventDefault();

@@ -65,6 +65,7 @@ export class Views {
 
   /** Asks for what is missing. */
   tick(now: number): void {
+    document.body.dataset.settled = String(!this.dirty && !this.asked && this.shown === 1);
     if (this.asked || !this.connection.isOpen) return;
     const rest = now - this.moved;
     if (this.dirty) this.ask(Math.min(this.scale, 0.999));

@@ -183,7 +183,7 @@ export async function phone(browser, address) {
   await page.tap("#tabs [data-tab=crop]");
   check("another tab shows another card", (await p.shown("#crop-sides")) && !(await p.shown("#layers")));
   await page.tap("#tabs [data-tab=photos]");
-  check("photographs are a tab", (await p.thumbnails()) > 3);
+  check("photographs are a tab", (await p.thumbnails(8)) && (await p.shown("#photographs")));
   const outside = await page.evaluate(() => [...document.querySelectorAll("body *")].filter((e) => e.checkVisibility() && e.getBoundingClientRect().right > 391).map((e) => e.id || e.className));
   check("nothing sticks out at the side", outside.length === 0, outside.join());
   await p.shot("phone photographs");

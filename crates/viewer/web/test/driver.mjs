@@ -105,11 +105,10 @@ export class Page {
 
   /** Waits until a whole view is shown and nothing moves. */
   async settled() {
-    await this.page.waitForTimeout(300);
     for (let before = -1, now = 0; before !== now; ) {
-      await until("a whole view", async () => Number(await this.data("scale")) === 1);
+      await this.page.waitForTimeout(150);
+      await until("a whole view", async () => (await this.data("settled")) === "true");
       [before, now] = [now, await this.views()];
-      if (before !== now) await this.page.waitForTimeout(150);
     }
   }
 
@@ -145,8 +144,8 @@ export class Page {
     return [box.x + box.width / 2, box.y + box.height / 2];
   }
 
-  /** Small photographs that are loaded. */
-  thumbnails = () => until("thumbnails", () => this.page.evaluate(() => [...document.querySelectorAll("#photographs img")].filter((i) => i.naturalWidth > 0).length));
+  /** Waits until more than `some` small photographs are loaded. */
+  thumbnails = (some) => until("thumbnails", () => this.page.evaluate((n) => [...document.querySelectorAll("#photographs img")].filter((i) => i.naturalWidth > 0).length > n, some));
 }
 
 export const difference = (a, b) => a.reduce((s, v, i) => s + Math.abs(v - b[i]), 0) / a.length;
