@@ -81,6 +81,11 @@ export class Stage {
   lookFrom(matrix: THREE.Matrix4, distance: number): void {
     const position = new THREE.Vector3().setFromMatrixPosition(matrix);
     const forward = new THREE.Vector3(0, 0, -1).transformDirection(matrix);
+    // Takes up what a drag has left to turn: it would move the camera from where it is put.
+    const { enableDamping } = this.controls;
+    this.controls.enableDamping = false;
+    this.controls.update();
+    this.controls.enableDamping = enableDamping;
     this.camera.position.copy(position);
     this.controls.target.copy(position).addScaledVector(forward, distance);
     this.controls.update();
