@@ -303,7 +303,10 @@ fn http_seeds() -> Vec<Vec<u8>> {
 fn message_seeds() -> Vec<Vec<u8>> {
     let pose = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 4];
     [
-        serde_json::json!({ "kind": "view", "id": 1, "width": 64, "height": 48, "fov_y": 0.8, "pose": pose, "layer": "depth", "clip": [0, 0, 0, 1, 1, 1] }),
+        serde_json::json!({ "kind": "view", "id": 1, "view": { "width": 64, "height": 48, "fov_y": 0.8, "pose": pose, "layer": "depth",
+            "values": { "sun": 0.5, "shadows": true, "sky": "dusk" }, "clip": [0, 0, 0, 1, 1, 1] } }),
+        serde_json::json!({ "kind": "view", "id": 2, "view": { "width": 64, "height": 48, "fov_y": 0.8, "pose": pose, "layer": "rgb",
+            "values": {}, "clip": null } }),
         serde_json::json!({ "kind": "export", "format": "glb", "faces": 100, "resolution": 64, "clip": null }),
         serde_json::json!({ "kind": "path", "json": "{}" }),
     ]

@@ -179,7 +179,9 @@ fn viewer_check() -> bool {
     ok &= step("bundle", npm(&["run", "build"]) && read() == before);
     let run = std::env::temp_dir().join(format!("diorama-viewer-check-{}", std::process::id()));
     let diorama = "target/release/diorama";
+    // The page is also shown a source of layers and controls that no run has.
     let made = cargo(&["build", "--release"])
+        && cargo(&["build", "--release", "-p", "diorama-viewer", "--example", "own_picture"])
         && Command::new(diorama)
             .args(["quickstart", "--seconds", "6", "--out"])
             .arg(&run)

@@ -17,6 +17,7 @@ pub mod ray;
 pub mod rng;
 pub mod splats;
 pub mod transform;
+pub mod view_controls;
 pub mod view_source;
 
 pub use camera::{Camera, Lens, Reduction};

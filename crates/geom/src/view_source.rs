@@ -1,25 +1,18 @@
 //! What a viewer needs of a run, without knowing what it is.
 
+use crate::view_controls::{ControlValues, ViewControl, ViewLayer};
 use crate::{Camera, ImageU8, Pose, Similarity};
 use std::path::PathBuf;
 
-/// What a pixel shows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ViewLayer {
-    Rgb,
-    Depth,
-    Normal,
-    Opacity,
-    /// How much of the occupancy grid a ray passes.
-    Occupancy,
-}
-
 /// A view to be drawn.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct ViewRequest {
     pub camera: Camera,
     pub world_from_camera: Pose,
-    pub layer: ViewLayer,
+    /// Id of a layer that the scene lists.
+    pub layer: String,
+    /// Values of the controls that the scene lists.
+    pub values: ControlValues,
     /// Lowest and highest corner in the world of what is shown.
     pub clip: Option<([f32; 3], [f32; 3])>,
 }
@@ -45,6 +38,14 @@ impl From<&crate::Frame> for ViewFrame {
 pub struct ViewScene {
     pub name: String,
     pub frames: Vec<ViewFrame>,
+    /// Pictures that can be drawn of a view; the first is shown first.
+    pub layers: Vec<ViewLayer>,
+    /// Settings of these pictures.
+    pub controls: Vec<ViewControl>,
+    /// One line about what can be seen and what cannot, shown with the picture; may be empty.
+    pub note: String,
+    /// Whether crop box, scale and camera path can be kept and meshes made: only a run can.
+    pub is_run: bool,
     /// What the cameras look at, and how far they stand from it.
     pub focus: [f64; 3],
     pub distance: f64,
@@ -77,7 +78,19 @@ pub struct ViewStatus {
     /// PSNR of held-out pixels when they were judged last.
     pub held_out: Option<f64>,
     pub rays_per_s: f64,
+    /// Share of the training that is done, 0 to 1; 0 where nothing trains.
+    pub progress: f64,
     pub running: bool,
+}
+
+/// A point of the training's curve.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ViewPoint {
+    pub step: u64,
+    /// PSNR of training pixels, in dB.
+    pub psnr: Option<f64>,
+    /// PSNR of held-out pixels, in dB.
+    pub held_out: Option<f64>,
 }
 
 /// A mesh to be made.
@@ -96,12 +109,17 @@ pub trait ViewSource: Send + Sync {
 
     fn status(&self) -> ViewStatus;
 
+    /// The training's curve so far, oldest first; empty where nothing was trained.
+    fn history(&self) -> Vec<ViewPoint> {
+        Vec::new()
+    }
+
     /// Frames whose views lie behind fog, as far as is known.
     fn behind_fog(&self) -> Vec<usize> {
         Vec::new()
     }
 
-    /// Draws a view as `[H, W, 3]` sRGB.
+    /// Draws a view as `[H, W, 3]` sRGB. Its layer and values are those of the scene's lists.
     fn view(&self, request: &ViewRequest) -> Result<ImageU8, String>;
 
     /// The place in the world that a pixel shows; none where nothing is.

@@ -3,6 +3,7 @@
 
 pub mod messages;
 mod request;
+mod scene;
 mod server;
 mod session;
 

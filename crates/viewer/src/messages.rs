@@ -4,19 +4,89 @@
 //! in the world.
 
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 pub type Box6 = [f32; 6];
 
-/// What a pixel shows.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+/// A picture that the program can draw of a view.
+#[derive(Clone, Debug, PartialEq, Serialize)]
 #[cfg_attr(test, derive(ts_rs::TS))]
-#[serde(rename_all = "snake_case")]
-pub enum Layer {
-    Rgb,
-    Depth,
-    Normal,
-    Opacity,
-    Occupancy,
+pub struct Layer {
+    pub id: String,
+    pub label: String,
+    pub legend: Option<Legend>,
+}
+
+/// What the colors of a layer stand for. Colors are `#rrggbb`.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum Legend {
+    Scale { colors: Vec<String>, low: String, high: String, unit: String },
+    Classes { classes: Vec<Class> },
+}
+
+/// A color and what it stands for.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+pub struct Class {
+    pub label: String,
+    pub color: String,
+}
+
+/// A setting of the views.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+pub struct Control {
+    pub id: String,
+    pub label: String,
+    pub help: String,
+    /// Layers that it changes; empty: all.
+    pub layers: Vec<String>,
+    pub input: Input,
+}
+
+/// What a control takes.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum Input {
+    Slider { min: f64, max: f64, step: f64, unit: String, default: f64 },
+    Toggle { default: bool },
+    Pick { options: Vec<Choice>, default: String },
+}
+
+/// One option of a pick.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+pub struct Choice {
+    pub id: String,
+    pub label: String,
+}
+
+/// The value of a control.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(ts_rs::TS), derive(Serialize))]
+#[serde(untagged)]
+pub enum Value {
+    Number(f64),
+    Switch(bool),
+    Choice(String),
+}
+
+/// What the camera sees.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[cfg_attr(test, derive(ts_rs::TS), derive(Serialize))]
+#[serde(deny_unknown_fields)]
+pub struct View {
+    pub width: u32,
+    pub height: u32,
+    pub fov_y: f64,
+    pub pose: [f64; 12],
+    pub layer: String,
+    /// Values of controls by their ids; those that are left out have their defaults.
+    pub values: BTreeMap<String, Value>,
+    pub clip: Option<Box6>,
 }
 
 /// From the page.
@@ -27,22 +97,13 @@ pub enum Ask {
     /// Draw a view; only the last one asked for counts. It is answered by a binary message: `id`, then a JPEG.
     View {
         id: u32,
-        width: u32,
-        height: u32,
-        fov_y: f64,
-        pose: [f64; 12],
-        layer: Layer,
-        clip: Option<Box6>,
+        view: View,
     },
     /// Which point of the world a pixel shows; answered by `Picked`.
     Pick {
         x: f64,
         y: f64,
-        width: u32,
-        height: u32,
-        fov_y: f64,
-        pose: [f64; 12],
-        clip: Option<Box6>,
+        view: View,
     },
     /// Keep the true length in metres between two points of the world as the scale of meshes.
     Measured {
@@ -92,6 +153,12 @@ pub enum Tell {
     Scene {
         name: String,
         photographs: Vec<Photograph>,
+        layers: Vec<Layer>,
+        controls: Vec<Control>,
+        /// One line about what can be seen and what cannot; may be empty.
+        note: String,
+        /// Whether boxes, lengths and paths can be kept and meshes made.
+        is_run: bool,
         focus: [f64; 3],
         distance: f64,
         /// Rows of the similarity that takes meshes to the world.
@@ -115,7 +182,13 @@ pub enum Tell {
         /// Of held-out pixels.
         held_out: Option<f64>,
         rays_per_s: f64,
+        /// 0 to 1.
+        progress: f64,
         running: bool,
+    },
+    /// The training's curve so far, oldest first: step, PSNR in dB, and PSNR of held-out pixels.
+    History {
+        points: Vec<(f64, Option<f64>, Option<f64>)>,
     },
     /// Photographs, by their number, that the field shows through fog.
     Fog {
@@ -142,6 +215,8 @@ pub enum Tell {
     },
     Failed {
         why: String,
+        /// The view that was not drawn, where it was one.
+        view: Option<u32>,
     },
 }
 
@@ -154,8 +229,10 @@ mod tests {
     #[test]
     fn the_pages_types_are_those_of_this_file() {
         let c = Config::default();
-        let types = [Layer::decl(&c), Ask::decl(&c), Photograph::decl(&c), Tell::decl(&c)];
-        let text: String = types.iter().map(|t| format!("export {t}\n")).collect();
+        let of_views = [Layer::decl(&c), Legend::decl(&c), Class::decl(&c), Control::decl(&c), Input::decl(&c), Choice::decl(&c)];
+        let types = [Value::decl(&c), View::decl(&c), Ask::decl(&c), Photograph::decl(&c), Tell::decl(&c)];
+        let types = of_views.into_iter().chain(types);
+        let text: String = types.map(|t| format!("export {t}\n")).collect();
         let text = format!("// Made from crates/viewer/src/messages.rs by its test; do not edit.\n\n{text}");
         let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("web/src/messages.ts");
         if std::env::var_os("DIORAMA_BLESS").is_some() {

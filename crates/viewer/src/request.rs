@@ -17,6 +17,9 @@ pub struct Request {
     pub socket_key: Option<String>,
 }
 
+/// Files of the page that hold nothing of a run. Browsers ask for them without the token of the page's address.
+const WITHOUT_TOKEN: [&str; 3] = ["/app.js", "/app.css", "/favicon.ico"];
+
 /// Why a request is turned away: status and reason.
 pub type Refusal = (u16, &'static str);
 
@@ -91,6 +94,7 @@ pub fn admit(r: &Request, hosts: &[String], token: Option<&str>) -> Result<(), R
     }
     match (token, &r.token) {
         (None, _) => Ok(()),
+        _ if WITHOUT_TOKEN.contains(&&r.path[..]) => Ok(()),
         (Some(t), Some(given)) if same(t.as_bytes(), given.as_bytes()) => Ok(()),
         _ => Err((401, "the token is missing or wrong: open the address that diorama printed")),
     }
@@ -140,6 +144,10 @@ mod tests {
         assert_eq!(verdict(&own, Some("abc")), 200);
         assert_eq!(verdict(&own, Some("abd")), 401);
         assert_eq!(verdict(&own, Some("ab")), 401);
+        for (path, status) in [("/app.js", 200), ("/app.css", 200), ("/", 401), ("/mesh.glb", 401), ("/camera_path.json", 401)] {
+            let r = parse(format!("GET {path} HTTP/1.1\r\nHost: {HERE}\r\n\r\n").as_bytes()).unwrap();
+            assert_eq!(admit(&r, &[HERE.into()], Some("abc")).map_or_else(|e| e.0, |()| 200), status, "{path}");
+        }
     }
 
     #[test]

@@ -1,8 +1,10 @@
 //! One browser's socket: the last view asked for is drawn, meshes are made beside it.
 
-use crate::messages::{Ask, Box6, Layer, Photograph, Tell};
+use crate::messages::{Ask, Box6, Tell, View};
+use crate::scene;
 use crate::server::Shared;
-use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewLayer, ViewRequest, ViewSource};
+use diorama_geom::view_controls::check_lists;
+use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewRequest, ViewScene};
 use diorama_geom::{Camera, ImageU8, Pose};
 use glam::{DMat3, DVec3};
 use std::net::TcpStream;
@@ -26,6 +28,8 @@ const THUMBNAIL: u32 = 1 << 31;
 struct Session<'a> {
     socket: WebSocket<TcpStream>,
     shared: &'a Arc<Shared>,
+    /// What the page was told that there is.
+    scene: ViewScene,
     /// What other threads have to tell the page.
     tell: Sender<Tell>,
     told: Receiver<Tell>,
@@ -41,7 +45,7 @@ pub fn run(stream: TcpStream, shared: &Arc<Shared>) {
     let config = WebSocketConfig::default().max_message_size(Some(LONGEST)).max_frame_size(Some(LONGEST));
     let socket = WebSocket::from_raw_socket(stream, Role::Server, Some(config));
     let (tell, told) = channel();
-    let mut s = Session { socket, shared, tell, told, view: None, exporting: Arc::default() };
+    let mut s = Session { socket, shared, scene: shared.source.scene(), tell, told, view: None, exporting: Arc::default() };
     // Errors mean that the page is gone or misbehaves: both end the session.
     let _ = s.talk();
     let _ = s.socket.close(None);
@@ -49,7 +53,11 @@ pub fn run(stream: TcpStream, shared: &Arc<Shared>) {
 
 impl Session<'_> {
     fn talk(&mut self) -> Result<(), Error> {
-        self.send(&scene(&*self.shared.source))?;
+        if let Err(why) = check_lists(&self.scene.layers, &self.scene.controls) {
+            return self.fail(why);
+        }
+        self.send(&scene::tell(&self.scene))?;
+        self.send(&scene::history(&self.shared.source.history()))?;
         let mut news = Instant::now() - NEWS;
         let (mut last, mut foggy) = (None, Vec::new());
         while !self.shared.stop.load(Ordering::Relaxed) {
@@ -66,7 +74,8 @@ impl Session<'_> {
                     let finite = |v: f64| if v.is_finite() { v } else { 0.0 };
                     let (step, seconds, loss, psnr) = (s.step, s.seconds, finite(s.loss), finite(s.psnr));
                     let held_out = s.held_out.filter(|v| v.is_finite());
-                    self.send(&Tell::Status { step, seconds, loss, psnr, held_out, rays_per_s: s.rays_per_s, running: s.running })?;
+                    let (rays_per_s, progress, running) = (finite(s.rays_per_s), finite(s.progress), s.running);
+                    self.send(&Tell::Status { step, seconds, loss, psnr, held_out, rays_per_s, progress, running })?;
                 }
                 let fog = self.shared.source.behind_fog();
                 if fog != foggy {
@@ -77,7 +86,7 @@ impl Session<'_> {
             if let Some((id, request)) = self.view.take() {
                 match self.shared.source.view(&request) {
                     Ok(image) => self.picture(id, &image, 85)?,
-                    Err(why) => self.fail(why)?,
+                    Err(why) => self.send(&Tell::Failed { why, view: Some(id) })?,
                 }
             }
         }
@@ -89,7 +98,7 @@ impl Session<'_> {
     }
 
     fn fail(&mut self, why: impl Into<String>) -> Result<(), Error> {
-        self.send(&Tell::Failed { why: why.into() })
+        self.send(&Tell::Failed { why: why.into(), view: None })
     }
 
     /// Takes all messages that have arrived.
@@ -111,15 +120,16 @@ impl Session<'_> {
     fn hear(&mut self, ask: Ask) -> Result<(), Error> {
         let source = self.shared.source.clone();
         match ask {
-            Ask::View { id, width, height, fov_y, pose, layer, clip } => match view_request(width, height, fov_y, &pose, layer, clip) {
-                Some(r) => self.view = Some((id, r)),
-                None => self.fail("the view asked for makes no sense")?,
+            Ask::View { id, view } => match view_request(&self.scene, view) {
+                Ok(r) => self.view = Some((id, r)),
+                Err(why) => self.send(&Tell::Failed { why, view: Some(id) })?,
             },
-            Ask::Pick { x, y, width, height, fov_y, pose, clip } => {
-                let inside = (0.0..width as f64).contains(&x) && (0.0..height as f64).contains(&y);
-                match view_request(width, height, fov_y, &pose, Layer::Rgb, clip).filter(|_| inside) {
-                    Some(r) => self.send(&Tell::Picked { point: source.point(&r, x, y) })?,
-                    None => self.fail("the point asked for makes no sense")?,
+            Ask::Pick { x, y, view } => {
+                let inside = (0.0..view.width as f64).contains(&x) && (0.0..view.height as f64).contains(&y);
+                match view_request(&self.scene, view) {
+                    Ok(r) if inside => self.send(&Tell::Picked { point: source.point(&r, x, y) })?,
+                    Ok(_) => self.fail("the point asked for lies outside the view")?,
+                    Err(why) => self.fail(why)?,
                 }
             }
             Ask::Measured { points, metres } => match measured(points, metres) {
@@ -184,7 +194,7 @@ impl Session<'_> {
                     }
                     Tell::Exported { file: file.display().to_string(), glb, scale }
                 }
-                Err(why) => Tell::Failed { why },
+                Err(why) => Tell::Failed { why, view: None },
             });
         });
         Ok(())
@@ -206,37 +216,6 @@ impl Session<'_> {
     }
 }
 
-fn scene(source: &dyn ViewSource) -> Tell {
-    let s = source.scene();
-    let photographs = s.frames.into_iter().map(|f| {
-        let (r, t, c) = (f.world_from_camera.rotation, f.world_from_camera.translation, f.camera);
-        let row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]];
-        let pose = [row(0), row(1), row(2)].concat().try_into().expect("twelve");
-        let fov_y = 2.0 * (0.5 * c.height as f64 / c.fy).atan();
-        Photograph { name: f.name, pose, fov_y, aspect: c.width as f64 / c.height as f64, held_out: f.held_out }
-    });
-    let six = |(lo, hi): ([f32; 3], [f32; 3])| [lo[0], lo[1], lo[2], hi[0], hi[1], hi[2]];
-    let w = s.world_from_capture;
-    let row = |k: usize| [w.scale * w.rotation.x_axis[k], w.scale * w.rotation.y_axis[k], w.scale * w.rotation.z_axis[k], w.translation[k]];
-    let rows: [f64; 12] = [row(0), row(1), row(2)].concat().try_into().expect("twelve");
-    let world_from_capture = Box::new(rows);
-    let (lo, hi) = s.bounds;
-    Tell::Scene {
-        name: s.name,
-        photographs: photographs.collect(),
-        focus: s.focus,
-        distance: s.distance,
-        world_from_capture,
-        bounds: [lo[0], lo[1], lo[2], hi[0], hi[1], hi[2]],
-        crop: s.crop.map(six),
-        measured: s.measured.map(|m| {
-            let [[a, b, c], [d, e, f]] = m.points;
-            Box::new([a, b, c, d, e, f, m.metres])
-        }),
-        path: s.path,
-    }
-}
-
 /// A length that can be one, or none to forget.
 fn measured(points: Option<[f64; 6]>, metres: f64) -> Result<Option<MeasuredLength>, ()> {
     let Some([a, b, c, d, e, f]) = points else { return Ok(None) };
@@ -254,32 +233,32 @@ fn corners(b: Option<Box6>) -> Result<Option<([f32; 3], [f32; 3])>, ()> {
     }
 }
 
-fn view_request(width: u32, height: u32, fov_y: f64, pose: &[f64; 12], layer: Layer, clip: Option<Box6>) -> Option<ViewRequest> {
-    let clip = corners(clip).ok()?;
-    if width < 1 || height < 1 || width.checked_mul(height)? > LARGEST || !(0.01..3.1).contains(&fov_y) {
-        return None;
+/// The view that a page asks for, if it makes sense and is of a layer and with values that the scene lists.
+fn view_request(scene: &ViewScene, v: View) -> Result<ViewRequest, String> {
+    let senseless = || "the view asked for makes no sense".to_string();
+    let View { width, height, fov_y, pose, layer, values, clip } = v;
+    let clip = corners(clip).map_err(|()| "the crop box is empty")?;
+    if width < 1 || height < 1 || width.checked_mul(height).ok_or_else(senseless)? > LARGEST || !(0.01..3.1).contains(&fov_y) {
+        return Err(senseless());
     }
     let column = |k: usize| DVec3::new(pose[k], pose[4 + k], pose[8 + k]);
     let world_from_camera = Pose { rotation: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) };
     if pose.iter().any(|v| !v.is_finite()) || world_from_camera.rigidity_error() > 1e-3 {
-        return None;
+        return Err(senseless());
     }
     let f = 0.5 * height as f64 / (0.5 * fov_y).tan();
     let camera = Camera { fx: f, fy: f, ..Camera::pinhole(width, height, 1.0) };
-    let layer = match layer {
-        Layer::Rgb => ViewLayer::Rgb,
-        Layer::Depth => ViewLayer::Depth,
-        Layer::Normal => ViewLayer::Normal,
-        Layer::Opacity => ViewLayer::Opacity,
-        Layer::Occupancy => ViewLayer::Occupancy,
-    };
-    Some(ViewRequest { camera, world_from_camera, layer, clip })
+    if !scene.layers.iter().any(|l| l.id == layer) {
+        return Err(format!("there is no layer {layer:?}"));
+    }
+    let values = scene::values(&scene.controls, values)?;
+    Ok(ViewRequest { camera, world_from_camera, layer, values, clip })
 }
 
 /// Reads a message as a session would.
 pub fn fuzz(text: &[u8]) {
-    if let Ok(Ask::View { width, height, fov_y, pose, layer, clip, .. }) = serde_json::from_slice(text)
-        && let Some(r) = view_request(width, height, fov_y, &pose, layer, clip)
+    if let Ok(Ask::View { view, .. }) = serde_json::from_slice(text)
+        && let Ok(r) = view_request(&scene::with_layer(&view.layer), view)
     {
         assert!(r.camera.width * r.camera.height <= LARGEST && r.camera.fx.is_finite());
     }
@@ -288,18 +267,31 @@ pub fn fuzz(text: &[u8]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::messages::Value;
+
+    const LEVEL: [f64; 12] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+
+    fn view() -> View {
+        View { width: 64, height: 48, fov_y: 0.8, pose: LEVEL, layer: "rgb".into(), values: Default::default(), clip: None }
+    }
 
     #[test]
     fn senseless_views_are_refused() {
-        let level = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
-        let ask = |w, h, fov, pose: &[f64; 12], clip| view_request(w, h, fov, pose, Layer::Rgb, clip).is_some();
-        assert!(ask(64, 48, 0.8, &level, None));
-        assert!(!ask(0, 48, 0.8, &level, None) && !ask(u32::MAX, u32::MAX, 0.8, &level, None) && !ask(64, 48, 4.0, &level, None));
-        assert!(!ask(64, 48, f64::NAN, &level, None) && !ask(64, 48, 0.8, &[f64::NAN; 12], None) && !ask(64, 48, 0.8, &[0.0; 12], None));
-        assert!(
-            !ask(64, 48, 0.8, &level, Some([0.0, 0.0, 0.0, 1.0, -1.0, 1.0]))
-                && ask(64, 48, 0.8, &level, Some([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
-        );
-        assert!(!ask(64, 48, 0.8, &level, Some([f32::NAN; 6])));
+        let sound = |v: View| view_request(&scene::with_layer("rgb"), v).is_ok();
+        assert!(sound(view()));
+        assert!(!sound(View { width: 0, ..view() }) && !sound(View { width: u32::MAX, height: u32::MAX, ..view() }));
+        assert!(!sound(View { fov_y: 4.0, ..view() }) && !sound(View { fov_y: f64::NAN, ..view() }));
+        assert!(!sound(View { pose: [f64::NAN; 12], ..view() }) && !sound(View { pose: [0.0; 12], ..view() }));
+        let clip = |b| View { clip: Some(b), ..view() };
+        assert!(sound(clip([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])));
+        assert!(!sound(clip([0.0, 0.0, 0.0, 1.0, -1.0, 1.0])) && !sound(clip([f32::NAN; 6])));
+    }
+
+    #[test]
+    fn layers_and_controls_that_are_not_listed_are_refused() {
+        let refusal = |v: View| view_request(&scene::with_layer("rgb"), v).unwrap_err();
+        assert_eq!(refusal(View { layer: "albedo".into(), ..view() }), "there is no layer \"albedo\"");
+        let values = [("sun".to_string(), Value::Number(1.0))].into();
+        assert_eq!(refusal(View { values, ..view() }), "there is no control \"sun\"");
     }
 }

@@ -4,7 +4,7 @@ use super::export::{self, ExportOptions, Size};
 use super::held_out;
 use super::model::ObjectModel;
 use super::render::{self, Layer};
-use super::run_folder::{RunSummary, read_summary};
+use super::run_folder::{RunSummary, read_rows, read_summary};
 use crate::error::{PipelineError, Result};
 use diorama_data::camera_path_json;
 use diorama_data::{DataError, atomic, photo};
@@ -12,7 +12,8 @@ use diorama_engine::renderers::volume::Quality;
 use diorama_engine::train::Event;
 use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
-use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewLayer, ViewRequest, ViewScene, ViewSource, ViewStatus};
+use diorama_geom::view_controls::ViewLayer;
+use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewPoint, ViewRequest, ViewScene, ViewSource, ViewStatus};
 use diorama_geom::{Camera, ImageU8, Similarity};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -141,7 +142,9 @@ impl RunView {
     pub fn new(folder: &Path, model: ObjectModel, running: bool) -> Result<Arc<RunView>> {
         let RunSummary { behind_fog: names, psnr_held_out: held_out, .. } = read_summary(folder)?.unwrap_or_default();
         let origin = model.origin;
-        let status = ViewStatus { step: origin.step, seconds: origin.seconds, running, held_out, ..ViewStatus::default() };
+        let last = read_rows(folder).into_iter().rev().find(|r| r.psnr.is_some() && !running).unwrap_or_default();
+        let (loss, psnr) = (last.loss.unwrap_or_default(), last.psnr.unwrap_or_default());
+        let status = ViewStatus { step: origin.step, seconds: origin.seconds, loss, psnr, running, held_out, ..ViewStatus::default() };
         let behind_fog = (0..model.capture.frames.len()).filter(|i| names.contains(&model.capture.frames[*i].name)).collect();
         Ok(Arc::new(RunView {
             saved: Mutex::new(Saved::read(folder, &model.capture.world_from_capture)?),
@@ -186,8 +189,8 @@ impl RunView {
     pub fn hear(&self, event: &Event) {
         let Ok(mut s) = self.status.lock() else { return };
         match event {
-            &Event::Progress { step, seconds, loss, psnr, rays_per_s, .. } => {
-                *s = ViewStatus { step, seconds, loss, psnr, rays_per_s, running: true, held_out: s.held_out };
+            &Event::Progress { step, seconds, progress, loss, psnr, rays_per_s, .. } => {
+                *s = ViewStatus { step, seconds, loss, psnr, rays_per_s, progress, running: true, held_out: s.held_out };
             }
             Event::Evaluated { psnr, views, .. } => {
                 s.held_out = Some(*psnr);
@@ -205,6 +208,18 @@ impl RunView {
     }
 }
 
+/// The pictures that [`render::picture`] draws, by the names that [`Layer`] is read from.
+fn layers() -> Vec<ViewLayer> {
+    let dark_to_light = [[0; 3], [255; 3]];
+    vec![
+        ViewLayer::new("rgb", "Color"),
+        ViewLayer::new("depth", "Depth").with_scale(&[[255; 3], [26; 3]], "near", "far", ""),
+        ViewLayer::new("normal", "Normals").with_classes(&[("x", [255, 128, 128]), ("y", [128, 255, 128]), ("z", [128, 128, 255])]),
+        ViewLayer::new("opacity", "Opacity").with_scale(&dark_to_light, "0", "1", ""),
+        ViewLayer::new("occupancy", "Occupancy").with_scale(&dark_to_light, "empty", "most cells", ""),
+    ]
+}
+
 impl ViewSource for RunView {
     fn scene(&self) -> ViewScene {
         let m = self.model();
@@ -217,6 +232,10 @@ impl ViewSource for RunView {
         ViewScene {
             name: self.folder.file_name().unwrap_or_default().to_string_lossy().into_owned(),
             frames,
+            layers: layers(),
+            controls: Vec::new(),
+            note: String::new(),
+            is_run: true,
             focus: focus.to_array(),
             distance,
             world_from_capture: m.capture.world_from_capture,
@@ -231,6 +250,11 @@ impl ViewSource for RunView {
         self.status.lock().map(|s| *s).unwrap_or_default()
     }
 
+    fn history(&self) -> Vec<ViewPoint> {
+        let point = |r: &super::run_folder::Row| ViewPoint { step: r.step, psnr: r.psnr, held_out: r.val_psnr };
+        read_rows(&self.folder).iter().map(point).collect()
+    }
+
     fn behind_fog(&self) -> Vec<usize> {
         self.behind_fog.lock().map(|f| f.clone()).unwrap_or_default()
     }
@@ -239,13 +263,7 @@ impl ViewSource for RunView {
         self.looked.store(true, Ordering::Relaxed);
         let m = self.model();
         let posed = m.to_model(r.camera, &r.world_from_camera);
-        let layer = match r.layer {
-            ViewLayer::Rgb => Layer::Rgb,
-            ViewLayer::Depth => Layer::Depth,
-            ViewLayer::Normal => Layer::Normal,
-            ViewLayer::Opacity => Layer::Opacity,
-            ViewLayer::Occupancy => Layer::Occupancy,
-        };
+        let layer = r.layer.parse::<Layer>()?;
         let picture = render::picture(&m, &posed, layer, r.clip, Quality::Fast);
         Self::tell(m.check_device().map(|()| picture))
     }

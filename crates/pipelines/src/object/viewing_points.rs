@@ -7,7 +7,8 @@ use diorama_engine::renderers::volume::View;
 use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
 use diorama_geom::splats::Splats;
-use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewLayer, ViewRequest, ViewScene, ViewSource, ViewStatus};
+use diorama_geom::view_controls::{ControlValues, ViewLayer};
+use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewRequest, ViewScene, ViewSource, ViewStatus};
 use diorama_geom::{Camera, Capture, Image, ImageU8, Pose, Similarity};
 use std::path::{Path, PathBuf};
 
@@ -79,9 +80,17 @@ impl PointsView {
         let poses: Vec<Pose> = frames.iter().map(|f| f.world_from_camera).collect();
         let (focus, distance) = focus_point(&poses);
         let name = of.canonicalize().unwrap_or(of.to_path_buf()).file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let note = match splats.len() {
+            0 => "This data set has no points: only its cameras can be shown until it is trained.",
+            _ => "",
+        };
         let scene = ViewScene {
             name,
             frames,
+            layers: layers(),
+            controls: Vec::new(),
+            note: note.into(),
+            is_run: false,
             focus: focus.to_array(),
             distance,
             world_from_capture,
@@ -138,6 +147,15 @@ fn gray(values: &Image, of: impl Fn(f32) -> f32) -> ImageU8 {
     ImageU8 { width: values.width, height: values.height, channels: 3, data }
 }
 
+/// Points have no surface: no normals, and what there is of them is opacity.
+fn layers() -> Vec<ViewLayer> {
+    vec![
+        ViewLayer::new("rgb", "Color"),
+        ViewLayer::new("depth", "Depth").with_scale(&[[255; 3], [26; 3]], "near", "far", ""),
+        ViewLayer::new("opacity", "Opacity").with_scale(&[[0; 3], [255; 3]], "0", "1", ""),
+    ]
+}
+
 const NO_RUN: &str = "this is no run: train it first, then view the run";
 
 impl ViewSource for PointsView {
@@ -151,16 +169,16 @@ impl ViewSource for PointsView {
 
     fn view(&self, r: &ViewRequest) -> std::result::Result<ImageU8, String> {
         let view = self.draw(r);
-        Ok(match r.layer {
-            ViewLayer::Depth => {
+        match &r.layer[..] {
+            "rgb" => Ok(view.rgb.to_u8()),
+            "depth" => {
                 let seen = || view.depth.data.iter().copied().filter(|d| *d > 0.0);
                 let (lo, hi) = seen().fold((f32::MAX, f32::MIN), |(a, b), d| (a.min(d), b.max(d)));
-                gray(&view.depth, |d| if d > 0.0 { 1.0 - 0.9 * (d - lo) / (hi - lo).max(1e-6) } else { 0.0 })
+                Ok(gray(&view.depth, |d| if d > 0.0 { 1.0 - 0.9 * (d - lo) / (hi - lo).max(1e-6) } else { 0.0 }))
             }
-            // Points have no surface; what there is of it is opacity.
-            ViewLayer::Opacity | ViewLayer::Normal | ViewLayer::Occupancy => gray(&view.opacity, |v| v),
-            ViewLayer::Rgb => view.rgb.to_u8(),
-        })
+            "opacity" => Ok(gray(&view.opacity, |v| v)),
+            other => Err(format!("there is no layer {other:?}")),
+        }
     }
 
     fn point(&self, r: &ViewRequest, x_px: f64, y_px: f64) -> Option<[f64; 3]> {
@@ -178,7 +196,8 @@ impl ViewSource for PointsView {
             Some(p) => photo::load_small(p, THUMBNAIL).map_err(|e| e.to_string()),
             None => {
                 let camera = f.camera.resized(THUMBNAIL as u32, THUMBNAIL as u32 * 3 / 4);
-                self.view(&ViewRequest { camera, world_from_camera: f.world_from_camera, layer: ViewLayer::Rgb, clip: None })
+                let (layer, values) = ("rgb".into(), ControlValues::default());
+                self.view(&ViewRequest { camera, world_from_camera: f.world_from_camera, layer, values, clip: None })
             }
         }
     }

@@ -3,7 +3,11 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
-import type { Photograph } from "./messages";
+import type { Photograph, View } from "./messages";
+
+/** Lowest and highest corner in the world. */
+export type Box6 = NonNullable<View["clip"]>;
+export type Pose = View["pose"];
 
 /** World from a three.js camera (looking along -z, y up), from `world_from_camera` rows (looking along z, y down). */
 export function matrixOf(pose: number[]): THREE.Matrix4 {
@@ -11,7 +15,7 @@ export function matrixOf(pose: number[]): THREE.Matrix4 {
   return new THREE.Matrix4().set(p[0], -p[1], -p[2], p[3], p[4], -p[5], -p[6], p[7], p[8], -p[9], -p[10], p[11], 0, 0, 0, 1);
 }
 
-export function poseOf(m: THREE.Matrix4): number[] {
+export function poseOf(m: THREE.Matrix4): Pose {
   const e = m.elements;
   return [e[0], -e[4], -e[8], e[12], e[1], -e[5], -e[9], e[13], e[2], -e[6], -e[10], e[14]];
 }
@@ -38,6 +42,8 @@ export class Stage {
     }
     this.camera.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.enableDamping = !matchMedia("(prefers-reduced-motion: reduce)").matches;
+    this.controls.dampingFactor = 0.2;
     this.controls.addEventListener("change", () => (this.changed = true));
     this.box = new THREE.Box3Helper(new THREE.Box3(), 0xffcc44);
     this.box.visible = false;
@@ -46,6 +52,12 @@ export class Stage {
 
   get hasOverlay(): boolean {
     return this.renderer !== null;
+  }
+
+  /** Whether anything lies over the picture. */
+  get hasSomething(): boolean {
+    const filled = (g: THREE.Group) => g.visible && g.children.length > 0;
+    return this.box.visible || Boolean(this.mesh?.visible) || [this.frusta, this.path, this.rule].some(filled);
   }
 
   resize(width: number, height: number): void {
@@ -69,6 +81,11 @@ export class Stage {
   lookFrom(matrix: THREE.Matrix4, distance: number): void {
     const position = new THREE.Vector3().setFromMatrixPosition(matrix);
     const forward = new THREE.Vector3(0, 0, -1).transformDirection(matrix);
+    // Takes up what a drag has left to turn: it would move the camera from where it is put.
+    const { enableDamping } = this.controls;
+    this.controls.enableDamping = false;
+    this.controls.update();
+    this.controls.enableDamping = enableDamping;
     this.camera.position.copy(position);
     this.controls.target.copy(position).addScaledVector(forward, distance);
     this.controls.update();
@@ -83,7 +100,7 @@ export class Stage {
     this.controls.target.add(by);
   }
 
-  pose(): number[] {
+  pose(): Pose {
     this.camera.updateMatrixWorld();
     return poseOf(this.camera.matrixWorld);
   }
@@ -100,20 +117,23 @@ export class Stage {
         const corners = [[-w, -h], [w, -h], [w, h], [-w, h]].map(([x, y]) => new THREE.Vector3(x, y, -size).applyMatrix4(m));
         corners.forEach((c, k) => points.push(...eye.toArray(), ...c.toArray(), ...c.toArray(), ...corners[(k + 1) % 4]!.toArray()));
       }
-      this.frusta.add(lines(points, held ? 0xdc3c28 : 0x4a8aff));
+      this.frusta.add(lines(points, held ? 0xff6b57 : 0x5b9dff));
     }
+    this.changed = true;
   }
 
   showFrusta(on: boolean): void {
     this.frusta.visible = on;
+    this.changed = true;
   }
 
-  showBox(box: number[] | null): void {
+  showBox(box: Box6 | null): void {
     this.box.visible = box !== null;
     if (box) {
-      this.box.box.min.set(box[0]!, box[1]!, box[2]!);
-      this.box.box.max.set(box[3]!, box[4]!, box[5]!);
+      this.box.box.min.set(box[0], box[1], box[2]);
+      this.box.box.max.set(box[3], box[4], box[5]);
     }
+    this.changed = true;
   }
 
   showPath(points: THREE.Vector3[]): void {
@@ -122,6 +142,7 @@ export class Stage {
       const material = new THREE.LineBasicMaterial({ color: 0x66ff99, depthTest: false });
       this.path.add(new THREE.Line(new THREE.BufferGeometry().setFromPoints(points), material));
     }
+    this.changed = true;
   }
 
   /** Shows one or two picked points, and the line between them. */
@@ -153,9 +174,9 @@ export class Stage {
     this.scene.add(this.mesh);
   }
 
-  showMesh(on: boolean): boolean {
+  showMesh(on: boolean): void {
     if (this.mesh) this.mesh.visible = on;
-    return this.mesh !== null;
+    this.changed = true;
   }
 }
 

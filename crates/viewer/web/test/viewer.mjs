@@ -1,74 +1,19 @@
 // Drives the viewer of a run in headless Chromium: node test/viewer.mjs DIORAMA RUN [PICTURES]
 // Prints a line per check and fails with the first that does not hold.
 
-import { execFileSync, spawn } from "node:child_process";
+import { execFileSync } from "node:child_process";
 import { existsSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
-import net from "node:net";
 import os from "node:os";
 import path from "node:path";
 import { chromium } from "playwright-core";
+import { lostAndFailed, ownLists, phone, shortcuts, themes } from "./appearance.mjs";
+import { Page, check, checked, complaints, difference, diorama, endAll, raw, requests, run, training, until, viewer } from "./driver.mjs";
 
-const [diorama, run, pictures] = process.argv.slice(2);
-const until = async (what, f, seconds = 60) => {
-  for (const end = Date.now() + seconds * 1000; Date.now() < end; await new Promise((r) => setTimeout(r, 50))) {
-    const v = await f();
-    if (v) return v;
-  }
-  throw new Error(`waited ${seconds} s for ${what}`);
-};
-let checks = 0;
-const check = (what, ok, detail = "") => {
-  if (!ok) throw new Error(`FAILED: ${what} ${detail}`);
-  checks += 1;
-  console.log(`ok  ${what} ${detail}`);
-};
+const scratch = mkdtempSync(path.join(os.tmpdir(), "viewer-"));
 
-/** Starts a viewer; its address and how to end it. */
-async function viewer(what, ...flags) {
-  const child = spawn(diorama, ["view", what, "--port", "0", "--json", "--device", "cpu", ...flags], { stdio: ["ignore", "pipe", "inherit"] });
-  let out = "";
-  child.stdout.on("data", (d) => (out += d));
-  const line = await until("the viewer's address", () => out.includes("\n") && out);
-  return { address: JSON.parse(line).address, end: () => new Promise((r) => (child.on("exit", r), child.kill("SIGINT"))) };
-}
-
-/** Starts training with a viewer on the capture of a run; its address, what it says, and how it ends. */
-async function training(out) {
-  const flags = ["--seconds", "60", "--view", "--port", "0", "--device", "cpu", "--set", "field.log2_size=15"];
-  const child = spawn(diorama, ["train", path.join(run, "capture"), "-o", out, ...flags], { stdio: ["ignore", "ignore", "pipe"] });
-  let said = "";
-  child.stderr.on("data", (d) => (said += d));
-  const ended = new Promise((r) => child.on("exit", r));
-  const address = await until("the address", () => said.match(/view: (http\S+)/)?.[1]);
-  return { address, stop: () => (child.kill("SIGINT"), ended), said: () => said };
-}
-
-/** Sends a request as it stands; the answer's status. */
-function raw(port, lines, host = "127.0.0.1") {
-  return new Promise((resolve, reject) => {
-    const s = net.connect(port, host, () => s.write(lines.join("\r\n") + "\r\n\r\n"));
-    let text = "";
-    s.on("data", (d) => {
-      text += d;
-      const m = text.match(/^HTTP\/1\.1 (\d+)/);
-      if (m) (s.destroy(), resolve(Number(m[1])));
-    });
-    s.on("error", reject);
-    s.on("close", () => resolve(0));
-  });
-}
-
-const browser = await chromium.launch({
-  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-  args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"],
-});
-let ends = [];
-try {
-  const { address, end } = await viewer(run);
-  ends.push(end);
+/** Who else may not ask. */
+async function guarded(browser, address) {
   const { port, host } = new URL(address);
-
-  // Who else may not ask.
   const upgrade = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="];
   const socket = (...h) => raw(port, ["GET /socket HTTP/1.1", ...h, ...upgrade]);
   check("the own page's socket is opened", (await socket(`Host: ${host}`, `Origin: http://${host}`)) === 101);
@@ -77,15 +22,18 @@ try {
   check("a wrong Host is refused", (await raw(port, ["GET / HTTP/1.1", `Host: evil.example:${port}`])) === 403);
   check("a path out of the page is not served", (await raw(port, ["GET /../config.toml HTTP/1.1", `Host: ${host}`])) === 404);
   check("another method is refused", (await raw(port, ["POST / HTTP/1.1", `Host: ${host}`])) === 405);
-  const open = await viewer(run, "--host", "0.0.0.0");
-  ends.push(open.end);
+  const open = await viewer(run, 0, "--host", "0.0.0.0");
   const far = new URL(open.address);
   check("a missing token is refused", (await raw(far.port, ["GET / HTTP/1.1", `Host: ${far.host}`])) === 401);
   check("a wrong token is refused", (await raw(far.port, [`GET /?token=${"0".repeat(32)} HTTP/1.1`, `Host: ${far.host}`])) === 401);
   check("the printed token is accepted", (await raw(far.port, [`GET /?${far.searchParams} HTTP/1.1`, `Host: ${far.host}`])) === 200);
+  const withToken = await Page.open(browser, open.address);
+  check("the page with the token connects", (await withToken.views()) > 0);
+  await withToken.close();
+  await open.end();
 
   // A page of another site in the same browser.
-  const page = await browser.newPage({ viewport: { width: 1000, height: 700 } });
+  const page = await browser.newPage();
   await page.goto("data:text/html,<p>elsewhere");
   const foreign = await page.evaluate((a) => new Promise((r) => {
     const s = new WebSocket(a.replace("http", "ws") + "socket");
@@ -93,109 +41,87 @@ try {
     s.onerror = () => r("refused");
   }), address);
   check("a socket from another site's page is refused", foreign === "refused");
+  await page.close();
+}
 
-  // The page itself.
-  const complaints = [];
-  const requests = [];
-  page.on("console", (m) => m.type() === "error" && complaints.push(m.text()));
-  page.on("pageerror", (e) => complaints.push(String(e)));
-  page.on("request", (r) => requests.push(r.url()));
-  await page.goto(address);
-  const views = () => page.evaluate(() => Number(document.body.dataset.views ?? 0));
-  const scale = () => page.evaluate(() => Number(document.body.dataset.scale ?? 0));
-  const settled = async () => {
-    await page.waitForTimeout(300);
-    await until("a whole view", async () => (await scale()) === 1);
-  };
-  const picture = () => page.evaluate(() => {
-    const c = document.getElementById("picture");
-    const small = document.createElement("canvas");
-    [small.width, small.height] = [64, 48];
-    const g = small.getContext("2d");
-    g.drawImage(c, 0, 0, 64, 48);
-    return [...g.getImageData(0, 0, 64, 48).data].filter((_, i) => i % 4 < 3);
-  });
-  const difference = (a, b) => a.reduce((s, v, i) => s + Math.abs(v - b[i]), 0) / a.length;
-  const shot = async (name) => pictures && (await page.screenshot({ path: path.join(pictures, `${name}.png`) }));
-  await until("a view", async () => (await views()) > 0);
-  await settled();
-  const first = await picture();
+/** Views from elsewhere and of every layer. */
+async function looking(p) {
+  const { page } = p;
+  const first = await p.picture();
   const spread = Math.max(...first) - Math.min(...first);
   check("a view is shown", spread > 40, `(brightness spans ${spread})`);
-  await shot("first");
-  await page.locator("#photographs button").first().scrollIntoViewIfNeeded();
-  const thumbs = await until("thumbnails", () => page.evaluate(() => [...document.querySelectorAll("#photographs img")].filter((i) => i.naturalWidth > 0).length));
-  check("photographs are listed", thumbs > 0, `(${thumbs} in sight)`);
+  await p.shot("first");
+  check("photographs are listed", await p.thumbnails(3));
+  await until("the curve", () => p.shown("#curve"));
+  check("a trained run shows its curve and figures", /\d+\.\d+ dB/.test(await p.text("#figure-psnr")) && /\d+\.\d+ dB/.test(await p.text("#figure-held-out")));
 
-  // Orbit.
-  const box = await page.locator("#overlay").boundingBox();
-  const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
-  const before = await views();
-  await page.mouse.move(x, y);
-  await page.mouse.down();
+  const before = await p.views();
   const begin = Date.now();
-  for (let i = 1; i <= 60; i++) {
-    await page.mouse.move(x + 3 * i, y + i / 2);
-    await page.waitForTimeout(16);
-  }
-  await page.mouse.up();
-  const rate = ((await views()) - before) / ((Date.now() - begin) / 1000);
-  await settled();
-  const turned = await picture();
+  await p.drag(180, 30, 60, 16);
+  const rate = ((await p.views()) - before) / ((Date.now() - begin) / 1000);
+  const turned = await p.picture();
   check("orbit changes the image", difference(first, turned) > 5, `(mean difference ${difference(first, turned).toFixed(1)}, ${rate.toFixed(1)} views per second while turning)`);
-  await shot("turned");
 
-  // Flying.
-  await page.keyboard.down("w");
-  await page.waitForTimeout(400);
-  await page.keyboard.up("w");
-  await settled();
-  check("keys fly", difference(turned, await picture()) > 1);
-  await page.keyboard.down("s");
-  await page.waitForTimeout(400);
-  await page.keyboard.up("s");
-  await settled();
-
-  // Layers.
-  const seen = { rgb: turned };
-  for (const layer of ["depth", "normal", "opacity", "occupancy"]) {
-    const n = await views();
-    await page.selectOption("#layer", layer);
-    await until(`layer ${layer}`, async () => (await views()) > n);
-    await settled();
-    seen[layer] = await picture();
-    const nearest = Math.min(...Object.entries(seen).filter(([k]) => k !== layer).map(([, p]) => difference(p, seen[layer])));
-    check(`layer ${layer} is another picture`, nearest > 2, `(mean difference ${nearest.toFixed(1)})`);
-    await shot(layer);
+  for (const [key, back] of [["w", "s"]]) {
+    await page.keyboard.down(key);
+    await page.waitForTimeout(400);
+    await page.keyboard.up(key);
+    check("keys fly", difference(turned, await p.picture()) > 1);
+    await page.keyboard.down(back);
+    await page.waitForTimeout(400);
+    await page.keyboard.up(back);
   }
-  await page.selectOption("#layer", "rgb");
-  await settled();
 
-  // Crop box.
-  const whole = await picture();
+  const names = await page.evaluate(() => [...document.querySelectorAll("#layers button")].map((b) => b.dataset.layer));
+  check("layers are those of a field", names.join() === "rgb,depth,normal,opacity,occupancy");
+  const seen = {};
+  for (const layer of names) {
+    const n = await p.views();
+    if (layer !== "rgb") {
+      await p.layer(layer);
+      await until(`layer ${layer}`, async () => (await p.views()) > n);
+    }
+    seen[layer] = await p.picture();
+    const nearest = Math.min(...Object.entries(seen).filter(([k]) => k !== layer).map(([, p]) => difference(p, seen[layer])));
+    if (layer !== "rgb") check(`layer ${layer} is another picture`, nearest > 2, `(mean difference ${nearest.toFixed(1)})`);
+    await p.shot(layer);
+  }
+  await p.layer("rgb");
+  // An axis of the corner.
+  const shown = await p.picture();
+  await page.focus("#gizmo g.z:not(.minus)");
+  await page.keyboard.press("Enter");
+  check("the corner's axes turn the camera", difference(shown, await p.picture()) > 3);
+  await page.keyboard.press("h");
+}
+
+async function cropping(p) {
+  const { page } = p;
+  await p.card("crop");
+  const whole = await p.picture();
   await page.evaluate(() => {
     const r = document.getElementById("crop-x0");
     r.value = String((Number(r.min) + 3 * Number(r.max)) / 4 > Number(document.getElementById("crop-x1").value)
       ? (Number(r.min) + Number(document.getElementById("crop-x1").value)) / 2 : (Number(r.min) + Number(r.max)) / 2);
     r.dispatchEvent(new Event("input"));
   });
-  await settled();
-  const cropped = await picture();
+  const cropped = await p.picture();
   check("the crop box changes the image", difference(whole, cropped) > 1, `(mean difference ${difference(whole, cropped).toFixed(1)})`);
-  await shot("cropped");
+  await p.shot("cropped");
   await page.click("#crop-save");
   await until("crop.json", () => existsSync(path.join(run, "crop.json")));
   const crop = JSON.parse(readFileSync(path.join(run, "crop.json")));
   const shownBox = await page.evaluate(() => [0, 1].map((end) => ["x", "y", "z"].map((axis) => Number(document.getElementById(`crop-${axis}${end}`).value))));
   const kept = [crop.min, crop.max].every((corner, end) => corner.every((v, k) => Math.abs(v - shownBox[end][k]) < 1e-4));
   check("the crop box is kept as it is shown", kept, `(${JSON.stringify(crop)})`);
+}
 
-  // Camera path.
+async function filming(p) {
+  const { page } = p;
+  await p.card("path");
   await page.click("#key-add");
-  await page.mouse.move(x, y);
-  await page.mouse.down();
-  await page.mouse.move(x + 150, y, { steps: 8 });
-  await page.mouse.up();
+  await p.drag(150, 0, 8);
+  await p.settled();
   await page.click("#key-add");
   await page.fill("#key-seconds", "0.5");
   await page.click("#path-save");
@@ -203,48 +129,62 @@ try {
   await until("camera_path.json", () => existsSync(file));
   const saved = JSON.parse(readFileSync(file));
   check("the camera path is kept", saved.keyframes.length === 2 && saved.camera_path.length === 12, `(${saved.camera_path.length} cameras)`);
-  const still = await views();
+  const [download] = await Promise.all([page.waitForEvent("download"), page.click("#path-download")]);
+  await download.saveAs(path.join(scratch, "path.json"));
+  check("the camera path is downloaded", JSON.parse(readFileSync(path.join(scratch, "path.json"))).keyframes.length === 2);
+  const still = await p.views();
   await page.click("#key-play");
-  await until("the path's preview", async () => (await views()) > still + 2);
+  await until("the path's preview", async () => (await p.views()) > still + 2);
   await page.click("#key-clear");
+  check("without views the list says what to do", (await p.shown("#keys-empty")) && (await page.isDisabled("#key-play")));
   await page.setInputFiles("#path-open", file);
-  await until("the keys of an opened path", () => page.evaluate(() => document.querySelectorAll("#keys li").length === 2));
+  await until("the keys of an opened path", async () => (await page.locator("#keys li").count()) === 2);
   check("a saved path is opened again", true);
+}
 
-  // Scale: two points a known length apart.
-  // Where something dark stands before the white: the page's places of two such pixels far apart.
-  await settled();
+/** Two points a known length apart; the units between them. */
+async function measuring(p) {
+  const { page } = p;
+  await p.card("measure");
+  await p.settled();
+  // Where something dark stands before the white: the page's places of two such pixels far apart, beside what floats.
   const [one, two] = await page.evaluate(() => {
     const c = document.getElementById("picture");
     const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
-    const dark = Array.from({ length: d.length / 4 }, (_, i) => i).filter((i) => d[4 * i] + d[4 * i + 1] + d[4 * i + 2] < 240);
-    dark.sort((a, b) => (a % c.width) - (b % c.width));
     const box = c.getBoundingClientRect();
     const place = (i) => [box.left + ((i % c.width + 0.5) * box.width) / c.width, box.top + ((Math.floor(i / c.width) + 0.5) * box.height) / c.height];
+    const dark = Array.from({ length: d.length / 4 }, (_, i) => i).filter((i) => i % 37 === 0 && d[4 * i] + d[4 * i + 1] + d[4 * i + 2] < 240)
+      .filter((i) => document.elementFromPoint(...place(i))?.id === "overlay");
+    dark.sort((a, b) => (a % c.width) - (b % c.width));
     return [dark[Math.floor(dark.length * 0.3)], dark[Math.floor(dark.length * 0.7)]].map(place);
   });
   await page.click("#measure");
   await page.mouse.click(...one);
-  await until("the first point", () => page.evaluate(() => document.getElementById("measure-note").textContent.includes("second")));
+  await until("the first point", async () => (await p.text("#measure-note")).includes("second"));
   await page.mouse.click(...two);
-  await until("the second point", () => page.evaluate(() => document.getElementById("measure-note").textContent.includes("units of the capture apart")));
+  await until("the second point", async () => (await p.text("#measure-note")).includes("units of the capture apart"));
   await page.fill("#measure-length", "25");
   await page.click("#measure-save");
   await until("scale.json", () => existsSync(path.join(run, "scale.json")));
   const scaled = JSON.parse(readFileSync(path.join(run, "scale.json")));
   const apart = Math.hypot(...scaled.points[0].map((v, k) => v - scaled.points[1][k]));
   check("a measured length is kept for export", scaled.metres === 0.25 && apart > 0.05 && apart < 2, `(${apart.toFixed(3)} units are 25 cm)`);
-  await shot("measured");
+  await p.shot("measured");
+  return apart;
+}
 
-  // Mesh.
+async function exporting(p, apart) {
+  const { page } = p;
+  await p.card("export");
   await page.fill("#faces", "5000");
   await page.fill("#resolution", "64");
   await page.click("#export");
-  await until("a mesh in the page", () => page.evaluate(() => document.body.dataset.mesh === "shown"), 180);
-  await settled();
-  await shot("mesh");
+  check("a mesh in the making shows how far it is", (await p.shown("#export-progress")) && (await page.isDisabled("#export")));
+  await until("a mesh in the page", async () => (await p.data("mesh")) === "shown", 180);
+  await p.settled();
+  await p.shot("mesh");
   const glb = readFileSync(path.join(run, "mesh.glb"));
-  check("a GLB is made and shown", glb.subarray(0, 4).toString() === "glTF", `(${glb.length >> 10} KiB)`);
+  check("a GLB is made and shown", glb.subarray(0, 4).toString() === "glTF" && (await page.isChecked("#mesh")), `(${glb.length >> 10} KiB)`);
   const extents = (bytes) => {
     const root = JSON.parse(bytes.subarray(20, 20 + bytes.readUInt32LE(12)));
     const at = root.accessors[root.meshes[0].primitives[0].attributes.POSITION];
@@ -257,36 +197,36 @@ try {
   const off = Math.max(...inMeters.map((v, k) => Math.abs(v / inUnits[k] / (0.25 / apart) - 1)));
   check("the mesh has the measured scale", off < 0.01, `(${inMeters.map((v) => v.toFixed(3)).join(" x ")} m, ${(100 * off).toFixed(2)} % off)`);
   const [download] = await Promise.all([page.waitForEvent("download"), page.click("#screenshot")]);
-  const folder = mkdtempSync(path.join(os.tmpdir(), "viewer-"));
-  await download.saveAs(path.join(folder, "s.png"));
-  check("a screenshot is saved", readFileSync(path.join(folder, "s.png")).subarray(1, 4).toString() === "PNG");
-  rmSync(folder, { recursive: true });
+  await download.saveAs(path.join(scratch, "s.png"));
+  check("a screenshot is saved", readFileSync(path.join(scratch, "s.png")).subarray(1, 4).toString() === "PNG");
+}
 
-  // Training shows itself.
-  const runs = mkdtempSync(path.join(os.tmpdir(), "viewer-"));
-  const live = await training(path.join(runs, "live"));
-  ends.push(live.stop);
-  const other = await browser.newPage({ viewport: { width: 700, height: 500 } });
-  other.on("console", (m) => m.type() === "error" && complaints.push(m.text()));
-  other.on("pageerror", (e) => complaints.push(String(e)));
-  await other.goto(live.address);
-  const step = () => other.evaluate(() => Number(document.getElementById("status").textContent.match(/step (\d+)/)?.[1] ?? 0));
+/** Training shows itself. */
+async function live(browser) {
+  const out = path.join(scratch, "live");
+  const { address, stop } = await training(out);
+  const p = await Page.open(browser, address);
+  const step = async () => Number((await p.data("step")) ?? 0);
   const early = await until("a step", step);
-  const shown = () => other.evaluate(() => Number(document.body.dataset.views ?? 0));
-  const seenViews = await until("a view in training", shown);
+  const seen = await p.views();
   const later = await until("later steps", async () => (await step()) > early + 50 && (await step()));
-  await until("views without a touch", async () => (await shown()) > seenViews + 2);
-  await until("held-out pixels", () => other.evaluate(() => /held out \d+\.\d+ dB/.test(document.getElementById("status").textContent)));
-  check("training shows held-out beside training PSNR, and how many views are behind fog", await other.evaluate(() => document.body.dataset.fog !== undefined));
+  await until("views without a touch", async () => (await p.views()) > seen + 2);
+  await until("held-out pixels", async () => /\d+\.\d+ dB/.test(await p.text("#figure-held-out").catch(() => "")));
+  check("training shows held-out beside training PSNR, and how many views are behind fog", (await p.data("fog")) !== undefined);
   check("training shows its steps and views by itself", true, `(steps ${early} to ${later})`);
-  if (pictures) await other.screenshot({ path: path.join(pictures, "training.png") });
-  const code = await live.stop();
-  check("Ctrl-C ends training and viewer with a checkpoint", code === 130 && existsSync(path.join(runs, "live", "checkpoints")), `(exit code ${code})`);
-  await other.close();
-  rmSync(runs, { recursive: true });
+  const points = () => p.page.evaluate(() => document.querySelector("#curve-lines .psnr")?.getAttribute("points").split(" ").length ?? 0);
+  const some = await points();
+  await until("a longer curve", async () => (await points()) > some);
+  check("training draws its curve and how much is done", (await p.shown("#training-progress")) && /^\d+ %$/.test(await p.text("#training-state")), `(${await points()} points, ${await p.text("#training-state")})`);
+  await p.shot("training");
+  await p.close();
+  const code = await stop();
+  check("Ctrl-C ends training and viewer with a checkpoint", code === 130 && existsSync(path.join(out, "checkpoints")), `(exit code ${code})`);
+}
 
-  // A data set and a file of splats, before there is any run.
-  const cloud = path.join(mkdtempSync(path.join(os.tmpdir(), "viewer-")), "ball.ply");
+/** A data set and a file of splats, before there is any run. */
+async function withoutRun(browser) {
+  const cloud = path.join(scratch, "ball.ply");
   const names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
   const rows = Array.from({ length: 600 }, (_, i) => {
     const [z, a] = [1 - (2 * i + 1) / 600, i * 2.4];
@@ -297,33 +237,52 @@ try {
   writeFileSync(cloud, head + rows.join("\n") + "\n");
   for (const [name, what] of [["a file of splats", cloud], ["a data set", path.join(run, "capture")]]) {
     const there = await viewer(what);
-    ends.push(there.end);
-    const look = await browser.newPage({ viewport: { width: 800, height: 500 } });
-    look.on("console", (m) => m.type() === "error" && complaints.push(m.text()));
-    look.on("pageerror", (e) => complaints.push(String(e)));
-    await look.goto(there.address);
-    await until("a view", () => look.evaluate(() => Number(document.body.dataset.views ?? 0) > 0));
-    await until("a whole view", () => look.evaluate(() => Number(document.body.dataset.scale ?? 0) === 1));
-    await look.locator("#photographs button").first().scrollIntoViewIfNeeded();
-    const pictures8 = await until("thumbnails", () => look.evaluate(() => [...document.querySelectorAll("#photographs img")].filter((i) => i.naturalWidth > 0).length));
-    const colors = await look.evaluate(() => {
+    const p = await Page.open(browser, there.address);
+    await p.settled();
+    const pictures = await p.thumbnails(3);
+    const colors = await p.page.evaluate(() => {
       const c = document.getElementById("picture");
       const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
       return new Set(Array.from({ length: d.length / 4 }, (_, i) => `${d[4 * i] >> 5} ${d[4 * i + 1] >> 5}`)).size;
     });
-    check(`${name} is shown`, pictures8 > 0 && colors >= (what === cloud ? 8 : 1), `(${colors} colours, ${pictures8} pictures)`);
-    if (pictures) await look.screenshot({ path: path.join(pictures, `${name}.png`) });
-    await look.close();
+    check(`${name} is shown`, pictures && colors >= (what === cloud ? 8 : 1), `(${colors} colors)`);
+    check(`${name} lists what points can show`, (await p.texts("#layers button")).join() === "Color,Depth,Opacity");
+    check(`${name} says where there is nothing to see`, (await p.shown("#note")) === (what !== cloud));
+    await p.shot(name);
+    await p.close();
+    await there.end();
   }
-  rmSync(path.dirname(cloud), { recursive: true });
+}
 
-  check("nothing is fetched from elsewhere", requests.every((r) => r.startsWith(address) || r.startsWith("blob:") || r.startsWith("data:")), `(${requests.length} requests)`);
+const browser = await chromium.launch({
+  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
+  args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"],
+});
+try {
+  const { address } = await viewer(run);
+  await guarded(browser, address);
+  await shortcuts(browser, address);
+  await themes(browser, address);
+  await phone(browser, address);
+  const p = await Page.open(browser, address);
+  await looking(p);
+  await cropping(p);
+  await filming(p);
+  await exporting(p, await measuring(p));
+  await p.close();
+  await ownLists(browser);
+  await lostAndFailed(browser);
+  await live(browser);
+  await withoutRun(browser);
+  const elsewhere = requests.filter(([r, own]) => !r.startsWith(new URL(own).origin) && !r.startsWith("blob:") && !r.startsWith("data:"));
+  check("nothing is fetched from elsewhere", elsewhere.length === 0, elsewhere.join() || `(${requests.length} requests)`);
   check("the console has no errors", complaints.length === 0, complaints.join("; "));
-  console.log(`${checks} checks passed`);
+  console.log(`${checked()} checks passed`);
 } catch (e) {
   console.error(String(e));
   process.exitCode = 1;
 } finally {
   await browser.close();
-  await Promise.all(ends.map((e) => e()));
+  await endAll();
+  rmSync(scratch, { recursive: true, force: true });
 }

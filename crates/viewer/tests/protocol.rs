@@ -1,0 +1,114 @@
+//! The socket of a stand-in source, driven as the page drives it: layers and controls that no other source has are listed, drawn and changed.
+
+#[allow(dead_code)]
+#[path = "../examples/own_picture.rs"]
+mod own_picture;
+
+use diorama_viewer::{Server, ViewerOptions};
+use serde_json::{Value, json};
+use std::net::TcpStream;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use tungstenite::{Message, WebSocket};
+
+struct Page(WebSocket<TcpStream>);
+
+impl Page {
+    fn open(address: &str) -> Page {
+        let host = address.trim_start_matches("http://").trim_end_matches('/');
+        let request = tungstenite::http::Request::builder()
+            .uri(format!("ws://{host}/socket"))
+            .header("Host", host)
+            .header("Origin", format!("http://{host}"))
+            .header("Upgrade", "websocket")
+            .header("Connection", "Upgrade")
+            .header("Sec-WebSocket-Version", "13")
+            .header("Sec-WebSocket-Key", tungstenite::handshake::client::generate_key())
+            .body(())
+            .unwrap();
+        Page(tungstenite::client(request, TcpStream::connect(host).unwrap()).unwrap().0)
+    }
+
+    /// The next message of this kind.
+    fn told(&mut self, kind: &str) -> Value {
+        loop {
+            if let Message::Text(t) = self.0.read().unwrap() {
+                let v: Value = serde_json::from_str(&t).unwrap();
+                if v["kind"] == kind {
+                    return v;
+                }
+            }
+        }
+    }
+
+    fn ask(&mut self, layer: &str, values: Value) {
+        // From (0, -4, 0) along +y: x to the right, y down the picture is -z.
+        let pose = [1, 0, 0, 0, 0, 0, 1, -4, 0, -1, 0, 0];
+        let view = json!({ "width": 64, "height": 64, "fov_y": 0.7, "pose": pose, "layer": layer, "values": values, "clip": null });
+        let ask = json!({ "kind": "view", "id": 7, "view": view });
+        self.0.send(Message::text(ask.to_string())).unwrap();
+    }
+
+    /// Mean color of a view's middle rows.
+    fn view(&mut self, layer: &str, values: Value) -> [f64; 3] {
+        self.ask(layer, values);
+        loop {
+            match self.0.read().unwrap() {
+                Message::Binary(b) => {
+                    assert_eq!(b[..4], 7u32.to_le_bytes());
+                    let image = image::load_from_memory(&b[4..]).unwrap().to_rgb8();
+                    let middle: Vec<_> = image.rows().skip(28).take(8).flatten().collect();
+                    return [0, 1, 2].map(|k| middle.iter().map(|p| p[k] as f64).sum::<f64>() / middle.len() as f64);
+                }
+                Message::Text(t) => assert!(!t.contains("failed"), "{t}"),
+                _ => {}
+            }
+        }
+    }
+}
+
+fn differ(a: [f64; 3], b: [f64; 3]) -> bool {
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum::<f64>() > 6.0
+}
+
+#[test]
+fn a_source_shows_layers_and_controls_of_its_own() {
+    let server = Server::bind(&ViewerOptions { port: 0, ..ViewerOptions::default() }, Arc::new(own_picture::Ball)).unwrap();
+    let (address, end) = (server.address(), Arc::new(AtomicBool::new(false)));
+    let serving = std::thread::spawn({
+        let end = end.clone();
+        move || server.run(&end)
+    });
+    let mut page = Page::open(&address);
+
+    let scene = page.told("scene");
+    let layers: Vec<&str> = scene["layers"].as_array().unwrap().iter().map(|l| l["id"].as_str().unwrap()).collect();
+    assert_eq!(layers, ["shaded", "albedo", "height"]);
+    assert_eq!(scene["layers"][1]["legend"]["classes"][0], json!({ "label": "warm paint", "color": "#e07a3f" }));
+    assert_eq!(scene["layers"][2]["legend"]["unit"], "m");
+    let slider = json!({ "kind": "slider", "min": 0.0, "max": 90.0, "step": 1.0, "unit": "°", "default": 40.0 });
+    assert_eq!(scene["controls"][0]["input"], slider);
+    assert_eq!(scene["controls"][0]["layers"], json!(["shaded"]));
+    assert_eq!(scene["controls"][1]["input"]["options"][2], json!({ "id": "checker", "label": "Checker" }));
+
+    let striped = page.view("albedo", json!({}));
+    assert!(differ(striped, page.view("shaded", json!({}))), "another layer is another picture");
+    assert_eq!(striped, page.view("albedo", json!({ "pattern": "stripes" })), "values that are left out have their defaults");
+    assert!(differ(striped, page.view("albedo", json!({ "pattern": "plain" }))), "a pick changes the picture");
+    assert_eq!(striped, page.view("albedo", json!({ "sun": 80 })), "albedo knows no sun");
+    assert!(differ(page.view("shaded", json!({ "sun": 80 })), page.view("shaded", json!({ "sun": 10 }))), "a slider changes the picture");
+    assert!(differ(striped, page.view("albedo", json!({ "sky": true }))), "a toggle changes the picture");
+
+    for (layer, values, why) in [
+        ("depth", json!({}), "there is no layer \"depth\""),
+        ("albedo", json!({ "moon": 1 }), "there is no control \"moon\""),
+        ("shaded", json!({ "sun": 91 }), "control \"sun\" does not take Number(91.0)"),
+        ("albedo", json!({ "pattern": "dots" }), "control \"pattern\" does not take Choice(\"dots\")"),
+    ] {
+        page.ask(layer, values);
+        let failed = page.told("failed");
+        assert_eq!((failed["why"].as_str(), failed["view"].as_u64()), (Some(why), Some(7)));
+    }
+    end.store(true, Ordering::Relaxed);
+    serving.join().unwrap();
+}

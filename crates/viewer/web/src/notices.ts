@@ -1,0 +1,70 @@
+// What the page says: short notices, the banner of a lost connection, and the state where no picture is.
+
+import type { Connection, ConnectionState } from "./connection";
+import { element, icon, make, onClick } from "./dom";
+
+export type Level = "info" | "good" | "error";
+
+const ICONS: Record<Level, string> = { info: "info", good: "check", error: "warn" };
+/** Milliseconds that a notice stays. */
+const STAY = { info: 4000, good: 4000, error: 9000 };
+
+export class Notices {
+  private lostOnce = false;
+  private everOpen = false;
+  private countdown = 0;
+
+  constructor(connection: Connection) {
+    onClick("retry", () => connection.connect());
+    connection.onState((s) => this.showState(s));
+  }
+
+  /** Shows a line for some seconds; the same line again only renews it. */
+  say(text: string, level: Level = "info"): void {
+    const place = element("toasts");
+    for (const old of place.querySelectorAll<HTMLElement>(".toast")) if (old.dataset.text === text) old.remove();
+    const close = make("button", { className: "quiet", type: "button", title: "Dismiss" }, icon("close"));
+    close.setAttribute("aria-label", "Dismiss");
+    const toast = make("div", { className: `toast ${level}` }, icon(ICONS[level]), make("span", { textContent: text }), close);
+    toast.dataset.text = text;
+    close.addEventListener("click", () => toast.remove());
+    place.append(toast);
+    while (place.children.length > 3) place.firstElementChild?.remove();
+    setTimeout(() => toast.remove(), STAY[level]);
+  }
+
+  /** Says over the stage why there is no picture; null: there is one. */
+  showEmpty(title: string | null, detail = "", busy = false): void {
+    const place = element("empty");
+    place.hidden = title === null;
+    place.classList.toggle("busy", busy);
+    element("empty-title").textContent = title ?? "";
+    element("empty-detail").textContent = detail;
+  }
+
+  private showState(state: ConnectionState): void {
+    clearInterval(this.countdown);
+    document.body.dataset.connection = state.kind;
+    if (state.kind === "open") {
+      element("banner").hidden = true;
+      if (this.lostOnce && this.everOpen) this.say("Connected again", "good");
+      if (!this.everOpen) this.showEmpty("Loading the scene", "", true);
+      this.lostOnce = false;
+      this.everOpen = true;
+    } else if (state.kind === "lost") {
+      this.lostOnce = true;
+      if (!this.everOpen) this.showEmpty("No connection", "Is diorama still running? Open the address that it printed, with its token where it has one.");
+      element("banner").hidden = false;
+      const tick = () => {
+        const left = Math.max(0, Math.ceil((state.retryAt - Date.now()) / 1000));
+        element("banner-text").textContent = `The program has gone or does not answer. Next try in ${left} s.`;
+      };
+      tick();
+      this.countdown = window.setInterval(tick, 500);
+    } else if (this.lostOnce) {
+      element("banner-text").textContent = "The program has gone or does not answer. Trying again…";
+    } else {
+      this.showEmpty("Connecting", "", true);
+    }
+  }
+}
