@@ -3,7 +3,7 @@
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::quickstart::write_capture;
 use diorama_pipelines::object::recipe;
-use diorama_pipelines::object::run_folder::RunFolder;
+use diorama_pipelines::run::RunFolder;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 

@@ -6,9 +6,10 @@ use crate::terminal::Progress;
 use diorama_data::DataError;
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::model::ObjectModel;
-use diorama_pipelines::object::run_folder::{RunFolder, read_config};
+use diorama_pipelines::object::run_folder::read_config;
 use diorama_pipelines::object::viewing::RunView;
 use diorama_pipelines::object::{memory, recipe};
+use diorama_pipelines::run::RunFolder;
 use diorama_pipelines::{PipelineError, Result};
 use diorama_viewer::Server;
 use std::sync::Arc;
@@ -24,8 +25,7 @@ pub fn run(a: &TrainArgs) -> Result<Outcome> {
     let existed = a.out.exists();
     let opened = if a.resume { Some(RunFolder::open(&a.out)?.0) } else { None };
     if let (Some(folder), Some(data)) = (&opened, &a.moved) {
-        folder.move_capture(data)?;
-        config.data.path = read_config(&a.out)?.data.path;
+        config.data.path = folder.move_capture::<Config>(data)?.data.path;
     }
     // The port is asked for before there is a folder.
     let viewing = if a.view { Some(watch(a, &config, opened.as_ref())?) } else { None };

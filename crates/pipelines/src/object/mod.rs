@@ -11,7 +11,6 @@ mod exposure_spread;
 pub(crate) mod extent;
 pub mod fog;
 pub mod held_out;
-pub mod kept_capture;
 mod loading;
 pub mod memory;
 pub mod model;
