@@ -23,6 +23,7 @@ pub mod recipe;
 pub mod render;
 pub mod report;
 pub mod run_folder;
+pub mod scored_view;
 pub mod seen_by;
 mod texture;
 pub mod viewing;
