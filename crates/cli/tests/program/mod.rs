@@ -4,7 +4,7 @@
 
 use diorama_pipelines::object::quickstart::write_capture;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Output};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
