@@ -6,6 +6,7 @@ use diorama_data::{
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, ImageU8, Pose, Similarity, SparsePoint};
+use diorama_pipelines::Application;
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::viewing;
 use std::path::PathBuf;
@@ -315,6 +316,9 @@ fn message_seeds() -> Vec<Vec<u8>> {
 }
 
 fn run_config(data: &[u8]) {
+    let _ = std::fs::create_dir_all(folder().join("run"));
+    let path = file("run/config.toml", data);
+    let _ = Application::of_run(path.parent().expect("a folder"));
     let Ok(text) = std::str::from_utf8(data) else { return };
     if let Ok(mut config) = Config::from_toml(text) {
         let _ = config.check();
@@ -327,7 +331,9 @@ fn run_config(data: &[u8]) {
 }
 
 fn config_seeds() -> Vec<Vec<u8>> {
-    [Method::Ngp, Method::Nerf, Method::Mlp, Method::Baseline].map(|m| Config::new(m, "data".into()).to_toml().into_bytes()).into()
+    let of = |m| Config::new(m, "data".into()).to_toml();
+    let unknown = of(Method::Ngp).replace("\"object\"", "\"sculpture\"");
+    [Method::Ngp, Method::Nerf, Method::Mlp, Method::Baseline].map(of).into_iter().chain([unknown]).map(String::into_bytes).collect()
 }
 
 fn crop_json(data: &[u8]) {

@@ -1,6 +1,9 @@
 //! Twenty faults that a trusted system survives, against the program as it is shipped. Each test is named after its fault; faults of
 //! formats that the program does not read are met by refusing the file.
 
+#[path = "program/mod.rs"]
+mod support;
+
 use diorama_data::checkpoint;
 use diorama_pipelines::object::quickstart::write_capture;
 use std::io::{Read, Write};
@@ -9,6 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
+use support::copy_of as copy;
 
 fn program() -> Command {
     let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
@@ -42,26 +46,6 @@ fn train(data: &Path, run: &Path, extra: &[&str]) -> Output {
     let mut c = program();
     c.arg("train").arg(data).arg("--out").arg(run).args(["--device", "cpu", "--set", "field.log2_size=10"]).args(extra);
     c.output().unwrap()
-}
-
-fn copy_all(from: &Path, to: &Path) {
-    std::fs::create_dir_all(to).unwrap();
-    for e in from.read_dir().unwrap().flatten() {
-        let target = to.join(e.file_name());
-        if e.path().is_dir() {
-            copy_all(&e.path(), &target);
-        } else {
-            std::fs::copy(e.path(), target).unwrap();
-        }
-    }
-}
-
-/// A copy of the good capture or run that a case may spoil.
-fn copy(from: &Path) -> (tempfile::TempDir, PathBuf) {
-    let dir = tempfile::tempdir().unwrap();
-    let to = dir.path().join("copy");
-    copy_all(from, &to);
-    (dir, to)
 }
 
 fn edit(capture: &Path, change: impl FnOnce(&mut serde_json::Value)) {

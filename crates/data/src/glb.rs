@@ -5,85 +5,73 @@ use crate::error::{DataError, Result};
 use crate::{atomic, photo};
 use diorama_geom::Mesh;
 use diorama_geom::color::linear_from_srgb;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::Path;
 
 fn y_up(p: [f32; 3]) -> [f32; 3] {
     [p[0], p[2], -p[1]]
 }
 
+/// Targets of buffer views: attributes of vertices, and indices.
+const ARRAY: u32 = 34962;
+const ELEMENTS: u32 = 34963;
+
+/// The binary chunk while it grows, and what describes it.
+#[derive(Default)]
+struct Chunk {
+    bytes: Vec<u8>,
+    views: Vec<Value>,
+    accessors: Vec<Value>,
+}
+
+impl Chunk {
+    /// Appends bytes with a description of where they are; returns the number of that view.
+    fn view(&mut self, data: Vec<u8>, target: Option<u32>) -> usize {
+        let mut view = json!({ "buffer": 0, "byteOffset": self.bytes.len(), "byteLength": data.len() });
+        if let Some(target) = target {
+            view["target"] = target.into();
+        }
+        self.views.push(view);
+        self.bytes.extend(data);
+        self.bytes.resize(self.bytes.len().next_multiple_of(4), 0);
+        self.views.len() - 1
+    }
+
+    /// Appends what an accessor reads; returns the accessor's number.
+    fn add(&mut self, data: Vec<u8>, target: u32, mut accessor: Value) -> Value {
+        accessor["bufferView"] = self.view(data, Some(target)).into();
+        self.accessors.push(accessor);
+        (self.accessors.len() - 1).into()
+    }
+}
+
 /// The file's bytes.
 ///
 /// # Errors
-/// When the mesh is empty, since glTF has no empty accessors.
+/// When the mesh is empty, since glTF has no empty accessors, or exceeds what the format holds.
 pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
     if mesh.faces.is_empty() {
         return Err(DataError::input(path, "the mesh is empty: nothing is denser than the level; lower --level or train longer"));
     }
     let n = mesh.positions.len();
-    let mut bin: Vec<u8> = Vec::new();
-    let mut views = Vec::new();
-    let mut accessors = Vec::new();
-    let mut add = |data: Vec<u8>, target: u32, mut accessor: serde_json::Value| -> usize {
-        let offset = bin.len();
-        views.push(json!({ "buffer": 0, "byteOffset": offset, "byteLength": data.len(), "target": target }));
-        bin.extend(data);
-        bin.resize(bin.len().next_multiple_of(4), 0);
-        accessor["bufferView"] = (views.len() - 1).into();
-        accessors.push(accessor);
-        accessors.len() - 1
-    };
-    let floats = |v: &mut dyn Iterator<Item = [f32; 3]>| v.flat_map(|p| p.map(f32::to_le_bytes)).flatten().collect::<Vec<u8>>();
-    let turned: Vec<[f32; 3]> = mesh.positions.iter().map(|p| y_up(*p)).collect();
-    let (lo, hi) = turned.iter().fold(([f32::MAX; 3], [f32::MIN; 3]), |(lo, hi), p| {
-        (std::array::from_fn(|k| lo[k].min(p[k])), std::array::from_fn(|k| hi[k].max(p[k])))
-    });
-    let mut attributes = json!({});
-    attributes["POSITION"] =
-        add(floats(&mut turned.iter().copied()), 34962, json!({ "componentType": 5126, "count": n, "type": "VEC3", "min": lo, "max": hi }))
-            .into();
-    if mesh.normals.len() == n {
-        let data = floats(&mut mesh.normals.iter().map(|v| y_up(*v)));
-        attributes["NORMAL"] = add(data, 34962, json!({ "componentType": 5126, "count": n, "type": "VEC3" })).into();
-    }
     let texture = mesh.texture.as_ref().filter(|_| mesh.uvs.len() == n);
-    if texture.is_some() {
-        let data = mesh.uvs.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
-        attributes["TEXCOORD_0"] = add(data, 34962, json!({ "componentType": 5126, "count": n, "type": "VEC2" })).into();
-    } else if mesh.colors_srgb.len() == n {
-        let word = |v: f32| ((linear_from_srgb(v.clamp(0.0, 1.0)) * 65535.0 + 0.5) as u16).to_le_bytes();
-        let data = mesh.colors_srgb.iter().flat_map(|c| [word(c[0]), word(c[1]), word(c[2]), [255, 255]]).flatten().collect();
-        attributes["COLOR_0"] = add(data, 34962, json!({ "componentType": 5123, "count": n, "type": "VEC4", "normalized": true })).into();
-    }
-    let indices = mesh.faces.iter().flatten().flat_map(|i| i.to_le_bytes()).collect();
-    let indices = add(indices, 34963, json!({ "componentType": 5125, "count": mesh.faces.len() * 3, "type": "SCALAR" }));
     let normal_map = mesh.normal_map.as_ref().filter(|_| texture.is_some() && mesh.tangents.len() == n);
+    let mut chunk = Chunk::default();
+    let mut attributes = attributes(mesh, texture.is_some(), &mut chunk);
+    let indices = mesh.faces.iter().flatten().flat_map(|i| i.to_le_bytes()).collect();
+    let indices = chunk.add(indices, ELEMENTS, json!({ "componentType": 5125, "count": mesh.faces.len() * 3, "type": "SCALAR" }));
     if normal_map.is_some() {
         let turned = mesh.tangents.iter().flat_map(|t| {
             let [x, y, z] = y_up([t[0], t[1], t[2]]);
             [x, y, z, t[3]]
         });
         let data = turned.flat_map(f32::to_le_bytes).collect();
-        attributes["TANGENT"] = add(data, 34962, json!({ "componentType": 5126, "count": n, "type": "VEC4" })).into();
-    }
-    let mut material = json!({ "name": "radiance", "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 1.0 } });
-    // What light falls on the surface is in its colours already; with a normal map the user's own lights are meant.
-    if normal_map.is_none() {
-        material["extensions"] = json!({ "KHR_materials_unlit": {} });
+        attributes["TANGENT"] = chunk.add(data, ARRAY, json!({ "componentType": 5126, "count": n, "type": "VEC4" }));
     }
     let mut images = Vec::new();
     for image in [texture, normal_map].into_iter().flatten() {
-        let png = photo::encode_png(image);
-        images.push(json!({ "mimeType": "image/png", "bufferView": views.len() }));
-        views.push(json!({ "buffer": 0, "byteOffset": bin.len(), "byteLength": png.len() }));
-        bin.extend(png);
-        bin.resize(bin.len().next_multiple_of(4), 0);
-    }
-    if texture.is_some() {
-        material["pbrMetallicRoughness"]["baseColorTexture"] = json!({ "index": 0 });
-    }
-    if normal_map.is_some() {
-        material["normalTexture"] = json!({ "index": 1 });
+        let view = chunk.view(photo::encode_png(image), None);
+        images.push(json!({ "mimeType": "image/png", "bufferView": view }));
     }
     let mut root = json!({
         "asset": { "version": "2.0", "generator": concat!("diorama ", env!("CARGO_PKG_VERSION")) },
@@ -91,10 +79,10 @@ pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
         "scenes": [{ "nodes": [0] }],
         "nodes": [{ "mesh": 0, "name": "mesh" }],
         "meshes": [{ "primitives": [{ "attributes": attributes, "indices": indices, "material": 0 }] }],
-        "materials": [material],
-        "buffers": [{ "byteLength": bin.len() }],
-        "bufferViews": views,
-        "accessors": accessors,
+        "materials": [material(texture.is_some(), normal_map.is_some())],
+        "buffers": [{ "byteLength": chunk.bytes.len() }],
+        "bufferViews": chunk.views,
+        "accessors": chunk.accessors,
     });
     if texture.is_some() {
         // Linear filters with mipmaps; repeated coordinates would bring the far edge in.
@@ -105,14 +93,60 @@ pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
     if normal_map.is_none() {
         root["extensionsUsed"] = json!(["KHR_materials_unlit"]);
     }
-    let mut text = serde_json::to_vec(&root).expect("JSON of plain values");
+    join(&root, &chunk.bytes, path)
+}
+
+/// Positions, normals, and texture coordinates or colors of the vertices.
+fn attributes(mesh: &Mesh, is_textured: bool, chunk: &mut Chunk) -> Value {
+    let n = mesh.positions.len();
+    let floats = |v: &mut dyn Iterator<Item = [f32; 3]>| v.flat_map(|p| p.map(f32::to_le_bytes)).flatten().collect::<Vec<u8>>();
+    let turned: Vec<[f32; 3]> = mesh.positions.iter().map(|p| y_up(*p)).collect();
+    let (lo, hi) = turned.iter().fold(([f32::MAX; 3], [f32::MIN; 3]), |(lo, hi), p| {
+        (std::array::from_fn(|k| lo[k].min(p[k])), std::array::from_fn(|k| hi[k].max(p[k])))
+    });
+    let mut attributes = json!({});
+    let accessor = json!({ "componentType": 5126, "count": n, "type": "VEC3", "min": lo, "max": hi });
+    attributes["POSITION"] = chunk.add(floats(&mut turned.iter().copied()), ARRAY, accessor);
+    if mesh.normals.len() == n {
+        let data = floats(&mut mesh.normals.iter().map(|v| y_up(*v)));
+        attributes["NORMAL"] = chunk.add(data, ARRAY, json!({ "componentType": 5126, "count": n, "type": "VEC3" }));
+    }
+    if is_textured {
+        let data = mesh.uvs.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+        attributes["TEXCOORD_0"] = chunk.add(data, ARRAY, json!({ "componentType": 5126, "count": n, "type": "VEC2" }));
+    } else if mesh.colors_srgb.len() == n {
+        let word = |v: f32| ((linear_from_srgb(v.clamp(0.0, 1.0)) * 65535.0 + 0.5) as u16).to_le_bytes();
+        let data = mesh.colors_srgb.iter().flat_map(|c| [word(c[0]), word(c[1]), word(c[2]), [255, 255]]).flatten().collect();
+        attributes["COLOR_0"] = chunk.add(data, ARRAY, json!({ "componentType": 5123, "count": n, "type": "VEC4", "normalized": true }));
+    }
+    attributes
+}
+
+/// What light falls on the surface is in its colors already; with a normal map the user's own lights are meant.
+fn material(is_textured: bool, is_lit: bool) -> Value {
+    let mut material = json!({ "name": "radiance", "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 1.0 } });
+    if !is_lit {
+        material["extensions"] = json!({ "KHR_materials_unlit": {} });
+    }
+    if is_textured {
+        material["pbrMetallicRoughness"]["baseColorTexture"] = json!({ "index": 0 });
+    }
+    if is_lit {
+        material["normalTexture"] = json!({ "index": 1 });
+    }
+    material
+}
+
+/// The container with its two chunks.
+fn join(root: &Value, binary: &[u8], path: &Path) -> Result<Vec<u8>> {
+    let mut text = serde_json::to_vec(root).expect("JSON of plain values");
     text.resize(text.len().next_multiple_of(4), b' ');
-    let total = 12 + 8 + text.len() + 8 + bin.len();
+    let total = 12 + 8 + text.len() + 8 + binary.len();
     let total = u32::try_from(total).map_err(|_| DataError::input(path, "the mesh exceeds 4 GiB, the limit of .glb; lower --faces"))?;
     let mut out = b"glTF".to_vec();
     out.extend(2u32.to_le_bytes());
     out.extend(total.to_le_bytes());
-    for (kind, chunk) in [(b"JSON", &text), (b"BIN\0", &bin)] {
+    for (kind, chunk) in [(b"JSON", &text[..]), (b"BIN\0", binary)] {
         out.extend((chunk.len() as u32).to_le_bytes());
         out.extend(kind);
         out.extend(chunk);

@@ -2,14 +2,15 @@
 
 use crate::archive::{self, ArchiveLimits};
 use crate::error::{DataError, Result};
+pub use crate::imported::locate;
+use crate::imported::{Imported, few};
 use crate::masks::{self, MaskOptions};
 use crate::split::{self, SplitRule};
-use crate::{colmap, llff, photo_check, photo_import, sparse, transforms_json};
-use diorama_geom::capture::{Agreement, Frame, MaskMeaning, Split, focus_point};
+use crate::{colmap, llff, photo_check, sparse, transforms_json};
+use diorama_geom::capture::{Frame, Split, focus_point};
 use diorama_geom::glam::DVec3;
-use diorama_geom::{Capture, SceneBox, Similarity, SparsePoint};
-use std::collections::{BTreeSet, HashSet};
-use std::path::{Component, Path, PathBuf};
+use diorama_geom::{Capture, SceneBox, Similarity};
+use std::path::{Path, PathBuf};
 
 /// Descriptions of a capture that can be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -78,34 +79,6 @@ impl Default for ImportOptions {
         }
     }
 }
-
-/// What a reader of one format returns.
-#[derive(Debug, Default)]
-pub struct Imported {
-    pub frames: Vec<Frame>,
-    /// The scene's box, where the format states it.
-    pub scene: Option<SceneBox>,
-    /// Names of listed images that do not exist.
-    pub missing: Vec<String>,
-    pub has_own_split: bool,
-    /// Undoes what the file's author did to the poses; none: nothing.
-    pub frames_from_capture: Option<Similarity>,
-    /// Whether the world is not z up yet and must be turned by the cameras' up directions.
-    pub unknown_up: bool,
-    /// What the file says that masks leave out.
-    pub mask_meaning: Option<MaskMeaning>,
-    /// Points of structure from motion, in the frames' world.
-    pub points: Vec<SparsePoint>,
-    /// How well they agree with the poses, where the format tells.
-    pub agreement: Option<Agreement>,
-    /// Folder of the model that says so.
-    pub model: Option<PathBuf>,
-    /// What was skipped or assumed, one line each.
-    pub notes: Vec<String>,
-}
-
-/// Folders that photographs may lie in, the best first; the last are copies of the first at a part of its size.
-pub const IMAGE_FOLDERS: [&str; 5] = ["images", ".", "images_2", "images_4", "images_8"];
 
 /// Reads a capture: a folder, one of the description files in it, or a zip of it.
 ///
@@ -281,66 +254,4 @@ fn automatic_scene(frames: &[Frame]) -> SceneBox {
     let poses: Vec<_> = frames.iter().map(|f| f.world_from_camera).collect();
     let (center, distance) = focus_point(&poses);
     SceneBox { center, half: 0.5 * distance, aabb_scale: 8 }
-}
-
-/// The first three of these names.
-fn few(names: &[String]) -> String {
-    format!("{}{}", names[..names.len().min(3)].join(", "), if names.len() > 3 { ", …" } else { "" })
-}
-
-/// A note that names the photographs beside those of a model that the model does not hold; none where there are none. The folder of
-/// the capture itself may hold other pictures.
-///
-/// # Errors
-/// When a folder of photographs cannot be read.
-pub(crate) fn without_pose(root: &Path, frames: &[Frame]) -> Result<Option<String>> {
-    let known: HashSet<&Path> = frames.iter().map(|f| &*f.image).collect();
-    let folders: BTreeSet<&Path> = known.iter().filter_map(|i| i.parent()).filter(|f| *f != root && *f != root.join(".")).collect();
-    let mut unknown = Vec::new();
-    for folder in folders {
-        let beside = photo_import::found(folder)?.into_iter().filter(|p| !known.contains(&**p));
-        unknown.extend(beside.filter_map(|p| p.file_name().map(|n| n.to_string_lossy().into_owned())));
-    }
-    let note = |n: usize| format!("{n} photographs beside these have no pose in the model and are left out ({})", few(&unknown));
-    Ok((!unknown.is_empty()).then(|| note(unknown.len())))
-}
-
-/// Finds a file that a description names, inside `root` only; a missing extension is completed.
-///
-/// # Errors
-/// When the name leads out of `root`.
-pub fn locate(root: &Path, name: &str, file: &Path, field: &str) -> Result<Option<PathBuf>> {
-    let escape = || DataError::input(file, format!("{field}: {name} leads out of the dataset folder; move the file into it"));
-    let relative = Path::new(name);
-    let windows = name.contains('\\') || name.as_bytes().get(1) == Some(&b':');
-    let mut depth = 0i32;
-    for c in relative.components() {
-        match c {
-            Component::Normal(_) => depth += 1,
-            Component::ParentDir => depth -= 1,
-            Component::CurDir => {}
-            Component::RootDir | Component::Prefix(_) => return Err(escape()),
-        }
-        if depth < 0 {
-            return Err(escape());
-        }
-    }
-    if windows {
-        return Err(escape());
-    }
-    let direct = root.join(relative);
-    let mut candidates = vec![direct.clone()];
-    for extension in ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "exr", "hdr"] {
-        let mut name = direct.clone().into_os_string();
-        name.push(".");
-        name.push(extension);
-        candidates.push(name.into());
-    }
-    let Some(found) = candidates.into_iter().find(|c| c.is_file()) else { return Ok(None) };
-    let real = found.canonicalize().map_err(DataError::io(&found, "read"))?;
-    let base = root.canonicalize().map_err(DataError::io(root, "read"))?;
-    if !real.starts_with(&base) {
-        return Err(escape());
-    }
-    Ok(Some(found))
 }

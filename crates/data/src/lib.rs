@@ -13,6 +13,7 @@ pub mod film;
 pub mod gif;
 pub mod glb;
 pub mod import;
+pub mod imported;
 pub mod jpeg;
 pub mod json;
 pub mod llff;

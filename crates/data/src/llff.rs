@@ -2,7 +2,7 @@
 //! centre; height, width, focal length) and the nearest and farthest depth.
 
 use crate::error::{self, DataError, Result};
-use crate::import::{self, Imported};
+use crate::imported::{self, Imported};
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::{Camera, Lens, Pose};
@@ -15,7 +15,7 @@ pub fn read(root: &Path) -> Result<Imported> {
     if shape.len() != 2 || shape[1] != 17 {
         return Err(DataError::input(&file, format!("has shape {shape:?}; expected [images, 17]")));
     }
-    let mut folders = import::IMAGE_FOLDERS.iter().filter(|f| **f != ".").map(|f| root.join(f));
+    let mut folders = imported::IMAGE_FOLDERS.iter().filter(|f| **f != ".").map(|f| root.join(f));
     let folder = folders.find(|f| f.is_dir()).unwrap_or(root.join("images"));
     let mut images: Vec<PathBuf> = folder
         .read_dir()

@@ -2,7 +2,7 @@
 //! set: camera-to-world matrices with OpenGL axes (x right, y up, looking along −z), world z up.
 
 use crate::error::{DataError, Result};
-use crate::import::{Imported, locate};
+use crate::imported::{Imported, locate};
 use crate::json::{self, Object};
 use crate::sparse_ply;
 use diorama_geom::capture::{Frame, Split};

@@ -4,8 +4,8 @@ use diorama_engine::renderers::volume::Quality;
 use diorama_geom::capture::Split;
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::quickstart::write_capture;
-use diorama_pipelines::object::run_folder::RunFolder;
 use diorama_pipelines::object::{evaluate, recipe};
+use diorama_pipelines::run::RunFolder;
 use std::sync::atomic::AtomicBool;
 
 /// Held-out PSNR after `steps`.

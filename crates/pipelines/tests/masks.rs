@@ -10,7 +10,8 @@ use diorama_pipelines::object::evaluate::{self, Report};
 use diorama_pipelines::object::model::ObjectModel;
 use diorama_pipelines::object::quickstart::write_capture;
 use diorama_pipelines::object::recipe;
-use diorama_pipelines::object::run_folder::{self, RunFolder};
+use diorama_pipelines::object::run_folder;
+use diorama_pipelines::run::RunFolder;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 

@@ -4,12 +4,13 @@ use diorama_engine::renderers::volume::Quality;
 use diorama_geom::capture::Split;
 use diorama_pipelines::bench;
 use diorama_pipelines::object::config::{Config, Method};
-use diorama_pipelines::object::evaluate::{self, Doing};
+use diorama_pipelines::object::evaluate;
 use diorama_pipelines::object::held_out;
 use diorama_pipelines::object::model::ObjectModel;
 use diorama_pipelines::object::quickstart::write_capture;
 use diorama_pipelines::object::recipe;
-use diorama_pipelines::object::run_folder::RunFolder;
+use diorama_pipelines::object::scored_view::Doing;
+use diorama_pipelines::run::RunFolder;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 

@@ -8,8 +8,8 @@ use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, Capture, ImageU8, Pose};
 use diorama_pipelines::object::config::{Config, Method};
 use diorama_pipelines::object::model::ObjectModel;
-use diorama_pipelines::object::run_folder::RunFolder;
 use diorama_pipelines::object::{evaluate, recipe};
+use diorama_pipelines::run::RunFolder;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 

@@ -1,29 +1,51 @@
 //! `diorama doctor`
 
-use super::Outcome;
-use crate::arguments::DoctorArgs;
+use super::mask_flags::MaskFlags;
+use super::{Outcome, Verb};
+use clap::Args;
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::memory;
 use diorama_kernels::device::Api;
 use diorama_pipelines::object::diagnose::{self, Grade};
 use diorama_pipelines::{PipelineError, Result};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-pub fn run(a: &DoctorArgs) -> Result<Outcome> {
-    match &a.data {
-        Some(data) => capture(data, a),
-        None if a.masks.mask.is_some() || a.masks.mask_meaning.is_some() => {
-            Err(PipelineError::Usage("--mask and --mask-meaning: give the capture's folder as well".into()))
+/// What this machine offers, and what each missing part disables; of a capture, what will likely go wrong
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Examples:\n  diorama doctor\n  diorama doctor data/chair")]
+pub struct Doctor {
+    /// A capture's folder; without it, this machine
+    data: Option<PathBuf>,
+    /// Format of a capture, where a folder holds several
+    #[arg(long, requires = "data")]
+    format: Option<String>,
+    #[command(flatten)]
+    masks: MaskFlags,
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for Doctor {
+    fn json(&self) -> bool {
+        self.json
+    }
+
+    fn run(&self) -> Result<Outcome> {
+        match &self.data {
+            Some(data) => capture(data, self),
+            None if self.masks.mask.is_some() || self.masks.mask_meaning.is_some() => {
+                Err(PipelineError::Usage("--mask and --mask-meaning: give the capture's folder as well".into()))
+            }
+            None => machine(self),
         }
-        None => machine(a),
     }
 }
 
 /// What a capture is, and what will likely go wrong.
-fn capture(data: &Path, a: &DoctorArgs) -> Result<Outcome> {
+fn capture(data: &Path, a: &Doctor) -> Result<Outcome> {
     let format = a.format.as_deref().map(str::parse).transpose().map_err(PipelineError::Usage)?;
-    let masks = super::mask_options(&a.masks)?;
+    let masks = a.masks.options()?;
     let options = ImportOptions { format, min_views: 1, masks, allow_broken: true, ..ImportOptions::default() };
     let capture = import::import(data, &options)?;
     let found = diagnose::diagnose(&capture)?;
@@ -47,7 +69,7 @@ fn capture(data: &Path, a: &DoctorArgs) -> Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-fn machine(a: &DoctorArgs) -> Result<Outcome> {
+fn machine(a: &Doctor) -> Result<Outcome> {
     let cpu = diorama_kernels::device::cpu();
     let gpus = diorama_kernels::device::gpus();
     let devices: Vec<&str> = std::iter::once("cpu").chain(gpus.iter().map(|g| g.api.name())).collect();

@@ -1,91 +1,189 @@
 //! `diorama eval`
 
-use super::{Outcome, note, use_threads};
-use crate::arguments::EvalArgs;
+use super::process::{note, usage, use_threads};
+use super::{Outcome, Verb};
 use crate::terminal::ShareShown;
+use clap::Args;
 use diorama_data::{DataError, photo};
+use diorama_engine::metrics::lpips::Lpips;
 use diorama_geom::ImageU8;
 use diorama_geom::capture::Split;
 use diorama_pipelines::object::depth_error::DepthError;
-use diorama_pipelines::object::evaluate::{EvaluationProgress, ScoredView};
+use diorama_pipelines::object::evaluate::{self, EvaluationProgress, Report};
+use diorama_pipelines::object::model::ObjectModel;
+use diorama_pipelines::object::scored_view::ScoredView;
 use diorama_pipelines::object::seen_by::{SeenBy, Sights};
-use diorama_pipelines::object::{device, evaluate, kept_capture, run_folder};
-use diorama_pipelines::{PipelineError, Result};
+use diorama_pipelines::object::{device, run_folder};
+use diorama_pipelines::run::kept_capture;
+use diorama_pipelines::{Application, Result};
 use std::cell::RefCell;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-pub fn run(a: &EvalArgs) -> Result<Outcome> {
-    use_threads(a.threads)?;
-    let split = match &a.on[..] {
-        "train" => Split::Train,
-        "val" => Split::Val,
-        "test" => Split::Test,
-        other => return Err(PipelineError::Usage(format!("--on {other}: expected train, val or test"))),
-    };
-    let quality = a.quality.parse().map_err(|e| PipelineError::Usage(format!("--{e}")))?;
-    let lpips = if a.lpips.is_empty() { None } else { Some(evaluate::load_lpips(&a.lpips)?) };
-    let (mut model, notes) = run_folder::load_model_of(&a.run, a.data.as_deref())?;
-    let no_points = run_folder::add_points(&mut model, &a.run, a.data.as_deref())?;
-    notes.iter().chain(&no_points).for_each(|n| note(n));
-    kept_capture::require_photographs(&model.capture)?;
-    device::accelerate(&mut model, &a.device, Box::new(note))?;
-    let folder = a.run.join("eval");
-    if a.save_images || a.explain {
-        std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
+/// Score held-out views
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  diorama eval runs/chair --save-images --json")]
+pub struct Eval {
+    /// Folder of the run
+    run: PathBuf,
+    /// Where the photographs are now, if they moved
+    #[arg(long, value_name = "FOLDER")]
+    data: Option<PathBuf>,
+    /// auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto")]
+    device: String,
+    /// train, val or test
+    #[arg(long, default_value = "test")]
+    on: String,
+    /// full, or fast as for previews
+    #[arg(long, default_value = "full")]
+    quality: String,
+    /// Also judge by LPIPS with these weights: AlexNet or VGG16 and the linear heads, safetensors or PyTorch's .pth, in one file or two
+    #[arg(long, value_name = "FILE[,FILE]", value_delimiter = ',')]
+    lpips: Vec<PathBuf>,
+    /// Write each render beside its photograph into RUN/eval
+    #[arg(long)]
+    save_images: bool,
+    /// Tell how many training views see what each view shows, and the PSNR where two or more do; maps in RUN/eval: purple none, red 1, orange 2, yellow 3, green more, gray nothing
+    #[arg(long)]
+    explain: bool,
+    #[arg(long)]
+    threads: Option<usize>,
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for Eval {
+    fn json(&self) -> bool {
+        self.json
     }
-    let shown = RefCell::new(ShareShown::new());
-    // Before the training views are drawn.
-    evaluate::judged(&model, split)?;
-    let sights = a.explain.then(|| {
-        let mut told = |done: usize, all: usize| {
-            shown.borrow_mut().show(done as f64 / all as f64, &format!("training view {} of {all}: where its rays end", done + 1));
+
+    fn run(&self) -> Result<Outcome> {
+        use_threads(self.threads)?;
+        match Application::of_run(&self.run)? {
+            Application::Object => self.object(),
+        }
+    }
+}
+
+/// What judging a run of the object application came to.
+struct Judgement {
+    model: ObjectModel,
+    report: Report,
+    lpips: Option<Lpips>,
+    /// Who sees what each view shows; empty where that was not asked.
+    seen_by: Vec<SeenBy>,
+    /// How many training views were asked what they see.
+    asked: usize,
+    /// Where pictures and maps lie.
+    folder: PathBuf,
+}
+
+impl Eval {
+    /// Judges a run of the object application.
+    fn object(&self) -> Result<Outcome> {
+        let split = match &self.on[..] {
+            "train" => Split::Train,
+            "val" => Split::Val,
+            "test" => Split::Test,
+            other => return Err(usage(format!("on {other}: expected train, val or test"))),
         };
-        Sights::of(&model, &mut told)
-    });
-    shown.borrow().finish();
-    shown.replace(ShareShown::new());
-    let asked = sights.as_ref().map_or(0, Sights::len);
-    let file = |name: &str, what: &str| folder.join(format!("{}{what}.png", name.replace(['/', '\\'], "_")));
-    let mut seen_by = Vec::new();
-    let mut each = |name: &str, v: &ScoredView| -> Result<()> {
-        shown.borrow().line(&format!("{name}: psnr {:.2} ssim {:.3}", v.scores.psnr, v.scores.ssim));
-        if a.save_images {
-            let (r, p) = (v.view.rgb.to_u8(), v.photo.to_u8());
-            let rows = r.data.chunks_exact(r.width * 3).zip(p.data.chunks_exact(p.width * 3));
-            let data = rows.flat_map(|(a, b)| [a, b].concat()).collect();
-            let both = ImageU8 { width: r.width + p.width, height: r.height, channels: 3, data };
-            photo::save_png(&file(name, ""), &both)?;
+        let quality = self.quality.parse().map_err(usage)?;
+        let lpips = if self.lpips.is_empty() { None } else { Some(evaluate::load_lpips(&self.lpips)?) };
+        let model = self.open()?;
+        let folder = self.run.join("eval");
+        if self.save_images || self.explain {
+            std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
         }
-        if let (Some(sights), Some(frame)) = (&sights, model.capture.frames.iter().position(|f| f.name == name)) {
-            let (seen, map) = sights.explain(&model, frame, v);
-            photo::save_png(&file(name, ".seen"), &map)?;
-            seen_by.push(seen);
+        // Before the training views are drawn.
+        evaluate::judged(&model, split)?;
+        let sights = self.explain.then(|| sights(&model));
+        let shown = RefCell::new(ShareShown::new());
+        let mut seen_by = Vec::new();
+        let mut each = |name: &str, v: &ScoredView| -> Result<()> {
+            shown.borrow().line(&format!("{name}: psnr {:.2} ssim {:.3}", v.scores.psnr, v.scores.ssim));
+            if self.save_images {
+                photo::save_png(&file(&folder, name, ""), &beside(v))?;
+            }
+            if let (Some(sights), Some(frame)) = (&sights, model.capture.frames.iter().position(|f| f.name == name)) {
+                let (seen, map) = sights.explain(&model, frame, v);
+                photo::save_png(&file(&folder, name, ".seen"), &map)?;
+                seen_by.push(seen);
+            }
+            Ok(())
+        };
+        let mut progress = |p: EvaluationProgress<'_>| {
+            let (done, all) = p.views;
+            shown.borrow_mut().show(p.share, &format!("view {} of {all} ({}): {}", done + 1, p.view, p.doing.name()));
+        };
+        let report = evaluate::evaluate_with_training(&model, split, quality, lpips.as_ref(), &mut each, &mut progress);
+        shown.borrow().finish();
+        let (report, asked) = (report?, sights.as_ref().map_or(0, Sights::len));
+        drop(sights);
+        let judgement = Judgement { report, lpips, seen_by, asked, folder, model };
+        if self.json {
+            println!("{}", judgement.json(self.explain));
+        } else {
+            judgement.print();
         }
-        Ok(())
+        Ok(Outcome::Done)
+    }
+
+    /// The model with the capture's points, on the device.
+    fn open(&self) -> Result<ObjectModel> {
+        let (mut model, notes) = run_folder::load_model_of(&self.run, self.data.as_deref())?;
+        let no_points = run_folder::add_points(&mut model, &self.run, self.data.as_deref())?;
+        notes.iter().chain(&no_points).for_each(|n| note(n));
+        kept_capture::require_photographs(&model.capture)?;
+        device::accelerate(&mut model, &self.device, Box::new(note))?;
+        Ok(model)
+    }
+}
+
+/// Where the rays of the training views end.
+fn sights(model: &ObjectModel) -> Sights {
+    let mut shown = ShareShown::new();
+    let mut progress = |done: usize, all: usize| {
+        shown.show(done as f64 / all as f64, &format!("training view {} of {all}: where its rays end", done + 1));
     };
-    let mut progress = |p: EvaluationProgress<'_>| {
-        let (done, all) = p.views;
-        shown.borrow_mut().show(p.share, &format!("view {} of {all} ({}): {}", done + 1, p.view, p.doing.name()));
-    };
-    let report = evaluate::evaluate_with_training(&model, split, quality, lpips.as_ref(), &mut each, &mut progress);
-    shown.borrow().finish();
-    let report = report?;
-    if a.json {
-        let mut object = serde_json::to_value(&report).expect("a report is JSON");
+    let sights = Sights::of(model, &mut progress);
+    shown.finish();
+    sights
+}
+
+/// The file of a view's picture.
+fn file(folder: &Path, name: &str, what: &str) -> PathBuf {
+    folder.join(format!("{}{what}.png", name.replace(['/', '\\'], "_")))
+}
+
+/// A render, and its photograph to the right of it.
+fn beside(v: &ScoredView) -> ImageU8 {
+    let (r, p) = (v.view.rgb.to_u8(), v.photo.to_u8());
+    let rows = r.data.chunks_exact(r.width * 3).zip(p.data.chunks_exact(p.width * 3));
+    let data = rows.flat_map(|(a, b)| [a, b].concat()).collect();
+    ImageU8 { width: r.width + p.width, height: r.height, channels: 3, data }
+}
+
+impl Judgement {
+    fn json(&self, explain: bool) -> serde_json::Value {
+        let report = &self.report;
+        let mut object = serde_json::to_value(report).expect("a report is JSON");
         object["gap"] = serde_json::json!(report.gap());
         object["advice"] = serde_json::json!(report.advice());
         object["depth_advice"] = serde_json::json!(report.depth.as_ref().and_then(DepthError::advice));
-        if a.explain {
-            object["seen_by"] = serde_json::json!(seen_by);
-            object["seen_by_of"] = serde_json::json!(asked);
+        if explain {
+            object["seen_by"] = serde_json::json!(self.seen_by);
+            object["seen_by_of"] = serde_json::json!(self.asked);
         }
-        println!("{object}");
-    } else {
+        object
+    }
+
+    fn print(&self) {
+        let report = &self.report;
         println!(
             "{} views: psnr {:.2} dB (worst {:.2}, affine {:.2}), ssim {:.4}, mse {:.5}",
             report.views, report.psnr, report.psnr_min, report.psnr_affine, report.ssim, report.mse
         );
-        if let (Some(l), Some(network)) = (report.lpips, &lpips) {
+        if let (Some(l), Some(network)) = (report.lpips, &self.lpips) {
             println!("lpips {l:.4} ({})", network.network());
         }
         if let Some(t) = &report.training {
@@ -97,17 +195,16 @@ pub fn run(a: &EvalArgs) -> Result<Outcome> {
         if let fog @ [_, ..] = &report.behind_fog()[..] {
             println!("behind fog: {}", fog.join(", "));
         }
-        if !seen_by.is_empty() {
-            print_seen_by(&seen_by, asked, model.train.len(), &folder);
+        if !self.seen_by.is_empty() {
+            print_seen_by(&self.seen_by, self.asked, self.model.train.len(), &self.folder);
         }
-        if model.is_linear() {
+        if self.model.is_linear() {
             println!("scored in {}: the photographs hold linear light", report.scored_in);
         }
         if let Some(p) = report.psnr_mean_image {
             println!("the mean training image in place of renders: {p:.2} dB");
         }
     }
-    Ok(Outcome::Done)
 }
 
 /// Which share of each view's light comes from places that so many training views see, and who sees what few see.

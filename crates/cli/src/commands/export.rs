@@ -1,99 +1,212 @@
 //! `diorama export`
 
-use super::{Outcome, clip_or_crop, note, use_threads};
-use crate::arguments::ExportArgs;
+use super::clip::clip_or_crop;
+use super::process::{note, usage, use_threads};
+use super::{Outcome, Verb};
+use clap::Args;
 use diorama_data::{DataError, mesh_text};
-use diorama_pipelines::object::export::{self, ExportOptions, Size};
+use diorama_pipelines::object::export::{self, ExportOptions, Exported, Size};
 use diorama_pipelines::object::model::ObjectModel;
 use diorama_pipelines::object::points::{self, PointFormat, PointOptions, Region};
-use diorama_pipelines::object::{device, run_folder, viewing};
-use diorama_pipelines::{PipelineError, Result};
+use diorama_pipelines::object::viewing::{self, Crop};
+use diorama_pipelines::object::{device, run_folder};
+use diorama_pipelines::{Application, PipelineError, Result};
+use std::path::PathBuf;
 use std::time::Instant;
 
-pub fn run(a: &ExportArgs) -> Result<Outcome> {
-    use_threads(a.threads)?;
-    let format = Format::of(a)?;
-    let written = [a.out.clone()].into_iter().chain(mesh_text::companions(&a.out));
-    if let Some(file) = written.filter(|_| !a.force).find(|f| f.exists()) {
-        return Err(DataError::input(file, "exists; give --force to replace it or another --out").into());
+/// Extract a mesh or a point cloud
+#[derive(Args, Clone, Debug)]
+#[command(
+    after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --scale-to 80cm -o chair.usdz\n  diorama export runs/chair --resolution 384 --faces 100000 --watertight --units mm -o chair.stl\n  diorama export runs/chair --format points --points 2000000 -o chair.ply\n  diorama export runs/chair -o chair.e57"
+)]
+pub struct Export {
+    /// Folder of the run
+    run: PathBuf,
+    /// auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto")]
+    device: String,
+    /// glb, obj, ply, stl, usdz or dae; points (a point cloud: ply, las or e57) [default: the extension of --out]
+    #[arg(long)]
+    format: Option<String>,
+    /// How many points a point cloud gets [default: 1000000]
+    #[arg(long, value_name = "N")]
+    points: Option<usize>,
+    /// The file to write
+    #[arg(short, long)]
+    out: PathBuf,
+    /// mc: marching cubes; mt: marching tetrahedra, some twice the faces before they are reduced
+    #[arg(long, default_value = "mc")]
+    extract: String,
+    /// Cells along the longest side
+    #[arg(long, default_value_t = 320)]
+    resolution: usize,
+    /// auto, or the density of the surface in inverse units of the input
+    #[arg(long, default_value = "auto")]
+    level: String,
+    /// Most faces; 0 keeps all [default: 60000 with a texture, 200000 without]
+    #[arg(long)]
+    faces: Option<usize>,
+    /// Edge of the texture in texels; 0 colours the vertices instead [default: 2048 where the format has textures]
+    #[arg(long)]
+    texture: Option<usize>,
+    /// Bake the field's normals too, for a material that is lit; glb and obj
+    #[arg(long)]
+    normal_map: bool,
+    /// Close the mesh, as printing needs it, or fail
+    #[arg(long)]
+    watertight: bool,
+    /// Metres per unit of the capture [default: by the length measured in the viewer, else 1]
+    #[arg(long, conflicts_with_all = ["scale_to", "measured"])]
+    scale: Option<f64>,
+    /// Make the longest side so long, for example 80cm, 0.8m, 800mm or 31.5in
+    #[arg(long, value_name = "LENGTH", conflicts_with = "measured")]
+    scale_to: Option<String>,
+    /// Two points of the capture and their true distance: x0,y0,z0,x1,y1,z1=45cm
+    #[arg(long, value_name = "POINTS=LENGTH", allow_hyphen_values = true)]
+    measured: Option<String>,
+    /// Unit of the coordinates in obj, ply, stl and las: m, cm, mm or in; the others are in metres by their standards
+    #[arg(long, default_value = "m")]
+    units: String,
+    /// Extract only x0,y0,z0,x1,y1,z1 (the input's frame), or auto, or all (points only) [default: the crop box saved in the viewer, else auto: what most cameras look at]
+    #[arg(long, allow_hyphen_values = true)]
+    clip: Option<String>,
+    /// Remove parts with fewer faces than this share of the largest part's
+    #[arg(long, default_value_t = 0.01)]
+    floaters: f32,
+    /// Keep parts that fewer than three training cameras see, and parts that stand close before one
+    #[arg(long)]
+    keep_unseen: bool,
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Replace an existing file
+    #[arg(long)]
+    force: bool,
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for Export {
+    fn json(&self) -> bool {
+        self.json
     }
-    if let Some(parent) = a.out.parent().filter(|p| !p.as_os_str().is_empty() && !p.is_dir()) {
-        return Err(DataError::input(parent, "is not a folder; create it or choose another --out").into());
-    }
-    let (size, unit_m) =
-        (size(a)?, unit(&a.units).ok_or_else(|| PipelineError::Usage(format!("--units {}: expected m, cm, mm or in", a.units)))?);
-    let (mut model, notes) = run_folder::load_model(&a.run)?;
-    notes.iter().for_each(|n| note(n));
-    let scale = model.capture.world_from_capture.scale as f32;
-    let level = match &a.level[..] {
-        "auto" => None,
-        // Densities per unit of the input become densities per unit of the world.
-        n => Some(
-            n.parse::<f32>()
-                .ok()
-                .filter(|v| v.is_finite() && *v > 0.0)
-                .map(|v| v / scale)
-                .ok_or_else(|| PipelineError::Usage(format!("--level {n}: expected auto or a number above 0")))?,
-        ),
-    };
-    let everything = a.clip.as_deref() == Some("all");
-    let clip = if everything { None } else { clip_or_crop(a.clip.as_deref(), "auto", &a.run, &model)? };
-    device::accelerate(&mut model, &a.device, Box::new(note))?;
-    let format = match format {
-        Format::Mesh(f) => f,
-        Format::Points(format) => {
-            let region = match clip {
-                Some((lo, hi)) => Region::Box(lo, hi),
-                None if everything => Region::Everything,
-                None => Region::Auto,
-            };
-            let points = a.points.unwrap_or(points::POINTS);
-            return export_points(a, &model, &PointOptions { format, out: a.out.clone(), points, region, size, unit_m });
+
+    fn run(&self) -> Result<Outcome> {
+        use_threads(self.threads)?;
+        match Application::of_run(&self.run)? {
+            Application::Object => self.object(),
         }
-    };
-    let options = ExportOptions {
-        format,
-        out: a.out.clone(),
-        method: a.extract.parse().map_err(|e| PipelineError::Usage(format!("--{e}")))?,
-        resolution: a.resolution,
-        level,
-        faces: a.faces,
-        texture: a.texture,
-        normal_map: a.normal_map,
-        watertight: a.watertight,
-        size,
-        unit_m,
-        clip,
-        floaters: a.floaters,
-        keep_unseen: a.keep_unseen,
-    };
-    let made = export::export(&model, &options, &mut note, &mut progress())?;
-    if a.json {
-        println!("{}", serde_json::to_string(&made).expect("plain values"));
-    } else {
-        println!(
-            "{}: {} vertices, {} faces, {}{} KiB, {}, {:.1} s, level {:.2}{}",
-            made.file.display(),
-            made.vertices,
-            made.faces,
-            if made.texture > 0 { format!("texture {0} x {0}, ", made.texture) } else { String::new() },
-            made.bytes >> 10,
-            extent(made.extent_m, size),
-            made.seconds,
-            made.level,
-            if made.watertight { ", watertight" } else { "" }
-        );
-        let r = made.removed;
-        println!(
-            "removed: {} faces of small parts, {} of parts that fewer than three cameras see, {} of parts close before a camera{}",
-            r.small,
-            r.unseen,
-            r.before_cameras,
-            if r.unseen + r.before_cameras > 0 { " (--keep-unseen keeps the latter two)" } else { "" }
-        );
-        made.notes.iter().for_each(|n| println!("note: {n}"));
     }
-    Ok(Outcome::Done)
+}
+
+impl Export {
+    /// Exports a run of the object application.
+    fn object(&self) -> Result<Outcome> {
+        let format = Format::of(self)?;
+        self.check_out()?;
+        let size = size(self)?;
+        let unit_m = unit(&self.units).ok_or_else(|| usage(format!("units {}: expected m, cm, mm or in", self.units)))?;
+        let (mut model, notes) = run_folder::load_model(&self.run)?;
+        notes.iter().for_each(|n| note(n));
+        let level = self.level(&model)?;
+        let everything = self.clip.as_deref() == Some("all");
+        let clip = if everything { None } else { clip_or_crop(self.clip.as_deref(), "auto", &self.run, &model)? };
+        device::accelerate(&mut model, &self.device, Box::new(note))?;
+        match format {
+            Format::Mesh(format) => self.mesh(&model, &ExportOptions { level, clip, size, unit_m, ..self.mesh_options(format)? }),
+            Format::Points(format) => {
+                let region = region(clip, everything);
+                let points = self.points.unwrap_or(points::POINTS);
+                export_points(self, &model, &PointOptions { format, out: self.out.clone(), points, region, size, unit_m })
+            }
+        }
+    }
+
+    /// # Errors
+    /// When the file is there already, or its folder is not.
+    fn check_out(&self) -> Result<()> {
+        let written = [self.out.clone()].into_iter().chain(mesh_text::companions(&self.out));
+        if let Some(file) = written.filter(|_| !self.force).find(|f| f.exists()) {
+            return Err(DataError::input(file, "exists; give --force to replace it or another --out").into());
+        }
+        if let Some(parent) = self.out.parent().filter(|p| !p.as_os_str().is_empty() && !p.is_dir()) {
+            return Err(DataError::input(parent, "is not a folder; create it or choose another --out").into());
+        }
+        Ok(())
+    }
+
+    /// `--level` in inverse units of the world; none: from the field.
+    fn level(&self, model: &ObjectModel) -> Result<Option<f32>> {
+        if self.level == "auto" {
+            return Ok(None);
+        }
+        let given = self.level.parse::<f32>().ok().filter(|v| v.is_finite() && *v > 0.0);
+        let given = given.ok_or_else(|| usage(format!("level {}: expected auto or a number above 0", self.level)))?;
+        // Densities per unit of the input become densities per unit of the world.
+        Ok(Some(given / model.capture.world_from_capture.scale as f32))
+    }
+
+    /// What the flags ask of a mesh, but for what depends on the model.
+    fn mesh_options(&self, format: export::Format) -> Result<ExportOptions> {
+        Ok(ExportOptions {
+            format,
+            out: self.out.clone(),
+            method: self.extract.parse().map_err(usage)?,
+            resolution: self.resolution,
+            level: None,
+            faces: self.faces,
+            texture: self.texture,
+            normal_map: self.normal_map,
+            watertight: self.watertight,
+            size: Size::Unknown,
+            unit_m: 1.0,
+            clip: None,
+            floaters: self.floaters,
+            keep_unseen: self.keep_unseen,
+        })
+    }
+
+    fn mesh(&self, model: &ObjectModel, options: &ExportOptions) -> Result<Outcome> {
+        let made = export::export(model, options, &mut note, &mut progress())?;
+        if self.json {
+            println!("{}", serde_json::to_string(&made).expect("plain values"));
+        } else {
+            print_mesh(&made, options.size);
+        }
+        Ok(Outcome::Done)
+    }
+}
+
+fn print_mesh(made: &Exported, size: Size) {
+    println!(
+        "{}: {} vertices, {} faces, {}{} KiB, {}, {:.1} s, level {:.2}{}",
+        made.file.display(),
+        made.vertices,
+        made.faces,
+        if made.texture > 0 { format!("texture {0} x {0}, ", made.texture) } else { String::new() },
+        made.bytes >> 10,
+        extent(made.extent_m, size),
+        made.seconds,
+        made.level,
+        if made.watertight { ", watertight" } else { "" }
+    );
+    let r = made.removed;
+    println!(
+        "removed: {} faces of small parts, {} of parts that fewer than three cameras see, {} of parts close before a camera{}",
+        r.small,
+        r.unseen,
+        r.before_cameras,
+        if r.unseen + r.before_cameras > 0 { " (--keep-unseen keeps the latter two)" } else { "" }
+    );
+    made.notes.iter().for_each(|n| println!("note: {n}"));
+}
+
+/// Where points are taken.
+fn region(clip: Option<Crop>, everything: bool) -> Region {
+    match clip {
+        Some((lo, hi)) => Region::Box(lo, hi),
+        None if everything => Region::Everything,
+        None => Region::Auto,
+    }
 }
 
 /// What the file will hold.
@@ -105,7 +218,7 @@ enum Format {
 
 impl Format {
     /// Of `--format`, else of the file's extension; flags that do not go with it are refused.
-    fn of(a: &ExportArgs) -> Result<Format> {
+    fn of(a: &Export) -> Result<Format> {
         let usage = |e: String| PipelineError::Usage(format!("--{e}"));
         let extension = a.out.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
         let named = a.format.as_deref().map(str::to_ascii_lowercase);
@@ -133,7 +246,7 @@ impl Format {
     }
 }
 
-fn export_points(a: &ExportArgs, model: &ObjectModel, options: &PointOptions) -> Result<Outcome> {
+fn export_points(a: &Export, model: &ObjectModel, options: &PointOptions) -> Result<Outcome> {
     let made = points::export(model, options, &mut progress())?;
     if a.json {
         println!("{}", serde_json::to_string(&made).expect("plain values"));
@@ -192,7 +305,7 @@ fn length(text: &str) -> Option<f64> {
     Some(value * unit(&text[split..])?).filter(|v| v.is_finite() && *v > 0.0)
 }
 
-fn size(a: &ExportArgs) -> Result<Size> {
+fn size(a: &Export) -> Result<Size> {
     let usage = |flag: &str, text: &str, expected: &str| PipelineError::Usage(format!("{flag} {text}: expected {expected}"));
     if let Some(text) = &a.scale_to {
         return length(text).map(Size::Longest).ok_or_else(|| usage("--scale-to", text, "a length with its unit, such as 80cm"));

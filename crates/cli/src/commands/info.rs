@@ -1,22 +1,72 @@
 //! `diorama info`
 
-use super::Outcome;
-use crate::arguments::InfoArgs;
+use super::{Outcome, Verb};
+use clap::Args;
 use diorama_data::import::{self, ImportOptions};
 use diorama_geom::capture::{Split, focus_point};
-use diorama_pipelines::object::run_folder;
-use diorama_pipelines::{PipelineError, Result};
+use diorama_pipelines::run::description;
+use diorama_pipelines::{Application, PipelineError, Result};
+use std::path::PathBuf;
 
-pub fn run(a: &InfoArgs) -> Result<Outcome> {
-    let object = if a.path.join("config.toml").exists() { describe_run(a)? } else { describe_capture(a)? };
-    if a.json {
-        println!("{object}");
-    } else if let Some(map) = object.as_object() {
-        for (k, v) in map {
-            println!("{:<18} {}", k.replace('_', " "), shown(v));
-        }
+/// What a capture or a run is
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Examples:\n  diorama info data/chair\n  diorama info runs/chair --json")]
+pub struct Info {
+    /// A capture's folder or a run's
+    path: PathBuf,
+    /// Format of a capture, where a folder holds several
+    #[arg(long)]
+    format: Option<String>,
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for Info {
+    fn json(&self) -> bool {
+        self.json
     }
-    Ok(Outcome::Done)
+
+    fn run(&self) -> Result<Outcome> {
+        let is_run = self.path.join(description::NAME).exists();
+        let object = if is_run { Application::of_run(&self.path)?.describe(&self.path)? } else { self.capture()? };
+        if self.json {
+            println!("{object}");
+        } else if let Some(map) = object.as_object() {
+            for (k, v) in map {
+                println!("{:<18} {}", k.replace('_', " "), shown(v));
+            }
+        }
+        Ok(Outcome::Done)
+    }
+}
+
+impl Info {
+    /// What a capture is.
+    fn capture(&self) -> Result<serde_json::Value> {
+        let format = self.format.as_deref().map(str::parse).transpose().map_err(PipelineError::Usage)?;
+        let c = import::import(&self.path, &ImportOptions { format, min_views: 1, allow_broken: true, ..ImportOptions::default() })?;
+        let poses: Vec<_> = c.frames.iter().map(|f| f.world_from_camera).collect();
+        let (focus, distance) = focus_point(&poses);
+        let first = &c.frames[0].camera;
+        Ok(serde_json::json!({
+            "kind": "capture",
+            "views": c.frames.len(),
+            "train": c.indices(Split::Train).len(),
+            "val": c.indices(Split::Val).len(),
+            "test": c.indices(Split::Test).len(),
+            "size": format!("{}x{}", first.width, first.height),
+            "focal_length_px": [first.fx, first.fy],
+            "lens": first.lens,
+            "masks": c.frames.iter().filter(|f| f.mask.is_some()).count(),
+            "points": c.points.len(),
+            "focus": focus.to_array(),
+            "camera_distance": distance,
+            "scene_center": c.scene.center.to_array(),
+            "scene_half": c.scene.half,
+            "aabb_scale": c.scene.aabb_scale,
+            "notes": c.notes,
+        }))
+    }
 }
 
 /// A value for people: four digits, lists without brackets.
@@ -45,50 +95,4 @@ fn shown(v: &serde_json::Value) -> String {
         }
         other => other.to_string(),
     }
-}
-
-fn describe_run(a: &InfoArgs) -> Result<serde_json::Value> {
-    let (model, notes) = run_folder::load_model(&a.path)?;
-    let o = model.origin;
-    Ok(serde_json::json!({
-        "kind": "object run",
-        "method": model.config.method,
-        "data": model.config.data.path,
-        "downscale": model.config.data.downscale,
-        "steps": o.step,
-        "seconds": o.seconds,
-        "rays": o.rays,
-        "samples": o.samples,
-        "parameters": model.field.groups().iter().map(|g| g.values.len()).sum::<usize>(),
-        "training_views": model.train.len(),
-        "held_out_views": model.capture.indices(Split::Test).len(),
-        "occupied": model.occupancy.as_ref().map(|g| g.bits.fill()),
-        "notes": notes,
-    }))
-}
-
-fn describe_capture(a: &InfoArgs) -> Result<serde_json::Value> {
-    let format = a.format.as_deref().map(str::parse).transpose().map_err(PipelineError::Usage)?;
-    let c = import::import(&a.path, &ImportOptions { format, min_views: 1, allow_broken: true, ..ImportOptions::default() })?;
-    let poses: Vec<_> = c.frames.iter().map(|f| f.world_from_camera).collect();
-    let (focus, distance) = focus_point(&poses);
-    let first = &c.frames[0].camera;
-    Ok(serde_json::json!({
-        "kind": "capture",
-        "views": c.frames.len(),
-        "train": c.indices(Split::Train).len(),
-        "val": c.indices(Split::Val).len(),
-        "test": c.indices(Split::Test).len(),
-        "size": format!("{}x{}", first.width, first.height),
-        "focal_length_px": [first.fx, first.fy],
-        "lens": first.lens,
-        "masks": c.frames.iter().filter(|f| f.mask.is_some()).count(),
-        "points": c.points.len(),
-        "focus": focus.to_array(),
-        "camera_distance": distance,
-        "scene_center": c.scene.center.to_array(),
-        "scene_half": c.scene.half,
-        "aabb_scale": c.scene.aabb_scale,
-        "notes": c.notes,
-    }))
 }

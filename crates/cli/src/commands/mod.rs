@@ -1,108 +1,97 @@
-//! One file per verb.
+//! The verbs: one file each, which holds the verb's flags and what it does with them.
+//!
+//! A verb of the program is a variant of [`Command`]. Verbs of an application other than the main one stand behind a noun, as those of
+//! `bench` do: a file of its own with an enum of verbs.
 
-pub mod bench;
-pub mod compare;
-pub mod doctor;
-pub mod eval;
-pub mod export;
-pub mod info;
-pub mod manual;
-pub mod prepare;
-pub mod quickstart;
-pub mod render;
-pub mod train;
-pub mod view;
+mod bench;
+mod clip;
+mod compare;
+mod doctor;
+mod eval;
+mod export;
+mod info;
+mod manual;
+mod mask_flags;
+mod prepare;
+mod process;
+mod quickstart;
+mod render;
+mod train;
+mod view;
 
-use crate::arguments::MaskArgs;
-use diorama_data::masks::{self, MaskOptions, MaskUse};
-use diorama_pipelines::{PipelineError, Result};
-use std::sync::atomic::{AtomicBool, Ordering};
+use clap::{Parser, Subcommand};
+use diorama_pipelines::Result;
 
-/// How a command ended, errors apart.
+/// A verb: a struct of flags, which clap parses, and what is done with them.
+pub trait Verb {
+    /// Whether results and errors are JSON objects on stdout.
+    fn json(&self) -> bool {
+        false
+    }
+
+    /// Does the work and prints its results.
+    ///
+    /// # Errors
+    /// When the request is wrong or the work failed.
+    fn run(&self) -> Result<Outcome>;
+}
+
+/// How a verb ended, errors apart.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
     Done,
     Interrupted,
 }
 
-/// Set by the first Ctrl-C; the second ends the program at once.
-pub static INTERRUPT: AtomicBool = AtomicBool::new(false);
-
-/// Lets Ctrl-C end long work cleanly.
-pub fn watch_interrupts() {
-    // A handler may already be there when verbs call verbs.
-    let _ = ctrlc::set_handler(|| {
-        if INTERRUPT.swap(true, Ordering::Relaxed) {
-            std::process::exit(130);
-        }
-        eprintln!("stopping after this step; press Ctrl-C again to stop at once");
-    });
+/// Photographs to radiance fields, novel views and meshes.
+#[derive(Parser)]
+#[command(
+    name = "diorama",
+    version,
+    arg_required_else_help = true,
+    after_help = "Exit codes: 0 done, 1 the work failed, 2 bad input or usage, 130 interrupted with a checkpoint written."
+)]
+pub struct Program {
+    #[command(subcommand)]
+    pub command: Command,
 }
 
-/// What flags say of masks.
-pub fn mask_options(a: &MaskArgs) -> Result<MaskOptions> {
-    let usage = |e: String| PipelineError::Usage(format!("--{e}"));
-    Ok(MaskOptions {
-        usage: a.mask.as_deref().map_or(Ok(MaskUse::Use), str::parse).map_err(usage)?,
-        meaning: a.mask_meaning.as_deref().map_or(Ok(None), masks::parse_meaning).map_err(usage)?,
-    })
+/// The verbs and nouns, in the order in which the help lists them.
+#[derive(Subcommand)]
+pub enum Command {
+    Prepare(prepare::Prepare),
+    Train(train::Train),
+    Eval(eval::Eval),
+    Render(render::Render),
+    Export(export::Export),
+    View(view::View),
+    Compare(compare::Compare),
+    Quickstart(quickstart::Quickstart),
+    Info(info::Info),
+    Doctor(doctor::Doctor),
+    Completions(manual::Completions),
+    Man(manual::Man),
+    #[command(subcommand)]
+    Bench(bench::Bench),
 }
 
-/// Bounds the threads of all kernels.
-pub fn use_threads(threads: Option<usize>) -> Result<()> {
-    if threads == Some(0) {
-        return Err(PipelineError::Usage("--threads 0: must be at least 1".into()));
-    }
-    if let Some(n) = threads {
-        let _ = rayon::ThreadPoolBuilder::new().num_threads(n).build_global();
-    }
-    Ok(())
-}
-
-/// Tells what the user should know.
-pub fn note(text: &str) {
-    eprintln!("note: {text}");
-}
-
-/// Six numbers `x0,y0,z0,x1,y1,z1` in the input's frame, as a box in the world.
-pub fn parse_clip(text: &str, world_from_capture: &diorama_geom::Similarity) -> Result<([f32; 3], [f32; 3])> {
-    let bad = || PipelineError::Usage(format!("--clip {text}: expected x0,y0,z0,x1,y1,z1 with each second corner above the first"));
-    let v: Vec<f64> = text.split(',').map(|s| s.trim().parse().map_err(|_| bad())).collect::<Result<_>>()?;
-    if v.len() != 6 || v.iter().any(|x| !x.is_finite()) || (0..3).any(|k| v[k] >= v[k + 3]) {
-        return Err(bad());
-    }
-    // The box that holds all eight turned corners.
-    let (mut lo, mut hi) = ([f32::MAX; 3], [f32::MIN; 3]);
-    for c in 0..8 {
-        let corner: [f64; 3] = std::array::from_fn(|k| v[k + 3 * (c >> k & 1)]);
-        let p = world_from_capture.point(diorama_geom::glam::DVec3::from_array(corner)).as_vec3().to_array();
-        for k in 0..3 {
-            lo[k] = lo[k].min(p[k]);
-            hi[k] = hi[k].max(p[k]);
-        }
-    }
-    Ok((lo, hi))
-}
-
-/// The box of `--clip`; without the flag that of the viewer, with `whole` none.
-pub fn clip_or_crop(
-    clip: Option<&str>,
-    whole: &str,
-    run: &std::path::Path,
-    model: &diorama_pipelines::object::model::ObjectModel,
-) -> Result<Option<([f32; 3], [f32; 3])>> {
-    match clip {
-        Some(c) if c == whole => Ok(None),
-        Some(c) => parse_clip(c, &model.capture.world_from_capture).map(Some),
-        None => {
-            let crop = diorama_pipelines::object::viewing::read_crop(run)?;
-            if crop.is_some() {
-                eprintln!(
-                    "note: within the crop box saved in the viewer ({}); --clip {whole} leaves it out",
-                    run.join("crop.json").display()
-                );
-            }
-            Ok(crop)
+impl Command {
+    /// The verb that was called.
+    pub fn verb(&self) -> &dyn Verb {
+        match self {
+            Command::Prepare(v) => v,
+            Command::Train(v) => v,
+            Command::Eval(v) => v,
+            Command::Render(v) => v,
+            Command::Export(v) => v,
+            Command::View(v) => v,
+            Command::Compare(v) => v,
+            Command::Quickstart(v) => v,
+            Command::Info(v) => v,
+            Command::Doctor(v) => v,
+            Command::Completions(v) => v,
+            Command::Man(v) => v,
+            Command::Bench(noun) => noun.verb(),
         }
     }
 }

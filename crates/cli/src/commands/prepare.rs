@@ -1,82 +1,187 @@
 //! `diorama prepare`
 
-use super::{INTERRUPT, Outcome, use_threads, watch_interrupts};
-use crate::arguments::PrepareArgs;
+use super::mask_flags::MaskFlags;
+use super::process::{INTERRUPT, usage, use_threads, watch_interrupts};
+use super::{Outcome, Verb};
+use clap::Args;
 use diorama_data::split::SplitRule;
 use diorama_data::video::Choice;
-use diorama_pipelines::object::prepare::{self, Finish, PrepareOptions, Sfm};
-use diorama_pipelines::{PipelineError, Result};
+use diorama_pipelines::Result;
+use diorama_pipelines::object::prepare::{self, Finish, PrepareOptions, Prepared, Sfm};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-pub fn run(a: &PrepareArgs) -> Result<Outcome> {
-    use_threads(a.threads)?;
-    let usage = |e: String| PipelineError::Usage(format!("--{e}"));
-    let least = |flag: &str, ok: bool, what: &str| if ok { Ok(()) } else { Err(usage(format!("{flag}: must be {what}"))) };
-    least("frames", a.frames >= 3, "at least 3")?;
-    least("fps", a.fps.is_none_or(|f| f > 0.0 && f.is_finite()), "above 0")?;
-    least("every", a.every >= 1, "at least 1")?;
-    least("features", a.features >= 256, "at least 256")?;
-    least("max-side", a.max_side.is_none_or(|s| s >= 64), "at least 64")?;
-    least("min-registered", (0.0..=100.0).contains(&a.min_registered), "0 to 100")?;
-    let sfm: Sfm = a.sfm.parse().map_err(usage)?;
-    if sfm == Sfm::Colmap
-        && let Some(flag) =
-            [("format", &a.format), ("mask", &a.masks.mask), ("mask-meaning", &a.masks.mask_meaning)].iter().find(|f| f.1.is_some())
-    {
-        return Err(usage(format!("{}: is for captures that have poses; give --sfm none as well", flag.0)));
+/// Photographs or a video to a data set, through COLMAP or with the poses that they have
+#[derive(Args, Clone, Debug)]
+#[command(
+    after_help = "Examples:\n  diorama prepare photos/ -o data/chair\n  diorama prepare chair.mp4 -o data/chair --frames 120\n  diorama prepare photos/ -o data/chair --resume --remove-background auto\n  diorama prepare posed/ -o data/chair --sfm none --remove-background auto\n\nCOLMAP (and ffmpeg for videos) must be installed; DIORAMA_COLMAP and DIORAMA_FFMPEG name other programs than those in PATH."
+)]
+pub struct Prepare {
+    /// Folder of photographs, or a video; with --sfm none a capture that has poses
+    input: PathBuf,
+    /// Folder of the data set
+    #[arg(short, long)]
+    out: PathBuf,
+    /// Where poses come from: colmap, or none for a capture that has them (transforms.json, COLMAP model, poses_bounds.npy)
+    #[arg(long, default_value = "colmap")]
+    sfm: String,
+    /// With --sfm none: transforms, blender, colmap or llff, where a folder holds several
+    #[arg(long)]
+    format: Option<String>,
+    #[command(flatten)]
+    masks: MaskFlags,
+    /// Most frames of a video; the sharpest of each stretch is taken
+    #[arg(long, default_value_t = 150, conflicts_with = "fps")]
+    frames: usize,
+    /// Frames per second of a video, instead of --frames
+    #[arg(long)]
+    fps: Option<f64>,
+    /// Take every N-th photograph
+    #[arg(long, default_value_t = 1)]
+    every: usize,
+    /// Reduce photographs whose longest side is larger
+    #[arg(long, value_name = "PIXELS")]
+    max_side: Option<u32>,
+    /// Pairs that are compared: auto, exhaustive or sequential
+    #[arg(long, default_value = "auto")]
+    matcher: String,
+    /// Most features per photograph; matching takes time with the square of it
+    #[arg(long, default_value_t = 8192)]
+    features: usize,
+    /// COLMAP's camera model: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or OPENCV_FISHEYE
+    #[arg(long, default_value = "OPENCV")]
+    lens: String,
+    /// Keep only some photographs: diverse:N, the N that differ most in place, direction and looks
+    #[arg(long, value_name = "diverse:N")]
+    select: Option<String>,
+    /// Cut the photographs once their poses are known: square, or x,y,width,height in pixels
+    #[arg(long)]
+    crop: Option<String>,
+    /// Remove noise (non-local means, as strong as the noise that is measured)
+    #[arg(long)]
+    denoise: bool,
+    /// Make exposure and white balance equal, by the points that several photographs show
+    #[arg(long)]
+    normalize_exposure: bool,
+    /// off, auto (by the points of what the cameras look at), or a segmentation network: NETWORK.onnx
+    #[arg(long, default_value = "off")]
+    remove_background: String,
+    /// every:N, A:B:C (percent), all, or file: as the capture says [default: every:8; with --sfm none file]
+    #[arg(long)]
+    split: Option<String>,
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Leave out photographs that cannot be decoded, for example because they were cut off, and list them
+    #[arg(long)]
+    skip_broken: bool,
+    /// Fail where fewer photographs than this percentage find a pose
+    #[arg(long, default_value_t = 80.0)]
+    min_registered: f64,
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Go on from what an interrupted call left
+    #[arg(long)]
+    resume: bool,
+    /// Replace an earlier data set
+    #[arg(long, conflicts_with = "resume")]
+    force: bool,
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for Prepare {
+    fn json(&self) -> bool {
+        self.json
     }
-    let split: Option<SplitRule> = a.split.as_deref().map(str::parse).transpose().map_err(usage)?;
-    let diverse = |text: &String| {
-        let n = text.strip_prefix("diverse:").and_then(|n| n.parse::<usize>().ok()).filter(|n| *n >= 3);
-        n.ok_or_else(|| usage(format!("select {text}: expected diverse:N with N of at least 3")))
-    };
-    let finish = Finish {
-        crop: a.crop.as_deref().map(str::parse).transpose().map_err(usage)?,
-        diverse: a.select.as_ref().map(diverse).transpose()?,
-        denoise: a.denoise,
-        normalize_exposure: a.normalize_exposure,
-        background: a.remove_background.parse().map_err(usage)?,
-    };
-    let options = PrepareOptions {
-        finish,
-        input: a.input.clone(),
-        out: a.out.clone(),
-        sfm,
-        format: a.format.as_deref().map(str::parse).transpose().map_err(usage)?,
-        masks: super::mask_options(&a.masks)?,
-        choice: a.fps.map_or(Choice::Count(a.frames), Choice::PerSecond),
-        every: a.every,
-        max_side: a.max_side.unwrap_or(u32::MAX),
-        matcher: a.matcher.parse().map_err(usage)?,
-        features: a.features,
-        lens: a.lens.to_uppercase(),
-        split: split.unwrap_or(SplitRule::File),
-        seed: a.seed,
-        min_registered: a.min_registered,
-        threads: a.threads,
-        resume: a.resume,
-        force: a.force,
-        skip_broken: a.skip_broken,
-    };
-    watch_interrupts();
-    let (mut last, mut stage) = (Instant::now(), String::new());
-    let mut note = |text: &str| {
-        // Each stage at once, counts within it every two seconds.
-        let begins = text.split(':').next().unwrap_or(text);
-        if begins != stage || last.elapsed() > Duration::from_secs(2) {
-            (last, stage) = (Instant::now(), begins.to_string());
-            eprintln!("{text}");
+
+    fn run(&self) -> Result<Outcome> {
+        use_threads(self.threads)?;
+        self.check_numbers()?;
+        let options = self.options()?;
+        watch_interrupts();
+        let (mut last, mut stage) = (Instant::now(), String::new());
+        let mut note = |text: &str| {
+            // Each stage at once, counts within it every two seconds.
+            let begins = text.split(':').next().unwrap_or(text);
+            if begins != stage || last.elapsed() > Duration::from_secs(2) {
+                (last, stage) = (Instant::now(), begins.to_string());
+                eprintln!("{text}");
+            }
+        };
+        let Some(made) = prepare::prepare(&options, &INTERRUPT, &mut note)? else {
+            let sfm = if options.sfm == Sfm::None { " --sfm none" } else { "" };
+            eprintln!("interrupted; go on with: diorama prepare {} -o {}{sfm} --resume", self.input.display(), self.out.display());
+            return Ok(Outcome::Interrupted);
+        };
+        if self.json {
+            println!("{}", serde_json::to_string(&made).expect("plain values"));
+            return Ok(Outcome::Done);
         }
-    };
-    let Some(made) = prepare::prepare(&options, &INTERRUPT, &mut note)? else {
-        let sfm = if sfm == Sfm::None { " --sfm none" } else { "" };
-        eprintln!("interrupted; go on with: diorama prepare {} -o {}{sfm} --resume", a.input.display(), a.out.display());
-        return Ok(Outcome::Interrupted);
-    };
-    if a.json {
-        println!("{}", serde_json::to_string(&made).expect("plain values"));
-        return Ok(Outcome::Done);
+        print(&made);
+        Ok(Outcome::Done)
     }
+}
+
+impl Prepare {
+    /// # Errors
+    /// When a number is outside of its range.
+    fn check_numbers(&self) -> Result<()> {
+        let least = |flag: &str, ok: bool, what: &str| if ok { Ok(()) } else { Err(usage(format!("{flag}: must be {what}"))) };
+        least("frames", self.frames >= 3, "at least 3")?;
+        least("fps", self.fps.is_none_or(|f| f > 0.0 && f.is_finite()), "above 0")?;
+        least("every", self.every >= 1, "at least 1")?;
+        least("features", self.features >= 256, "at least 256")?;
+        least("max-side", self.max_side.is_none_or(|s| s >= 64), "at least 64")?;
+        least("min-registered", (0.0..=100.0).contains(&self.min_registered), "0 to 100")
+    }
+
+    /// What the flags ask for.
+    fn options(&self) -> Result<PrepareOptions> {
+        let sfm: Sfm = self.sfm.parse().map_err(usage)?;
+        if sfm == Sfm::Colmap
+            && let Some(flag) = [("format", &self.format), ("mask", &self.masks.mask), ("mask-meaning", &self.masks.mask_meaning)]
+                .iter()
+                .find(|f| f.1.is_some())
+        {
+            return Err(usage(format!("{}: is for captures that have poses; give --sfm none as well", flag.0)));
+        }
+        let split: Option<SplitRule> = self.split.as_deref().map(str::parse).transpose().map_err(usage)?;
+        let diverse = |text: &String| {
+            let n = text.strip_prefix("diverse:").and_then(|n| n.parse::<usize>().ok()).filter(|n| *n >= 3);
+            n.ok_or_else(|| usage(format!("select {text}: expected diverse:N with N of at least 3")))
+        };
+        let finish = Finish {
+            crop: self.crop.as_deref().map(str::parse).transpose().map_err(usage)?,
+            diverse: self.select.as_ref().map(diverse).transpose()?,
+            denoise: self.denoise,
+            normalize_exposure: self.normalize_exposure,
+            background: self.remove_background.parse().map_err(usage)?,
+        };
+        Ok(PrepareOptions {
+            finish,
+            input: self.input.clone(),
+            out: self.out.clone(),
+            sfm,
+            format: self.format.as_deref().map(str::parse).transpose().map_err(usage)?,
+            masks: self.masks.options()?,
+            choice: self.fps.map_or(Choice::Count(self.frames), Choice::PerSecond),
+            every: self.every,
+            max_side: self.max_side.unwrap_or(u32::MAX),
+            matcher: self.matcher.parse().map_err(usage)?,
+            features: self.features,
+            lens: self.lens.to_uppercase(),
+            split: split.unwrap_or(SplitRule::File),
+            seed: self.seed,
+            min_registered: self.min_registered,
+            threads: self.threads,
+            resume: self.resume,
+            force: self.force,
+            skip_broken: self.skip_broken,
+        })
+    }
+}
+
+fn print(made: &Prepared) {
     println!(
         "{}: {} of {} photographs have poses, {} points, {} held out, scene {} times the inner cube{}",
         made.folder.display(),
@@ -108,5 +213,4 @@ pub fn run(a: &PrepareArgs) -> Result<Outcome> {
     }
     println!("look at: {}", made.sheet.display());
     println!("next: diorama train {} -o runs/{}", made.folder.display(), made.folder.file_name().unwrap_or_default().to_string_lossy());
-    Ok(Outcome::Done)
 }

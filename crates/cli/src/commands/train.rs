@@ -1,93 +1,194 @@
 //! `diorama train`
 
-use super::{INTERRUPT, Outcome, use_threads, watch_interrupts};
-use crate::arguments::TrainArgs;
+use super::mask_flags::MaskFlags;
+use super::process::{INTERRUPT, usage, use_threads, watch_interrupts};
+use super::view::ListenFlags;
+use super::{Outcome, Verb};
 use crate::terminal::Progress;
+use clap::Args;
 use diorama_data::DataError;
+use diorama_engine::train::Summary;
 use diorama_pipelines::object::config::{Config, Method};
+use diorama_pipelines::object::memory;
 use diorama_pipelines::object::model::ObjectModel;
-use diorama_pipelines::object::run_folder::{RunFolder, read_config};
+use diorama_pipelines::object::recipe::{self, Trained};
+use diorama_pipelines::object::run_folder::read_config;
 use diorama_pipelines::object::viewing::RunView;
-use diorama_pipelines::object::{memory, recipe};
-use diorama_pipelines::{PipelineError, Result};
+use diorama_pipelines::run::RunFolder;
+use diorama_pipelines::run::config::key_and_value;
+use diorama_pipelines::{Application, PipelineError, Result};
 use diorama_viewer::Server;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-pub fn run(a: &TrainArgs) -> Result<Outcome> {
-    use_threads(a.threads)?;
-    let mut config = configuration(a)?;
-    if !a.resume {
-        // Read the capture before anything is written.
-        memory::check_training(&config, &recipe::load_capture(&config)?)?;
+/// Fit a field to photographs with poses
+#[derive(Args, Clone, Debug)]
+#[command(
+    after_help = "Examples:\n  diorama train capture/ -o runs/chair --seconds 120\n  diorama train lego/ -o runs/lego --method mlp --downscale 8 --background white\n  diorama train capture/ -o runs/chair --resume"
+)]
+pub struct Train {
+    /// Folder with photographs and transforms.json, transforms_train.json, a COLMAP model or poses_bounds.npy
+    data: Option<PathBuf>,
+    /// With --resume: where the photographs are now, if they moved
+    #[arg(long = "data", value_name = "FOLDER", requires = "resume", conflicts_with = "data")]
+    moved: Option<PathBuf>,
+    /// Folder of the run
+    #[arg(short, long)]
+    out: PathBuf,
+    /// ngp, nerf, mlp or baseline [default: ngp]
+    #[arg(long)]
+    method: Option<String>,
+    /// transforms, blender, colmap or llff, where a folder holds several
+    #[arg(long)]
+    format: Option<String>,
+    /// Reduce the photographs N times
+    #[arg(long)]
+    downscale: Option<u32>,
+    /// Stop after N steps
+    #[arg(long)]
+    steps: Option<u64>,
+    /// Stop after S seconds of training
+    #[arg(long, allow_negative_numbers = true)]
+    seconds: Option<f64>,
+    /// every:N, A:B:C (percent), file or all
+    #[arg(long)]
+    split: Option<String>,
+    #[command(flatten)]
+    masks: MaskFlags,
+    /// auto, white, black, random or learned
+    #[arg(long)]
+    background: Option<String>,
+    /// auto, cpu, cuda, vulkan, metal or webgpu; auto is the best GPU that the build reaches, else the CPU
+    #[arg(long)]
+    device: Option<String>,
+    #[arg(long)]
+    threads: Option<usize>,
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Leave out photographs that cannot be decoded, for example because they were cut off, and list them
+    #[arg(long)]
+    skip_broken: bool,
+    /// `report`: the shortest side of each photograph becomes 100 pixels
+    #[arg(long, conflicts_with = "downscale")]
+    preset: Option<String>,
+    /// Override a configuration value, for example loss.distortion=0.01; may be repeated
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+    /// Start from a config.toml
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Show the run in the browser while it trains
+    #[arg(long)]
+    view: bool,
+    #[command(flatten)]
+    listen: ListenFlags,
+    /// Go on from the last checkpoint
+    #[arg(long)]
+    resume: bool,
+    /// Replace what the run folder holds
+    #[arg(long)]
+    force: bool,
+    /// Print one JSON object on stdout
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for Train {
+    fn json(&self) -> bool {
+        self.json
     }
-    let device = recipe::device(&config)?;
-    let existed = a.out.exists();
-    let opened = if a.resume { Some(RunFolder::open(&a.out)?.0) } else { None };
-    if let (Some(folder), Some(data)) = (&opened, &a.moved) {
-        folder.move_capture(data)?;
-        config.data.path = read_config(&a.out)?.data.path;
-    }
-    // The port is asked for before there is a folder.
-    let viewing = if a.view { Some(watch(a, &config, opened.as_ref())?) } else { None };
-    let mut folder = opened.map_or_else(|| RunFolder::create(&a.out, a.force), Ok)?;
-    watch_interrupts();
-    let mut progress = Progress::new();
-    eprintln!("device: {device}");
-    let viewing = viewing.map(|(view, server)| (view, std::thread::spawn(move || server.run(&INTERRUPT))));
-    let view = viewing.as_ref().map(|v| &*v.0);
-    let result = recipe::train(&config, &mut folder, a.resume, view, &INTERRUPT, &mut |e| progress.event(e));
-    let recipe::Trained { model, summary, device } = match result {
-        Ok(r) => r,
-        Err(e) => {
-            // A run that never began leaves nothing behind, and what was there before stays.
-            if !existed && !folder.checkpoints().exists() {
-                drop(folder);
-                let _ = std::fs::remove_dir_all(&a.out);
-            }
-            return Err(e);
+
+    fn run(&self) -> Result<Outcome> {
+        use_threads(self.threads)?;
+        // Runs of other applications begin with the application's own verb, and may go on with this one.
+        match if self.resume { Application::of_run(&self.out)? } else { Application::Object } {
+            Application::Object => self.object(),
         }
-    };
-    let seconds = summary.seconds.max(1e-9);
-    let object = serde_json::json!({
-        "run": a.out,
-        "method": model.config.method,
-        "device": device,
-        "steps": summary.step,
-        "seconds": summary.seconds,
-        "rays": summary.rays,
-        "samples": summary.samples,
-        "rays_per_s": summary.rays as f64 / seconds,
-        "samples_per_s": summary.samples as f64 / seconds,
-        "loss": finite(summary.loss),
-        "psnr_train": finite(summary.psnr),
-        "psnr_held_out": summary.held_out.and_then(finite),
-    });
-    if a.json {
-        println!("{object}");
-    } else if summary.psnr.is_finite() {
+    }
+}
+
+impl Train {
+    /// Trains a run of the object application.
+    fn object(&self) -> Result<Outcome> {
+        let mut config = configuration(self)?;
+        if !self.resume {
+            // Read the capture before anything is written.
+            memory::check_training(&config, &recipe::load_capture(&config)?)?;
+        }
+        let device = recipe::device(&config)?;
+        let existed = self.out.exists();
+        let opened = if self.resume { Some(RunFolder::open(&self.out)?.0) } else { None };
+        if let (Some(folder), Some(data)) = (&opened, &self.moved) {
+            config.data.path = folder.move_capture::<Config>(data)?.data.path;
+        }
+        // The port is asked for before there is a folder.
+        let viewing = if self.view { Some(watch(self, &config, opened.as_ref())?) } else { None };
+        let mut folder = opened.map_or_else(|| RunFolder::create(&self.out, self.force), Ok)?;
+        watch_interrupts();
+        let mut progress = Progress::new();
+        eprintln!("device: {device}");
+        let viewing = viewing.map(|(view, server)| (view, std::thread::spawn(move || server.run(&INTERRUPT))));
+        let view = viewing.as_ref().map(|v| &*v.0);
+        let trained = recipe::train(&config, &mut folder, self.resume, view, &INTERRUPT, &mut |e| progress.event(e));
+        if trained.is_err() && !existed && !folder.checkpoints().exists() {
+            // A run that never began leaves nothing behind, and what was there before stays.
+            drop(folder);
+            let _ = std::fs::remove_dir_all(&self.out);
+        }
+        let trained = trained?;
+        if self.json {
+            println!("{}", self.results(&trained));
+        } else {
+            self.print(&trained.summary);
+        }
+        if let Some((_, server)) = viewing {
+            eprintln!("the viewer goes on until Ctrl-C");
+            let _ = server.join();
+        }
+        Ok(if trained.summary.interrupted { Outcome::Interrupted } else { Outcome::Done })
+    }
+
+    fn results(&self, trained: &Trained) -> serde_json::Value {
+        let Trained { model, summary, device } = trained;
+        let seconds = summary.seconds.max(1e-9);
+        serde_json::json!({
+            "run": self.out,
+            "method": model.config.method,
+            "device": device,
+            "steps": summary.step,
+            "seconds": summary.seconds,
+            "rays": summary.rays,
+            "samples": summary.samples,
+            "rays_per_s": summary.rays as f64 / seconds,
+            "samples_per_s": summary.samples as f64 / seconds,
+            "loss": finite(summary.loss),
+            "psnr_train": finite(summary.psnr),
+            "psnr_held_out": summary.held_out.and_then(finite),
+        })
+    }
+
+    fn print(&self, summary: &Summary) {
+        if !summary.psnr.is_finite() {
+            return;
+        }
         println!(
             "{}: {} steps in {:.1} s, {:.0} rays/s, psnr {:.2} dB on training rays{}",
-            a.out.display(),
+            self.out.display(),
             summary.step,
             summary.seconds,
-            summary.rays as f64 / seconds,
+            summary.rays as f64 / summary.seconds.max(1e-9),
             summary.psnr,
             summary.held_out.map_or(String::new(), |p| format!(", {p:.2} dB on held-out pixels"))
         );
-        println!("next: diorama eval {}", a.out.display());
+        println!("next: diorama eval {}", self.out.display());
     }
-    if let Some((_, server)) = viewing {
-        eprintln!("the viewer goes on until Ctrl-C");
-        let _ = server.join();
-    }
-    Ok(if summary.interrupted { Outcome::Interrupted } else { Outcome::Done })
 }
 
 /// The run as the viewer sees it while it trains, and a server that is bound and does not serve yet.
-fn watch(a: &TrainArgs, config: &Config, resumed: Option<&RunFolder>) -> Result<(Arc<RunView>, Server)> {
+fn watch(a: &Train, config: &Config, resumed: Option<&RunFolder>) -> Result<(Arc<RunView>, Server)> {
     let capture = resumed.map_or_else(|| recipe::load_capture(config), RunFolder::capture)?;
     let view = RunView::new(&a.out, ObjectModel::new(config.clone(), capture, false)?, true)?;
-    let server = super::view::listen(&a.listen, view.clone())?;
+    let server = a.listen.bind(view.clone())?;
     eprintln!("view: {}", server.address());
     Ok((view, server))
 }
@@ -97,33 +198,8 @@ fn finite(v: f64) -> Option<f64> {
 }
 
 /// The run's configuration: defaults, then a file, then flags; a resumed run keeps its own but for the budget.
-fn configuration(a: &TrainArgs) -> Result<Config> {
-    let mut c = if a.resume {
-        let c = read_config(&a.out)?;
-        if let Some(d) = &a.data
-            && std::path::absolute(d).ok() != std::path::absolute(&c.data.path).ok()
-        {
-            return Err(PipelineError::Usage(format!(
-                "--resume: {} was trained on {}, not on {}; if the photographs moved, give their folder as --data FOLDER instead",
-                a.out.display(),
-                c.data.path.display(),
-                d.display()
-            )));
-        }
-        c
-    } else {
-        let data = a.data.clone().ok_or_else(|| PipelineError::Usage("train: give the folder of photographs".into()))?;
-        let method: Method = a.method.as_deref().unwrap_or("ngp").parse().map_err(|e| PipelineError::Usage(format!("--method {e}")))?;
-        match &a.config {
-            None => Config::new(method, data),
-            Some(file) => {
-                let text = std::fs::read_to_string(file).map_err(DataError::io(file, "read"))?;
-                let mut c = Config::from_toml(&text).map_err(|e| PipelineError::from(DataError::input(file, e)))?;
-                c.data.path = data;
-                c
-            }
-        }
-    };
+fn configuration(a: &Train) -> Result<Config> {
+    let mut c = if a.resume { resumed(a)? } else { begun(a)? };
     let before = a.resume.then(|| c.clone());
     let mut set = |key: &str, value: Option<String>| value.map_or(Ok(()), |v| c.set(key, &v));
     // A method that was named on top of a file keeps the file's other values.
@@ -137,35 +213,17 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
     set("device", a.device.clone())?;
     set("seed", a.seed.map(|v| v.to_string()))?;
     set("data.skip_broken", (a.skip_broken && !a.resume).then(|| "true".into()))?;
-    if let Some(s) = a.seconds {
-        if !(s.is_finite() && s > 0.0) {
-            return Err(PipelineError::Usage(format!("--seconds {s}: must be greater than 0")));
-        }
-        // A budget in seconds replaces the default number of steps.
-        c.run.seconds = s;
-        if a.steps.is_none() {
-            c.run.steps = 0;
-        }
-    }
-    if let Some(n) = a.steps {
-        if n == 0 {
-            return Err(PipelineError::Usage("--steps 0: must be at least 1".into()));
-        }
-        c.run.steps = n;
-        if a.seconds.is_none() {
-            c.run.seconds = 0.0;
-        }
-    }
+    set_budget(a, &mut c)?;
     for o in &a.overrides {
-        let (key, value) = o.split_once('=').ok_or_else(|| PipelineError::Usage(format!("--set {o}: expected KEY=VALUE")))?;
+        let (key, value) = key_and_value(o)?;
         // What a run has settled stays so.
-        if !(a.resume && is_settled_later(key.trim(), value.trim())) {
-            c.set(key.trim(), value.trim())?;
+        if !(a.resume && is_settled_later(key, value)) {
+            c.set(key, value)?;
         }
     }
     if let Some(p) = &a.preset {
         if p != "report" {
-            return Err(PipelineError::Usage(format!("--preset {p}: the only preset is report")));
+            return Err(usage(format!("preset {p}: the only preset is report")));
         }
         (c.data.shortest_side, c.data.downscale) = (100, 1);
     }
@@ -176,12 +234,69 @@ fn configuration(a: &TrainArgs) -> Result<Config> {
     Ok(c)
 }
 
+/// The configuration of the run that goes on.
+fn resumed(a: &Train) -> Result<Config> {
+    let c = read_config(&a.out)?;
+    if let Some(d) = &a.data
+        && std::path::absolute(d).ok() != std::path::absolute(&c.data.path).ok()
+    {
+        return Err(PipelineError::Usage(format!(
+            "--resume: {} was trained on {}, not on {}; if the photographs moved, give their folder as --data FOLDER instead",
+            a.out.display(),
+            c.data.path.display(),
+            d.display()
+        )));
+    }
+    Ok(c)
+}
+
+/// The defaults of a method, or a file.
+fn begun(a: &Train) -> Result<Config> {
+    let data = a.data.clone().ok_or_else(|| PipelineError::Usage("train: give the folder of photographs".into()))?;
+    let method: Method = a.method.as_deref().unwrap_or("ngp").parse().map_err(|e| usage(format!("method {e}")))?;
+    let Some(file) = &a.config else { return Ok(Config::new(method, data)) };
+    let mut c = read_file(file)?;
+    c.data.path = data;
+    Ok(c)
+}
+
+/// The configuration that `--config` names.
+fn read_file(file: &Path) -> Result<Config> {
+    let text = std::fs::read_to_string(file).map_err(DataError::io(file, "read"))?;
+    Config::from_toml(&text).map_err(|e| DataError::input(file, e).into())
+}
+
+/// Steps and seconds: a budget in one of them replaces a default in the other.
+fn set_budget(a: &Train, c: &mut Config) -> Result<()> {
+    if let Some(s) = a.seconds {
+        if !(s.is_finite() && s > 0.0) {
+            return Err(usage(format!("seconds {s}: must be greater than 0")));
+        }
+        c.run.seconds = s;
+        if a.steps.is_none() {
+            c.run.steps = 0;
+        }
+    }
+    if let Some(n) = a.steps {
+        if n == 0 {
+            return Err(usage("steps 0: must be at least 1".into()));
+        }
+        c.run.steps = n;
+        if a.seconds.is_none() {
+            c.run.seconds = 0.0;
+        }
+    }
+    Ok(())
+}
+
+/// A value that a resumed run cannot take.
+fn changed(flag: &str, run: &str, said: &str) -> Result<()> {
+    let what = format!("{flag} cannot change on --resume: the run has {run}, not {said}; start a new run with another --out");
+    Err(PipelineError::Usage(what))
+}
+
 /// What a resumed run keeps: the same value may be said again, another one is named with the run's.
-fn same(a: &TrainArgs, before: &Config, now: &Config) -> Result<()> {
-    let changed = |flag: &str, run: &str, said: &str| {
-        let what = format!("{flag} cannot change on --resume: the run has {run}, not {said}; start a new run with another --out");
-        Err(PipelineError::Usage(what))
-    };
+fn same(a: &Train, before: &Config, now: &Config) -> Result<()> {
     let (run, said) = (before.values(), now.values());
     let kept = |key: &str| key == "method" || key == "background" || key == "seed" || key.starts_with("field.") || key.starts_with("data.");
     for ((key, run), (_, said)) in run.iter().zip(&said).filter(|((key, run), (_, said))| kept(key) && run != said) {
@@ -191,9 +306,13 @@ fn same(a: &TrainArgs, before: &Config, now: &Config) -> Result<()> {
             return changed(flag, run, said);
         }
     }
+    same_file(a, before)
+}
+
+/// The same of the file of `--config`, where there is one.
+fn same_file(a: &Train, before: &Config) -> Result<()> {
     let Some(file) = &a.config else { return Ok(()) };
-    let text = std::fs::read_to_string(file).map_err(DataError::io(file, "read"))?;
-    let given = Config::from_toml(&text).map_err(|e| PipelineError::from(DataError::input(file, e)))?.values();
+    let (run, given) = (before.values(), read_file(file)?.values());
     // Flags of the same command stand above the file, as they did when the run began.
     let flagged = |key: &str| {
         let set = a.overrides.iter().any(|o| o.split('=').next().is_some_and(|k| k.trim() == key));
@@ -228,7 +347,7 @@ const FLAGS: [(&str, &str); 10] = [
     ("--skip-broken", "data.skip_broken"),
 ];
 
-fn is_given(a: &TrainArgs, flag: &str) -> bool {
+fn is_given(a: &Train, flag: &str) -> bool {
     match flag {
         "--method" => a.method.is_some(),
         "--downscale" => a.downscale.is_some(),

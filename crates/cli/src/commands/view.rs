@@ -1,46 +1,100 @@
 //! `diorama view`
 
-use super::{INTERRUPT, Outcome, note, use_threads, watch_interrupts};
-use crate::arguments::{ListenArgs, ViewArgs};
+use super::process::{INTERRUPT, note, use_threads, watch_interrupts};
+use super::{Outcome, Verb};
+use clap::Args;
 use diorama_data::import::{self, ImportOptions};
 use diorama_geom::view_source::ViewSource;
 use diorama_pipelines::object::viewing::RunView;
 use diorama_pipelines::object::viewing_points::PointsView;
-use diorama_pipelines::object::{device, kept_capture, run_folder};
-use diorama_pipelines::{PipelineError, Result};
+use diorama_pipelines::object::{device, run_folder};
+use diorama_pipelines::run::{description, folder, kept_capture};
+use diorama_pipelines::{Application, PipelineError, Result};
 use diorama_viewer::{Server, ViewerOptions};
+use std::net::IpAddr;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-pub fn run(a: &ViewArgs) -> Result<Outcome> {
-    use_threads(a.threads)?;
-    let source = source(a)?;
-    let server = listen(&a.listen, source.shown())?;
-    watch_interrupts();
-    if a.json {
-        println!("{}", serde_json::json!({ "address": server.address() }));
-    } else {
-        println!("{}", server.address());
+/// Where the viewer listens: flags of `view`, and of `train --view`.
+#[derive(Args, Clone, Debug)]
+pub struct ListenFlags {
+    /// Address to listen on; any but 127.0.0.1 asks for a token, which is part of the printed address
+    #[arg(long, default_value = "127.0.0.1")]
+    pub host: IpAddr,
+    /// 0: any that is free
+    #[arg(long, default_value_t = 7007)]
+    pub port: u16,
+}
+
+impl ListenFlags {
+    /// A server that is bound and does not serve yet.
+    ///
+    /// # Errors
+    /// When the address cannot be bound.
+    pub fn bind(&self, source: Arc<dyn ViewSource>) -> Result<Server> {
+        Server::bind(&ViewerOptions { host: self.host, port: self.port }, source).map_err(|e| PipelineError::Usage(e.to_string()))
     }
-    eprintln!("open this address in a browser; Ctrl-C ends");
-    let Source::Run(run) = source else {
-        server.run(&INTERRUPT);
-        return Ok(Outcome::Done);
-    };
-    // A device that was named and fails ends the viewer.
-    std::thread::scope(|s| {
-        s.spawn(|| {
-            while !INTERRUPT.load(Ordering::Relaxed) {
-                std::thread::sleep(Duration::from_millis(100));
-                if run.check_device().is_err() {
-                    INTERRUPT.store(true, Ordering::Relaxed);
+}
+
+/// Look at a run in the browser: views, cameras, crop box, scale, camera paths, meshes; or at a data set's cameras and points
+#[derive(Args, Clone, Debug)]
+#[command(
+    after_help = "Examples:\n  diorama view runs/chair\n  diorama view data/chair\n  diorama view splats.ply\n  diorama view runs/chair --host 0.0.0.0 --port 8080"
+)]
+pub struct View {
+    /// Folder of a run or of a data set, or a PLY file of points or Gaussian splats
+    path: PathBuf,
+    /// Of a run: where its photographs are now, if they moved
+    #[arg(long, value_name = "FOLDER")]
+    data: Option<PathBuf>,
+    /// auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto")]
+    device: String,
+    #[command(flatten)]
+    listen: ListenFlags,
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Print the address as a JSON object on stdout
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for View {
+    fn json(&self) -> bool {
+        self.json
+    }
+
+    fn run(&self) -> Result<Outcome> {
+        use_threads(self.threads)?;
+        let source = source(self)?;
+        let server = self.listen.bind(source.shown())?;
+        watch_interrupts();
+        if self.json {
+            println!("{}", serde_json::json!({ "address": server.address() }));
+        } else {
+            println!("{}", server.address());
+        }
+        eprintln!("open this address in a browser; Ctrl-C ends");
+        let Source::Run(run) = source else {
+            server.run(&INTERRUPT);
+            return Ok(Outcome::Done);
+        };
+        // A device that was named and fails ends the viewer.
+        std::thread::scope(|s| {
+            s.spawn(|| {
+                while !INTERRUPT.load(Ordering::Relaxed) {
+                    std::thread::sleep(Duration::from_millis(100));
+                    if run.check_device().is_err() {
+                        INTERRUPT.store(true, Ordering::Relaxed);
+                    }
                 }
-            }
+            });
+            server.run(&INTERRUPT);
         });
-        server.run(&INTERRUPT);
-    });
-    run.check_device().map(|()| Outcome::Done)
+        run.check_device().map(|()| Outcome::Done)
+    }
 }
 
 enum Source {
@@ -58,8 +112,8 @@ impl Source {
 }
 
 /// What there is to look at: a run, a file of points or splats, or a data set.
-fn source(a: &ViewArgs) -> Result<Source> {
-    let is_run = ["config.toml", "checkpoints"].iter().any(|n| a.path.join(n).exists());
+fn source(a: &View) -> Result<Source> {
+    let is_run = a.path.join(description::NAME).exists() || folder::checkpoints(&a.path).exists();
     if a.data.is_some() && !is_run {
         return Err(PipelineError::Usage(format!("--data: {} is no run, so it has no photographs elsewhere", a.path.display())));
     }
@@ -69,13 +123,9 @@ fn source(a: &ViewArgs) -> Result<Source> {
         return Ok(Source::Points(Arc::new(view)));
     }
     if is_run || !a.path.is_dir() {
-        let (mut model, notes) = run_folder::load_model_of(&a.path, a.data.as_deref())?;
-        notes.iter().for_each(|n| note(n));
-        if let Err(e) = kept_capture::require_photographs(&model.capture) {
-            note(&format!("photographs cannot be shown: {e}"));
-        }
-        device::accelerate(&mut model, &a.device, Box::new(note))?;
-        return Ok(Source::Run(RunView::new(&a.path, model, false)?));
+        return match Application::of_run(&a.path)? {
+            Application::Object => object(a),
+        };
     }
     let capture = import::import(&a.path, &ImportOptions { min_views: 1, allow_broken: true, ..ImportOptions::default() })?;
     capture.notes.iter().for_each(|n| note(n));
@@ -84,7 +134,13 @@ fn source(a: &ViewArgs) -> Result<Source> {
     Ok(Source::Points(Arc::new(view)))
 }
 
-/// A server that is bound and does not serve yet.
-pub fn listen(a: &ListenArgs, source: Arc<dyn ViewSource>) -> Result<Server> {
-    Server::bind(&ViewerOptions { host: a.host, port: a.port }, source).map_err(|e| PipelineError::Usage(e.to_string()))
+/// A run of the object application.
+fn object(a: &View) -> Result<Source> {
+    let (mut model, notes) = run_folder::load_model_of(&a.path, a.data.as_deref())?;
+    notes.iter().for_each(|n| note(n));
+    if let Err(e) = kept_capture::require_photographs(&model.capture) {
+        note(&format!("photographs cannot be shown: {e}"));
+    }
+    device::accelerate(&mut model, &a.device, Box::new(note))?;
+    Ok(Source::Run(RunView::new(&a.path, model, false)?))
 }

@@ -62,8 +62,8 @@ impl Table<'_> {
         lost.map_or(Ok(seconds / batch as f64), |e| Err(told(e)))
     }
 
-    /// `flops` and `bytes` per unit; 0: not told.
-    fn row(&mut self, op: &str, shape: &str, unit: &'static str, units: usize, flops: f64, bytes: f64, f: impl FnMut()) -> Result<()> {
+    /// `flops` and `bytes` per unit, which is given with how many a call does; 0: not told.
+    fn row(&mut self, op: &str, shape: &str, (unit, units): (&'static str, usize), flops: f64, bytes: f64, f: impl FnMut()) -> Result<()> {
         let ns = self.seconds(f)? * 1e9 / units as f64;
         let rate = |n: f64| (n > 0.0).then_some(n / ns);
         let figure =
@@ -104,17 +104,17 @@ fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let (d, d_table) = (random(gpu, s * grid.output_dims(), 3), gpu.zeros(grid.params_len()));
     // Eight rows of two numbers per level and point, and the result.
     let bytes = 16.0 * (8.0 * 8.0 + 8.0);
-    t.row("hash_grid", "16 x 2^19 x 2, random points", "point", s, 0.0, bytes, || {
+    t.row("hash_grid", "16 x 2^19 x 2, random points", ("point", s), 0.0, bytes, || {
         on_gpu.forward(gpu, &rows, &points, &table);
     })?;
-    t.row("hash_grid, backward", "16 x 2^19 x 2, random points", "point", s, 0.0, bytes + 16.0 * 64.0, || {
+    t.row("hash_grid, backward", "16 x 2^19 x 2, random points", ("point", s), 0.0, bytes + 16.0 * 64.0, || {
         on_gpu.backward(gpu, &rows, &points, &d, &d_table);
     })?;
     let (p, m, v) = (random(gpu, grid.params_len(), 4), gpu.zeros(grid.params_len()), gpu.zeros(grid.params_len()));
-    t.row("adam", "all rows touched", "parameter", grid.params_len(), 0.0, 32.0, || {
+    t.row("adam", "all rows touched", ("parameter", grid.params_len()), 0.0, 32.0, || {
         adam::gpu::step(gpu, &Adam::default(), 1, false, &p, &m, &v, &d_table);
     })?;
-    t.row("spherical_harmonics", "degree 4", "direction", s, 0.0, 76.0, || {
+    t.row("spherical_harmonics", "degree 4", ("direction", s), 0.0, 76.0, || {
         spherical_harmonics::gpu::forward(gpu, 4, &points);
     })
 }
@@ -124,10 +124,10 @@ fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let (x, w, d) = (random(gpu, s * k, 1), random(gpu, k * n, 2), random(gpu, s * n, 3));
     let (kind, a, flops) = (BiasKind::None, Activation::Relu, (2 * k * n) as f64);
     let shape = format!("{s}x64x64 f32");
-    t.row("linear", &shape, "row", s, flops, 0.0, || {
+    t.row("linear", &shape, ("row", s), flops, 0.0, || {
         linear::gpu::forward(gpu, &rows, (k, n), &x, &w, None, kind, a);
     })?;
-    t.row("linear, forward and backward", &shape, "row", s, 3.0 * flops, 0.0, || {
+    t.row("linear, forward and backward", &shape, ("row", s), 3.0 * flops, 0.0, || {
         let out = linear::gpu::forward(gpu, &rows, (k, n), &x, &w, None, kind, a);
         linear::gpu::backward(gpu, &rows, (k, n), &x, &w, kind, a, &out, &d);
     })?;
@@ -146,10 +146,10 @@ fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
             continue;
         }
         let shape = format!("32 -> 64 -> 16, 32 -> 64 -> 64 -> 16 {name}");
-        t.row("field network", &shape, "sample", s, flops, 0.0, || {
+        t.row("field network", &shape, ("sample", s), flops, 0.0, || {
             net.evaluate(gpu, &params, &p, &features, &[&direction], false);
         })?;
-        t.row("field network, forward and backward", &shape, "sample", s, 3.0 * flops, 0.0, || {
+        t.row("field network, forward and backward", &shape, ("sample", s), 3.0 * flops, 0.0, || {
             let at = net.evaluate(gpu, &params, &p, &features, &[&direction], true);
             net.gradients(gpu, &params, &p, &at, &g);
         })?;
@@ -169,15 +169,15 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let (sigma, rgb, background) = (random(gpu, s, 1), random(gpu, s * 3, 2), gpu.zeros(p.rays() * 3));
     let out = composite::forward(gpu, &p, &sigma, &rgb, 3, &background);
     let d = composite::forward(gpu, &p, &sigma, &rgb, 3, &background);
-    t.row("composite", "3 channels, 32 samples per ray", "sample", s, 0.0, 28.0, || {
+    t.row("composite", "3 channels, 32 samples per ray", ("sample", s), 0.0, 28.0, || {
         composite::forward(gpu, &p, &sigma, &rgb, 3, &background);
     })?;
-    t.row("composite, backward", "3 channels, 32 samples per ray", "sample", s, 0.0, 52.0, || {
+    t.row("composite, backward", "3 channels, 32 samples per ray", ("sample", s), 0.0, 52.0, || {
         composite::backward(gpu, &p, &rgb, 3, &background, &out, &d);
     })?;
     let (target, left_out, sums) = (random(gpu, p.rays() * 4, 8), gpu.upload_u32(&vec![0; p.rays()]), gpu.zeros(SUMS));
     let target = Target { rgba: &target, background: &background, left_out: &left_out, distance: &left_out };
-    t.row("composite, loss and backward", "3 channels, 32 samples per ray", "sample", s, 0.0, 64.0, || {
+    t.row("composite, loss and backward", "3 channels, 32 samples per ray", ("sample", s), 0.0, 64.0, || {
         let figures = Figures { sums: &sums, marched: &p.offsets, is_main: true };
         loss::composite_and_loss(
             gpu,

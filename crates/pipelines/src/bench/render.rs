@@ -2,9 +2,9 @@
 
 use super::median_seconds;
 use crate::error::{PipelineError, Result};
-use crate::object::evaluate;
 use crate::object::held_out;
 use crate::object::model::ObjectModel;
+use crate::object::scored_view::{reference, scores};
 use diorama_data::photo;
 use diorama_engine::fields::Pruning;
 use diorama_engine::metrics;
@@ -57,14 +57,14 @@ pub fn run(model: &ObjectModel, repeats: usize, device: String) -> Result<Render
     let mut sums = [QualityFigure::default(); 3];
     let mut seconds = [0.0; 3];
     for &i in &frames {
-        let (photo, counts) = evaluate::reference(model, i, photo::load_full(&model.capture.frames[i].image)?)?;
+        let (photo, counts) = reference(model, i, photo::load_full(&model.capture.frames[i].image)?)?;
         let posed = model.posed(i);
         let mut exhaustive: Option<View> = None;
         for ((tracer, sum), seconds) in tracers.iter().zip(&mut sums).zip(&mut seconds) {
             let mut view = None;
             *seconds += median_seconds(repeats, || view = Some(tracer.view(&posed, &mut |_| {})));
             let view = view.expect("a view was drawn");
-            sum.psnr += evaluate::scores(&view, &photo, &counts).psnr;
+            sum.psnr += scores(&view, &photo, &counts).psnr;
             let to = exhaustive.get_or_insert_with(|| view.clone());
             let squares: f64 = view.rgb.data.iter().zip(&to.rgb.data).map(|(a, b)| ((a - b) as f64).powi(2)).sum();
             sum.psnr_against_exhaustive += metrics::psnr(squares / view.rgb.data.len() as f64);

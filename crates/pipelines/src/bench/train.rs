@@ -3,37 +3,7 @@
 use crate::error::Result;
 use crate::object::config::Config;
 use crate::object::recipe;
-use serde::Serialize;
-
-/// Share of one stage in a step.
-#[derive(Clone, Debug, Serialize)]
-pub struct StageFigure {
-    pub stage: &'static str,
-    pub share: f64,
-    /// Milliseconds per step.
-    pub ms: f64,
-}
-
-/// Where a training step's time goes, over the last part of a run.
-#[derive(Clone, Debug, Serialize)]
-pub struct TrainReport {
-    pub threads: usize,
-    pub simd: &'static str,
-    /// `cpu`, or what the GPU calls itself.
-    pub device: String,
-    pub steps: u64,
-    pub seconds: f64,
-    pub rays_per_s: f64,
-    /// Samples that were marched to, per second.
-    pub marched_per_s: f64,
-    /// Samples that went back through the network, per second.
-    pub trained_per_s: f64,
-    pub marched_per_ray: f64,
-    pub trained_per_ray: f64,
-    /// Share of occupied cells.
-    pub occupied: Option<f64>,
-    pub stages: Vec<StageFigure>,
-}
+use crate::run::profile::TrainReport;
 
 /// Trains `warmup` steps unmeasured, then `steps` steps measured, and writes nothing.
 pub fn run(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> {

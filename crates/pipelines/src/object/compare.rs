@@ -2,10 +2,11 @@
 
 use super::evaluate;
 use super::held_out;
-use super::kept_capture::require_photographs;
 use super::model::ObjectModel;
-use super::run_folder::{charts, load_model_of, read_rows, read_summary};
+use super::run_folder::{load_model_of, read_summary};
 use crate::error::{PipelineError, Result};
+use crate::run::kept_capture::require_photographs;
+use crate::run::metrics::{charts, read_rows};
 use diorama_data::{DataError, atomic, photo, plot};
 use diorama_engine::renderers::volume::Quality;
 use diorama_geom::ImageU8;

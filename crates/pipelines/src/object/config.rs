@@ -1,11 +1,12 @@
 //! Everything that a run depends on, as written to `config.toml`.
 
 use crate::error::{PipelineError, Result};
+pub use crate::run::config::Auto;
+use crate::run::{self, config::Configuration};
 use diorama_data::masks::{self, MaskOptions};
 use diorama_geom::Reduction;
 use diorama_kernels::device::Api;
-use serde::de::Error as _;
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
 /// The four methods (object.md, section 4).
@@ -122,47 +123,6 @@ pub struct FieldConfig {
     pub space: String,
     /// `auto`: networks multiply in bf16 where the CPU has tiles for it; `f32`.
     pub precision: String,
-}
-
-/// A number, or `auto`: by the run's space.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub enum Auto {
-    #[default]
-    Auto,
-    Is(f32),
-}
-
-impl Auto {
-    pub fn or(self, auto: f32) -> f32 {
-        match self {
-            Auto::Auto => auto,
-            Auto::Is(v) => v,
-        }
-    }
-}
-
-impl Serialize for Auto {
-    fn serialize<S: Serializer>(&self, s: S) -> std::result::Result<S::Ok, S::Error> {
-        match self {
-            Auto::Auto => s.serialize_str("auto"),
-            Auto::Is(v) => s.serialize_f32(*v),
-        }
-    }
-}
-
-impl<'de> Deserialize<'de> for Auto {
-    fn deserialize<D: Deserializer<'de>>(d: D) -> std::result::Result<Auto, D::Error> {
-        let value = toml::Value::deserialize(d)?;
-        let number = match &value {
-            toml::Value::String(s) if s == "auto" => return Ok(Auto::Auto),
-            toml::Value::String(s) => s.parse().ok(),
-            toml::Value::Integer(v) => Some(*v as f64),
-            toml::Value::Float(v) => Some(*v),
-            _ => None,
-        };
-        let number = number.filter(|v| v.is_finite() && *v >= 0.0);
-        number.map(|v| Auto::Is(v as f32)).ok_or_else(|| D::Error::custom(format!("{value} is neither a number from 0 on nor \"auto\"")))
-    }
 }
 
 /// What the field is trained to do.
@@ -357,68 +317,30 @@ impl Config {
         }
     }
 
-    /// Overrides one value, named by its path, for example `loss.distortion`.
+    /// Overrides one value ([`run::config::set`]).
     ///
     /// # Errors
     /// When the key does not exist (the nearest one is named) or the value has the wrong type.
     pub fn set(&mut self, key: &str, value: &str) -> Result<()> {
-        let mut table = toml::Value::try_from(&*self).expect("a configuration is a table");
-        let known = keys(&table, "");
-        let mut at = &mut table;
-        for part in key.split('.') {
-            let exists = at.get(part).is_some();
-            if !exists {
-                return Err(PipelineError::Usage(unknown_key(key, &known)));
-            }
-            at = &mut at[part];
-        }
-        let parsed = match at {
-            toml::Value::String(_) => Some(toml::Value::String(value.into())),
-            toml::Value::Integer(_) => value.parse().ok().map(toml::Value::Integer),
-            toml::Value::Float(_) if value == "auto" => Some(toml::Value::String(value.into())),
-            toml::Value::Float(_) => value.parse().ok().filter(|v: &f64| v.is_finite()).map(toml::Value::Float),
-            toml::Value::Boolean(_) => value.parse().ok().map(toml::Value::Boolean),
-            _ => None,
-        };
-        let expected = match at {
-            toml::Value::Integer(_) => "a whole number",
-            toml::Value::Float(_) => "a number",
-            _ => "true or false",
-        };
-        *at = parsed.ok_or_else(|| PipelineError::Usage(format!("{key}: {value:?} is not {expected}")))?;
-        *self = table.try_into().map_err(|e: toml::de::Error| PipelineError::Usage(format!("{key} = {value:?}: {}", e.message())))?;
-        self.check()
+        run::config::set(self, key, value)
     }
 
     /// Reads what [`Config::to_toml`] wrote.
+    ///
+    /// # Errors
+    /// When the text is no TOML, is of another application, or holds an unknown key or a wrong value.
     pub fn from_toml(text: &str) -> std::result::Result<Config, String> {
-        let value: toml::Value = toml::from_str(text).map_err(|e| e.message().to_string())?;
-        let template = toml::Value::try_from(Config::new(Method::Ngp, "x".into())).expect("a configuration is a table");
-        let known = keys(&template, "");
-        if let Some(bad) = keys(&value, "").into_iter().find(|k| !known.contains(k)) {
-            return Err(unknown_key(&bad, &known));
-        }
-        value.try_into().map_err(|e: toml::de::Error| e.message().to_string())
+        run::config::from_toml(text)
     }
 
+    /// The configuration as `config.toml` keeps it.
     pub fn to_toml(&self) -> String {
-        toml::to_string(self).expect("a configuration is a table")
+        run::config::to_toml(self)
     }
 
     /// All keys with their values as text, in order.
     pub fn values(&self) -> Vec<(String, String)> {
-        let table = toml::Value::try_from(self).expect("a configuration is a table");
-        let of = |key: String| {
-            let value = key.split('.').fold(&table, |at, part| &at[part]);
-            let text = match value {
-                toml::Value::String(s) => s.clone(),
-                // As they were given, not as f64 has what f32 holds.
-                toml::Value::Float(f) if *f as f32 as f64 == *f => (*f as f32).to_string(),
-                v => v.to_string(),
-            };
-            (key, text)
-        };
-        keys(&table, "").into_iter().map(of).collect()
+        run::config::values(self)
     }
 
     /// Values that make no sense together or alone.
@@ -481,35 +403,20 @@ impl Config {
     }
 }
 
-/// Paths of all leaves.
-fn keys(value: &toml::Value, prefix: &str) -> Vec<String> {
-    match value {
-        toml::Value::Table(t) => {
-            t.iter().flat_map(|(k, v)| keys(v, &if prefix.is_empty() { k.clone() } else { format!("{prefix}.{k}") })).collect()
-        }
-        _ => vec![prefix.to_string()],
-    }
-}
+impl Configuration for Config {
+    const APPLICATION: &'static str = "object";
 
-fn unknown_key(key: &str, known: &[String]) -> String {
-    let nearest = known.iter().min_by_key(|k| distance(key, k).min(k.rsplit('.').next().map_or(99, |last| distance(key, last))));
-    format!("unknown configuration key {key}; did you mean {}?", nearest.map_or("", |k| k))
-}
-
-/// Levenshtein distance.
-fn distance(a: &str, b: &str) -> usize {
-    let b: Vec<char> = b.chars().collect();
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.chars().enumerate() {
-        let mut diagonal = row[0];
-        row[0] = i + 1;
-        for (j, y) in b.iter().enumerate() {
-            let next = (diagonal + (x != *y) as usize).min(row[j] + 1).min(row[j + 1] + 1);
-            diagonal = row[j + 1];
-            row[j + 1] = next;
-        }
+    fn template() -> Config {
+        Config::new(Method::Ngp, "x".into())
     }
-    row[b.len()]
+
+    fn data_set(&mut self) -> Option<&mut PathBuf> {
+        Some(&mut self.data.path)
+    }
+
+    fn check(&self) -> Result<()> {
+        Config::check(self)
+    }
 }
 
 #[cfg(test)]

@@ -1,10 +1,10 @@
 //! How far the surfaces of held-out views are from the sparse points that the views show: scores of pixels hide it, as a wall of
 //! one color looks the same in any depth.
 
-use super::evaluate::{ScoredView, admits};
 use super::fog::median;
 use super::model::ObjectModel;
 use super::observations::LARGEST_ERROR;
+use super::scored_view::{ScoredView, admits};
 use diorama_geom::capture::SparsePoint;
 use rayon::prelude::*;
 use serde::Serialize;

@@ -1,13 +1,14 @@
 //! Everything at once on a capture that the project generates itself.
 
 use super::config::{Config, Method};
-use super::evaluate::{self, Report, ScoredView};
+use super::evaluate::{self, Report};
 use super::export::{self, ExportOptions, Exported, Format, Size};
 use super::recipe::{self, Trained};
 use super::render::{self, Layer, PathKind, RenderOptions};
 use super::report;
-use super::run_folder::RunFolder;
+use super::scored_view::ScoredView;
 use crate::error::Result;
+use crate::run::RunFolder;
 use diorama_data::{DataError, photo, transforms_json};
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::train::{Event, Summary};

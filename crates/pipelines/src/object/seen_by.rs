@@ -1,8 +1,8 @@
 //! Where held-out rays end, and how many training views see that place: what few of them see, nothing but those few explains.
 
-use super::evaluate::{ScoredView, admits};
 use super::held_out::spread;
 use super::model::ObjectModel;
+use super::scored_view::{ScoredView, admits};
 use diorama_engine::metrics;
 use diorama_engine::renderers::volume::Quality;
 use diorama_geom::glam::DVec3;

@@ -19,7 +19,7 @@ use diorama_geom::glam::DVec3;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::HashMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Which part of a photograph stays.
@@ -131,10 +131,7 @@ pub fn finish(
     let mut made = Finished::default();
     if let Some(n) = o.diverse {
         note("choosing photographs that differ");
-        let looks = frames.par_iter().map(|f| Ok(select::looks(&photo::load(&f.image)?))).collect::<Result<Vec<_>>>()?;
-        let chosen = select::diverse(frames, &looks, n);
-        made.left_out = frames.len() - chosen.len();
-        *frames = chosen.into_iter().map(|i| frames[i].clone()).collect();
+        made.left_out = keep_diverse(frames, n)?;
     }
     let folder = root.join(PARTIAL);
     if folder.exists() {
@@ -151,51 +148,15 @@ pub fn finish(
     if frames.iter().any(|f| photo::header(&f.image).is_ok_and(|h| h.depth > photo::Depth::Eight)) {
         note("photographs of more than 8 bits are finished in 8 bits");
     }
-    let name = |f: &Frame| f.image.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let gains = o.normalize_exposure.then(|| {
-        note("comparing exposures");
-        let of = |f: &Frame| match found.observed.get(&name(f)) {
-            Some(seen) => Ok(exposure::colors(&photo::load(&f.image)?, seen)),
-            None => Ok(Vec::new()),
-        };
-        Ok::<_, PipelineError>(exposure::gains(&frames.par_iter().map(of).collect::<Result<Vec<_>>>()?))
-    });
-    let gains = gains.transpose()?;
-    made.exposure_stops = gains.as_ref().map(|g| {
-        let stops = g.iter().map(|g| g.iter().sum::<f32>() / 3.0 / std::f32::consts::LN_2);
-        stops.fold([f32::INFINITY, f32::NEG_INFINITY], |[lo, hi], s| [lo.min(s), hi.max(s)])
-    });
-    let remover = Remover::open(&o.background, frames, found)?;
-    let work = |i: usize, f: &Frame| -> Result<(Frame, f32, f32)> {
-        let mut image = photo::load(&f.image)?;
-        if let Some(g) = &gains {
-            exposure::apply(&mut image, g[i]);
+    let gains = match o.normalize_exposure {
+        true => {
+            note("comparing exposures");
+            Some(exposure_gains(frames, found)?)
         }
-        // A mask is made of what the camera saw, before its noise is gone.
-        let alpha = remover.alpha(&image, f, found)?;
-        let sigma = if o.denoise { denoise::noise(&image) } else { 0.0 };
-        image = denoise::denoise(&image, sigma);
-        let mut share = 1.0;
-        if let Some(alpha) = alpha {
-            share = alpha.iter().map(|a| *a as f64).sum::<f64>() as f32 / 255.0 / alpha.len().max(1) as f32;
-            image = background::with_alpha(&image, &alpha);
-        }
-        let mut f = f.clone();
-        let stem = f.image.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        if let Some(crop) = o.crop {
-            let mask = masks::of_frame(&f, &MaskRule::default(), (image.width, image.height))?;
-            if let Some(mask) = mask {
-                let cut = crop_to(crop, mask, &mut f.clone())?;
-                let written = folder.join(MASKS).join(format!("{stem}.png"));
-                photo::save_png(&written, &cut)?;
-                f.mask = Some(root.join(FINISHED).join(MASKS).join(written.file_name().unwrap_or_default()));
-            }
-            image = crop_to(crop, image, &mut f)?;
-        }
-        let written = photo_import::write_like(&f.image, &image, &folder, &stem)?;
-        f.image = root.join(FINISHED).join(written.file_name().unwrap_or_default());
-        Ok((f, sigma, share))
+        false => None,
     };
+    made.exposure_stops = gains.as_deref().map(stops);
+    let finisher = Finisher { options: o, root, folder, found, gains, remover: Remover::open(&o.background, frames, found)? };
     let mut out = Vec::new();
     // In groups, so that progress shows and Ctrl-C is heard.
     for first in (0..frames.len()).step_by(4) {
@@ -203,16 +164,95 @@ pub fn finish(
             return Ok(None);
         }
         let last = (first + 4).min(frames.len());
-        let group: Vec<_> = (first..last).into_par_iter().map(|i| work(i, &frames[i])).collect::<Result<_>>()?;
+        let group: Vec<_> = (first..last).into_par_iter().map(|i| finisher.finish(i, &frames[i])).collect::<Result<_>>()?;
         out.extend(group);
         note(&format!("finishing photographs: {last} of {}", frames.len()));
     }
-    let mut sigmas: Vec<f32> = out.iter().map(|v| v.1).collect();
+    let mut sigmas: Vec<f32> = out.iter().map(|v| v.noise).collect();
     sigmas.sort_by(f32::total_cmp);
     made.noise = o.denoise.then(|| sigmas[sigmas.len() / 2]);
-    made.foreground = (o.background != Background::Keep).then(|| out.iter().map(|v| v.2).sum::<f32>() / out.len().max(1) as f32);
-    *frames = out.into_iter().map(|v| v.0).collect();
+    made.foreground = (o.background != Background::Keep).then(|| out.iter().map(|v| v.foreground).sum::<f32>() / out.len().max(1) as f32);
+    *frames = out.into_iter().map(|v| v.frame).collect();
     Ok(Some(made))
+}
+
+/// Keeps the `n` photographs that differ most; returns how many were left out.
+fn keep_diverse(frames: &mut Vec<Frame>, n: usize) -> Result<usize> {
+    let looks = frames.par_iter().map(|f| Ok(select::looks(&photo::load(&f.image)?))).collect::<Result<Vec<_>>>()?;
+    let chosen = select::diverse(frames, &looks, n);
+    let left_out = frames.len() - chosen.len();
+    *frames = chosen.into_iter().map(|i| frames[i].clone()).collect();
+    Ok(left_out)
+}
+
+/// Logarithms of the gains that make exposures equal, per photograph and channel.
+fn exposure_gains(frames: &[Frame], found: &Found) -> Result<Vec<[f32; 3]>> {
+    let name = |f: &Frame| f.image.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let of = |f: &Frame| match found.observed.get(&name(f)) {
+        Some(seen) => Ok(exposure::colors(&photo::load(&f.image)?, seen)),
+        None => Ok(Vec::new()),
+    };
+    Ok(exposure::gains(&frames.par_iter().map(of).collect::<Result<Vec<_>>>()?))
+}
+
+/// Least and greatest gain in stops.
+fn stops(gains: &[[f32; 3]]) -> [f32; 2] {
+    let stops = gains.iter().map(|g| g.iter().sum::<f32>() / 3.0 / std::f32::consts::LN_2);
+    stops.fold([f32::INFINITY, f32::NEG_INFINITY], |[lo, hi], s| [lo.min(s), hi.max(s)])
+}
+
+/// Finishes photographs one by one.
+struct Finisher<'a> {
+    options: &'a Finish,
+    /// The data set.
+    root: &'a Path,
+    /// Where finished photographs are made.
+    folder: PathBuf,
+    found: &'a Found,
+    gains: Option<Vec<[f32; 3]>>,
+    remover: Remover,
+}
+
+/// A frame whose photograph is finished.
+struct FinishedFrame {
+    frame: Frame,
+    /// Standard deviation of the noise that was removed.
+    noise: f32,
+    /// Share of the pixels that are foreground.
+    foreground: f32,
+}
+
+impl Finisher<'_> {
+    fn finish(&self, i: usize, f: &Frame) -> Result<FinishedFrame> {
+        let mut image = photo::load(&f.image)?;
+        if let Some(g) = &self.gains {
+            exposure::apply(&mut image, g[i]);
+        }
+        // A mask is made of what the camera saw, before its noise is gone.
+        let alpha = self.remover.alpha(&image, f, self.found)?;
+        let noise = if self.options.denoise { denoise::noise(&image) } else { 0.0 };
+        image = denoise::denoise(&image, noise);
+        let mut foreground = 1.0;
+        if let Some(alpha) = alpha {
+            foreground = alpha.iter().map(|a| *a as f64).sum::<f64>() as f32 / 255.0 / alpha.len().max(1) as f32;
+            image = background::with_alpha(&image, &alpha);
+        }
+        let mut frame = f.clone();
+        let stem = f.image.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        if let Some(crop) = self.options.crop {
+            let mask = masks::of_frame(&frame, &MaskRule::default(), (image.width, image.height))?;
+            if let Some(mask) = mask {
+                let cut = crop_to(crop, mask, &mut frame.clone())?;
+                let written = self.folder.join(MASKS).join(format!("{stem}.png"));
+                photo::save_png(&written, &cut)?;
+                frame.mask = Some(self.root.join(FINISHED).join(MASKS).join(written.file_name().unwrap_or_default()));
+            }
+            image = crop_to(crop, image, &mut frame)?;
+        }
+        let written = photo_import::write_like(&frame.image, &image, &self.folder, &stem)?;
+        frame.image = self.root.join(FINISHED).join(written.file_name().unwrap_or_default());
+        Ok(FinishedFrame { frame, noise, foreground })
+    }
 }
 
 /// What tells foreground from background.

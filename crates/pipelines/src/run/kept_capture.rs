@@ -2,8 +2,6 @@
 //!
 //! Paths are relative to the data set's folder, which is kept both as it was and as seen from the run.
 
-use super::config::Config;
-use super::loading;
 use crate::error::Result;
 use diorama_data::{DataError, atomic, error, import};
 use diorama_geom::Capture;
@@ -11,7 +9,8 @@ use diorama_geom::capture::Frame;
 use serde::{Deserialize, Serialize};
 use std::path::{Component, Path, PathBuf};
 
-const NAME: &str = "capture.json";
+/// File of the capture.
+pub const NAME: &str = "capture.json";
 const LIMIT: u64 = 1 << 30;
 
 /// What the file holds. Files of earlier versions have no folders; their paths are relative to the folder that the
@@ -84,19 +83,8 @@ fn open(run: &Path) -> Result<KeptCapture> {
     Ok(serde_json::from_slice(&bytes).map_err(|e| DataError::input(&file, format!("is damaged: {e}; train again")))?)
 }
 
-/// Reads the sparse points of a kept capture, which its run has not kept, from its data set; a note says so where they cannot be had.
-pub fn add_points(kept: &mut Capture, config: &Config, data: &Path) {
-    let mut config = config.clone();
-    config.data.path = data.to_path_buf();
-    match loading::load_capture(&config) {
-        Ok(fresh) if has_same_views(&fresh, kept) => kept.points = fresh.points,
-        Ok(_) => kept.notes.push("the capture has changed since the run began: its sparse points are not used".into()),
-        Err(e) => kept.notes.push(format!("the capture's sparse points cannot be read again: {e}")),
-    }
-}
-
 /// Whether photographs have the same names and poses: else the points are of another world.
-fn has_same_views(a: &Capture, b: &Capture) -> bool {
+pub fn has_same_views(a: &Capture, b: &Capture) -> bool {
     let close = 1e-5 * b.scene.half;
     let is_same = |(a, b): (&Frame, &Frame)| {
         let (p, q) = (&a.world_from_camera, &b.world_from_camera);
@@ -151,11 +139,25 @@ fn relative(to: &Path, from: &Path) -> Option<PathBuf> {
 mod tests {
     use super::*;
     use diorama_data::import::ImportOptions;
+    use diorama_data::{photo, transforms_json};
+    use diorama_scenes::still_life;
+
+    /// Four photographs of the still life with their poses.
+    fn write_capture(data: &Path) {
+        std::fs::create_dir_all(data.join("images")).unwrap();
+        let frame = |p: still_life::Photo| {
+            let image = data.join(format!("images/{}.png", p.name));
+            photo::save_png(&image, &p.image).unwrap();
+            Frame::new(p.name, image, p.camera, p.world_from_camera)
+        };
+        let capture = Capture::new(still_life::photographs(4, 16).into_iter().map(frame).collect(), still_life::scene_box());
+        transforms_json::write(&data.join("transforms.json"), data, &capture, None).unwrap();
+    }
 
     /// A data set and a run beside each other.
     fn pair(dir: &Path) -> (PathBuf, PathBuf) {
         let (data, run) = (dir.join("data/chair"), dir.join("runs/chair"));
-        super::super::quickstart::write_capture(&data, 4, 16).unwrap();
+        write_capture(&data);
         std::fs::create_dir_all(&run).unwrap();
         write(&run, &data, &import::import(&data, &ImportOptions::default()).unwrap()).unwrap();
         (data, run)
@@ -194,22 +196,6 @@ mod tests {
         std::fs::remove_file(far.join("images/view_02.png")).unwrap();
         let wrong = found(&run, Some(&far)).unwrap_err().to_string();
         assert!(wrong.contains("far") && wrong.contains("view_02.png"), "{wrong}");
-    }
-
-    #[test]
-    fn points_of_another_world_are_not_used() {
-        let dir = tempfile::tempdir().unwrap();
-        let (data, run) = pair(dir.path());
-        let config = Config::new(super::super::config::Method::Ngp, data.clone());
-        let mut kept = read(&run, None, &data).unwrap();
-        add_points(&mut kept, &config, &data);
-        assert_eq!(kept.notes, Vec::<String>::new(), "the same capture");
-        kept.frames[1].world_from_camera.translation.x += 0.1;
-        add_points(&mut kept, &config, &data);
-        assert!(kept.notes[0].contains("has changed"), "{:?}", kept.notes);
-        std::fs::remove_file(data.join("transforms.json")).unwrap();
-        add_points(&mut kept, &config, &data);
-        assert!(kept.notes[1].contains("cannot be read again"), "{:?}", kept.notes);
     }
 
     #[test]

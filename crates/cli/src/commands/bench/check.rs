@@ -1,0 +1,54 @@
+//! `diorama bench check`
+
+use crate::commands::{Outcome, Verb};
+use clap::Args;
+use diorama_pipelines::bench;
+use diorama_pipelines::{PipelineError, Result};
+use std::path::PathBuf;
+
+/// Every op on a GPU against its f64 reference; exit code 1 if one is wrong
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  diorama bench check --device vulkan")]
+pub struct Check {
+    /// Also train on this capture, on the device and on the CPU, and compare the losses
+    #[arg(long, value_name = "FOLDER")]
+    data: Option<PathBuf>,
+    /// cuda, vulkan, metal or webgpu
+    #[arg(long)]
+    device: String,
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for Check {
+    fn json(&self) -> bool {
+        self.json
+    }
+
+    fn run(&self) -> Result<Outcome> {
+        let r = bench::check::run(&self.device, self.data.as_deref())?;
+        let wrong = r.lines.iter().filter(|l| l.fault.is_some()).count();
+        if self.json {
+            println!("{}", serde_json::json!(r));
+        } else {
+            for l in &r.lines {
+                let error = l.error.map_or("FAILED ".into(), |e| format!("{e:.1e}"));
+                println!("{error}  {:<20} {:<18} {:<28} {}", l.op, l.result, l.shape, l.fault.as_deref().unwrap_or(""));
+            }
+            let atomics = if r.native_atomics { "native f32 atomics" } else { "exchanged f32 atomics" };
+            let kind = if r.software { "software" } else { "hardware" };
+            println!(
+                "{} ({}, {kind}, {atomics}): {} of {} right in {:.1} s",
+                r.device,
+                r.name,
+                r.lines.len() - wrong,
+                r.lines.len(),
+                r.seconds
+            );
+        }
+        if wrong > 0 {
+            return Err(PipelineError::Device(format!("{wrong} of {} results on {} are wrong", r.lines.len(), r.device)));
+        }
+        Ok(Outcome::Done)
+    }
+}

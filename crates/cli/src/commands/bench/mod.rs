@@ -1,0 +1,33 @@
+//! `diorama bench`: a noun with its verbs.
+
+mod check;
+mod mesh;
+mod ops;
+mod render;
+mod train;
+
+use super::Verb;
+use clap::Subcommand;
+
+/// Measure the kernels and the training step on this machine
+#[derive(Subcommand)]
+pub enum Bench {
+    Ops(ops::Ops),
+    Train(train::Train),
+    Render(render::Render),
+    Mesh(mesh::Mesh),
+    Check(check::Check),
+}
+
+impl Bench {
+    /// The verb that was called.
+    pub fn verb(&self) -> &dyn Verb {
+        match self {
+            Bench::Ops(v) => v,
+            Bench::Train(v) => v,
+            Bench::Render(v) => v,
+            Bench::Mesh(v) => v,
+            Bench::Check(v) => v,
+        }
+    }
+}

@@ -1,0 +1,109 @@
+//! The real program on a small capture with a short run, for tests of it. Each test uses a part of this.
+
+#![allow(dead_code, reason = "each test program uses a part")]
+
+use diorama_pipelines::object::quickstart::write_capture;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+pub const SMALL: [&str; 8] =
+    ["--device", "cpu", "--set", "field.log2_size=12", "--set", "sampling.batch_samples=4096", "--set", "sampling.occupancy_points=2048"];
+
+pub struct Good {
+    _folder: tempfile::TempDir,
+    pub capture: PathBuf,
+    pub run: PathBuf,
+}
+
+/// A capture and a short run on it, made once.
+pub fn good() -> &'static Good {
+    static GOOD: OnceLock<Good> = OnceLock::new();
+    GOOD.get_or_init(|| {
+        let folder = tempfile::tempdir().unwrap();
+        let (capture, run) = (folder.path().join("capture"), folder.path().join("run"));
+        write_capture(&capture, 16, 48).unwrap();
+        works(folder.path(), &[&["train", s(&capture), "-o", s(&run), "--steps", "60"], &SMALL[..]].concat());
+        Good { _folder: folder, capture, run }
+    })
+}
+
+pub fn s(p: &Path) -> &str {
+    p.to_str().unwrap()
+}
+
+/// How long a call may take: `view` would serve for ever.
+pub const LIMIT: Duration = Duration::from_secs(300);
+
+pub fn call(folder: &Path, arguments: &[&str]) -> Output {
+    call_in(folder, &[], arguments)
+}
+
+/// A call with variables of its environment.
+pub fn call_in(folder: &Path, variables: &[(&str, &str)], arguments: &[&str]) -> Output {
+    let said = tempfile::tempdir().unwrap();
+    let file = |name: &str| std::fs::File::create(said.path().join(name)).unwrap();
+    let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
+    c.args(arguments).envs(variables.iter().copied());
+    let mut child = c.current_dir(folder).stdout(file("out")).stderr(file("err")).spawn().unwrap();
+    let begin = Instant::now();
+    let status = loop {
+        if let Some(status) = child.try_wait().unwrap() {
+            break status;
+        }
+        if begin.elapsed() > LIMIT {
+            child.kill().unwrap();
+            child.wait().unwrap();
+            panic!("{arguments:?} goes on after {LIMIT:?}");
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    };
+    let read = |name: &str| std::fs::read(said.path().join(name)).unwrap();
+    Output { status, stdout: read("out"), stderr: read("err") }
+}
+
+/// What a call from `folder` prints, which succeeds.
+#[track_caller]
+pub fn works(folder: &Path, arguments: &[&str]) -> String {
+    let o = call(folder, arguments);
+    assert!(o.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&o.stderr));
+    String::from_utf8(o.stdout).unwrap()
+}
+
+/// A call fails with one line that holds all of `parts`; all that it says.
+#[track_caller]
+pub fn fails(folder: &Path, arguments: &[&str], code: i32, parts: &[&str]) -> String {
+    let o = call(folder, arguments);
+    let said = String::from_utf8_lossy(&o.stderr).into_owned();
+    assert_eq!(o.status.code(), Some(code), "{arguments:?}: {said}");
+    let errors: Vec<&str> = said.lines().filter(|l| l.starts_with("diorama: ")).collect();
+    assert_eq!(errors.len(), 1, "{said}");
+    parts.iter().for_each(|p| assert!(errors[0].contains(p), "{p:?} is not in {said}"));
+    said
+}
+
+pub fn copy_all(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).unwrap();
+    for e in from.read_dir().unwrap().flatten() {
+        let target = to.join(e.file_name());
+        if e.path().is_dir() {
+            copy_all(&e.path(), &target);
+        } else {
+            std::fs::copy(e.path(), target).unwrap();
+        }
+    }
+}
+
+/// A copy of a folder that a case may spoil.
+pub fn copy_of(from: &Path) -> (tempfile::TempDir, PathBuf) {
+    let dir = tempfile::tempdir().unwrap();
+    let to = dir.path().join("copy");
+    copy_all(from, &to);
+    (dir, to)
+}
+
+/// A copy of the good run that a case may spoil.
+pub fn copy() -> (tempfile::TempDir, PathBuf) {
+    copy_of(&good().run)
+}

@@ -1,0 +1,91 @@
+//! The applications, and which of them a run is of. Verbs that accept any run (`eval`, `render`, `export`, `view`, `info`, `compare`,
+//! `train --resume`) match on [`Application::of_run`]: a new application does not compile until each of them says what it does with it.
+
+use crate::error::Result;
+use crate::object::{config::Config, run_folder};
+use crate::run::RunDescription;
+use crate::run::config::Configuration;
+use diorama_data::DataError;
+use serde_json::Value;
+use std::path::Path;
+
+/// Every application of the program.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Application {
+    /// Photographs to a radiance field, novel views and a mesh.
+    Object,
+}
+
+impl Application {
+    /// All of them, in the order in which they are listed to users.
+    pub const ALL: [Application; 1] = [Application::Object];
+
+    /// The name that `config.toml` gives.
+    pub fn name(self) -> &'static str {
+        match self {
+            Application::Object => Config::APPLICATION,
+        }
+    }
+
+    /// The application that the run in a folder is of.
+    ///
+    /// # Errors
+    /// When there is no run, or its application is unknown.
+    pub fn of_run(run: &Path) -> Result<Application> {
+        let described = RunDescription::read(run)?;
+        let found = Application::ALL.into_iter().find(|a| a.name() == described.application);
+        found.ok_or_else(|| {
+            let known = Application::ALL.map(Application::name).join(", ");
+            let unknown =
+                format!("application: {:?} is unknown; this program has {known}, a newer one may have more", described.application);
+            DataError::input(&described.file, unknown).into()
+        })
+    }
+
+    /// What a run of this application is, as `diorama info` tells it.
+    ///
+    /// # Errors
+    /// When the run is damaged.
+    pub fn describe(self, run: &Path) -> Result<Value> {
+        match self {
+            Application::Object => run_folder::describe(run),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::object::config::Method;
+
+    #[test]
+    fn runs_name_their_application_and_those_of_before_are_object() {
+        let dir = tempfile::tempdir().unwrap();
+        let of = |text: &str| {
+            std::fs::write(dir.path().join("config.toml"), text).unwrap();
+            Application::of_run(dir.path())
+        };
+        let text = Config::new(Method::Ngp, "data".into()).to_toml();
+        let (name, before) = text.split_once('\n').unwrap();
+        assert_eq!(name, "application = \"object\"");
+        assert_eq!(of(&text).unwrap(), Application::Object);
+        assert_eq!(of(before).unwrap(), Application::Object, "a run from before there were applications");
+        let unknown = of(&text.replace("\"object\"", "\"sculpture\"")).unwrap_err();
+        assert!(unknown.is_input());
+        let unknown = unknown.to_string();
+        assert!(["config.toml", "sculpture", "object"].iter().all(|w| unknown.contains(w)) && !unknown.contains('\n'), "{unknown}");
+        assert!(of("application = 3").unwrap_err().to_string().contains("name in quotes"));
+        assert!(of("[").unwrap_err().is_input());
+        let none = Application::of_run(&dir.path().join("none")).unwrap_err().to_string();
+        assert!(none.contains("not a run folder"), "{none}");
+    }
+
+    #[test]
+    fn a_run_of_another_application_is_not_read_as_an_object() {
+        let dir = tempfile::tempdir().unwrap();
+        let text = Config::new(Method::Ngp, "data".into()).to_toml();
+        std::fs::write(dir.path().join("config.toml"), text.replace("\"object\"", "\"head\"")).unwrap();
+        let e = run_folder::read_config(dir.path()).unwrap_err().to_string();
+        assert!(e.contains("head") && e.contains("object"), "{e}");
+    }
+}

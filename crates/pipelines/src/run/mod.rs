@@ -1,0 +1,12 @@
+//! What the runs of all applications share: configuration, folder, kept capture, metrics, summary. It imports no application.
+
+pub mod config;
+pub mod description;
+pub mod folder;
+pub mod kept_capture;
+pub mod metrics;
+pub mod profile;
+pub mod summary;
+
+pub use description::RunDescription;
+pub use folder::RunFolder;
