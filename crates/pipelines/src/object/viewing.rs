@@ -4,7 +4,8 @@ use super::export::{self, ExportOptions, Size};
 use super::held_out;
 use super::model::ObjectModel;
 use super::render::{self, Layer};
-use super::run_folder::{RunSummary, read_rows, read_summary};
+use super::run_folder::{RunSummary, read_summary};
+use crate::run::metrics::{Row, read_rows};
 use crate::error::{PipelineError, Result};
 use diorama_data::camera_path_json;
 use diorama_data::{DataError, atomic, photo};
@@ -251,7 +252,7 @@ impl ViewSource for RunView {
     }
 
     fn history(&self) -> Vec<ViewPoint> {
-        let point = |r: &super::run_folder::Row| ViewPoint { step: r.step, psnr: r.psnr, held_out: r.val_psnr };
+        let point = |r: &Row| ViewPoint { step: r.step, psnr: r.psnr, held_out: r.val_psnr };
         read_rows(&self.folder).iter().map(point).collect()
     }
 
