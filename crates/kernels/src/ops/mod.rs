@@ -3,6 +3,7 @@
 pub mod adam;
 pub mod composite;
 pub mod conv2d;
+pub mod conv_transpose2d;
 pub mod depth_loss;
 pub mod distortion;
 pub mod frequency;
