@@ -7,9 +7,9 @@
 import argparse
 import json
 import os
-import resource
 import statistics
 import subprocess
+import sys
 import time
 
 import torch
@@ -112,23 +112,35 @@ def vit():
 CASES = {"mlp_384_65536": mlp, "unet_128_b8": unet, "resnet18_fpn_320_b4": resnet, "vgg16_224": vgg, "vit_b_32": vit}
 
 
+def peak_mib():
+    """Most memory of this process so far."""
+    with open("/proc/self/status") as f:
+        return next(int(line.split()[1]) >> 10 for line in f if line.startswith("VmHWM"))
+
+
+def run_alone(command, threads):
+    """What a process of its own prints, so that its peak memory is that of one network."""
+    env = os.environ | {"RAYON_NUM_THREADS": str(threads)}
+    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True, env=env).stdout)
+
+
 def main():
     arguments = argparse.ArgumentParser()
-    arguments.add_argument("ours")
+    arguments.add_argument("ours", help="the example nets-speed, or `torch` to time one network here")
     arguments.add_argument("names", nargs="*")
     arguments.add_argument("--threads", type=int, default=2)
     a = arguments.parse_args()
     torch.set_num_threads(a.threads)
-    for name, run in CASES.items():
+    if a.ours == "torch":
+        print(json.dumps({"ms": CASES[a.names[0]](), "peak_mib": peak_mib()}))
+        return
+    for name in CASES:
         if a.names and name not in a.names:
             continue
-        theirs = run()
-        # A process of its own for each network, whose peak memory the system tells.
-        before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-        out = subprocess.run([a.ours, name], capture_output=True, text=True, check=True, env=os.environ | {"RAYON_NUM_THREADS": str(a.threads)})
-        peak = max(before, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss) >> 10
-        ours = json.loads(out.stdout)
-        print(f"{name:<22} torch {theirs:9.2f} ms  ours {ours['ms']:9.2f} ms  ratio {theirs / ours['ms']:.2f}  our peak {peak} MiB", flush=True)
+        theirs = run_alone([sys.executable, __file__, "torch", name, "--threads", str(a.threads)], a.threads)
+        ours = run_alone([a.ours, name], a.threads)
+        ratio, memory = theirs["ms"] / ours["ms"], f"{theirs['peak_mib']} MiB, ours {ours['peak_mib']} MiB"
+        print(f"{name:<22} torch {theirs['ms']:9.2f} ms  ours {ours['ms']:9.2f} ms  ratio {ratio:.2f}  peak torch {memory}", flush=True)
 
 
 if __name__ == "__main__":

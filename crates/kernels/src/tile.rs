@@ -15,14 +15,12 @@ pub enum Start {
     Bias(*const f32),
 }
 
-/// Operands of one tile: `c[r, j] = start + Σ_k a[r · row + offsets[k].0] · b[j · vector + offsets[k].1 ..]`.
+/// Operands of one tile: `c[r, j] = start + Σ_k a[r · row + offsets[k].0] · b[offsets[k].1 + j]`.
 pub struct Tile<'a> {
     pub a: *const f32,
     /// Floats between rows of A.
     pub row: usize,
     pub b: *const f32,
-    /// Floats between neighboring vectors of B.
-    pub vector: usize,
     /// Per term of the sum, where A and B stand.
     pub offsets: &'a [(u32, u32)],
     pub c: *mut f32,
@@ -53,6 +51,34 @@ pub struct Pack<'a> {
     pub exact: bool,
 }
 
+/// One row of outputs of one channel: `c[i] = start + Σ_t weights[t] b[offsets[t] + i]`, whole vectors of it.
+pub struct Row<'a> {
+    pub weights: &'a [f32],
+    pub offsets: &'a [(u32, u32)],
+    pub b: *const f32,
+    pub columns: usize,
+    pub start: f32,
+    pub c: *mut f32,
+}
+
+/// Products of a gradient's rows with shifted rows of an input: `sums[t, i mod lanes] += Σ_rows Σ_i d[i] b[offsets[t] + i]`.
+pub struct Dots<'a> {
+    pub d: *const f32,
+    pub d_pitch: usize,
+    pub b: *const f32,
+    pub b_pitch: usize,
+    pub rows: usize,
+    /// Columns of a row, a multiple of the lanes.
+    pub columns: usize,
+    /// At most [`MOST_DOTS`].
+    pub offsets: &'a [(u32, u32)],
+    /// `[offsets.len(), lanes]`
+    pub sums: *mut f32,
+}
+
+/// Taps of one [`Dots`].
+pub const MOST_DOTS: usize = 9;
+
 type TileFn = unsafe fn(&Tile);
 
 /// Most rows and vectors of any level's tile.
@@ -69,6 +95,8 @@ pub struct Kernel {
     pub vectors: usize,
     tiles: [[TileFn; MOST_VECTORS]; MOST_ROWS],
     pack: unsafe fn(&Pack),
+    row: unsafe fn(&Row),
+    dots: unsafe fn(&Dots),
 }
 
 impl Kernel {
@@ -94,6 +122,25 @@ impl Kernel {
         // SAFETY: as the caller vouches.
         unsafe { (self.pack)(pack) }
     }
+
+    /// Computes a row of a depthwise convolution.
+    ///
+    /// # Safety
+    /// Inputs and outputs exist up to the next multiple of the largest tile's width.
+    pub unsafe fn row(&self, row: &Row) {
+        // SAFETY: as the caller vouches.
+        unsafe { (self.row)(row) }
+    }
+
+    /// Adds the products of rows to sums per tap.
+    ///
+    /// # Safety
+    /// All that the operands address must exist.
+    pub unsafe fn dots(&self, dots: &Dots) {
+        assert!(dots.offsets.len() <= MOST_DOTS && dots.columns % self.lanes == 0, "dots: {} taps", dots.offsets.len());
+        // SAFETY: as the caller vouches.
+        unsafe { (self.dots)(dots) }
+    }
 }
 
 #[inline(always)]
@@ -106,19 +153,16 @@ unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(t: &Tile) {
                 *row = [L::splat(*bias.add(r)); NR];
             }
         }
-        let (row, vector) = (t.row, t.vector);
-        for &(a, b) in t.offsets {
-            let (ap, bp) = (t.a.add(a as usize), t.b.add(b as usize));
-            let mut bv = [L::splat(0.0); NR];
-            for (q, v) in bv.iter_mut().enumerate() {
-                *v = L::load(bp.add(q * vector));
-            }
-            for (r, sums) in acc.iter_mut().enumerate() {
-                let av = L::splat(*ap.add(r * row));
-                for q in 0..NR {
-                    sums[q] = L::fma(av, bv[q], sums[q]);
-                }
-            }
+        // Unrolled: scalar instructions share ports with the multiply-adds.
+        let mut fours = t.offsets.chunks_exact(4);
+        for four in &mut fours {
+            add::<L, MR, NR>(t, four[0], &mut acc);
+            add::<L, MR, NR>(t, four[1], &mut acc);
+            add::<L, MR, NR>(t, four[2], &mut acc);
+            add::<L, MR, NR>(t, four[3], &mut acc);
+        }
+        for &one in fours.remainder() {
+            add::<L, MR, NR>(t, one, &mut acc);
         }
         let one = L::splat(1.0);
         for (r, sums) in acc.iter().enumerate() {
@@ -126,6 +170,25 @@ unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(t: &Tile) {
                 let c = t.c.add(r * t.c_row + q * t.c_vector);
                 let v = if matches!(t.start, Start::Accumulate) { L::fma(*v, one, L::load(c)) } else { *v };
                 L::store(c, v);
+            }
+        }
+    }
+}
+
+/// Adds one term of the sum.
+#[inline(always)]
+unsafe fn add<L: Lane, const MR: usize, const NR: usize>(t: &Tile, (a, b): (u32, u32), acc: &mut [[L::V; NR]; MR]) {
+    // SAFETY: `Kernel::run` states what must exist.
+    unsafe {
+        let (ap, bp) = (t.a.add(a as usize), t.b.add(b as usize));
+        let mut bv = [L::splat(0.0); NR];
+        for (q, v) in bv.iter_mut().enumerate() {
+            *v = L::load(bp.add(q * L::N));
+        }
+        for (r, sums) in acc.iter_mut().enumerate() {
+            let av = L::splat(*ap.add(r * t.row));
+            for q in 0..NR {
+                sums[q] = L::fma(av, bv[q], sums[q]);
             }
         }
     }
@@ -160,6 +223,67 @@ unsafe fn pack<L: Lane>(p: &Pack) {
     }
 }
 
+#[inline(always)]
+unsafe fn row<L: Lane>(r: &Row) {
+    const VECTORS: usize = 4;
+    // SAFETY: `Kernel::row` states what must exist.
+    unsafe {
+        let mut i = 0;
+        while i < r.columns {
+            let mut acc = [L::splat(r.start); VECTORS];
+            for (w, &(_, offset)) in r.weights.iter().zip(r.offsets) {
+                let (w, b) = (L::splat(*w), r.b.add(offset as usize + i));
+                for (q, v) in acc.iter_mut().enumerate() {
+                    *v = L::fma(w, L::load(b.add(q * L::N)), *v);
+                }
+            }
+            for (q, v) in acc.iter().enumerate() {
+                L::store(r.c.add(i + q * L::N), *v);
+            }
+            i += VECTORS * L::N;
+        }
+    }
+}
+
+#[inline(always)]
+unsafe fn dots<L: Lane>(s: &Dots) {
+    // SAFETY: `Kernel::dots` states what must exist.
+    unsafe {
+        match s.offsets.len() {
+            9 => dots_of::<L, 9>(s, s.offsets, s.sums),
+            _ => {
+                for (t, offset) in s.offsets.iter().enumerate() {
+                    dots_of::<L, 1>(s, std::slice::from_ref(offset), s.sums.add(t * L::N));
+                }
+            }
+        }
+    }
+}
+
+#[inline(always)]
+unsafe fn dots_of<L: Lane, const T: usize>(s: &Dots, offsets: &[(u32, u32)], sums: *mut f32) {
+    // SAFETY: `Kernel::dots` states what must exist.
+    unsafe {
+        let mut acc = [L::splat(0.0); T];
+        for y in 0..s.rows {
+            let (d, b) = (s.d.add(y * s.d_pitch), s.b.add(y * s.b_pitch));
+            let mut i = 0;
+            while i < s.columns {
+                let v = L::load(d.add(i));
+                for (t, sum) in acc.iter_mut().enumerate() {
+                    *sum = L::fma(v, L::load(b.add(offsets[t].1 as usize + i)), *sum);
+                }
+                i += L::N;
+            }
+        }
+        let one = L::splat(1.0);
+        for (t, sum) in acc.iter().enumerate() {
+            let to = sums.add(t * L::N);
+            L::store(to, L::fma(*sum, one, L::load(to)));
+        }
+    }
+}
+
 macro_rules! kernel {
     ($name:ident, $lane:ty, $rows:literal, $vectors:literal, [$($m:literal)*], $(#[$target:meta])*) => {
         mod $name {
@@ -177,12 +301,26 @@ macro_rules! kernel {
                 unsafe { pack::<$lane>(p) }
             }
 
+            $(#[$target])*
+            unsafe fn one_row(r: &Row) {
+                // SAFETY: compiled for the set; the rest as `Kernel::row` states.
+                unsafe { row::<$lane>(r) }
+            }
+
+            $(#[$target])*
+            unsafe fn products(d: &Dots) {
+                // SAFETY: compiled for the set; the rest as `Kernel::dots` states.
+                unsafe { dots::<$lane>(d) }
+            }
+
             pub static KERNEL: Kernel = Kernel {
                 lanes: <$lane as Lane>::N,
                 rows: $rows,
                 vectors: $vectors,
                 tiles: [$([of::<$m, 1>, of::<$m, 2>, of::<$m, 3>]),*],
                 pack: copy,
+                row: one_row,
+                dots: products,
             };
         }
     };
@@ -264,17 +402,7 @@ mod tests {
                 })
                 .collect();
             let (lanes, c_row) = (kernel.lanes, n);
-            let t = Tile {
-                a: a.as_ptr(),
-                row: terms,
-                b: b.as_ptr(),
-                vector: lanes,
-                offsets: &offsets,
-                c: c.as_mut_ptr(),
-                c_row,
-                c_vector: lanes,
-                start,
-            };
+            let t = Tile { a: a.as_ptr(), row: terms, b: b.as_ptr(), offsets: &offsets, c: c.as_mut_ptr(), c_row, c_vector: lanes, start };
             // SAFETY: all operands have the tile's size.
             unsafe { kernel.run(rows, vectors, &t) };
             assert_close("tile", &c, &want, 1e-5);

@@ -134,6 +134,13 @@ fn adam() -> Result<(usize, f64)> {
     Ok((param::count(&net), times[3]))
 }
 
+/// Most memory of this process so far, where the system tells; else 0.
+fn peak_mib() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
+    line.and_then(|l| l.split_whitespace().next()?.parse::<u64>().ok()).unwrap_or(0) >> 10
+}
+
 fn main() -> Result<()> {
     let names: Vec<String> = std::env::args().skip(1).collect();
     type Case = fn() -> Result<(usize, f64)>;
@@ -149,10 +156,9 @@ fn main() -> Result<()> {
         let before = pool::figures();
         let (weights, ms) = run()?;
         let after = pool::figures();
-        let mib = after.peak_bytes >> 20;
+        let (fresh, pool_mib, peak_mib) = (after.fresh - before.fresh, after.peak_bytes >> 20, peak_mib());
         println!(
-            r#"{{"name": "{name}", "weights": {weights}, "ms": {ms:.2}, "fresh": {}, "pool_peak_mib": {mib}}}"#,
-            after.fresh - before.fresh
+            r#"{{"name": "{name}", "weights": {weights}, "ms": {ms:.2}, "fresh": {fresh}, "pool_mib": {pool_mib}, "peak_mib": {peak_mib}}}"#
         );
         pool::release();
     }

@@ -5,6 +5,7 @@ pub mod adam;
 pub mod attention;
 pub mod composite;
 pub mod conv2d;
+pub mod conv_transpose2d;
 pub mod depth_loss;
 pub mod distortion;
 pub mod dropout;

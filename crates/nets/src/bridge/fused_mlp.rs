@@ -70,20 +70,26 @@ impl DeviceKernels for MlpOp {
         let (params, inputs) = i.split_last().expect("the parameters come last");
         let inputs: Vec<&Buffer> = inputs.iter().map(|i| &i.data).collect();
         let values = kernels::forward(gpu, &self.0, &params.data, &inputs, &Rows::all(gpu, n));
-        let out = values.last().cloned().unwrap_or_else(|| gpu.empty(0));
-        DeviceOutputs { outputs: vec![(out, vec![n, width])], kept: values }
+        let out = values.layers.last().cloned().unwrap_or_else(|| gpu.empty(0));
+        // Outputs of all layers, then the inputs of activations that need them.
+        let kept = values.layers.into_iter().chain(values.pre.into_iter().flatten()).collect();
+        DeviceOutputs { outputs: vec![(out, vec![n, width])], kept }
     }
 
     fn backward_on(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let Some(d) = &d[0] else { return vec![None; i.len()] };
         let (params, inputs) = i.split_last().expect("the parameters come last");
         let inputs: Vec<&Buffer> = inputs.iter().map(|i| &i.data).collect();
-        let mut d_layers = vec![None; kept.len()];
+        let (layers, pre) = kept.split_at(self.0.layers.len());
+        let mut pre = pre.iter().cloned();
+        let pre = self.0.layers.iter().map(|l| if l.activation.is_monotonic() { None } else { pre.next() }).collect();
+        let values = kernels::Values { layers: layers.to_vec(), pre };
+        let mut d_layers = vec![None; layers.len()];
         if let Some(last) = d_layers.last_mut() {
             *last = Some(d.clone());
         }
         let rows = Rows::all(gpu, i[0].shape[0]);
-        let (d_params, d_inputs) = kernels::backward(gpu, &self.0, &params.data, &inputs, kept, &rows, d_layers);
+        let (d_params, d_inputs) = kernels::backward(gpu, &self.0, &params.data, &inputs, &values, &rows, d_layers);
         d_inputs.into_iter().chain([d_params]).map(Some).collect()
     }
 }

@@ -7,6 +7,7 @@ use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::activation::cpu as activations;
 use diorama_kernels::ops::sum::cpu as sums;
+use rayon::prelude::*;
 
 #[derive(Clone, Debug)]
 pub(super) struct ActivationOp(pub(super) Activation);
@@ -158,7 +159,7 @@ impl SliceOp for ModulateOp {
         let places = x[0].shape()[2] * x[0].shape()[3];
         let mut out = ValuesMut::any(x[0].shape());
         if places > 0 {
-            let planes = out.chunks_exact_mut(places).zip(x[0].chunks_exact(places)).zip(&x[1][..]).zip(&x[2][..]);
+            let planes = out.par_chunks_exact_mut(places).zip(x[0].par_chunks_exact(places)).zip(x[1].par_iter()).zip(x[2].par_iter());
             planes.for_each(|(((o, x), scale), shift)| o.iter_mut().zip(x).for_each(|(o, x)| *o = x * (1.0 + scale) + shift));
         }
         Forward::one(out.freeze(), Kept::of(&x[..2]))
@@ -169,17 +170,17 @@ impl SliceOp for ModulateOp {
         let [x, scale] = [&kept.values[0], &kept.values[1]];
         let places = (x.shape()[2] * x.shape()[3]).max(1);
         let (mut dx, mut ds, mut dt) = (ValuesMut::any(x.shape()), ValuesMut::zeros(scale.shape()), ValuesMut::zeros(scale.shape()));
-        let (ds_slice, dt_slice): (&mut [f32], &mut [f32]) = (&mut ds, &mut dt);
-        let planes = dx.chunks_exact_mut(places).zip(x.chunks_exact(places)).zip(d.chunks_exact(places)).enumerate();
-        for (plane, ((dx, x), d)) in planes {
+        let planes = dx.par_chunks_exact_mut(places).zip(x.par_chunks_exact(places)).zip(d.par_chunks_exact(places));
+        let planes = planes.zip(scale.par_iter()).zip(ds.par_iter_mut()).zip(dt.par_iter_mut());
+        planes.for_each(|(((((dx, x), d), scale), ds), dt)| {
             let (mut along, mut sum) = (0.0f64, 0.0f64);
             for ((dx, x), d) in dx.iter_mut().zip(x).zip(d) {
-                *dx = d * (1.0 + scale[plane]);
+                *dx = d * (1.0 + scale);
                 along += (d * x) as f64;
                 sum += *d as f64;
             }
-            (ds_slice[plane], dt_slice[plane]) = (along as f32, sum as f32);
-        }
+            (*ds, *dt) = (along as f32, sum as f32);
+        });
         vec![Some(dx.freeze()), Some(ds.freeze()), Some(dt.freeze())]
     }
 

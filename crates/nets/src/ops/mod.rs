@@ -6,6 +6,7 @@
 mod attention;
 mod by_burn;
 mod conv;
+mod conv_transpose;
 mod elementwise;
 mod embedding;
 mod join;
@@ -18,6 +19,7 @@ mod tests;
 
 pub use attention::attention;
 pub use conv::{Conv, conv2d};
+pub use conv_transpose::conv_transpose2d;
 pub use diorama_kernels::ops::activation::Activation;
 pub use diorama_kernels::ops::grid_sample::{Mode as GridMode, Outside};
 pub use diorama_kernels::ops::mean_error::Error;

@@ -6,7 +6,7 @@ use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::grid_sample::{self, GridSample, Mode, Outside};
 use diorama_kernels::ops::pool::{Pool, cpu as pools};
-use diorama_kernels::ops::resample::{Filter, Resample, cpu as resampling};
+use diorama_kernels::ops::resample::{Filter, Resample, cpu as resampling, shuffle};
 use std::collections::HashMap;
 use std::sync::{Arc, LazyLock, Mutex};
 
@@ -200,19 +200,6 @@ pub fn average_pool(x: Tensor<4>, pool: Pool, count_padding: bool) -> Result<Ten
 #[derive(Clone, Debug)]
 pub(super) struct ShuffleOp(pub(super) usize);
 
-/// Calls `visit` with the place in the many channels and that in the large image.
-fn shuffled(r: usize, [n, c, h, w]: [usize; 4], mut visit: impl FnMut(usize, usize)) {
-    for plane in 0..n * c {
-        for (dy, dx) in (0..r).flat_map(|dy| (0..r).map(move |dx| (dy, dx))) {
-            for y in 0..h {
-                let small = ((plane * r * r + dy * r + dx) * h + y) * w;
-                let large = (plane * h * r + y * r + dy) * w * r + dx;
-                (0..w).for_each(|x| visit(small + x, large + x * r));
-            }
-        }
-    }
-}
-
 impl SliceOp for ShuffleOp {
     fn name(&self) -> &'static str {
         "pixel shuffle"
@@ -230,8 +217,7 @@ impl SliceOp for ShuffleOp {
         let (s, r) = (x[0].shape(), self.0);
         let c = s[1] / (r * r);
         let mut out = ValuesMut::any(&[s[0], c, s[2] * r, s[3] * r]);
-        let (from, to): (&[f32], &mut [f32]) = (&x[0], &mut out);
-        shuffled(r, [s[0], c, s[2], s[3]], |small, large| to[large] = from[small]);
+        shuffle::shuffle(s[0] * c, [s[2], s[3]], r, &x[0], &mut out);
         Forward::one(out.freeze(), Kept::default())
     }
 
@@ -241,8 +227,7 @@ impl SliceOp for ShuffleOp {
             let s = d.shape();
             let (h, w) = (s[2] / r, s[3] / r);
             let mut dx = ValuesMut::any(&[s[0], s[1] * r * r, h, w]);
-            let (from, to): (&[f32], &mut [f32]) = (d, &mut dx);
-            shuffled(r, [s[0], s[1], h, w], |small, large| to[small] = from[large]);
+            shuffle::unshuffle(s[0] * s[1], [h, w], r, d, &mut dx);
             dx.freeze()
         })]
     }

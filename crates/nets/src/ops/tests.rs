@@ -181,6 +181,14 @@ fn assert_by_burn(op: impl crate::bridge::SliceOp + Clone, shapes: &[&[usize]]) 
 fn burns_own_ops_give_the_same() {
     let image: &[usize] = &[2, 4, 6, 5];
     let f = Activation::Silu;
+    for groups in [1, 2] {
+        let settings = Conv { groups, ..Conv::same(3).stride(2) };
+        let op = conv::ConvOp { settings, activation: conv_kernel::Activation::Silu };
+        assert_by_burn(op, &[image, &[6, 4 / groups, 3, 3], &[6]]);
+        let settings = Conv { output_padding: [1; 2], ..settings };
+        let op = conv_transpose::ConvTransposeOp { settings, activation: conv_kernel::Activation::Sigmoid };
+        assert_by_burn(op, &[image, &[4, 6 / groups, 3, 3], &[6]]);
+    }
     assert_by_burn(elementwise::ActivationOp(Activation::Gelu), &[image]);
     assert_by_burn(elementwise::SumOp { relu: true }, &[image, image]);
     assert_by_burn(elementwise::ModulateOp, &[image, &[2, 4], &[2, 4]]);

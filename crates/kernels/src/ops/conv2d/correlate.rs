@@ -2,6 +2,7 @@
 
 use super::Activation;
 use super::bands::{Bands, Scratch, aligned, with_scratch};
+use super::depthwise;
 use super::planes::{Planes, Source};
 use crate::simd;
 use crate::tile::{Kernel, Pack, Segment, Shared, Start, Tile, kernel};
@@ -9,11 +10,11 @@ use rayon::prelude::*;
 use std::ops::Range;
 
 /// Terms of a sum per pass, so that a panel of them stays in the first-level cache.
-const TERMS: usize = 192;
+const TERMS: usize = 288;
 /// The same where the input is read in place of a panel.
-const TERMS_DIRECT: usize = 288;
+const TERMS_DIRECT: usize = 576;
 /// Floats of sums that a band keeps between passes.
-const SUMS: usize = 192 << 10;
+const SUMS: usize = 96 << 10;
 /// Fewest pixels that a band is cut into to keep all threads busy.
 const FEWEST: usize = 192;
 
@@ -107,7 +108,8 @@ struct Part {
     features: Range<usize>,
 }
 
-fn offset(v: usize) -> u32 {
+/// Of a term, which tables hold in 32 bits.
+pub(super) fn offset(v: usize) -> u32 {
     u32::try_from(v).expect("an image has less than 2³² floats")
 }
 
@@ -120,6 +122,9 @@ impl Correlation {
         assert!(t.before.as_ref().is_none_or(|b| b.len() == t.out.len()), "convolution: values before the activation");
         if t.out.is_empty() {
             return;
+        }
+        if self.channels == 1 && self.features <= 2 {
+            return depthwise::run(self, t);
         }
         let level = simd::level();
         let job = self.job(t, kernel(level));
@@ -338,7 +343,6 @@ impl Job<'_> {
                 a: self.weights[weights..].as_ptr(),
                 row: c.weight_feature,
                 b,
-                vector: lanes,
                 offsets,
                 c: sums.as_mut_ptr(),
                 c_row: width,

@@ -1,7 +1,12 @@
 //! Forward and backward passes: correlations of the input and of the output's gradient, depthwise layers on their own.
 
 use super::correlate::{Correlation, Phase, Tap, Tensors};
-use super::{Conv2d, Gradients, Images};
+use super::weights::WeightSums;
+use super::{Activation, Conv2d, Gradients, Images};
+use crate::math::multiversion;
+use crate::simd;
+use rayon::prelude::*;
+use std::cell::RefCell;
 
 impl Conv2d {
     /// Weights between output channels.
@@ -20,7 +25,12 @@ impl Conv2d {
 
     /// From inputs to outputs.
     pub(crate) fn correlation(&self, images: &Images) -> Correlation {
-        let output = self.output(images).size();
+        self.correlation_to(images, &self.output(images))
+    }
+
+    /// From inputs to outputs of a size that may be smaller than what the inputs allow.
+    pub(crate) fn correlation_to(&self, images: &Images, output: &Images) -> Correlation {
+        let output = output.size();
         Correlation {
             batch: images.batch,
             groups: self.groups,
@@ -41,6 +51,11 @@ impl Conv2d {
     ///
     /// Input pixel `stride · grid + start` meets output pixel `grid + d` through the taps with `start − at = stride · d`.
     pub(crate) fn transposed(&self, images: &Images) -> Correlation {
+        self.transposed_from(images, &self.output(images))
+    }
+
+    /// The same with outputs of a size that may be smaller than what the inputs allow.
+    pub(crate) fn transposed_from(&self, images: &Images, output: &Images) -> Correlation {
         let input = images.size();
         let mut phases = Vec::new();
         for start in (0..self.stride[0]).flat_map(|y| (0..self.stride[1]).map(move |x| [y, x])) {
@@ -59,7 +74,7 @@ impl Conv2d {
             batch: images.batch,
             groups: self.groups,
             channels: self.channels_out / self.groups,
-            input: self.output(images).size(),
+            input: output.size(),
             features: self.channels_in / self.groups,
             output: input,
             step: [1; 2],
@@ -68,6 +83,22 @@ impl Conv2d {
             weight_group: self.channels_out / self.groups * self.weight_feature(),
             weight_feature: self.taps(),
             weight_channel: self.weight_feature(),
+        }
+    }
+
+    /// Products of the outputs' gradient with the input.
+    pub(crate) fn weight_sums(&self, images: &Images) -> WeightSums {
+        WeightSums {
+            batch: images.batch,
+            groups: self.groups,
+            rows: self.channels_out / self.groups,
+            grid: self.output(images).size(),
+            columns: self.channels_in / self.groups,
+            input: images.size(),
+            kernel: self.kernel,
+            step: self.stride,
+            padding: self.padding,
+            dilation: self.dilation,
         }
     }
 
@@ -91,6 +122,67 @@ pub fn forward(c: &Conv2d, images: &Images, x: &[f32], weights: &[f32], bias: &[
 
 /// Gradients, given that of the outputs and what the forward pass computed: `kept` is `before` where the activation
 /// needs it, else `out`.
+///
+/// # Shapes
+/// As [`Conv2d`] says; `kept` and `d_out` as `out`; `kept` is not read without an activation.
 pub fn backward(c: &Conv2d, images: &Images, x: &[f32], weights: &[f32], kept: &[f32], d_out: &[f32], gradients: Gradients) {
-    let _ = (c, images, x, weights, kept, d_out, gradients);
+    c.check_tensors(images, x, weights, d_out.len());
+    with_slopes(c.activation, kept, d_out, |d| {
+        if let Some(bias) = gradients.bias {
+            bias_gradient(images.batch, d, bias);
+        }
+        if let Some(out) = gradients.input {
+            c.transposed(images).run(Tensors { x: d, weights, bias: &[], activation: Activation::None, out, before: None });
+        }
+        if let Some(out) = gradients.weights {
+            c.weight_sums(images).run(d, x, out);
+        }
+    });
+}
+
+thread_local! {
+    static SLOPES: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+}
+
+/// Floats per task of an elementwise pass.
+const CHUNK: usize = 1 << 14;
+
+/// Calls `work` with the gradient before an activation.
+pub(crate) fn with_slopes(activation: Activation, kept: &[f32], d_out: &[f32], work: impl FnOnce(&[f32])) {
+    if activation == Activation::None {
+        return work(d_out);
+    }
+    assert_eq!(kept.len(), d_out.len(), "convolution: kept values");
+    let mut d = SLOPES.take();
+    d.resize(d_out.len(), 0.0);
+    let level = simd::level();
+    d.par_chunks_mut(CHUNK).zip(kept.par_chunks(CHUNK)).zip(d_out.par_chunks(CHUNK)).for_each(|((d, kept), d_out)| {
+        simd::with_level(level, || activation.backward(kept, d_out, d));
+    });
+    work(&d);
+    SLOPES.set(d);
+}
+
+/// Sums per channel over images and pixels; `d` is `[batch, out.len(), pixels]`.
+pub(crate) fn bias_gradient(batch: usize, d: &[f32], out: &mut [f32]) {
+    let (channels, level) = (out.len(), simd::level());
+    let pixels = d.len() / (batch * channels).max(1);
+    out.par_iter_mut().enumerate().for_each(|(c, out)| {
+        let planes = (0..batch).map(|n| sum(&d[(n * channels + c) * pixels..][..pixels]));
+        *out = simd::with_level(level, || planes.sum());
+    });
+}
+
+multiversion! {
+    fn sum(values: &[f32]) -> f32 {
+        let mut lanes = [0.0f32; 64];
+        let chunks = values.chunks_exact(64);
+        let rest: f32 = chunks.remainder().iter().sum();
+        for chunk in chunks {
+            for (l, v) in lanes.iter_mut().zip(chunk) {
+                *l += v;
+            }
+        }
+        lanes.iter().sum::<f32>() + rest
+    }
 }

@@ -1,1 +1,140 @@
-//! Later.
+//! Layers whose outputs have one input channel each: whole rows at a time, vectors along pixels.
+
+use super::bands::{aligned, with_scratch};
+use super::correlate::{Correlation, Tensors, offset};
+use super::planes::{Planes, Source};
+use super::weights::WeightSums;
+use crate::simd;
+use crate::tile::{Dots, MOST_DOTS, Row, Shared, kernel};
+use rayon::prelude::*;
+
+/// A correlation with one input channel per group.
+pub fn run(c: &Correlation, t: Tensors) {
+    let level = simd::level();
+    let kernel = kernel(level);
+    let mut planes = Planes::default();
+    planes.update(c.input, c.step, c.phases.iter().flat_map(|p| &p.taps).map(|t| t.at));
+    let most = |i: usize| c.phases.iter().map(|p| p.size[i]).max().unwrap_or(0);
+    planes.fit(1, most(0), most(1));
+    let offsets: Vec<Vec<(u32, u32)>> =
+        c.phases.iter().map(|p| p.taps.iter().map(|t| (offset(t.weight), offset(planes.offset(t.at)))).collect()).collect();
+    let (x, bias, pixels) = (t.x, t.bias, c.output[0] * c.output[1]);
+    let row_len = most(1).next_multiple_of(64) + 64;
+    let compute = |image: usize, group: usize, out: &mut [f32], mut before: Option<&mut [f32]>| {
+        with_scratch(|scratch| {
+            let copy = aligned(&mut scratch.planes, planes.channel + row_len + 64);
+            let row = aligned(&mut scratch.sums, row_len);
+            let source = Source { data: x, image_stride: c.groups * c.input[0] * c.input[1], first_channel: group };
+            planes.fill(source, 0..1, image..image + 1, 0, copy);
+            for feature in 0..c.features {
+                let channel = group * c.features + feature;
+                let weights = &t.weights[group * c.weight_group + feature * c.weight_feature..];
+                for (phase, offsets) in c.phases.iter().zip(&offsets) {
+                    let taps: Vec<f32> = offsets.iter().map(|o| weights[o.0 as usize]).collect();
+                    for y in 0..phase.size[0] {
+                        let columns = phase.size[1];
+                        let r = Row {
+                            weights: &taps,
+                            offsets,
+                            b: copy[y * planes.pitch..].as_ptr(),
+                            columns,
+                            start: bias.get(channel).copied().unwrap_or(0.0),
+                            c: row.as_mut_ptr(),
+                        };
+                        // SAFETY: the copy goes on for a row more, and the row for a tile more.
+                        unsafe { kernel.row(&r) };
+                        let row = &mut row[..columns];
+                        let at = feature * pixels + (phase.start[0] + y * c.spread[0]) * c.output[1] + phase.start[1];
+                        if let Some(before) = &mut before {
+                            spread(row, c.spread[1], &mut before[at..]);
+                        }
+                        t.activation.apply(row);
+                        spread(row, c.spread[1], &mut out[at..]);
+                    }
+                }
+            }
+        });
+    };
+    let size = c.features * pixels;
+    let place = |i: usize| (i / c.groups, i % c.groups);
+    match t.before {
+        Some(before) => t.out.par_chunks_mut(size).zip(before.par_chunks_mut(size)).enumerate().for_each(|(i, (out, before))| {
+            simd::with_level(level, || compute(place(i).0, place(i).1, out, Some(before)));
+        }),
+        None => t.out.par_chunks_mut(size).enumerate().for_each(|(i, out)| {
+            simd::with_level(level, || compute(place(i).0, place(i).1, out, None));
+        }),
+    }
+}
+
+/// `out[step · i] = row[i]`
+fn spread(row: &[f32], step: usize, out: &mut [f32]) {
+    if step == 1 {
+        out[..row.len()].copy_from_slice(row);
+    } else {
+        out.iter_mut().step_by(step).zip(row).for_each(|(o, v)| *o = *v);
+    }
+}
+
+/// Weight gradients of layers with one input channel and at most a few outputs per group.
+pub fn weight_gradient(s: &WeightSums, d: &[f32], x: &[f32], out: &mut [f32]) {
+    let level = simd::level();
+    let kernel = kernel(level);
+    let taps: Vec<[isize; 2]> = (0..s.kernel[0] * s.kernel[1])
+        .map(|t| {
+            let k = [t / s.kernel[1], t % s.kernel[1]];
+            std::array::from_fn(|i| (k[i] * s.dilation[i]) as isize - s.padding[i] as isize)
+        })
+        .collect();
+    let mut planes = Planes::default();
+    planes.update(s.input, s.step, taps.iter().copied());
+    planes.fit(1, s.grid[0], s.grid[1]);
+    let offsets: Vec<(u32, u32)> = taps.iter().map(|t| (0, offset(planes.offset(*t)))).collect();
+    let columns = s.grid[1].next_multiple_of(kernel.lanes);
+    let pixels = s.grid[0] * s.grid[1];
+    let compute = |group: usize, out: &mut [f32]| {
+        with_scratch(|scratch| {
+            let copy = aligned(&mut scratch.planes, planes.channel + 2 * kernel.lanes);
+            let rows = aligned(&mut scratch.panel, s.grid[0] * columns);
+            let sums = aligned(&mut scratch.sums, s.rows * taps.len() * kernel.lanes);
+            sums.fill(0.0);
+            for image in 0..s.batch {
+                let source = Source { data: x, image_stride: s.groups * s.input[0] * s.input[1], first_channel: group };
+                planes.fill(source, 0..1, image..image + 1, 0, copy);
+                // Columns beyond the last are multiplied by 0, so they must be numbers.
+                copy[planes.image..].fill(0.0);
+                for feature in 0..s.rows {
+                    let from = &d[((image * s.groups + group) * s.rows + feature) * pixels..][..pixels];
+                    for (to, from) in rows.chunks_exact_mut(columns).zip(from.chunks_exact(s.grid[1])) {
+                        to[..from.len()].copy_from_slice(from);
+                        to[from.len()..].fill(0.0);
+                    }
+                    for first in (0..taps.len()).step_by(MOST_DOTS) {
+                        let dots = Dots {
+                            d: rows.as_ptr(),
+                            d_pitch: columns,
+                            b: copy.as_ptr(),
+                            b_pitch: planes.pitch,
+                            rows: s.grid[0],
+                            columns,
+                            offsets: &offsets[first..(first + MOST_DOTS).min(taps.len())],
+                            sums: sums[(feature * taps.len() + first) * kernel.lanes..].as_mut_ptr(),
+                        };
+                        // SAFETY: rows are whole vectors; the copy goes on for a vector beyond its last row.
+                        unsafe { kernel.dots(&dots) };
+                    }
+                }
+            }
+            for (o, lanes) in out.iter_mut().zip(sums.chunks_exact(kernel.lanes)) {
+                *o = lanes.iter().sum();
+            }
+        });
+    };
+    let out = Shared(out.as_mut_ptr());
+    let size = s.rows * taps.len();
+    (0..s.groups).into_par_iter().for_each(|group| {
+        // SAFETY: every group has its own part.
+        let out = unsafe { std::slice::from_raw_parts_mut(out.at(group * size), size) };
+        simd::with_level(level, || compute(group, out));
+    });
+}

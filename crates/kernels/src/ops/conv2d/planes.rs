@@ -64,11 +64,6 @@ impl Planes {
         columns + self.reach[1]
     }
 
-    /// Floats per channel and image for a grid of a size.
-    pub fn floats_of(&self, rows: usize, columns: usize) -> usize {
-        (rows + self.reach[0]) * self.pitch_of(columns) * self.residues.len()
-    }
-
     fn split(&self, tap: [isize; 2]) -> ([usize; 2], [usize; 2]) {
         let d = [(tap[0] - self.low[0]) as usize, (tap[1] - self.low[1]) as usize];
         ([d[0] % self.step[0], d[1] % self.step[1]], [d[0] / self.step[0], d[1] / self.step[1]])

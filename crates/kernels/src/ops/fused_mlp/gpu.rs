@@ -13,7 +13,7 @@ pub struct Values {
     /// Outputs `[N, width]` of every layer.
     pub layers: Vec<Buffer>,
     /// Inputs of the activations whose slope needs them.
-    pre: Vec<Option<Buffer>>,
+    pub pre: Vec<Option<Buffer>>,
 }
 
 /// Runs all layers.

@@ -1,0 +1,54 @@
+//! The passes of the adjoint convolution, exchanged.
+
+use super::{Activation, ConvTranspose2d, Gradients, Images};
+use crate::ops::conv2d::correlate::Tensors;
+use crate::ops::conv2d::cpu::{bias_gradient, with_slopes};
+use crate::ops::conv2d::weights::WeightSums;
+
+fn check(c: &ConvTranspose2d, images: &Images, x: &[f32], weights: &[f32], out: usize) -> Images {
+    let output = c.output(images);
+    assert_eq!(x.len(), images.batch * c.channels_in * images.pixels(), "conv_transpose2d: input");
+    assert_eq!(weights.len(), c.weights_len(), "conv_transpose2d: weights");
+    assert_eq!(out, images.batch * c.channels_out * output.pixels(), "conv_transpose2d: output");
+    output
+}
+
+/// `out = act(wᵀ ∗ x + bias)`, all of it written; `before` gets the values before the activation.
+///
+/// # Shapes
+/// As [`ConvTranspose2d`] says; `bias` may be empty, `before` as `out`.
+pub fn forward(
+    c: &ConvTranspose2d,
+    images: &Images,
+    x: &[f32],
+    weights: &[f32],
+    bias: &[f32],
+    out: &mut [f32],
+    before: Option<&mut [f32]>,
+) {
+    let output = check(c, images, x, weights, out.len());
+    c.adjoint().transposed_from(&output, images).run(Tensors { x, weights, bias, activation: c.activation, out, before });
+}
+
+/// Gradients, given that of the outputs and what the forward pass computed: `kept` is `before` where the activation
+/// needs it, else `out`.
+///
+/// # Shapes
+/// As [`ConvTranspose2d`] says; `kept` and `d_out` as `out`; `kept` is not read without an activation.
+pub fn backward(c: &ConvTranspose2d, images: &Images, x: &[f32], weights: &[f32], kept: &[f32], d_out: &[f32], gradients: Gradients) {
+    let output = check(c, images, x, weights, d_out.len());
+    let adjoint = c.adjoint();
+    with_slopes(c.activation, kept, d_out, |d| {
+        if let Some(bias) = gradients.bias {
+            assert_eq!(bias.len(), c.channels_out, "conv_transpose2d: gradient of the bias");
+            bias_gradient(images.batch, d, bias);
+        }
+        if let Some(out) = gradients.input {
+            let correlation = adjoint.correlation_to(&output, images);
+            correlation.run(Tensors { x: d, weights, bias: &[], activation: Activation::None, out, before: None });
+        }
+        if let Some(out) = gradients.weights {
+            WeightSums { grid: images.size(), ..adjoint.weight_sums(&output) }.run(x, d, out);
+        }
+    });
+}
