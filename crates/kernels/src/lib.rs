@@ -18,3 +18,4 @@ pub mod scatter_max;
 pub mod simd;
 mod sums;
 pub mod tasks;
+mod vector;
