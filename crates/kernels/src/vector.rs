@@ -125,6 +125,38 @@ pub(crate) fn ln_1p<const F: bool>(e: f32) -> f32 {
     2.0 * z * polynomial::<F, 8>(z * z, series)
 }
 
+/// Floats from which on a result is written past the caches, which could not hold it anyway.
+pub(crate) const LARGE: usize = 1 << 23;
+
+/// Copies to memory that is not read into the caches first. [`fence`] must follow before other threads read it.
+pub(crate) fn stream(from: &[f32], to: &mut [f32]) {
+    assert_eq!(from.len(), to.len());
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_mm_loadu_ps, _mm_stream_ps};
+        let head = to.as_ptr().align_offset(16).min(to.len());
+        to[..head].copy_from_slice(&from[..head]);
+        let (from, to) = (&from[head..], &mut to[head..]);
+        let whole = to.len() / 4 * 4;
+        for i in (0..whole).step_by(4) {
+            // SAFETY: four floats from i on exist in both; `to` begins at a multiple of 16 bytes; the set belongs to the architecture.
+            unsafe { _mm_stream_ps(to.as_mut_ptr().add(i), _mm_loadu_ps(from.as_ptr().add(i))) };
+        }
+        to[whole..].copy_from_slice(&from[whole..]);
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    to.copy_from_slice(from);
+}
+
+/// Orders what [`stream`] wrote before what this thread writes next.
+pub(crate) fn fence() {
+    #[cfg(target_arch = "x86_64")]
+    // SAFETY: the set belongs to the architecture.
+    unsafe {
+        std::arch::x86_64::_mm_sfence();
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -163,6 +195,18 @@ mod tests {
             let [e, s, t, n, _] = with_level(level, || all(f32::NEG_INFINITY));
             assert!(e == 0.0 && s < 1e-38 && t == -1.0 && n == 0.0);
             assert!(with_level(level, || all(f32::NAN)).iter().all(|v| v.is_nan()));
+        }
+    }
+
+    #[test]
+    fn streams_copy_from_and_to_any_place() {
+        let from: Vec<f32> = (0..40).map(|i| i as f32).collect();
+        for (start, n) in [(0, 0), (0, 1), (1, 2), (3, 17), (2, 32), (5, 35)] {
+            let mut to = [-1.0f32; 40];
+            stream(&from[start..start + n], &mut to[start..start + n]);
+            fence();
+            assert_eq!(to[start..start + n], from[start..start + n]);
+            assert!(to[..start].iter().chain(&to[start + n..]).all(|v| *v == -1.0));
         }
     }
 }
