@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
-use support::copy_of as copy;
+use support::{Small, copy_of as copy};
 
 fn program() -> Command {
     let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
@@ -99,23 +99,6 @@ fn fault_01_kill_in_a_save_leaves_a_file_that_loads_and_no_stale_temporaries() {
     assert!(diorama(&["train", "--out", run.to_str().unwrap(), "--resume", "--steps", "8"]).status.success());
     assert!(!partial.exists());
     checkpoint::load(&run.join("checkpoints")).unwrap();
-}
-
-/// A file system of a mebibyte, or none where this user may not mount one.
-struct Small(PathBuf);
-
-impl Small {
-    fn mount(at: &Path) -> Option<Small> {
-        std::fs::create_dir_all(at).unwrap();
-        let ok = Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m", "tmpfs"]).arg(at).stderr(Stdio::null()).status();
-        ok.is_ok_and(|s| s.success()).then(|| Small(at.to_path_buf()))
-    }
-}
-
-impl Drop for Small {
-    fn drop(&mut self) {
-        let _ = Command::new("umount").arg(&self.0).status();
-    }
 }
 
 #[test]

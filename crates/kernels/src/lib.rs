@@ -19,3 +19,4 @@ pub mod simd;
 mod sums;
 pub mod tasks;
 pub mod tile;
+mod vector;

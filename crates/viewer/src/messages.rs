@@ -149,6 +149,7 @@ pub struct Photograph {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[cfg_attr(test, derive(ts_rs::TS))]
 #[serde(tag = "kind", rename_all = "snake_case")]
+#[allow(clippy::large_enum_variant, reason = "one message at a time")]
 pub enum Tell {
     Scene {
         name: String,

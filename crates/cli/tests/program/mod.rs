@@ -4,7 +4,7 @@
 
 use diorama_pipelines::object::quickstart::write_capture;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
@@ -106,4 +106,21 @@ pub fn copy_of(from: &Path) -> (tempfile::TempDir, PathBuf) {
 /// A copy of the good run that a case may spoil.
 pub fn copy() -> (tempfile::TempDir, PathBuf) {
     copy_of(&good().run)
+}
+
+/// A file system of a mebibyte, or none where this user may not mount one.
+pub struct Small(PathBuf);
+
+impl Small {
+    pub fn mount(at: &Path) -> Option<Small> {
+        std::fs::create_dir_all(at).unwrap();
+        let ok = Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m", "tmpfs"]).arg(at).stderr(Stdio::null()).status();
+        ok.is_ok_and(|s| s.success()).then(|| Small(at.to_path_buf()))
+    }
+}
+
+impl Drop for Small {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg(&self.0).status();
+    }
 }

@@ -2,37 +2,37 @@
 
 use super::Activation;
 use super::functions::{Function, with_function};
-use crate::math::multiversion;
 use crate::tasks::{self, Parts};
+use crate::vector::vectorized;
 
 /// Elements per task.
 const BLOCK: usize = 1 << 14;
 
-multiversion! {
+vectorized! {
     /// `out = f(x)` on this thread.
-    pub(crate) fn forward_block(a: Activation, x: &[f32], out: &mut [f32]) {
-        with_function!(a, f => out.iter_mut().zip(x).for_each(|(o, x)| *o = f.value(*x)))
+    pub(crate) fn forward_block<const F>(a: Activation, x: &[f32], out: &mut [f32]) {
+        with_function!(a, f => out.iter_mut().zip(x).for_each(|(o, x)| *o = f.value::<F>(*x)))
     }
 }
 
-multiversion! {
+vectorized! {
     /// `values ← f(values)` on this thread.
-    pub(crate) fn forward_in_place(a: Activation, values: &mut [f32]) {
-        with_function!(a, f => values.iter_mut().for_each(|v| *v = f.value(*v)))
+    pub(crate) fn forward_in_place<const F>(a: Activation, values: &mut [f32]) {
+        with_function!(a, f => values.iter_mut().for_each(|v| *v = f.value::<F>(*v)))
     }
 }
 
-multiversion! {
+vectorized! {
     /// `dx = d · f′(x)` on this thread.
-    pub(crate) fn backward_block(a: Activation, x: &[f32], d: &[f32], dx: &mut [f32]) {
-        with_function!(a, f => dx.iter_mut().zip(x).zip(d).for_each(|((o, x), d)| *o = d * f.slope(*x)))
+    pub(crate) fn backward_block<const F>(a: Activation, x: &[f32], d: &[f32], dx: &mut [f32]) {
+        with_function!(a, f => dx.iter_mut().zip(x).zip(d).for_each(|((o, x), d)| *o = d * f.slope::<F>(*x)))
     }
 }
 
-multiversion! {
+vectorized! {
     /// `values ← d · f′(values)` on this thread.
-    pub(crate) fn backward_in_place(a: Activation, d: &[f32], values: &mut [f32]) {
-        with_function!(a, f => values.iter_mut().zip(d).for_each(|(v, d)| *v = d * f.slope(*v)))
+    pub(crate) fn backward_in_place<const F>(a: Activation, d: &[f32], values: &mut [f32]) {
+        with_function!(a, f => values.iter_mut().zip(d).for_each(|(v, d)| *v = d * f.slope::<F>(*v)))
     }
 }
 

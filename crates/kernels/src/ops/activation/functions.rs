@@ -1,58 +1,22 @@
 //! The functions and their slopes in f32, free of branches, so that loops over them become vector code.
 
-use crate::math::exp;
+use crate::vector::{exp, fma, ln_1p, normal, sigmoid, tanh};
 
 /// One function of one number.
 pub(crate) trait Function: Copy {
-    fn value(self, x: f32) -> f32;
-    fn slope(self, x: f32) -> f32;
-}
-
-/// `tanh x` to about 2e-7.
-#[inline(always)]
-pub(crate) fn tanh(x: f32) -> f32 {
-    let s = x * x;
-    // Taylor where 1 − 2 / (e²ˣ + 1) would cancel.
-    let near = x * (1.0 + s * (-1.0 / 3.0 + s * (2.0 / 15.0 + s * (-17.0 / 315.0 + s * (62.0 / 2835.0 + s * (-1382.0 / 155_925.0))))));
-    let far = 1.0 - 2.0 / (exp(2.0 * x) + 1.0);
-    if x.abs() < 0.35 { near } else { far }
-}
-
-/// `1 / (1 + e⁻ˣ)`
-#[inline(always)]
-pub(crate) fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + exp(-x))
-}
-
-/// `ln(1 + e)` for `e` in 0..=1: `2 artanh(e / (2 + e))`.
-#[inline(always)]
-pub(crate) fn ln_1p(e: f32) -> f32 {
-    let z = e / (2.0 + e);
-    let s = z * z;
-    let tail = 1.0 / 9.0 + s * (1.0 / 11.0 + s * (1.0 / 13.0 + s * (1.0 / 15.0)));
-    2.0 * z * (1.0 + s * (1.0 / 3.0 + s * (1.0 / 5.0 + s * (1.0 / 7.0 + s * tail))))
-}
-
-/// The normal distribution's `Φ(x)` and `e^(−x²/2)`: Abramowitz and Stegun 7.1.26, absolute error 1.5e-7.
-#[inline(always)]
-pub(crate) fn normal(x: f32) -> (f32, f32) {
-    let z = x.abs() * std::f32::consts::FRAC_1_SQRT_2;
-    let bell = exp(-z * z);
-    let t = 1.0 / (1.0 + 0.327_591_1 * z);
-    let p = t * (0.254_829_6 + t * (-0.284_496_74 + t * (1.421_413_7 + t * (-1.453_152 + t * 1.061_405_4))));
-    let tail = 0.5 * p * bell;
-    (if x < 0.0 { tail } else { 1.0 - tail }, bell)
+    fn value<const F: bool>(self, x: f32) -> f32;
+    fn slope<const F: bool>(self, x: f32) -> f32;
 }
 
 #[derive(Clone, Copy)]
 pub(crate) struct Identity;
 impl Function for Identity {
     #[inline(always)]
-    fn value(self, x: f32) -> f32 {
+    fn value<const F: bool>(self, x: f32) -> f32 {
         x
     }
     #[inline(always)]
-    fn slope(self, _: f32) -> f32 {
+    fn slope<const F: bool>(self, _: f32) -> f32 {
         1.0
     }
 }
@@ -61,12 +25,12 @@ impl Function for Identity {
 pub(crate) struct Relu;
 impl Function for Relu {
     #[inline(always)]
-    fn value(self, x: f32) -> f32 {
+    fn value<const F: bool>(self, x: f32) -> f32 {
         // Written so that NaN stays NaN.
         if x < 0.0 { 0.0 } else { x }
     }
     #[inline(always)]
-    fn slope(self, x: f32) -> f32 {
+    fn slope<const F: bool>(self, x: f32) -> f32 {
         if x > 0.0 { 1.0 } else { 0.0 }
     }
 }
@@ -75,11 +39,11 @@ impl Function for Relu {
 pub(crate) struct LeakyRelu(pub f32);
 impl Function for LeakyRelu {
     #[inline(always)]
-    fn value(self, x: f32) -> f32 {
+    fn value<const F: bool>(self, x: f32) -> f32 {
         if x > 0.0 { x } else { self.0 * x }
     }
     #[inline(always)]
-    fn slope(self, x: f32) -> f32 {
+    fn slope<const F: bool>(self, x: f32) -> f32 {
         if x > 0.0 { 1.0 } else { self.0 }
     }
 }
@@ -88,12 +52,12 @@ impl Function for LeakyRelu {
 pub(crate) struct Softplus;
 impl Function for Softplus {
     #[inline(always)]
-    fn value(self, x: f32) -> f32 {
-        (if x < 0.0 { 0.0 } else { x }) + ln_1p(exp(-x.abs()))
+    fn value<const F: bool>(self, x: f32) -> f32 {
+        (if x < 0.0 { 0.0 } else { x }) + ln_1p::<F>(exp::<F>(-x.abs()))
     }
     #[inline(always)]
-    fn slope(self, x: f32) -> f32 {
-        sigmoid(x)
+    fn slope<const F: bool>(self, x: f32) -> f32 {
+        sigmoid::<F>(x)
     }
 }
 
@@ -101,12 +65,12 @@ impl Function for Softplus {
 pub(crate) struct Sigmoid;
 impl Function for Sigmoid {
     #[inline(always)]
-    fn value(self, x: f32) -> f32 {
-        sigmoid(x)
+    fn value<const F: bool>(self, x: f32) -> f32 {
+        sigmoid::<F>(x)
     }
     #[inline(always)]
-    fn slope(self, x: f32) -> f32 {
-        let y = sigmoid(x);
+    fn slope<const F: bool>(self, x: f32) -> f32 {
+        let y = sigmoid::<F>(x);
         y * (1.0 - y)
     }
 }
@@ -115,13 +79,13 @@ impl Function for Sigmoid {
 pub(crate) struct Tanh;
 impl Function for Tanh {
     #[inline(always)]
-    fn value(self, x: f32) -> f32 {
-        tanh(x)
+    fn value<const F: bool>(self, x: f32) -> f32 {
+        tanh::<F>(x)
     }
     #[inline(always)]
-    fn slope(self, x: f32) -> f32 {
-        let y = tanh(x);
-        1.0 - y * y
+    fn slope<const F: bool>(self, x: f32) -> f32 {
+        let y = tanh::<F>(x);
+        fma::<F>(-y, y, 1.0)
     }
 }
 
@@ -129,13 +93,14 @@ impl Function for Tanh {
 pub(crate) struct Silu;
 impl Function for Silu {
     #[inline(always)]
-    fn value(self, x: f32) -> f32 {
-        x * sigmoid(x)
+    fn value<const F: bool>(self, x: f32) -> f32 {
+        x / (1.0 + exp::<F>(-x))
     }
     #[inline(always)]
-    fn slope(self, x: f32) -> f32 {
-        let s = sigmoid(x);
-        s * (1.0 + x * (1.0 - s))
+    fn slope<const F: bool>(self, x: f32) -> f32 {
+        let s = sigmoid::<F>(x);
+        let y = x * s;
+        fma::<F>(-y, s, y) + s
     }
 }
 
@@ -143,13 +108,13 @@ impl Function for Silu {
 pub(crate) struct Gelu;
 impl Function for Gelu {
     #[inline(always)]
-    fn value(self, x: f32) -> f32 {
-        x * normal(x).0
+    fn value<const F: bool>(self, x: f32) -> f32 {
+        x * normal::<F>(x)
     }
     #[inline(always)]
-    fn slope(self, x: f32) -> f32 {
-        let (below, bell) = normal(x);
-        below + x * bell * 0.398_942_3
+    fn slope<const F: bool>(self, x: f32) -> f32 {
+        const DENSITY: f32 = 0.398_942_3;
+        fma::<F>(x * DENSITY, exp::<F>(-0.5 * x * x), normal::<F>(x))
     }
 }
 
@@ -160,13 +125,15 @@ const GELU: (f32, f32) = (0.797_884_6, 0.044_715);
 pub(crate) struct GeluTanh;
 impl Function for GeluTanh {
     #[inline(always)]
-    fn value(self, x: f32) -> f32 {
-        0.5 * x * (1.0 + tanh(GELU.0 * (x + GELU.1 * x * x * x)))
+    fn value<const F: bool>(self, x: f32) -> f32 {
+        let half = 0.5 * x;
+        fma::<F>(half, tanh::<F>(GELU.0 * x * fma::<F>(GELU.1 * x, x, 1.0)), half)
     }
     #[inline(always)]
-    fn slope(self, x: f32) -> f32 {
-        let t = tanh(GELU.0 * (x + GELU.1 * x * x * x));
-        0.5 * (1.0 + t) + 0.5 * x * (1.0 - t * t) * GELU.0 * (1.0 + 3.0 * GELU.1 * x * x)
+    fn slope<const F: bool>(self, x: f32) -> f32 {
+        let t = tanh::<F>(GELU.0 * x * fma::<F>(GELU.1 * x, x, 1.0));
+        let inner = GELU.0 * fma::<F>(3.0 * GELU.1 * x, x, 1.0);
+        0.5 * (1.0 + t) + 0.5 * x * fma::<F>(-t, t, 1.0) * inner
     }
 }
 

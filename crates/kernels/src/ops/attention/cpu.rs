@@ -2,8 +2,8 @@
 
 use super::Attention;
 use crate::gemm::{Init, Precision, View, gemm};
-use crate::math::{exp, multiversion};
 use crate::tasks::{self, Parts};
+use crate::vector::{exp, vectorized};
 
 /// Queries per tile.
 const QUERIES: usize = 64;
@@ -32,10 +32,10 @@ fn transpose(width: usize, scale: f32, x: &[f32], out: &mut [f32]) {
     }
 }
 
-multiversion! {
+vectorized! {
     /// One step of the softmax of columns: `tile ← e^(tile − most)` with the new largest values; the sums and what is summed so far
     /// shrink by `shrink`.
-    fn exponentials(tile: &mut [f32], most: &mut [f32; QUERIES], sums: &mut [f32; QUERIES], shrink: &mut [f32; QUERIES]) {
+    fn exponentials<const F>(tile: &mut [f32], most: &mut [f32; QUERIES], sums: &mut [f32; QUERIES], shrink: &mut [f32; QUERIES]) {
         let before = *most;
         let mut top = *most;
         for row in tile.chunks_exact(QUERIES) {
@@ -46,32 +46,32 @@ multiversion! {
         let mut total = [0.0f32; QUERIES];
         for row in tile.chunks_exact_mut(QUERIES) {
             for i in 0..QUERIES {
-                row[i] = exp(row[i] - top[i]);
+                row[i] = exp::<F>(row[i] - top[i]);
                 total[i] += row[i];
             }
         }
         for i in 0..QUERIES {
-            shrink[i] = exp(before[i] - top[i]);
+            shrink[i] = exp::<F>(before[i] - top[i]);
             sums[i] = sums[i] * shrink[i] + total[i];
         }
         *most = top;
     }
 }
 
-multiversion! {
+vectorized! {
     /// `tile ← e^(tile − log_sums)`
-    fn weights(tile: &mut [f32], log_sums: &[f32; QUERIES]) {
+    fn weights<const F>(tile: &mut [f32], log_sums: &[f32; QUERIES]) {
         for row in tile.chunks_exact_mut(QUERIES) {
             for i in 0..QUERIES {
-                row[i] = exp(row[i] - log_sums[i]);
+                row[i] = exp::<F>(row[i] - log_sums[i]);
             }
         }
     }
 }
 
-multiversion! {
+vectorized! {
     /// `tile ← tile (along − mean) scale`
-    fn gradients(tile: &mut [f32], along: &[f32], mean: &[f32; QUERIES], scale: f32) {
+    fn gradients<const F>(tile: &mut [f32], along: &[f32], mean: &[f32; QUERIES], scale: f32) {
         for (row, along) in tile.chunks_exact_mut(QUERIES).zip(along.chunks_exact(QUERIES)) {
             for i in 0..QUERIES {
                 row[i] *= (along[i] - mean[i]) * scale;

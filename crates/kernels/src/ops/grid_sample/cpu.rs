@@ -90,7 +90,8 @@ multiversion! {
 fn spread(corners: &Corners, d: &[f32], dx: &mut [f32]) {
     for (i, d) in d.iter().enumerate().take(POINTS) {
         for k in 0..4 {
-            dx[corners.pixel[k][i] as usize] += corners.weight[k][i] * d;
+            // SAFETY: as in `sample`.
+            unsafe { *dx.get_unchecked_mut(corners.pixel[k][i] as usize) += corners.weight[k][i] * d };
         }
     }
 }

@@ -2,67 +2,66 @@
 //! f64 (Chan et al. 1979).
 
 use super::{Norm, Over};
-use crate::math::multiversion;
 use crate::ops::activation::{Activation, cpu as activation};
 use crate::sums;
 use crate::tasks::{self, Parts};
+use crate::vector::{fma, vectorized};
 
 /// Elements that stay in the first-level cache between loops.
 const BLOCK: usize = 2048;
 
-multiversion! {
+vectorized! {
     /// Mean of a slice and its squares about that mean.
-    pub(super) fn moments(x: &[f32]) -> (f32, f32) {
-        let mean = sums::sum(x) / x.len() as f32;
-        (mean, sums::squares_about(mean, x))
+    fn moments<const F>(x: &[f32]) -> (f32, f32) {
+        sums::moments::<F>(x)
     }
 }
 
-multiversion! {
+vectorized! {
     /// `max((x − mean) scale + shift, floor)`
-    fn apply(x: &[f32], line: Line, out: &mut [f32]) {
+    fn apply<const F>(x: &[f32], line: Line, out: &mut [f32]) {
         for (o, x) in out.iter_mut().zip(x) {
-            let v = (x - line.mean) * line.scale + line.shift;
+            let v = fma::<F>(x - line.mean, line.scale, line.shift);
             *o = if v < line.floor { line.floor } else { v };
         }
     }
 }
 
-multiversion! {
+vectorized! {
     /// `Σ d` and `Σ d (x − mean)` where the output is above the floor.
-    fn gradient_sums(x: &[f32], d: &[f32], line: Line) -> (f32, f32) {
+    fn gradient_sums<const F>(x: &[f32], d: &[f32], line: Line) -> (f32, f32) {
         let (mut sum, mut along) = ([0.0f32; sums::LANES], [0.0f32; sums::LANES]);
         let (xs, ds) = (x.chunks_exact(sums::LANES), d.chunks_exact(sums::LANES));
         let tails = xs.remainder().iter().zip(ds.remainder());
         let term = |x: f32, d: f32| {
             let centered = x - line.mean;
-            let g = if centered * line.scale + line.shift > line.floor { d } else { 0.0 };
-            (g, g * centered)
+            let g = if fma::<F>(centered, line.scale, line.shift) > line.floor { d } else { 0.0 };
+            (g, centered)
         };
         for (x, d) in xs.zip(ds) {
             for j in 0..sums::LANES {
-                let (g, a) = term(x[j], d[j]);
+                let (g, centered) = term(x[j], d[j]);
                 sum[j] += g;
-                along[j] += a;
+                along[j] = fma::<F>(g, centered, along[j]);
             }
         }
         let (mut sum, mut along) = (sums::fold(sum), sums::fold(along));
         for (x, d) in tails {
-            let (g, a) = term(*x, *d);
+            let (g, centered) = term(*x, *d);
             sum += g;
-            along += a;
+            along = fma::<F>(g, centered, along);
         }
         (sum, along)
     }
 }
 
-multiversion! {
+vectorized! {
     /// `scale d + slope (x − mean) + constant`, with `d` where the output is above the floor.
-    fn apply_gradient(x: &[f32], d: &[f32], line: Line, slope: f32, constant: f32, dx: &mut [f32]) {
+    fn apply_gradient<const F>(x: &[f32], d: &[f32], line: Line, slope: f32, constant: f32, dx: &mut [f32]) {
         for ((o, x), d) in dx.iter_mut().zip(x).zip(d) {
             let centered = x - line.mean;
-            let g = if centered * line.scale + line.shift > line.floor { *d } else { 0.0 };
-            *o = line.scale * g + slope * centered + constant;
+            let g = if fma::<F>(centered, line.scale, line.shift) > line.floor { *d } else { 0.0 };
+            *o = fma::<F>(line.scale, g, fma::<F>(slope, centered, constant));
         }
     }
 }

@@ -134,3 +134,24 @@ fn running_statistics_move_by_the_momentum() {
     // The unbiased variance is 5.
     assert_close("variance", &variance, &[2.3], 1e-6);
 }
+
+#[test]
+fn results_too_large_for_caches_are_those_of_small_ones() {
+    let (width, rows) = (1030, crate::vector::LARGE / 1030 + 1);
+    let norm = LayerNorm { width, epsilon: 1e-5, scale: None, shift: None, activation: Activation::Relu };
+    let (x, d) = (shifted(width * rows, 1), random(width * rows, 2));
+    let run = |first: usize, last: usize| {
+        let (x, d, rows) = (&x[first * width..last * width], &d[first * width..last * width], last - first);
+        let (mut mean, mut variance, mut out, mut dx) = (vec![0.0; rows], vec![0.0; rows], vec![9.0; x.len()], vec![9.0; x.len()]);
+        layer::forward(&norm, x, &mut mean, &mut variance, &mut out);
+        let g = Gradients { x: &mut dx, scale: &mut [], shift: &mut [] };
+        layer::backward(&norm, x, &mean, &variance, d, g, &mut Vec::new());
+        (out, dx)
+    };
+    let (out, dx) = run(0, rows);
+    for first in [0, rows - 7] {
+        let (small, d_small) = run(first, first + 7);
+        assert_eq!(out[first * width..(first + 7) * width], small);
+        assert_eq!(dx[first * width..(first + 7) * width], d_small);
+    }
+}

@@ -1,9 +1,9 @@
 //! Rows on their own: largest value, exponentials with their sum, division.
 
 use super::Targets;
-use crate::math::{exp, multiversion};
 use crate::sums;
 use crate::tasks::{self, Parts};
+use crate::vector::{exp, fma, vectorized};
 
 /// Elements per task, about.
 const BLOCK: usize = 1 << 14;
@@ -14,72 +14,72 @@ fn rows_per_task(n: usize) -> usize {
 
 /// `values ← e^(values − shift)`; returns their sum. To be called from a function compiled for the instruction set.
 #[inline(always)]
-pub(crate) fn exponentials(shift: f32, values: &mut [f32]) -> f32 {
+pub(crate) fn exponentials<const F: bool>(shift: f32, values: &mut [f32]) -> f32 {
     let mut lanes = [0.0f32; sums::LANES];
     let mut blocks = values.chunks_exact_mut(sums::LANES);
     for block in &mut blocks {
         for (lane, v) in lanes.iter_mut().zip(block) {
-            *v = exp(*v - shift);
+            *v = exp::<F>(*v - shift);
             *lane += *v;
         }
     }
     let mut tail = 0.0;
     for v in blocks.into_remainder() {
-        *v = exp(*v - shift);
+        *v = exp::<F>(*v - shift);
         tail += *v;
     }
     sums::fold(lanes) + tail
 }
 
-multiversion! {
-    fn softmax_rows(n: usize, x: &[f32], out: &mut [f32]) {
+vectorized! {
+    fn softmax_rows<const F>(n: usize, x: &[f32], out: &mut [f32]) {
         for (row, x) in out.chunks_exact_mut(n).zip(x.chunks_exact(n)) {
             row.copy_from_slice(x);
-            let scale = 1.0 / exponentials(sums::most(x), row);
+            let scale = 1.0 / exponentials::<F>(sums::most(x), row);
             row.iter_mut().for_each(|v| *v *= scale);
         }
     }
 }
 
-multiversion! {
-    fn log_softmax_rows(n: usize, x: &[f32], out: &mut [f32]) {
+vectorized! {
+    fn log_softmax_rows<const F>(n: usize, x: &[f32], out: &mut [f32]) {
         for (row, x) in out.chunks_exact_mut(n).zip(x.chunks_exact(n)) {
             let most = sums::most(x);
             row.copy_from_slice(x);
-            let total = most + exponentials(most, row).ln();
+            let total = most + exponentials::<F>(most, row).ln();
             row.iter_mut().zip(x).for_each(|(v, x)| *v = x - total);
         }
     }
 }
 
-multiversion! {
-    fn softmax_rows_backward(n: usize, y: &[f32], d: &[f32], dx: &mut [f32]) {
+vectorized! {
+    fn softmax_rows_backward<const F>(n: usize, y: &[f32], d: &[f32], dx: &mut [f32]) {
         for ((row, y), d) in dx.chunks_exact_mut(n).zip(y.chunks_exact(n)).zip(d.chunks_exact(n)) {
-            let dot = sums::dot(y, d);
+            let dot = sums::dot::<F>(y, d);
             row.iter_mut().zip(y).zip(d).for_each(|((o, y), d)| *o = y * (d - dot));
         }
     }
 }
 
-multiversion! {
-    fn log_softmax_rows_backward(n: usize, l: &[f32], d: &[f32], dx: &mut [f32]) {
+vectorized! {
+    fn log_softmax_rows_backward<const F>(n: usize, l: &[f32], d: &[f32], dx: &mut [f32]) {
         for ((row, l), d) in dx.chunks_exact_mut(n).zip(l.chunks_exact(n)).zip(d.chunks_exact(n)) {
             let sum = sums::sum(d);
-            row.iter_mut().zip(l).zip(d).for_each(|((o, l), d)| *o = d - exp(*l) * sum);
+            row.iter_mut().zip(l).zip(d).for_each(|((o, l), d)| *o = d - exp::<F>(*l) * sum);
         }
     }
 }
 
-multiversion! {
+vectorized! {
     /// `(e^l − target) · scale`, with the targets' smoothed shares.
-    fn cross_entropy_rows_backward(n: usize, l: &[f32], classes: &[i64], t: &Targets, scale: f32, dx: &mut [f32]) {
+    fn cross_entropy_rows_backward<const F>(n: usize, l: &[f32], classes: &[i64], t: &Targets, scale: f32, dx: &mut [f32]) {
         for ((row, l), class) in dx.chunks_exact_mut(n).zip(l.chunks_exact(n)).zip(classes) {
             if *class == t.ignored {
                 row.fill(0.0);
                 continue;
             }
             let spread = t.smoothing / n as f32;
-            row.iter_mut().zip(l).for_each(|(o, l)| *o = scale * (exp(*l) - spread));
+            row.iter_mut().zip(l).for_each(|(o, l)| *o = scale * (exp::<F>(*l) - spread));
             row[*class as usize] -= scale * (1.0 - t.smoothing);
         }
     }
@@ -134,28 +134,44 @@ pub fn log_softmax_backward(n: usize, l: &[f32], d: &[f32], dx: &mut [f32]) {
     by_rows(n, dx, |first, dx| log_softmax_rows_backward(n, &l[first..first + dx.len()], &d[first..first + dx.len()], dx));
 }
 
-/// Mean cross entropy over the rows that count, NaN where none does; writes `ln softmax(x)`, which backward needs.
+vectorized! {
+    /// Loss of each row that counts, 0 of the others.
+    fn cross_entropy_rows<const F>(n: usize, l: &[f32], classes: &[i64], t: &Targets, losses: &mut [f32]) {
+        for ((loss, l), class) in losses.iter_mut().zip(l.chunks_exact(n)).zip(classes) {
+            *loss = 0.0;
+            if *class != t.ignored {
+                let spread = if t.smoothing > 0.0 { t.smoothing / n as f32 * sums::sum(l) } else { 0.0 };
+                *loss = -fma::<F>(1.0 - t.smoothing, l[*class as usize], spread);
+            }
+        }
+    }
+}
+
+/// Mean cross entropy over the rows that count, NaN where none does; writes `ln softmax(x)`, which backward needs, and each
+/// row's loss.
 ///
 /// # Shapes
-/// x, log_probabilities `[M, n]`, classes `[M]`.
+/// x, log_probabilities `[M, n]`, classes, losses `[M]`.
 ///
 /// # Panics
 /// When a class that is not ignored is not in `0..n`.
-pub fn cross_entropy(n: usize, x: &[f32], targets: &Targets, log_probabilities: &mut [f32]) -> f32 {
-    assert_eq!(x.len(), targets.classes.len() * n, "cross entropy: shapes");
-    log_softmax(n, x, log_probabilities);
-    let (epsilon, mut sum) = (targets.smoothing as f64, 0.0f64);
-    for (l, class) in log_probabilities.chunks_exact(n.max(1)).zip(targets.classes) {
-        if *class == targets.ignored {
-            continue;
-        }
-        assert!((0..n as i64).contains(class), "cross entropy: class {class} of {n}");
-        sum -= (1.0 - epsilon) * l[*class as usize] as f64;
-        if epsilon > 0.0 {
-            sum -= epsilon / n as f64 * l.iter().map(|v| *v as f64).sum::<f64>();
-        }
+pub fn cross_entropy(n: usize, x: &[f32], targets: &Targets, log_probabilities: &mut [f32], losses: &mut [f32]) -> f32 {
+    let classes = targets.classes;
+    assert!(x.len() == classes.len() * n && log_probabilities.len() == x.len() && losses.len() == classes.len(), "cross entropy: shapes");
+    if let Some(class) = classes.iter().find(|c| **c != targets.ignored && !(0..n as i64).contains(c)) {
+        panic!("cross entropy: class {class} of {n}");
     }
-    (sum / targets.counted() as f64) as f32
+    let per_task = rows_per_task(n);
+    let (l, parts) = (Parts::new(log_probabilities), Parts::new(losses));
+    tasks::run(if n == 0 { 0 } else { classes.len().div_ceil(per_task) }, x.len(), |task| {
+        let rows = task * per_task..((task + 1) * per_task).min(classes.len());
+        let span = rows.start * n..rows.end * n;
+        // SAFETY: each task has rows of its own.
+        let (l, losses) = unsafe { (l.range(span.clone()), parts.range(rows.clone())) };
+        log_softmax_rows(n, &x[span], l);
+        cross_entropy_rows(n, l, &classes[rows], targets, losses);
+    });
+    (losses.iter().map(|l| *l as f64).sum::<f64>() / targets.counted() as f64) as f32
 }
 
 /// Gradient of the logits from that of the loss, given what [`cross_entropy`] wrote.

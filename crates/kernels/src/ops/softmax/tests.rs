@@ -41,9 +41,9 @@ fn cross_entropy_matches_the_reference_both_ways_at_every_level() {
             for smoothing in [0.0, 0.1] {
                 let (x, classes) = (scaled(m * n, 1), classes(m, n));
                 let targets = Targets { classes: &classes, smoothing, ignored: -100 };
-                let (mut l, mut dx) = (vec![9.0; m * n], vec![9.0; m * n]);
+                let (mut l, mut dx, mut losses) = (vec![9.0; m * n], vec![9.0; m * n], vec![9.0; m]);
                 let loss = with_level(level, || {
-                    let loss = cpu::cross_entropy(n, &x, &targets, &mut l);
+                    let loss = cpu::cross_entropy(n, &x, &targets, &mut l, &mut losses);
                     cpu::cross_entropy_backward(n, &l, &targets, 3.0, &mut dx);
                     loss
                 });
@@ -83,11 +83,11 @@ fn large_logits_neither_overflow_nor_lose_their_order() {
 #[test]
 fn a_loss_of_no_rows_is_no_number() {
     let targets = Targets { classes: &[-100, -100], smoothing: 0.0, ignored: -100 };
-    assert!(cpu::cross_entropy(2, &[1.0; 4], &targets, &mut [0.0; 4]).is_nan());
+    assert!(cpu::cross_entropy(2, &[1.0; 4], &targets, &mut [0.0; 4], &mut [0.0; 2]).is_nan());
 }
 
 #[test]
 #[should_panic(expected = "class 7 of 3")]
 fn a_class_outside_is_refused() {
-    cpu::cross_entropy(3, &[0.0; 3], &Targets { classes: &[7], smoothing: 0.0, ignored: -100 }, &mut [0.0; 3]);
+    cpu::cross_entropy(3, &[0.0; 3], &Targets { classes: &[7], smoothing: 0.0, ignored: -100 }, &mut [0.0; 3], &mut [0.0]);
 }
