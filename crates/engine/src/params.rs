@@ -53,8 +53,8 @@ impl ParamGroup {
         }
         let a = Adam { rate: self.adam.rate * rate_scale, ..self.adam };
         if self.touched.is_empty() {
-            let all = [0..self.values.len()];
-            for r in self.trained.as_deref().unwrap_or(&all) {
+            let all = std::iter::once(0..self.values.len()).collect();
+            for r in self.trained.as_ref().unwrap_or(&all) {
                 let (values, grads) = (&mut self.values[r.clone()], &self.grads[r.clone()]);
                 adam::dense(&a, t, values, &mut self.moment1[r.clone()], &mut self.moment2[r.clone()], grads);
             }

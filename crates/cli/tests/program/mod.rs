@@ -109,7 +109,7 @@ pub fn copy() -> (tempfile::TempDir, PathBuf) {
 }
 
 /// A file system of a mebibyte, or none where this user may not mount one.
-pub struct Small(PathBuf);
+pub struct Small(pub PathBuf);
 
 impl Small {
     pub fn mount(at: &Path) -> Option<Small> {

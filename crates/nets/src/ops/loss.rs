@@ -100,7 +100,8 @@ impl SliceOp for CrossEntropyOp {
     fn forward(&self, x: &[Values], _: &[bool]) -> Forward {
         let mut logs = ValuesMut::any(x[0].shape());
         let mut out = ValuesMut::any(&[1]);
-        out[0] = cpu::cross_entropy(x[0].shape()[1], &x[0], &self.targets(), &mut logs);
+        let mut losses = ValuesMut::any(&[self.classes.len()]);
+        out[0] = cpu::cross_entropy(x[0].shape()[1], &x[0], &self.targets(), &mut logs, &mut losses);
         Forward::one(out.freeze(), Kept::of(&[logs.freeze()]))
     }
 
