@@ -13,6 +13,7 @@ pub mod linear;
 pub mod march;
 pub mod marching_cubes;
 pub mod marching_tetrahedra;
+pub mod matmul;
 pub mod ngp_field;
 pub mod pixel_gather;
 pub mod ray_aabb;
