@@ -137,7 +137,7 @@ impl Kernel {
     /// # Safety
     /// All that the operands address must exist.
     pub unsafe fn dots(&self, dots: &Dots) {
-        assert!(dots.offsets.len() <= MOST_DOTS && dots.columns % self.lanes == 0, "dots: {} taps", dots.offsets.len());
+        assert!(dots.offsets.len() <= MOST_DOTS && dots.columns.is_multiple_of(self.lanes), "dots: {} taps", dots.offsets.len());
         // SAFETY: as the caller vouches.
         unsafe { (self.dots)(dots) }
     }

@@ -97,7 +97,10 @@ impl Conv2d {
     }
 
     pub(crate) fn check(&self) {
-        assert!(self.groups > 0 && self.channels_in % self.groups == 0 && self.channels_out % self.groups == 0, "conv2d: groups");
+        assert!(
+            self.groups > 0 && self.channels_in.is_multiple_of(self.groups) && self.channels_out.is_multiple_of(self.groups),
+            "conv2d: groups"
+        );
         let positive = [self.kernel, self.stride, self.dilation].iter().flatten().all(|&v| v > 0);
         assert!(positive, "conv2d: kernel, stride and dilation are at least 1");
     }

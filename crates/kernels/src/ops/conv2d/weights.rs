@@ -217,7 +217,7 @@ pub fn interleave(from: &[f32], stride: usize, channels: usize, width: usize, ou
     let pixels = out.len() / width;
     let mut done = 0;
     #[cfg(target_arch = "x86_64")]
-    if simd::level() == simd::Level::Avx512 && width % 16 == 0 {
+    if simd::level() == simd::Level::Avx512 && width.is_multiple_of(16) {
         let whole = channels / 16 * 16;
         assert!(pixels == 0 || whole == 0 || from.len() >= (whole - 1) * stride + pixels);
         for c in (0..whole).step_by(16) {

@@ -70,6 +70,7 @@ impl Job<'_> {
         let Scratch { panel, sums, offsets, .. } = scratch;
         let panel = aligned(panel, (TERMS + 1) * width);
         let edge = aligned(sums, self.kernel.rows * width);
+        assert!(u32::try_from(TERMS * term).is_ok(), "matmul: {} rows of a transposed matrix", s.m);
         offsets.clear();
         offsets.extend((0..TERMS.min(s.k)).map(|p| ((p * term) as u32, (p * width) as u32)));
         for p in (0..s.k).step_by(TERMS) {
@@ -94,7 +95,7 @@ impl Job<'_> {
                     let vectors = count.div_ceil(self.kernel.lanes);
                     // SAFETY: rows and terms of A exist from there; the panel has all terms; C's columns are this task's own.
                     unsafe {
-                        if count % self.kernel.lanes == 0 {
+                        if count.is_multiple_of(self.kernel.lanes) {
                             let start = if add { Start::Accumulate } else { Start::Zero };
                             self.kernel.run(height, vectors, &Tile { c: self.c.at(to), c_row: s.n, start, ..tile });
                         } else {
