@@ -2,11 +2,13 @@
 //!
 //! `benches/peers/nets_torch.py` prints the same lines for PyTorch.
 
+use diorama_kernels::ops::conv_transpose2d::{self, ConvTranspose2d};
 use diorama_kernels::ops::conv2d::{Conv2d, Gradients, Images, cpu};
+use diorama_kernels::ops::matmul::{Matmul, cpu::matmul};
 use diorama_kernels::probe;
 use std::time::Instant;
 
-#[derive(Clone, Copy, PartialEq)]
+#[derive(Clone, Copy)]
 enum Kind {
     Conv,
     Transpose,
@@ -38,6 +40,18 @@ const LAYERS: &[Layer] = &[
     ("vgg_256_56", Kind::Conv, 1, 256, 256, 56, 3, 1, 1, 1),
     ("vgg_512_28", Kind::Conv, 1, 512, 512, 28, 3, 1, 1, 1),
     ("vgg_512_14", Kind::Conv, 1, 512, 512, 14, 3, 1, 1, 1),
+];
+
+/// Name, batch, m, k, n, whether the second operand is transposed.
+type Product = (&'static str, usize, usize, usize, usize, bool);
+
+const PRODUCTS: &[Product] = &[
+    ("linear_384_65536", 1, 65536, 384, 384, false),
+    ("linear_768_3072_b4x50", 1, 200, 768, 3072, false),
+    ("vgg_fc_25088_4096", 1, 1, 25088, 4096, false),
+    ("attention_qk_12x50", 48, 50, 64, 50, true),
+    ("attention_pv_12x50", 48, 50, 50, 64, false),
+    ("attention_qk_12x577", 12, 577, 64, 577, true),
 ];
 
 /// Shortest time of a call, after one that warms up.
@@ -88,6 +102,38 @@ fn conv(layer: &Layer) {
     print(name, flops, forward, training);
 }
 
+fn transposed(layer: &Layer) {
+    let (name, _, batch, channels_in, channels_out, size, kernel, stride, padding, groups) = *layer;
+    let c = ConvTranspose2d { padding: [padding; 2], groups, ..ConvTranspose2d::new(channels_in, channels_out, kernel, stride) };
+    let images = Images { batch, height: size, width: size };
+    let outputs = batch * channels_out * c.output(&images).pixels();
+    let (x, w, b, d) = (numbers(batch * channels_in * images.pixels()), numbers(c.weights_len()), numbers(channels_out), numbers(outputs));
+    let mut out = vec![0.0; outputs];
+    let forward = seconds(|| conv_transpose2d::cpu::forward(&c, &images, &x, &w, &b, &mut out, None));
+    let (mut dx, mut dw, mut db) = (vec![0.0; x.len()], vec![0.0; w.len()], vec![0.0; channels_out]);
+    let training = seconds(|| {
+        conv_transpose2d::cpu::forward(&c, &images, &x, &w, &b, &mut out, None);
+        let gradients = Gradients { input: Some(&mut dx), weights: Some(&mut dw), bias: Some(&mut db) };
+        conv_transpose2d::cpu::backward(&c, &images, &x, &w, &out, &d, gradients);
+    });
+    let flops = 2.0 * (batch * images.pixels() * channels_in * channels_out / groups * kernel * kernel) as f64;
+    print(name, flops, forward, training);
+}
+
+fn product(&(name, batch, m, k, n, b_transposed): &Product) {
+    let s = Matmul { batch, b_transposed, ..Matmul::new(m, n, k) };
+    let (a, b, d) = (numbers(batch * m * k), numbers(batch * k * n), numbers(batch * m * n));
+    let (mut c, mut da, mut db) = (vec![0.0; d.len()], vec![0.0; a.len()], vec![0.0; b.len()]);
+    let forward = seconds(|| matmul(&s, &a, &b, &mut c));
+    let training = seconds(|| {
+        matmul(&s, &a, &b, &mut c);
+        matmul(&s.gradient_a(), &d, &b, &mut da);
+        let (first, second) = if b_transposed { (&d, &a) } else { (&a, &d) };
+        matmul(&s.gradient_b(), first, second, &mut db);
+    });
+    print(name, 2.0 * (batch * m * k * n) as f64, forward, training);
+}
+
 fn main() {
     let mut args: Vec<String> = std::env::args().skip(1).collect();
     let mut threads = 2;
@@ -99,8 +145,10 @@ fn main() {
     println!("multiply-adds: {:.1} GFLOP/s per core", (0..5).map(|_| probe::fma_peak(1 << 24)).fold(0.0, f64::max) / 1e9);
     let wanted = |name: &str| args.is_empty() || args.iter().any(|a| name.contains(&a[..]));
     for layer in LAYERS.iter().filter(|l| wanted(l.0)) {
-        if layer.1 == Kind::Conv {
-            conv(layer);
+        match layer.1 {
+            Kind::Conv => conv(layer),
+            Kind::Transpose => transposed(layer),
         }
     }
+    PRODUCTS.iter().filter(|p| wanted(p.0)).for_each(product);
 }

@@ -19,6 +19,7 @@ pub mod linear;
 pub mod march;
 pub mod marching_cubes;
 pub mod marching_tetrahedra;
+pub mod matmul;
 pub mod mean_error;
 pub mod norm;
 pub mod pixel_gather;

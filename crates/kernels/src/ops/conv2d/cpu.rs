@@ -129,6 +129,7 @@ pub fn backward(c: &Conv2d, images: &Images, x: &[f32], weights: &[f32], kept: &
     c.check_tensors(images, x, weights, d_out.len());
     with_slopes(c.activation, kept, d_out, |d| {
         if let Some(bias) = gradients.bias {
+            assert_eq!(bias.len(), c.channels_out, "conv2d: gradient of the bias");
             bias_gradient(images.batch, d, bias);
         }
         if let Some(out) = gradients.input {

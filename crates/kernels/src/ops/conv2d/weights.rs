@@ -213,7 +213,7 @@ impl Task<'_> {
 }
 
 /// `out[i, c] = from[c · stride + i]` for `channels`; others are left as they are.
-fn interleave(from: &[f32], stride: usize, channels: usize, width: usize, out: &mut [f32]) {
+pub fn interleave(from: &[f32], stride: usize, channels: usize, width: usize, out: &mut [f32]) {
     let pixels = out.len() / width;
     let mut done = 0;
     #[cfg(target_arch = "x86_64")]

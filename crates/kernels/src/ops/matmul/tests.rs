@@ -1,0 +1,64 @@
+use super::*;
+use crate::simd::{Level, with_level};
+use diorama_testkit::{assert_close, assert_gradient, random, wide};
+
+fn cases() -> Vec<Matmul> {
+    let mut all = Vec::new();
+    for (batch, m, n, k) in [
+        (0, 3, 4, 5),
+        (2, 0, 4, 5),
+        (2, 3, 4, 0),
+        (1, 1, 1, 1),
+        (3, 7, 5, 9),
+        (2, 50, 50, 64),
+        (1, 101, 150, 300),
+        (1, 9, 48, 600),
+        (1, 200, 33, 17),
+    ] {
+        for flags in 0..8 {
+            let [a_transposed, b_transposed, accumulate] = [1, 2, 4].map(|b| flags & b > 0);
+            all.push(Matmul { batch, a_transposed, b_transposed, accumulate, ..Matmul::new(m, n, k) });
+        }
+    }
+    all
+}
+
+#[test]
+fn every_shape_matches_the_reference_both_ways_on_every_level() {
+    for level in Level::available() {
+        with_level(level, || cases().iter().for_each(check));
+    }
+}
+
+fn check(s: &Matmul) {
+    let (a, b, d) = (random(s.batch * s.m * s.k, 1), random(s.batch * s.k * s.n, 2), random(s.batch * s.m * s.n, 3));
+    let mut c = d.clone();
+    let mut want = wide(&d);
+    cpu::matmul(s, &a, &b, &mut c);
+    reference::forward(s, &wide(&a), &wide(&b), &mut want);
+    assert_close(&format!("{s:?}"), &c, &want, 1e-5);
+    let (ra, rb) = reference::backward(s, &wide(&a), &wide(&b), &wide(&d));
+    let (mut da, mut db) = (vec![9.0; a.len()], vec![9.0; b.len()]);
+    let (first, second) = if s.a_transposed { (&b, &d) } else { (&d, &b) };
+    cpu::matmul(&s.gradient_a(), first, second, &mut da);
+    assert_close(&format!("a's gradient of {s:?}"), &da, &ra, 1e-5);
+    let (first, second) = if s.b_transposed { (&d, &a) } else { (&a, &d) };
+    cpu::matmul(&s.gradient_b(), first, second, &mut db);
+    assert_close(&format!("b's gradient of {s:?}"), &db, &rb, 1e-5);
+}
+
+#[test]
+fn reference_gradients_match_central_differences() {
+    for s in [Matmul { batch: 2, ..Matmul::new(3, 2, 4) }, Matmul { a_transposed: true, b_transposed: true, ..Matmul::new(2, 3, 2) }] {
+        let (a, b) = (wide(&random(s.batch * s.m * s.k, 1)), wide(&random(s.batch * s.k * s.n, 2)));
+        let d = wide(&random(s.batch * s.m * s.n, 3));
+        let loss = |a: &[f64], b: &[f64]| {
+            let mut c = vec![0.0; d.len()];
+            reference::forward(&s, a, b, &mut c);
+            c.iter().zip(&d).map(|(a, b)| a * b).sum::<f64>()
+        };
+        let (da, db) = reference::backward(&s, &a, &b, &d);
+        assert_gradient("a", &da, &a, 1e-6, |a| loss(a, &b));
+        assert_gradient("b", &db, &b, 1e-6, |b| loss(&a, b));
+    }
+}
