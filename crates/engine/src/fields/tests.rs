@@ -52,7 +52,7 @@ struct Rays {
 
 impl Rays {
     fn new(n: usize) -> Rays {
-        let dirs = random(n * 3, 2).chunks_exact(3).flat_map(diorama_testkit_unit).collect();
+        let dirs = random(n * 3, 2).chunks_exact(3).flat_map(unit).collect();
         Rays {
             positions: random_unit(n * 9, 1),
             dirs,
@@ -70,7 +70,7 @@ impl Rays {
     }
 }
 
-fn diorama_testkit_unit(d: &[f32]) -> [f32; 3] {
+fn unit(d: &[f32]) -> [f32; 3] {
     let l = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt().max(1e-6);
     [d[0] / l, d[1] / l, d[2] / l]
 }
@@ -130,7 +130,7 @@ fn every_encoder_passes_gradients_to_its_table_and_to_positions() {
             (at[0][i], at[1][i]) = (at[0][i] - step, at[1][i] + step);
             let [low, mid, high] = [&at[0], &rays.positions, &at[1]].map(|p| value(&mut f, p, None));
             // A kink between the two is no place to take a difference.
-            if (high - 2.0 * mid + low).abs() < 1e-4 * scale as f64 {
+            if (high - 2.0 * mid + low).abs() < 1e-5 * scale as f64 {
                 assert!(near((high - low) / (2.0 * step as f64), d[i], scale), "{:?} {i}: {} for {}", f.encoder.dims(), d[i], high - low);
                 checked += 1;
             }
