@@ -234,7 +234,7 @@ fn corrections(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     without_focal.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);
     table.close("camera corrections", "focal lengths kept", "5 cameras", &kept, &wide(&without_focal))?;
     cameras.correct(gpu, &gpu.upload(&numbers), true);
-    let (o, d) = cameras.forward(gpu, &gpu.upload_u32(&index), &gpu.upload(&at));
+    let (o, d) = cameras.forward(gpu, &gpu.upload(&index), &gpu.upload(&at));
     table.close("camera corrections", "origins", "5 cameras", &o, &wide(&origins))?;
     table.close("camera corrections", "directions", "5 cameras", &d, &wide(&dirs))?;
 
@@ -399,7 +399,7 @@ fn grids(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let met: Vec<u32> = cells.iter().rev().copied().collect();
             let met_sigma: Vec<f32> = random(3000, step + 2).iter().map(|s| s * 9.0).collect();
             grid.record(&met, &met_sigma);
-            on_gpu.record(gpu, &Rows::all(gpu, 3000), &gpu.upload_u32(&met), &gpu.upload(&met_sigma));
+            on_gpu.record(gpu, &Rows::all(gpu, 3000), &gpu.upload(&met), &gpu.upload(&met_sigma));
             grid.fold(&cells, &sigma, block);
             on_gpu.update(gpu, &cells_gpu, &gpu.upload(&sigma), block);
             let (density, _) = on_gpu.read(gpu)?;
@@ -476,7 +476,7 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                 GpuComposited { color: up(&out.color), depth: up(&out.depth), opacity: up(&out.opacity), weights: up(&out.weights) };
             let left_out: Vec<u32> = batch.target.chunks_exact(4).map(|t| t[0].is_nan() as u32).collect();
             let rgba: Vec<f32> = batch.target.iter().map(|v| if v.is_nan() { 0.3 } else { *v }).collect();
-            let (rgba, background, left_out, sums) = (up(&rgba), up(&background), gpu.upload_u32(&left_out), gpu.zeros(SUMS));
+            let (rgba, background, left_out, sums) = (up(&rgba), up(&background), gpu.upload(&left_out), gpu.zeros(SUMS));
             let distance = up(&batch.distance);
             let target = Target { rgba: &rgba, background: &background, left_out: &left_out, distance: &distance };
             let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
@@ -521,7 +521,7 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         // Gradients close to the camera.
         let (d_sigma, d_rgb) = (random(s, 3), random(s * 3, 4));
         let (got_sigma, got_rgb) = (gpu.upload(&d_sigma), gpu.upload(&d_rgb));
-        field::soften(gpu, &GpuPacked::upload(gpu, &p), &got_sigma, &got_rgb, near);
+        field::scale_near_gradients(gpu, &GpuPacked::upload(gpu, &p), &got_sigma, &got_rgb, near);
         let scale = |i: usize| ((scene.t[i] + 0.5 * scene.dt[i]) / near).min(1.0).powi(2) as f64;
         let shape = format!("S={s}");
         let want: Vec<f64> = (0..s).map(|i| d_sigma[i] as f64 * scale(i)).collect();
@@ -642,7 +642,7 @@ fn look_ups(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     for n in [0, 1, 200] {
         let (rows, width, codes, d) = (7, 5, random(35, 1), random(n * 5, 2));
         let index: Vec<u32> = (0..n as u32).map(|i| i * 3 % 7).collect();
-        let index_gpu = gpu.upload_u32(&index);
+        let index_gpu = gpu.upload(&index);
         let want: Vec<f64> = index.iter().flat_map(|i| wide(&codes[*i as usize * width..][..width])).collect();
         let shape = format!("R={n}");
         table.close("look up", "forward", &shape, &field::look_up(gpu, &gpu.upload(&codes), &index_gpu, width), &want)?;

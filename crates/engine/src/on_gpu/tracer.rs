@@ -51,7 +51,7 @@ impl Looks {
         let direction = self.shape.direction(gpu, &rays.dirs);
         let code = self.appearance.as_ref().map(|(codes, dims)| {
             let mean = (codes.len() / dims - 1) as u32;
-            field::look_up(gpu, codes, &gpu.upload_u32(&vec![appearance.unwrap_or(mean); n]), *dims)
+            field::look_up(gpu, codes, &gpu.upload(&vec![appearance.unwrap_or(mean); n]), *dims)
         });
         let codes: Vec<&Buffer> = direction.iter().chain(&code).collect();
         let black = gpu.zeros(n * 3);
@@ -115,8 +115,8 @@ impl GpuTracer {
         for (points, dirs) in model.chunks(self.room * 3).zip(dirs.chunks(self.room * 3)) {
             let n = points.len() / 3;
             // One sample per ray, so long that it is opaque.
-            let offsets = gpu.upload_u32(&(0..=n as u32).collect::<Vec<_>>());
-            let packed = GpuPacked { offsets, t: gpu.zeros(n), dt: gpu.upload(&vec![1e30; n]) };
+            let offsets = gpu.upload(&(0..=n as u32).collect::<Vec<_>>());
+            let packed = GpuPacked { offsets, t: gpu.zeros(n), dt: gpu.upload(&vec![1e30f32; n]) };
             let points = gpu.upload(points);
             let (near_far, jitter) = (gpu.zeros(n * 2), gpu.zeros(n));
             let rays = GpuRays { origins: points.clone(), dirs: gpu.upload(dirs), near_far, jitter, resumed: false };
@@ -186,7 +186,7 @@ impl GpuTracer {
     ) -> Result<Option<(GpuComposited, Buffer)>, GpuError> {
         let (gpu, f) = (&self.gpu, &self.field);
         let marched = march::march(gpu, grid, rays, config, self.room);
-        if may_split && gpu.read_u32(&marched.cut)?.contains(&1) {
+        if may_split && gpu.read(&marched.cut)?.contains(&1) {
             return Ok(None);
         }
         let features = f.features(gpu, rays, &marched.packed);

@@ -60,7 +60,7 @@ impl GpuGroup {
     fn step(&self, gpu: &Gpu, (t, scale): (u32, f32), grads: &Buffer) {
         if !self.frozen {
             let a = Adam { rate: self.adam.rate * scale, ..self.adam };
-            adam::gpu::step(gpu, &a, t, self.sparse, &self.values, &self.moment1, &self.moment2, grads);
+            adam::gpu::step(gpu, &a, (t, self.sparse), &self.values, [&self.moment1, &self.moment2], grads);
         }
     }
 }
@@ -297,7 +297,7 @@ impl GpuTrainer {
         let background = sky.as_ref().map_or(&drawn.background, |(_, _, rgb)| rgb);
         let target = Target { rgba: &drawn.target, background, left_out: &drawn.left_out, distance: &drawn.distance };
         let moves = self.corrections.is_some();
-        let train = |of: &GpuField, packed: &GpuPacked, (points, features), marched: &Buffer, target, is_main: bool, wants_weights| {
+        let train = |of: &GpuField, packed: &GpuPacked, (points, features), marched: &Buffer<u32>, target, is_main: bool, wants_weights| {
             let figures = loss::Figures { sums: &self.sums, marched, is_main };
             let moves = moves && is_main;
             of.train(gpu, s, &Samples { rays: &rays, packed, points, features, drawn: &drawn, target, figures, wants_weights, moves })

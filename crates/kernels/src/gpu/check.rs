@@ -20,6 +20,7 @@ use crate::ops::trilinear_corner_grid::{self, Corners, gpu::GpuCorners};
 use crate::ops::{
     frequency, marching_cubes, marching_tetrahedra, pixel_gather, ray_aabb, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
 };
+use cubecl::prelude::CubeElement;
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, Lens, PixelFormat, Pose};
@@ -110,10 +111,10 @@ impl<'a> Table<'a> {
         op: &'static str,
         result: &'static str,
         shape: impl ToString,
-        got: &Buffer,
+        got: &Buffer<impl CubeElement>,
         want: &[u32],
     ) -> Result<(), GpuError> {
-        let got = self.gpu.read_u32(got)?;
+        let got = self.gpu.read(&got.cast::<u32>())?;
         let differs = got.iter().zip(want).position(|(a, b)| a != b);
         let outcome = match differs {
             _ if got.len() != want.len() => Err(format!("lengths differ: {} and {}", got.len(), want.len())),
@@ -367,7 +368,7 @@ fn in_one_launch(gpu: &Gpu, table: &mut Table, mlp: &Mlp, params: &Buffer, input
             Ok::<_, GpuError>(())
         };
         close("forward", &kept.heads[0], want.last().expect("layers"))?;
-        let (dp, di) = net.backward(gpu, params, inputs, &kept, &rows, &[&gpu.upload(&d)], 64.0);
+        let (dp, di) = net.backward(gpu, params, inputs, &kept, &rows, (&[&gpu.upload(&d)], 64.0));
         close("d parameters", &dp, &want_params)?;
         for (got, want) in di.iter().zip(&want_inputs) {
             close("d input", got.as_ref().expect("wanted"), want)?;
@@ -439,11 +440,11 @@ fn compositing(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 fn sums(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     for n in [0, 1, 255, 256, 10_001] {
         let counts: Vec<u32> = random_unit(n, 1).iter().map(|v| (v * 40.0) as u32).collect();
-        let got = scan::gpu::exclusive(gpu, &gpu.upload_u32(&counts));
+        let got = scan::gpu::exclusive(gpu, &gpu.upload(&counts));
         table.equal("scan", "exclusive", format!("R={n}"), &got, &scan_of(&counts))?;
     }
     let scene = Rays::new(77);
-    let (x, offsets) = (random(scene.t.len(), 2), gpu.upload_u32(&scene.offsets));
+    let (x, offsets) = (random(scene.t.len(), 2), gpu.upload(&scene.offsets));
     let got = scan::gpu::inclusive(gpu, &offsets, &gpu.upload(&x));
     table.close("scan", "inclusive", "R=77", &got, &scan::reference::inclusive(&scene.offsets, &wide(&x)))?;
     let got = scan::gpu::inclusive_backward(gpu, &offsets, &gpu.upload(&x));
@@ -504,7 +505,7 @@ fn marches(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let occupancy = march::gpu::GpuOccupancy::upload(gpu, &grid);
             let marched = march::gpu::march(gpu, &occupancy, &on_gpu, &config, capacity);
             let packed = &marched.packed;
-            let (offsets, t, cells) = (gpu.read_u32(&packed.offsets)?, gpu.read(&packed.t)?, gpu.read_u32(&marched.cells)?);
+            let (offsets, t, cells) = (gpu.read(&packed.offsets)?, gpu.read(&packed.t)?, gpu.read(&marched.cells)?);
             let places = gpu.read(&march::gpu::positions(gpu, &on_gpu, packed, Space::Model))?;
             let mut ties = 0;
             for i in 0..n {
@@ -587,7 +588,7 @@ fn pixels(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         for n in [0, 1, 67] {
             let at: Vec<u32> = random_unit(n, 2).iter().map(|v| (v * 100.0) as u32).collect();
             let chosen: Vec<usize> = at.iter().map(|i| *i as usize).collect();
-            let got = pixel_gather::gpu::gather(gpu, format, &gpu.upload_u32(&words), &gpu.upload_u32(&at));
+            let got = pixel_gather::gpu::gather(gpu, format, &gpu.upload(&words), &gpu.upload(&at));
             let want = pixel_gather::reference::gather(format, &words, &chosen);
             table.close("pixel gather", "forward", format!("R={n} {format:?}"), &got, &want)?;
         }
@@ -605,7 +606,7 @@ fn steps(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let mut g = random(n, 10 + t as u64);
             g.iter_mut().skip(t as usize % 3).step_by(3).for_each(|g| *g = 0.0);
             let gg = gpu.upload(&g);
-            adam::gpu::step(gpu, &a, t, sparse, &pg, &mg, &vg, &gg);
+            adam::gpu::step(gpu, &a, (t, sparse), &pg, [&mg, &vg], &gg);
             adam::reference::step(&a, t, sparse, &mut pw, &mut mw, &mut vw, &wide(&g));
             table.close("adam", "gradient cleared", format!("N={n} sparse={sparse}"), &gg, &vec![0.0; n])?;
         }
@@ -633,7 +634,7 @@ fn surface(gpu: &Gpu, table: &mut Table, op: &'static str, cases: &CaseTable) ->
         let mut mesher = marching_cubes::cpu::Mesher::new(cases, nx, ny, level);
         density.chunks_exact((nx * ny).max(1)).for_each(|slice| mesher.push(slice));
         let (vertices, faces) = marching_cubes::gpu::extract(gpu, cases, &gpu.upload(&density), (nx, ny, nz), level)?;
-        let (vertices, faces) = (gpu.read(&vertices)?, gpu.read_u32(&faces)?);
+        let (vertices, faces) = (gpu.read(&vertices)?, gpu.read(&faces)?);
         let shape = format!("{nx}x{ny}x{nz}");
         let sorted = |vertices: &[f32]| {
             let mut all: Vec<_> = vertices.chunks_exact(3).map(|p| (edge_of(p), [p[0], p[1], p[2]])).collect();
@@ -681,7 +682,7 @@ fn cast(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     for n in [0, 1, 301] {
         let index: Vec<u32> = (0..n as u32).map(|i| i % 5).collect();
         let pixels: Vec<f32> = random_unit(n * 2, 1).iter().map(|v| v * 48.0).collect();
-        let (ig, pg, shape) = (gpu.upload_u32(&index), gpu.upload(&pixels), format!("R={n}"));
+        let (ig, pg, shape) = (gpu.upload(&index), gpu.upload(&pixels), format!("R={n}"));
         let (origins, dirs) = on_gpu.forward(gpu, &ig, &pg);
         let (want_o, want_d) = ray_generation::reference::forward(&all, &index, &wide(&pixels));
         table.close("ray generation", "origins", &shape, &origins, &want_o)?;
@@ -698,14 +699,15 @@ fn images(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     for (w, h, c) in [(11, 11, 1), (10, 30, 3), (24, 17, 3)] {
         let (x, y) = (random_unit(w * h * c, 1), random_unit(w * h * c, 2));
         let (xg, yg, shape) = (gpu.upload(&x), gpu.upload(&y), format!("{w}x{h}x{c}"));
-        let values = gpu.read(&ssim::gpu::forward(gpu, (w, h, c), &xg, &yg))?;
+        let pair = ssim::gpu::Pair { size: (w, h, c), x: &xg, y: &yg };
+        let values = gpu.read(&ssim::gpu::forward(gpu, pair))?;
         let mean = values.iter().sum::<f32>() / values.len() as f32;
         let want = ssim::reference::ssim(w, h, c, &wide(&x), &wide(&y));
         let outcome = if want.is_nan() && mean.is_nan() { Ok(0.0) } else { compare(&[mean], &[want], TOLERANCE) };
         table.row("SSIM", "mean", shape.clone(), outcome);
         let fits = w >= ssim::WINDOW && h >= ssim::WINDOW;
         let want = if fits { ssim::reference::gradient(w, h, c, &wide(&x), &wide(&y)) } else { vec![0.0; x.len()] };
-        table.close("SSIM", "d x", &shape, &ssim::gpu::backward(gpu, (w, h, c), &xg, &yg), &want)?;
+        table.close("SSIM", "d x", &shape, &ssim::gpu::backward(gpu, pair), &want)?;
     }
     Ok(())
 }

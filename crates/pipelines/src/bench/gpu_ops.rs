@@ -88,7 +88,7 @@ pub fn run(device: &str, repeats: usize, progress: &mut dyn FnMut(&OpFigure)) ->
     let samples = if gpu.software { 1 << 14 } else { 1 << 20 };
     let mut table = Table { gpu: &gpu, repeats, ops: Vec::new(), progress };
     let n = samples * 32;
-    let (from, to) = (gpu.zeros(n), gpu.empty(n));
+    let (from, to): (Buffer, Buffer) = (gpu.zeros(n), gpu.empty(n));
     let copy_gb_per_s = n as f64 * 8.0 / table.seconds(|| gpu.copy(&from, &to))? / 1e9;
     encodings(&gpu, samples, &mut table)?;
     networks(&gpu, samples, &mut table)?;
@@ -112,7 +112,7 @@ fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     })?;
     let (p, m, v) = (random(gpu, grid.params_len(), 4), gpu.zeros(grid.params_len()), gpu.zeros(grid.params_len()));
     t.row("adam", "all rows touched", ("parameter", grid.params_len()), 0.0, 32.0, || {
-        adam::gpu::step(gpu, &Adam::default(), 1, false, &p, &m, &v, &d_table);
+        adam::gpu::step(gpu, &Adam::default(), (1, false), &p, [&m, &v], &d_table);
     })?;
     t.row("spherical_harmonics", "degree 4", ("direction", s), 0.0, 76.0, || {
         spherical_harmonics::gpu::forward(gpu, 4, &points);
@@ -175,8 +175,9 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     t.row("composite, backward", "3 channels, 32 samples per ray", ("sample", s), 0.0, 52.0, || {
         composite::backward(gpu, &p, &rgb, 3, &background, &out, &d);
     })?;
-    let (target, left_out, sums) = (random(gpu, p.rays() * 4, 8), gpu.upload_u32(&vec![0; p.rays()]), gpu.zeros(SUMS));
-    let target = Target { rgba: &target, background: &background, left_out: &left_out, distance: &left_out };
+    let (target, left_out, sums) = (random(gpu, p.rays() * 4, 8), gpu.upload(&vec![0u32; p.rays()]), gpu.zeros(SUMS));
+    let distance = gpu.empty(0);
+    let target = Target { rgba: &target, background: &background, left_out: &left_out, distance: &distance };
     t.row("composite, loss and backward", "3 channels, 32 samples per ray", ("sample", s), 0.0, 64.0, || {
         let figures = Figures { sums: &sums, marched: &p.offsets, is_main: true };
         loss::composite_and_loss(

@@ -30,7 +30,7 @@ pub(super) fn depths(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let left_out: Vec<u32> = (0..rays as u32).map(|r| (r % 7 == 6) as u32).collect();
         let counted: Vec<f32> = surface.iter().zip(&left_out).map(|(s, out)| s * (1 - out) as f32).collect();
         let (p, losses, slopes) = (GpuPacked::upload(gpu, &packed), gpu.upload(&values), gpu.upload(&d));
-        depth_loss::gpu::add(gpu, &p, &gpu.upload(&w), &gpu.upload(&surface), &gpu.upload_u32(&left_out), depth, scale, &losses, &slopes);
+        depth_loss::gpu::add(gpu, &p, &gpu.upload(&w), &gpu.upload(&surface), &gpu.upload(&left_out), (depth, scale), (&losses, &slopes));
         let added = |to: &[f32], more: Vec<f64>| -> Vec<f64> { to.iter().zip(more).map(|(a, b)| *a as f64 + b).collect() };
         let loss = depth_loss::reference::forward(&packed, &wide(&w), &counted).iter().map(|l| depth as f64 * l).collect();
         let slope = depth_loss::reference::backward(&packed, &counted, (depth * scale) as f64);

@@ -3,7 +3,7 @@
 pub mod fused;
 
 use super::{Mlp, Source};
-use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
+use crate::gpu::{Buffer, Gpu, Rows, launch};
 use crate::ops::linear::gpu::{self as linear, Part};
 use crate::ops::linear::{Activation, BiasKind};
 use cubecl::prelude::*;
@@ -132,68 +132,47 @@ fn joined(gpu: &Gpu, mlp: &Mlp, j: usize, inputs: &[&Buffer], values: &[Buffer],
     out
 }
 
-/// Copies or adds `width` columns between matrices given as (buffer, width, first column).
-pub(crate) fn columns(gpu: &Gpu, rows: &Rows, width: usize, from: (&Buffer, usize, usize), to: (&Buffer, usize, usize), add: bool) {
-    if rows.most * width == 0 {
-        return;
-    }
-    let (live, at) = rows.arg();
-    // SAFETY: units past the rows stop; the columns lie within both matrices.
-    unsafe {
-        copy::launch_unchecked(
-            &gpu.client,
-            units(rows.most * width),
-            CubeDim::new_1d(CUBE),
-            live,
-            from.0.arg(),
-            to.0.arg(),
-            at,
-            width as u32,
-            from.1 as u32,
-            from.2 as u32,
-            to.1 as u32,
-            to.2 as u32,
-            add,
-        );
-    }
+/// Columns of a matrix: its buffer, its width, and the first of them.
+pub(crate) type Columns<'a> = (&'a Buffer, usize, usize);
+
+/// Copies or adds `width` columns.
+pub(crate) fn columns(gpu: &Gpu, rows: &Rows, width: usize, from: Columns, to: Columns, add: bool) {
+    assert!(from.2 + width <= from.1 && to.2 + width <= to.1, "columns beyond a matrix");
+    let m = rows.most;
+    launch!(
+        gpu,
+        copy,
+        m * width,
+        [rows.live => rows.at + 1, from.0 => m * from.1, to.0 => m * to.1],
+        rows.place(),
+        width as u32,
+        from.1 as u32,
+        from.2 as u32,
+        to.1 as u32,
+        to.2 as u32,
+        add,
+    );
 }
 
-/// Multiplies `width` columns of two matrices, each given as (buffer, width, first column), into those of a third, or adds the
-/// products to them.
-fn multiply(
-    gpu: &Gpu,
-    rows: &Rows,
-    width: usize,
-    a: (&Buffer, usize, usize),
-    b: (&Buffer, usize, usize),
-    to: (&Buffer, usize, usize),
-    add: bool,
-) {
-    if rows.most * width == 0 {
-        return;
-    }
-    let (live, at) = rows.arg();
-    // SAFETY: units past the rows stop; the columns lie within the matrices.
-    unsafe {
-        product::launch_unchecked(
-            &gpu.client,
-            units(rows.most * width),
-            CubeDim::new_1d(CUBE),
-            live,
-            a.0.arg(),
-            b.0.arg(),
-            to.0.arg(),
-            at,
-            width as u32,
-            a.1 as u32,
-            a.2 as u32,
-            b.1 as u32,
-            b.2 as u32,
-            to.1 as u32,
-            to.2 as u32,
-            add,
-        );
-    }
+/// Multiplies `width` columns of two matrices into those of a third, or adds the products to them.
+fn multiply(gpu: &Gpu, rows: &Rows, width: usize, a: Columns, b: Columns, to: Columns, add: bool) {
+    assert!([a, b, to].iter().all(|m| m.2 + width <= m.1), "columns beyond a matrix");
+    let m = rows.most;
+    launch!(
+        gpu,
+        product,
+        m * width,
+        [rows.live => rows.at + 1, a.0 => m * a.1, b.0 => m * b.1, to.0 => m * to.1],
+        rows.place(),
+        width as u32,
+        a.1 as u32,
+        a.2 as u32,
+        b.1 as u32,
+        b.2 as u32,
+        to.1 as u32,
+        to.2 as u32,
+        add,
+    );
 }
 
 #[cube(launch_unchecked)]

@@ -2,7 +2,7 @@
 //! formed by slices of rows and then added up.
 
 use super::{Activation, BiasKind};
-use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
+use crate::gpu::{Buffer, Gpu, Rows, launch};
 use cubecl::prelude::*;
 
 /// Edge of a cube.
@@ -54,86 +54,49 @@ fn per_unit(n: usize) -> usize {
 /// `A B`, `[M, K] [K, N]`, or with the second factor turned `A Bᵀ`, `[M, K] [N, K]`.
 fn product(gpu: &Gpu, second_turned: bool, rows: &Rows, (k, n): (usize, usize), a: &Buffer, b: Part, out: Part) {
     let m = rows.most;
-    if m * n == 0 {
-        return;
-    }
-    assert!(a.len() == m * k && b.buffer.len() >= b.at + k * n && out.buffer.len() >= out.at + m * n, "linear: {m} x {k} x {n}");
     let (mr, nr) = (per_unit(m), per_unit(n));
     let (tiles_m, tiles_n) = (m.div_ceil(TILE * mr), n.div_ceil(TILE * nr));
-    assert!(tiles_n <= MAX_TILES && tiles_m <= MAX_TILES * MAX_TILES, "linear: {m} x {n}");
-    let count = CubeCount::Static(tiles_n as u32, tiles_m.min(MAX_TILES) as u32, tiles_m.div_ceil(MAX_TILES) as u32);
-    let (live, at) = rows.arg();
-    // SAFETY: the kernel checks rows and columns against the sizes.
-    unsafe {
-        multiply::launch_unchecked(
-            &gpu.client,
-            count,
-            CubeDim::new_2d(TILE as u32, TILE as u32),
-            live,
-            a.arg(),
-            b.buffer.arg(),
-            out.buffer.arg(),
-            at,
-            b.at as u32,
-            out.at as u32,
-            k as u32,
-            n as u32,
-            mr,
-            nr,
-            second_turned,
-            gpu.shared,
-        );
-    }
+    launch!(
+        gpu,
+        multiply,
+        ([tiles_n, tiles_m.min(MAX_TILES), tiles_m.div_ceil(MAX_TILES)], CubeDim::new_2d(TILE as u32, TILE as u32)),
+        [rows.live => rows.at + 1, a => m * k, b.buffer => b.at + k * n, out.buffer => out.at + m * n],
+        rows.place(),
+        b.at as u32,
+        out.at as u32,
+        k as u32,
+        n as u32,
+        mr,
+        nr,
+        second_turned,
+        gpu.shared,
+    );
 }
 
 /// `Xᵀ G`, `[K, N]` for X `[M, K]` and G `[M, N]`.
 fn outer(gpu: &Gpu, rows: &Rows, (k, n): (usize, usize), x: &Buffer, g: &Buffer, out: Part) {
-    assert!(x.len() == rows.most * k && g.len() == rows.most * n && out.buffer.len() >= out.at + k * n, "linear: {k} x {n}");
-    if k * n == 0 {
-        return;
-    }
     let slices = (rows.most / SLICE).clamp(1, MAX_SLICES);
     let parts = gpu.empty(slices * k * n);
     let (kr, nr) = (per_unit(k), per_unit(n));
-    let count = CubeCount::Static(n.div_ceil(TILE * nr) as u32, k.div_ceil(TILE * kr) as u32, slices as u32);
-    let (live, at) = rows.arg();
-    // SAFETY: the kernel checks rows and columns against the sizes.
-    unsafe {
-        gather::launch_unchecked(
-            &gpu.client,
-            count,
-            CubeDim::new_2d(TILE as u32, TILE as u32),
-            live,
-            x.arg(),
-            g.arg(),
-            parts.arg(),
-            at,
-            k as u32,
-            n as u32,
-            slices as u32,
-            kr,
-            nr,
-            gpu.shared,
-        );
-    }
+    launch!(
+        gpu,
+        gather,
+        ([n.div_ceil(TILE * nr), k.div_ceil(TILE * kr), slices], CubeDim::new_2d(TILE as u32, TILE as u32)),
+        [rows.live => rows.at + 1, x => rows.most * k, g => rows.most * n, parts => slices * k * n],
+        rows.place(),
+        k as u32,
+        n as u32,
+        slices as u32,
+        kr,
+        nr,
+        gpu.shared,
+    );
     add_up(gpu, &parts, slices, k * n, out);
 }
 
 /// Sums of `slices` rows of `n` numbers.
 fn add_up(gpu: &Gpu, parts: &Buffer, slices: usize, n: usize, out: Part) {
-    // SAFETY: units past `n` stop.
-    unsafe {
-        total::launch_unchecked(
-            &gpu.client,
-            units(n),
-            CubeDim::new_1d(CUBE),
-            parts.arg(),
-            out.buffer.arg(),
-            out.at as u32,
-            slices as u32,
-            n as u32,
-        );
-    }
+    launch!(gpu, total, n, [parts => slices * n, out.buffer => out.at + n], out.at as u32, slices as u32, n as u32);
 }
 
 /// [`forward`] with a weight and bias that lie in a larger buffer.
@@ -171,60 +134,47 @@ pub fn forward(
 
 /// Adds a bias and activates, in place.
 pub(crate) fn finish(gpu: &Gpu, out: &Buffer, rows: &Rows, n: usize, bias: Option<Part>, kind: BiasKind, a: Activation) {
-    if out.is_empty() || (kind == BiasKind::None && a == Activation::None) {
+    if kind == BiasKind::None && a == Activation::None {
         return;
     }
     // Bound where there is no bias to read.
     let spare = gpu.empty(1);
     let bias = bias.unwrap_or(Part::from(&spare));
-    let bias_kind = match kind {
-        BiasKind::None => 0u32,
-        BiasKind::Shared => 1,
-        BiasKind::PerRow => 2,
+    let (bias_kind, bias_len) = match kind {
+        BiasKind::None => (0u32, 0),
+        BiasKind::Shared => (1, n),
+        BiasKind::PerRow => (2, rows.most * n),
     };
-    let (live, at) = rows.arg();
-    // SAFETY: units past the rows stop.
-    unsafe {
-        activate::launch_unchecked(
-            &gpu.client,
-            units(out.len()),
-            CubeDim::new_1d(CUBE),
-            live,
-            bias.buffer.arg(),
-            out.arg(),
-            at,
-            bias.at as u32,
-            n as u32,
-            bias_kind,
-            code(a),
-        );
-    }
+    launch!(
+        gpu,
+        activate,
+        rows.most * n,
+        [rows.live => rows.at + 1, bias.buffer => bias.at + bias_len, out => rows.most * n],
+        rows.place(),
+        bias.at as u32,
+        n as u32,
+        bias_kind,
+        code(a),
+    );
 }
 
 /// Channels of a layer's output `[M, width]`, shifted and activated, `[M, channels]`.
 pub(crate) fn head(gpu: &Gpu, rows: &Rows, from: (&Buffer, usize, usize), channels: usize, shift: f32, a: Activation) -> Buffer {
-    let out = gpu.empty(rows.most * channels);
+    let n = rows.most * channels;
+    let out = gpu.empty(n);
     let (values, width, first) = from;
-    if !out.is_empty() {
-        let (live, at) = rows.arg();
-        // SAFETY: units past the rows stop; the channels lie within the width.
-        unsafe {
-            pick::launch_unchecked(
-                &gpu.client,
-                units(out.len()),
-                CubeDim::new_1d(CUBE),
-                live,
-                values.arg(),
-                out.arg(),
-                at,
-                width as u32,
-                first as u32,
-                channels as u32,
-                shift,
-                code(a),
-            );
-        }
-    }
+    launch!(
+        gpu,
+        pick,
+        n,
+        [rows.live => rows.at + 1, values => rows.most * width, out => n],
+        rows.place(),
+        width as u32,
+        first as u32,
+        channels as u32,
+        shift,
+        code(a),
+    );
     out
 }
 
@@ -265,25 +215,17 @@ pub fn backward(
 
 /// `d_out · act'`, from the activated output; for SiLU from its input.
 pub(crate) fn before_activation(gpu: &Gpu, rows: &Rows, n: usize, a: Activation, out: &Buffer, d_out: &Buffer) -> Buffer {
-    let g = gpu.empty(out.len());
-    if !out.is_empty() {
-        let (live, at) = rows.arg();
-        // SAFETY: units past the rows stop.
-        unsafe {
-            chain::launch_unchecked(
-                &gpu.client,
-                units(out.len()),
-                CubeDim::new_1d(CUBE),
-                live,
-                out.arg(),
-                d_out.arg(),
-                g.arg(),
-                at,
-                n as u32,
-                code(a),
-            );
-        }
-    }
+    let all = rows.most * n;
+    let g = gpu.empty(all);
+    launch!(
+        gpu,
+        chain,
+        all,
+        [rows.live => rows.at + 1, out => all, d_out => all, g => all],
+        rows.place(),
+        n as u32,
+        code(a),
+    );
     g
 }
 
@@ -304,21 +246,15 @@ pub(crate) fn input_gradient(gpu: &Gpu, rows: &Rows, (k, n): (usize, usize), w: 
 pub(crate) fn sum_rows_part(gpu: &Gpu, rows: &Rows, n: usize, g: &Buffer, out: Part) {
     let slices = (rows.most / SLICE).clamp(1, MAX_SLICES);
     let parts = gpu.empty(slices * n);
-    let (live, at) = rows.arg();
-    // SAFETY: units past the slices stop.
-    unsafe {
-        sum_rows::launch_unchecked(
-            &gpu.client,
-            units(slices * n),
-            CubeDim::new_1d(CUBE),
-            live,
-            g.arg(),
-            parts.arg(),
-            at,
-            slices as u32,
-            n as u32,
-        );
-    }
+    launch!(
+        gpu,
+        sum_rows,
+        slices * n,
+        [rows.live => rows.at + 1, g => rows.most * n, parts => slices * n],
+        rows.place(),
+        slices as u32,
+        n as u32,
+    );
     add_up(gpu, &parts, slices, n, out);
 }
 

@@ -5,7 +5,7 @@ pub mod occupancy;
 pub mod prune;
 
 use super::{MarchConfig, OccupancyBits};
-use crate::gpu::{Buffer, CUBE, Gpu, GpuError, units};
+use crate::gpu::{Buffer, Gpu, GpuError, launch};
 use crate::ops::composite::gpu::GpuPacked;
 use crate::ops::scan;
 use cubecl::prelude::*;
@@ -16,19 +16,23 @@ const _: () = assert!(super::BLOCK == 8, "the kernel's blocks are 8 cells wide")
 pub struct GpuOccupancy {
     resolution: usize,
     cascades: usize,
-    bits: Buffer,
-    blocks: Buffer,
+    bits: Buffer<u32>,
+    blocks: Buffer<u32>,
 }
 
 impl GpuOccupancy {
     pub fn upload(gpu: &Gpu, grid: &OccupancyBits) -> Self {
         let bits: Vec<u32> = grid.bits.iter().flat_map(|w| [*w as u32, (*w >> 32) as u32]).collect();
         let blocks: Vec<u32> = grid.blocks.iter().map(|b| *b as u32).collect();
-        GpuOccupancy { resolution: grid.resolution, cascades: grid.cascades, bits: gpu.upload_u32(&bits), blocks: gpu.upload_u32(&blocks) }
+        GpuOccupancy { resolution: grid.resolution, cascades: grid.cascades, bits: gpu.upload(&bits), blocks: gpu.upload(&blocks) }
     }
 }
 
 impl GpuOccupancy {
+    fn cells(&self) -> usize {
+        self.resolution.pow(3) * self.cascades
+    }
+
     /// Words of bits and blocks in which this differs from another grid.
     ///
     /// # Errors
@@ -37,7 +41,7 @@ impl GpuOccupancy {
         let other = GpuOccupancy::upload(gpu, other);
         let mut wrong = 0;
         for (a, b) in [(&self.bits, &other.bits), (&self.blocks, &other.blocks)] {
-            wrong += gpu.read_u32(a)?.iter().zip(gpu.read_u32(b)?).filter(|(a, b)| **a != *b).count();
+            wrong += gpu.read(a)?.iter().zip(gpu.read(b)?).filter(|(a, b)| **a != *b).count();
         }
         Ok(wrong)
     }
@@ -68,9 +72,9 @@ impl GpuRays {
 pub struct GpuMarched {
     pub packed: GpuPacked,
     /// Cells `[capacity]` that the samples lie in.
-    pub cells: Buffer,
+    pub cells: Buffer<u32>,
     /// 1 for each ray that lost samples because they found no room, `[R]`.
-    pub cut: Buffer,
+    pub cut: Buffer<u32>,
 }
 
 /// Coordinates in which positions are given.
@@ -106,23 +110,24 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
     let n = rays.jitter.len();
     let counts = gpu.empty(n);
     let (t, dt, cells) = (gpu.empty(capacity), gpu.empty(capacity), gpu.empty(capacity));
-    // SAFETY: units past the rays stop; samples beyond the capacity are not written.
-    let launch = |offsets: &Buffer, write: bool| unsafe {
-        walk::launch_unchecked(
-            &gpu.client,
-            units(n),
-            CubeDim::new_1d(CUBE),
-            grid.bits.arg(),
-            grid.blocks.arg(),
-            rays.origins.arg(),
-            rays.dirs.arg(),
-            rays.near_far.arg(),
-            rays.jitter.arg(),
-            offsets.arg(),
-            counts.arg(),
-            t.arg(),
-            dt.arg(),
-            cells.arg(),
+    let pass = |offsets: &Buffer<u32>, write: bool| {
+        launch!(
+            gpu,
+            walk,
+            n,
+            [
+                grid.bits => grid.cells() / 32,
+                grid.blocks => grid.cells() / 512,
+                rays.origins => n * 3,
+                rays.dirs => n * 3,
+                rays.near_far => n * 2,
+                rays.jitter => n,
+                offsets => n + 1,
+                counts => n,
+                t => capacity,
+                dt => capacity,
+                cells => capacity,
+            ],
             n as u32,
             grid.resolution as u32,
             grid.cascades as u32,
@@ -137,61 +142,36 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
             write,
         );
     };
-    if n > 0 {
-        launch(&gpu.zeros(n + 1), false);
-    }
+    pass(&gpu.zeros(n + 1), false);
     let whole = scan::gpu::exclusive(gpu, &counts);
     let cut = gpu.zeros(n);
-    if n > 0 {
-        launch(&whole, true);
-    }
+    pass(&whole, true);
     let offsets = bounded(gpu, &whole, &cut, capacity);
     GpuMarched { packed: GpuPacked { offsets, t, dt }, cells, cut }
 }
 
 /// Offsets that end where the memory does, so that no reader passes it; rays that lose samples are marked.
-fn bounded(gpu: &Gpu, offsets: &Buffer, cut: &Buffer, capacity: usize) -> Buffer {
-    let out = gpu.empty(offsets.len());
-    // SAFETY: units past the offsets stop.
-    unsafe {
-        bound::launch_unchecked(
-            &gpu.client,
-            units(offsets.len()),
-            CubeDim::new_1d(CUBE),
-            offsets.arg(),
-            out.arg(),
-            cut.arg(),
-            offsets.len() as u32,
-            capacity as u32,
-        );
-    }
+fn bounded(gpu: &Gpu, offsets: &Buffer<u32>, cut: &Buffer<u32>, capacity: usize) -> Buffer<u32> {
+    let n = offsets.len();
+    let out = gpu.empty(n);
+    launch!(gpu, bound, n, [offsets => n, out => n, cut => n - 1], n as u32, capacity as u32);
     out
 }
 
 /// Midpoints of packed samples `[S, 3]`.
 pub fn positions(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked, space: Space) -> Buffer {
-    let out = gpu.empty(samples.t.len() * 3);
-    let n = samples.rays();
-    if n > 0 {
-        let (kind, width) = space.arg();
-        // SAFETY: offsets bound the samples.
-        unsafe {
-            place::launch_unchecked(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                samples.offsets.arg(),
-                samples.t.arg(),
-                samples.dt.arg(),
-                rays.origins.arg(),
-                rays.dirs.arg(),
-                out.arg(),
-                n as u32,
-                width,
-                kind,
-            );
-        }
-    }
+    let (n, s) = (samples.rays(), samples.t.len());
+    let out = gpu.empty(s * 3);
+    let (kind, width) = space.arg();
+    launch!(
+        gpu,
+        place,
+        n,
+        [samples.offsets => n + 1, samples.t => s, samples.dt => s, rays.origins => n * 3, rays.dirs => n * 3, out => s * 3],
+        n as u32,
+        width,
+        kind,
+    );
     out
 }
 
@@ -334,43 +314,36 @@ fn bound(offsets: &[u32], out: &mut [u32], cut: &mut [u32], n: u32, capacity: u3
 
 /// Model points `[N, 3]` as coordinates of a space.
 pub fn to_space(gpu: &Gpu, points: &Buffer, space: Space) -> Buffer {
-    let (out, n) = (gpu.empty(points.len()), points.len() / 3);
-    if n > 0 {
-        let (kind, width) = space.arg();
-        // SAFETY: units past the points stop.
-        unsafe {
-            convert::launch_unchecked(&gpu.client, units(n), CubeDim::new_1d(CUBE), points.arg(), out.arg(), n as u32, width, kind);
-        }
-    }
+    let n = points.len() / 3;
+    let out = gpu.empty(n * 3);
+    let (kind, width) = space.arg();
+    launch!(gpu, convert, n, [points => n * 3, out => n * 3], n as u32, width, kind);
     out
 }
 
 /// Gradients of origins and directions `[R, 3]`, given those of positions `[S, 3]` in a space.
 pub fn positions_backward(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked, d: &Buffer, space: Space) -> (Buffer, Buffer) {
-    let n = samples.rays();
+    let (n, s) = (samples.rays(), samples.t.len());
     let (d_origins, d_dirs) = (gpu.empty(n * 3), gpu.empty(n * 3));
-    if n > 0 {
-        let (kind, width) = space.arg();
-        // SAFETY: offsets bound the samples.
-        unsafe {
-            pull::launch_unchecked(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                samples.offsets.arg(),
-                samples.t.arg(),
-                samples.dt.arg(),
-                rays.origins.arg(),
-                rays.dirs.arg(),
-                d.arg(),
-                d_origins.arg(),
-                d_dirs.arg(),
-                n as u32,
-                width,
-                kind,
-            );
-        }
-    }
+    let (kind, width) = space.arg();
+    launch!(
+        gpu,
+        pull,
+        n,
+        [
+            samples.offsets => n + 1,
+            samples.t => s,
+            samples.dt => s,
+            rays.origins => n * 3,
+            rays.dirs => n * 3,
+            d => s * 3,
+            d_origins => n * 3,
+            d_dirs => n * 3,
+        ],
+        n as u32,
+        width,
+        kind,
+    );
     (d_origins, d_dirs)
 }
 

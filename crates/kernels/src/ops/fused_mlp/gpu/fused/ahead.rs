@@ -131,7 +131,7 @@ fn finish<E: Float>(
 /// A tile of rows through all layers.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
-pub(super) fn ahead<E: Float>(
+pub(super) fn forward_tiles<E: Float>(
     live: &[u32],
     x0: &[f32],
     x1: &[f32],

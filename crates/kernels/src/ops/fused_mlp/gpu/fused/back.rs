@@ -81,7 +81,7 @@ fn seed(out: &[f32], d: &[f32], row: usize, c: usize, #[comptime] head: PlannedH
 /// Tiles of rows back through all layers.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
-pub(super) fn back<E: Float>(
+pub(super) fn backward_tiles<E: Float>(
     live: &[u32],
     x0: &[f32],
     x1: &[f32],
