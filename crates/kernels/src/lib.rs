@@ -4,8 +4,6 @@
 #![allow(unsafe_code)]
 
 #[cfg(target_arch = "x86_64")]
-mod amx;
-#[cfg(target_arch = "x86_64")]
 mod amx_chain;
 pub mod device;
 pub mod gemm;

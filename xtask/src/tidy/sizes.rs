@@ -24,8 +24,8 @@ const LONGER: [(&str, usize); 9] = [
 const LONGER_FUNCTIONS: [(&str, &str, usize); 13] = [
     ("crates/data/src/pickle.rs", "run", 127),
     ("crates/engine/src/on_gpu/check.rs", "losses", 117),
-    ("crates/kernels/src/ops/fused_mlp/gpu/fused/ahead.rs", "ahead", 124),
-    ("crates/kernels/src/ops/fused_mlp/gpu/fused/back.rs", "back", 302),
+    ("crates/kernels/src/ops/fused_mlp/gpu/fused/ahead.rs", "forward_tiles", 124),
+    ("crates/kernels/src/ops/fused_mlp/gpu/fused/back.rs", "backward_tiles", 302),
     ("crates/kernels/src/ops/fused_mlp/gpu/fused/plan.rs", "new", 130),
     ("crates/kernels/src/ops/linear/gpu.rs", "gather", 91),
     ("crates/kernels/src/ops/linear/gpu.rs", "multiply", 95),

@@ -497,7 +497,7 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                 let terms = Terms { huber, relative, distortion, normalized, alpha, depth };
                 let (sigma_gpu, rgb_gpu, sums) = (up(&scene.sigma), up(&rgb), gpu.zeros(SUMS));
                 let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };
-                let (g, own_errors) = loss::composite_and_loss(gpu, terms, &on_gpu, &sigma_gpu, &rgb_gpu, target, reach, figures);
+                let (g, own_errors) = loss::composite_and_loss(gpu, terms, &on_gpu, (&sigma_gpu, &rgb_gpu), target, reach, figures);
                 table.close("composite + loss", "errors", &shape, &own_errors, &wide(&gpu.read(&errors)?))?;
                 let d = Composited { color: wide(&d_color), depth: vec![0.0; rays], opacity: wide(&d_opacity), weights: wide(&d_weights) };
                 let (sigma, background) = (wide(&scene.sigma), wide(&gpu.read(&background)?));

@@ -8,7 +8,7 @@ use crate::samplers::RayBatch;
 use crate::samplers::occupancy::Occupancy;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
-use diorama_kernels::ops::field_step::gpu as field;
+use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays};
@@ -55,7 +55,7 @@ impl Looks {
         });
         let codes: Vec<&Buffer> = direction.iter().chain(&code).collect();
         let black = gpu.zeros(n * 3);
-        self.shape.net.forward(gpu, &self.weights, packed, features, &codes, &black, false).out
+        self.shape.net.forward(gpu, &self.weights, &FieldInput { packed, features, codes: &codes }, &black, false).out
     }
 }
 

@@ -10,9 +10,9 @@ use diorama_geom::rng::Rng;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::gpu::GpuPacked;
-use diorama_kernels::ops::field_step::gpu as field;
 use diorama_kernels::ops::field_step::gpu::loss::{self, SUMS, Target, Terms};
-use diorama_kernels::ops::linear::{self, Activation, BiasKind};
+use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
+use diorama_kernels::ops::linear::{self, Activation, BiasKind, Dense};
 use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
@@ -26,6 +26,11 @@ use diorama_kernels::ops::{ray_aabb, spherical_harmonics};
 
 /// Terms of the learned background per channel.
 const SKY: usize = 16;
+
+/// The learned background as a layer on codes of directions.
+fn sky_layer(activation: Activation) -> Dense {
+    Dense { k: SKY, n: 3, bias: BiasKind::None, activation }
+}
 
 /// A group of parameters on the device.
 struct GpuGroup {
@@ -136,15 +141,16 @@ impl GpuField {
         let direction = self.shape.direction(gpu, &on.rays.dirs);
         let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &on.drawn.images, *dims));
         let codes: Vec<&Buffer> = direction.iter().chain(&appearance).collect();
+        let input = FieldInput { packed, features: &on.features, codes: &codes };
         let (g, errors, composited) = if !on.wants_weights {
-            let at = net.evaluate(gpu, weights, packed, &on.features, &codes, true);
-            let (d, errors) = loss::composite_and_loss(gpu, s.terms, packed, &at.sigma, &at.outputs, on.target, s.near_scaling, on.figures);
-            (net.gradients(gpu, weights, packed, &at, &d), errors, None)
+            let at = net.evaluate(gpu, weights, &input, true);
+            let (d, errors) =
+                loss::composite_and_loss(gpu, s.terms, packed, (&at.sigma, &at.outputs), on.target, s.near_scaling, on.figures);
+            (net.gradients(gpu, weights, &at, &d), errors, None)
         } else {
-            let background = on.target.background;
-            let step = net.forward(gpu, weights, packed, &on.features, &codes, background, true);
+            let step = net.forward(gpu, weights, &input, on.target.background, true);
             let (d, errors) = loss::loss(gpu, s.terms, packed, &step.out, on.target, on.figures);
-            let g = net.backward(gpu, weights, packed, background, &step, &d, s.near_scaling);
+            let g = net.backward(gpu, weights, &step, &d, s.near_scaling);
             (g, errors, Some(step.out.weights))
         };
         let points = match (&g.features, on.moves) {
@@ -291,7 +297,7 @@ impl GpuTrainer {
         let sky = self.learned.as_ref().map(|(g, activation)| {
             let every_ray = Rows::all(gpu, s.rays);
             let codes = spherical_harmonics::gpu::forward(gpu, 4, &rays.dirs);
-            let rgb = linear::gpu::forward(gpu, &every_ray, (SKY, 3), &codes, &g.values, None, BiasKind::None, *activation);
+            let rgb = linear::gpu::forward(gpu, &every_ray, &sky_layer(*activation), &codes, &g.values, None);
             (every_ray, codes, rgb)
         });
         let background = sky.as_ref().map_or(&drawn.background, |(_, _, rgb)| rgb);
@@ -340,8 +346,8 @@ impl GpuTrainer {
 
         let at = (s.t, s.rate_scale);
         if let (Some((group, activation)), Some((every_ray, codes, rgb))) = (&self.learned, &sky) {
-            let (none, d) = (BiasKind::None, &learned.background);
-            let d = linear::gpu::backward(gpu, every_ray, (SKY, 3), codes, &group.values, none, *activation, rgb, d);
+            let (layer, d) = (sky_layer(*activation), &learned.background);
+            let d = linear::gpu::backward(gpu, every_ray, &layer, codes, &group.values, rgb, d);
             group.step(gpu, at, &d.w);
         }
         if let (Some((group, focal)), Some(d_points)) = (&self.corrections, &learned.points) {

@@ -7,12 +7,12 @@ use super::{Buffer, Gpu, GpuError, Rows};
 use crate::device::Api;
 use crate::ops::adam::{self, Adam};
 use crate::ops::composite::{self, Composited, Packed, gpu::GpuComposited, gpu::GpuPacked};
-use crate::ops::field_step::gpu::{Arithmetic, GpuNet};
+use crate::ops::field_step::gpu::{Arithmetic, FieldInput, GpuNet};
 use crate::ops::field_step::{self, FieldNet, Output};
 use crate::ops::fused_mlp::gpu::fused::{self, Element, Fused};
 use crate::ops::fused_mlp::{self, Head, Layer, Mlp, Source};
 use crate::ops::hash_grid::{self, HashGrid, HashGridConfig, gpu::GpuHashGrid};
-use crate::ops::linear::{self, Activation, BiasKind};
+use crate::ops::linear::{self, Activation, BiasKind, Dense};
 use crate::ops::march::{self, MarchConfig, MarchRays, OccupancyBits, gpu::Space};
 use crate::ops::marching_cubes::CaseTable;
 use crate::ops::ray_generation::{self, PosedCamera, gpu::GpuCameras};
@@ -264,10 +264,11 @@ fn layers(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                 let w: Vec<f32> = random(k * n, 2).iter().map(|w| w / (k as f32).sqrt()).collect();
                 let (xg, wg, bg) = (gpu.upload(&x), gpu.upload(&w), gpu.upload(&b));
                 let (xd, wd, bd) = (wide(&x), wide(&w), wide(&b));
-                let out = on_gpu::forward(gpu, &Rows::all(gpu, m), (k, n), &xg, &wg, Some(&bg), kind, a);
-                table.close("linear", "forward", &shape, &out, &reference::forward(m, k, n, &xd, &wd, &bd, kind, a))?;
-                let g = on_gpu::backward(gpu, &Rows::all(gpu, m), (k, n), &xg, &wg, kind, a, &out, &gpu.upload(&d));
-                let (dx, dw, db) = reference::backward(m, k, n, &xd, &wd, &bd, kind, a, &wide(&d));
+                let layer = Dense { k, n, bias: kind, activation: a };
+                let out = on_gpu::forward(gpu, &Rows::all(gpu, m), &layer, &xg, &wg, Some(&bg));
+                table.close("linear", "forward", &shape, &out, &reference::forward(m, &layer, &xd, &wd, &bd))?;
+                let g = on_gpu::backward(gpu, &Rows::all(gpu, m), &layer, &xg, &wg, &out, &gpu.upload(&d));
+                let (dx, dw, db) = reference::backward(m, &layer, &xd, &wd, &bd, &wide(&d));
                 table.close("linear", "d x", &shape, &g.x, &dx)?;
                 table.close("linear", "d weight", &shape, &g.w, &dw)?;
                 if let Some(bias) = &g.bias {
@@ -791,12 +792,13 @@ fn field(gpu: &Gpu, table: &mut Table, net: &FieldNet, (levels, per_level): (usi
                 Ok::<_, GpuError>(())
             };
             close("density", &on_gpu_net.density(gpu, &pg, &features, &on_gpu.rows()), &want.sigma)?;
-            let step = on_gpu_net.forward(gpu, &pg, &on_gpu, &features, &[&ca, &cb], &bg, true);
+            let input = FieldInput { packed: &on_gpu, features: &features, codes: &[&ca, &cb] };
+            let step = on_gpu_net.forward(gpu, &pg, &input, &bg, true);
             close("color", &step.out.color, &want.out.color)?;
             close("weights", &step.out.weights, &want.out.weights)?;
             let [color, depth, opacity, weights] = d.each_ref().map(|v| up(v));
             let d = GpuComposited { color, depth, opacity, weights };
-            let g = on_gpu_net.backward(gpu, &pg, &on_gpu, &bg, &step, &d, 0.0);
+            let g = on_gpu_net.backward(gpu, &pg, &step, &d, 0.0);
             close("d parameters", &g.params, &want.d_params)?;
             close("d background", &g.background, &want.d_background)?;
             let level_major: Vec<f64> = (0..levels * s * per_level)

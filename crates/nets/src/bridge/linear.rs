@@ -8,7 +8,7 @@ use burn::tensor::Tensor;
 use diorama_kernels::gpu::{Buffer, Gpu, Rows};
 #[cfg(feature = "gpu")]
 use diorama_kernels::ops::linear::gpu as kernels;
-use diorama_kernels::ops::linear::{Activation, BiasKind, cpu};
+use diorama_kernels::ops::linear::{Activation, BiasKind, Dense, cpu};
 
 #[derive(Debug)]
 struct LinearOp {
@@ -20,6 +20,10 @@ impl LinearOp {
     /// Rows of x, its width, and that of the result.
     fn size(x: &[usize], weight: &[usize]) -> (usize, usize, usize) {
         (x[..x.len() - 1].iter().product(), weight[0], weight[1])
+    }
+
+    fn dense(&self, k: usize, n: usize) -> Dense {
+        Dense { k, n, bias: self.bias, activation: self.activation }
     }
 
     fn result(x: &[usize], width: usize) -> Vec<usize> {
@@ -55,7 +59,7 @@ impl SliceOp for LinearOp {
         let (m, k, n) = Self::size(x[0].shape(), x[1].shape());
         let mut out = ValuesMut::any(&Self::result(x[0].shape(), n));
         let bias = x.get(2).map_or(&[][..], |b| &b[..]);
-        cpu::forward(m, k, n, &x[0], &x[1], bias, self.bias, self.activation, &mut out);
+        cpu::forward(m, &self.dense(k, n), &x[0], &x[1], bias, &mut out);
         let out = out.freeze();
         if !wanted.contains(&true) {
             return Forward::one(out, Kept::default());
@@ -72,7 +76,7 @@ impl SliceOp for LinearOp {
         let (m, k, n) = Self::size(x.shape(), w.shape());
         let bias_shape = kept.values.get(3).map_or(&[0][..], |b| b.shape());
         let (mut dx, mut dw, mut db) = (ValuesMut::any(x.shape()), ValuesMut::any(w.shape()), ValuesMut::any(bias_shape));
-        cpu::backward(m, k, n, x, w, self.bias, self.activation, out, d, &mut dx, &mut dw, &mut db);
+        cpu::backward(m, &self.dense(k, n), x, w, out, d, [&mut dx, &mut dw, &mut db]);
         let mut all = vec![Some(dx.freeze()), Some(dw.freeze()), Some(db.freeze())];
         all.truncate(wanted.len());
         all
@@ -117,14 +121,14 @@ impl DeviceKernels for LinearOp {
     fn forward_on(&self, gpu: &Gpu, i: &[OnDevice]) -> DeviceOutputs {
         let (m, k, n) = Self::size(&i[0].shape, &i[1].shape);
         let (rows, bias) = (Rows::all(gpu, m), i.get(2).map(|b| &b.data));
-        let out = kernels::forward(gpu, &rows, (k, n), &i[0].data, &i[1].data, bias, self.bias, self.activation);
+        let out = kernels::forward(gpu, &rows, &self.dense(k, n), &i[0].data, &i[1].data, bias);
         DeviceOutputs { outputs: vec![(out.clone(), Self::result(&i[0].shape, n))], kept: vec![out] }
     }
 
     fn backward_on(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let Some(d) = &d[0] else { return vec![None; i.len()] };
         let (m, k, n) = Self::size(&i[0].shape, &i[1].shape);
-        let g = kernels::backward(gpu, &Rows::all(gpu, m), (k, n), &i[0].data, &i[1].data, self.bias, self.activation, &kept[0], d);
+        let g = kernels::backward(gpu, &Rows::all(gpu, m), &self.dense(k, n), &i[0].data, &i[1].data, &kept[0], d);
         vec![Some(g.x), Some(g.w), g.bias]
     }
 }
@@ -144,7 +148,8 @@ mod tests {
         let (x, w, b) = (random(20, 1), random(12, 2), random(3, 3));
         let (xt, wt, bt) = (t(&x, 5, 4), t(&w, 4, 3), t(&b, 1, 3));
         let grads = linear(xt.clone(), wt.clone(), Some(bt.clone()), Activation::Sigmoid).unwrap().sum().backward();
-        let (dx, dw, db) = reference::backward(5, 4, 3, &wide(&x), &wide(&w), &wide(&b), BiasKind::Shared, Activation::Sigmoid, &[1.0; 15]);
+        let layer = Dense { k: 4, n: 3, bias: BiasKind::Shared, activation: Activation::Sigmoid };
+        let (dx, dw, db) = reference::backward(5, &layer, &wide(&x), &wide(&w), &wide(&b), &[1.0; 15]);
         assert_close("x", &read_values(xt.grad(&grads).unwrap()), &dx, 1e-4);
         assert_close("w", &read_values(wt.grad(&grads).unwrap()), &dw, 1e-4);
         assert_close("b", &read_values(bt.grad(&grads).unwrap()), &db, 1e-4);

@@ -12,7 +12,7 @@ use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::composite::gpu::{self as composite, GpuGradients, GpuPacked};
 use diorama_kernels::ops::field_step::gpu::loss::{self, Figures, SUMS, Target, Terms};
-use diorama_kernels::ops::field_step::gpu::{Arithmetic, GpuNet};
+use diorama_kernels::ops::field_step::gpu::{Arithmetic, FieldInput, GpuNet};
 use diorama_kernels::ops::fused_mlp::gpu::fused::Element;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
@@ -122,14 +122,15 @@ fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
 fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let (k, n, rows) = (64, 64, Rows::all(gpu, s));
     let (x, w, d) = (random(gpu, s * k, 1), random(gpu, k * n, 2), random(gpu, s * n, 3));
-    let (kind, a, flops) = (BiasKind::None, Activation::Relu, (2 * k * n) as f64);
+    let layer = linear::Dense { k, n, bias: BiasKind::None, activation: Activation::Relu };
+    let flops = (2 * k * n) as f64;
     let shape = format!("{s}x64x64 f32");
     t.row("linear", &shape, ("row", s), flops, 0.0, || {
-        linear::gpu::forward(gpu, &rows, (k, n), &x, &w, None, kind, a);
+        linear::gpu::forward(gpu, &rows, &layer, &x, &w, None);
     })?;
     t.row("linear, forward and backward", &shape, ("row", s), 3.0 * flops, 0.0, || {
-        let out = linear::gpu::forward(gpu, &rows, (k, n), &x, &w, None, kind, a);
-        linear::gpu::backward(gpu, &rows, (k, n), &x, &w, kind, a, &out, &d);
+        let out = linear::gpu::forward(gpu, &rows, &layer, &x, &w, None);
+        linear::gpu::backward(gpu, &rows, &layer, &x, &w, &out, &d);
     })?;
     // The standard field's network: layer by layer, in one launch, and on tensor cores.
     let grid = HashGridConfig { levels: 16, features: 2, log2_size: 4, base: 4, finest: 16 };
@@ -139,6 +140,7 @@ fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let p = evenly(gpu, s);
     let direction = random(gpu, p.rays() * 16, 5);
     let g = GpuGradients { sigma: random(gpu, s, 6), features: random(gpu, s * 3, 7), background: gpu.zeros(p.rays() * 3) };
+    let input = FieldInput { packed: &p, features: &features, codes: &[&direction] };
     for (arithmetic, name) in [(Arithmetic::Layers, "layers"), (Arithmetic::Exact, "one launch"), (Arithmetic::Best, "tensor cores")] {
         let net = GpuNet::new(gpu, net, &density, 2, &[true, false], arithmetic);
         let element = net.element();
@@ -147,11 +149,11 @@ fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
         }
         let shape = format!("32 -> 64 -> 16, 32 -> 64 -> 64 -> 16 {name}");
         t.row("field network", &shape, ("sample", s), flops, 0.0, || {
-            net.evaluate(gpu, &params, &p, &features, &[&direction], false);
+            net.evaluate(gpu, &params, &input, false);
         })?;
         t.row("field network, forward and backward", &shape, ("sample", s), 3.0 * flops, 0.0, || {
-            let at = net.evaluate(gpu, &params, &p, &features, &[&direction], true);
-            net.gradients(gpu, &params, &p, &at, &g);
+            let at = net.evaluate(gpu, &params, &input, true);
+            net.gradients(gpu, &params, &at, &g);
         })?;
     }
     Ok(())
@@ -184,8 +186,7 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
             gpu,
             Terms { huber: 0.0, relative: 0.0, distortion: 0.0, normalized: false, alpha: 0.0, depth: 0.0 },
             &p,
-            &sigma,
-            &rgb,
+            (&sigma, &rgb),
             target,
             0.0,
             figures,

@@ -111,15 +111,15 @@ fn networks(t: &mut Table) {
         let (m, k, n) = (4096, width, width);
         let (x, w, d) = (random(m * k, 1), random(k * n, 2), random(m * n, 3));
         let (mut out, mut dx, mut dw) = (vec![0.0; m * n], vec![0.0; m * k], vec![0.0; k * n]);
+        let layer = linear::Dense { k, n, bias: BiasKind::None, activation: Activation::Relu };
         let shape = format!("{m}x{width}x{width} f32");
         let flops = (2 * k * n) as f64;
         t.row("linear", &shape, "row", m, Work::Flops(flops), || {
-            linear::cpu::forward(m, k, n, &x, &w, &[], BiasKind::None, Activation::Relu, &mut out);
+            linear::cpu::forward(m, &layer, &x, &w, &[], &mut out);
         });
         t.row("linear, forward and backward", &shape, "row", m, Work::Flops(3.0 * flops), || {
-            linear::cpu::forward(m, k, n, &x, &w, &[], BiasKind::None, Activation::Relu, &mut out);
-            let (kind, a) = (BiasKind::None, Activation::Relu);
-            linear::cpu::backward(m, k, n, &x, &w, kind, a, &out, &d, &mut dx, &mut dw, &mut []);
+            linear::cpu::forward(m, &layer, &x, &w, &[], &mut out);
+            linear::cpu::backward(m, &layer, &x, &w, &out, &d, [&mut dx, &mut dw, &mut []]);
         });
     }
     for (name, inputs, widths) in [("fused_mlp", 32, &[64, 64, 16][..]), ("fused_mlp", 60, &[256, 256, 256, 16])] {

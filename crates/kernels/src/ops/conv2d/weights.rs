@@ -245,7 +245,7 @@ unsafe fn interleave16(from: *const f32, stride: usize, pixels: usize, out: *mut
             let count = (pixels - i).min(16);
             let mask = (((1u32 << count) - 1) & 0xffff) as u16;
             let v: [__m512i; 16] = std::array::from_fn(|c| _mm512_maskz_loadu_epi32(mask, from.add(c * stride + i).cast()));
-            let t = crate::amx::transpose16(v);
+            let t = crate::gemm::amx::transpose16(v);
             for (p, t) in t.iter().enumerate().take(count) {
                 _mm512_storeu_si512(out.add((i + p) * width).cast(), *t);
             }

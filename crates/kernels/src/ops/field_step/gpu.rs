@@ -36,6 +36,17 @@ pub struct GpuNet {
     fused: Option<[Fused; 2]>,
 }
 
+/// Samples as a network reads them.
+///
+/// # Shapes
+/// features: as [`GpuNet::features`] gives them; codes: `[R, K_i]`.
+#[derive(Clone, Copy)]
+pub struct FieldInput<'a> {
+    pub packed: &'a GpuPacked,
+    pub features: &'a Buffer,
+    pub codes: &'a [&'a Buffer],
+}
+
 impl GpuNet {
     /// `density` is the network up to its density head, which reads input 0 alone; `wanted` says of which inputs
     /// gradients are asked.
@@ -92,13 +103,10 @@ impl GpuNet {
     }
 
     /// Densities and colours of packed samples; with `keep` ready for [`GpuNet::gradients`].
-    ///
-    /// # Shapes
-    /// features: as the network reads them; codes: `[R, K_i]`.
-    pub fn evaluate(&self, gpu: &Gpu, params: &Buffer, p: &GpuPacked, features: &Buffer, codes: &[&Buffer], keep: bool) -> Evaluated {
-        let rows = p.rows();
-        let mut inputs = vec![features.clone()];
-        for (code, width) in codes.iter().zip(&self.net.mlp.input_widths[1..]) {
+    pub fn evaluate(&self, gpu: &Gpu, params: &Buffer, input: &FieldInput, keep: bool) -> Evaluated {
+        let (p, rows) = (input.packed, input.packed.rows());
+        let mut inputs = vec![input.features.clone()];
+        for (code, width) in input.codes.iter().zip(&self.net.mlp.input_widths[1..]) {
             let per_sample = gpu.empty(rows.most * width);
             expand_ray_code(gpu, p, code, &per_sample, *width, true);
             inputs.push(per_sample);
@@ -117,7 +125,7 @@ impl GpuNet {
                 (Values::Layers(values), sigma, outputs)
             }
         };
-        Evaluated { inputs, values, sigma, outputs }
+        Evaluated { packed: p.clone(), inputs, values, sigma, outputs }
     }
 
     /// Activated channels of all outputs, `[S, C]`.
@@ -136,25 +144,15 @@ impl GpuNet {
     }
 
     /// [`GpuNet::evaluate`], composited on a background `[R, C]`.
-    #[allow(clippy::too_many_arguments)]
-    pub fn forward(
-        &self,
-        gpu: &Gpu,
-        params: &Buffer,
-        p: &GpuPacked,
-        features: &Buffer,
-        codes: &[&Buffer],
-        background: &Buffer,
-        keep: bool,
-    ) -> GpuStep {
-        let at = self.evaluate(gpu, params, p, features, codes, keep);
-        let out = composite::forward(gpu, p, &at.sigma, &at.outputs, self.net.channels(), background);
-        GpuStep { out, at }
+    pub fn forward(&self, gpu: &Gpu, params: &Buffer, input: &FieldInput, background: &Buffer, keep: bool) -> GpuStep {
+        let at = self.evaluate(gpu, params, input, keep);
+        let out = composite::forward(gpu, &at.packed, &at.sigma, &at.outputs, self.net.channels(), background);
+        GpuStep { out, at, background: background.clone() }
     }
 
     /// Gradients of parameters, features and codes, given those of densities and colours.
-    pub fn gradients(&self, gpu: &Gpu, params: &Buffer, p: &GpuPacked, at: &Evaluated, g: &GpuGradients) -> GpuStepGradients {
-        let (rows, net) = (p.rows(), &self.net);
+    pub fn gradients(&self, gpu: &Gpu, params: &Buffer, at: &Evaluated, g: &GpuGradients) -> GpuStepGradients {
+        let (p, rows, net) = (&at.packed, at.packed.rows(), &self.net);
         let inputs: Vec<&Buffer> = at.inputs.iter().collect();
         let (d_params, d_inputs) = match (&self.fused, &at.values) {
             (Some([whole, _]), Values::Kept(kept)) => {
@@ -203,22 +201,13 @@ impl GpuNet {
     }
 
     /// [`GpuNet::gradients`], given those of what compositing gave; see [`super::StepInput::near_scaling`].
-    #[allow(clippy::too_many_arguments)]
-    pub fn backward(
-        &self,
-        gpu: &Gpu,
-        params: &Buffer,
-        p: &GpuPacked,
-        background: &Buffer,
-        step: &GpuStep,
-        d: &GpuComposited,
-        near_scaling: f32,
-    ) -> GpuStepGradients {
-        let g = composite::backward(gpu, p, &step.at.outputs, self.net.channels(), background, &step.out, d);
+    pub fn backward(&self, gpu: &Gpu, params: &Buffer, step: &GpuStep, d: &GpuComposited, near_scaling: f32) -> GpuStepGradients {
+        let p = &step.at.packed;
+        let g = composite::backward(gpu, p, &step.at.outputs, self.net.channels(), &step.background, &step.out, d);
         if near_scaling > 0.0 {
             scale_near_gradients(gpu, p, &g.sigma, &g.features, near_scaling);
         }
-        self.gradients(gpu, params, p, &step.at, &g)
+        self.gradients(gpu, params, &step.at, &g)
     }
 }
 
@@ -286,6 +275,7 @@ enum Values {
 
 /// Densities `[S]` and outputs `[S, C]`, and what a backward pass needs beside them.
 pub struct Evaluated {
+    packed: GpuPacked,
     inputs: Vec<Buffer>,
     values: Values,
     pub sigma: Buffer,
@@ -296,6 +286,7 @@ pub struct Evaluated {
 pub struct GpuStep {
     pub out: GpuComposited,
     at: Evaluated,
+    background: Buffer,
 }
 
 /// Gradients of a step.

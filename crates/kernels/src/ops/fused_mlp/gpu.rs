@@ -5,7 +5,7 @@ pub mod fused;
 use super::{Mlp, Source};
 use crate::gpu::{Buffer, Gpu, Rows, launch};
 use crate::ops::linear::gpu::{self as linear, Part};
-use crate::ops::linear::{Activation, BiasKind};
+use crate::ops::linear::{Activation, BiasKind, Dense};
 use cubecl::prelude::*;
 
 /// Activations of a network for the way back.
@@ -23,8 +23,9 @@ pub fn forward(gpu: &Gpu, mlp: &Mlp, params: &Buffer, inputs: &[&Buffer], rows: 
         let x = joined(gpu, mlp, j, inputs, &values.layers, rows);
         let (k, n) = (mlp.fan_in(j), layer.width);
         let (w, bias) = parts(mlp, j, params);
+        let dense = Dense { k, n, bias: kind(mlp, j), activation: layer.activation };
         if layer.modulation.is_none() && layer.activation.is_monotonic() {
-            values.layers.push(linear::forward_part(gpu, rows, (k, n), &x, w, bias, kind(mlp, j), layer.activation));
+            values.layers.push(linear::forward_part(gpu, rows, &dense, &x, w, bias));
             values.pre.push(None);
             continue;
         }
@@ -33,7 +34,7 @@ pub fn forward(gpu: &Gpu, mlp: &Mlp, params: &Buffer, inputs: &[&Buffer], rows: 
             multiply(gpu, rows, k, (&x, k, 0), (inputs[m], k + n, 0), (&scaled, k, 0), false);
             scaled
         });
-        let out = linear::forward_part(gpu, rows, (k, n), &x, w, bias, kind(mlp, j), Activation::None);
+        let out = linear::forward_part(gpu, rows, &Dense { activation: Activation::None, ..dense }, &x, w, bias);
         if let Some(m) = layer.modulation {
             columns(gpu, rows, n, (inputs[m], k + n, k), (&out, n, 0), true);
         }
@@ -42,7 +43,7 @@ pub fn forward(gpu: &Gpu, mlp: &Mlp, params: &Buffer, inputs: &[&Buffer], rows: 
             gpu.copy(&out, &pre);
             pre
         }));
-        linear::finish(gpu, &out, rows, n, None, BiasKind::None, layer.activation);
+        linear::finish(gpu, &out, rows, &Dense { bias: BiasKind::None, ..dense }, None);
         values.layers.push(out);
     }
     values

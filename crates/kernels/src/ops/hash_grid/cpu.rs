@@ -99,7 +99,7 @@ pub(crate) fn has_lines(grid: &HashGrid) -> bool {
 /// # Panics
 /// When the points are not a multiple of 16, or a slice does not fit.
 #[cfg(target_arch = "x86_64")]
-pub(crate) fn forward_lines(grid: &HashGrid, points: [&[f32]; 3], table: &[f32], out: &mut [crate::amx::Line]) {
+pub(crate) fn forward_lines(grid: &HashGrid, points: [&[f32]; 3], table: &[f32], out: &mut [crate::gemm::amx::Line]) {
     let n = points[0].len();
     assert!(has_lines(grid) && n.is_multiple_of(16) && points.iter().all(|p| p.len() == n), "hash grid: lines");
     assert!(table.len() == grid.params_len() && out.len() >= n, "hash grid: shapes");
@@ -307,7 +307,7 @@ pub fn jacobian_backward(grid: &HashGrid, points: &[f32], d_jacobian: &[f32], d_
 #[cfg(target_arch = "x86_64")]
 mod x86 {
     use super::Level;
-    use crate::amx::{Line, transpose16};
+    use crate::gemm::amx::{Line, transpose16};
     use std::arch::x86_64::*;
 
     /// Indices and weights of the eight corners of sixteen points.

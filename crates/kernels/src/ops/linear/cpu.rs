@@ -1,7 +1,7 @@
 //! Blocks of rows through the small matrix product; weight gradients per block group, added in order.
 
-use super::{Activation, BiasKind, LEAK};
-use crate::gemm::{self, Init, Precision, View, gemm};
+use super::{Activation, BiasKind, Dense, LEAK};
+use crate::gemm::{self, Gemm, Init, Precision, View, gemm};
 use crate::math;
 use rayon::prelude::*;
 
@@ -67,8 +67,8 @@ pub fn slope_from_output(a: Activation, y: f32) -> f32 {
 ///
 /// # Shapes
 /// x `[m, k]`, w `[k, n]`, bias empty, `[n]` or `[m, n]`, out `[m, n]`.
-#[allow(clippy::too_many_arguments)]
-pub fn forward(m: usize, k: usize, n: usize, x: &[f32], w: &[f32], bias: &[f32], kind: BiasKind, a: Activation, out: &mut [f32]) {
+pub fn forward(m: usize, layer: &Dense, x: &[f32], w: &[f32], bias: &[f32], out: &mut [f32]) {
+    let &Dense { k, n, bias: kind, activation: a } = layer;
     assert!(x.len() == m * k && w.len() == k * n && out.len() == m * n, "linear: shapes");
     if m * n == 0 {
         return;
@@ -84,7 +84,7 @@ pub fn forward(m: usize, k: usize, n: usize, x: &[f32], w: &[f32], bias: &[f32],
                 Init::Accumulate
             }
         };
-        gemm(Precision::F32, rows, n, k, x, w, n, out, n, init, a == Activation::Relu);
+        gemm(Precision::F32, Gemm { m: rows, n, k, a: x, b: w, ldb: n, ldc: n, init, relu: a == Activation::Relu }, out);
         if a != Activation::Relu {
             activate(a, out);
         }
@@ -92,21 +92,12 @@ pub fn forward(m: usize, k: usize, n: usize, x: &[f32], w: &[f32], bias: &[f32],
 }
 
 /// Gradients of x, w and b, overwritten, given the layer's output.
-#[allow(clippy::too_many_arguments)]
-pub fn backward(
-    m: usize,
-    k: usize,
-    n: usize,
-    x: &[f32],
-    w: &[f32],
-    kind: BiasKind,
-    a: Activation,
-    out: &[f32],
-    d: &[f32],
-    dx: &mut [f32],
-    dw: &mut [f32],
-    db: &mut [f32],
-) {
+///
+/// # Shapes
+/// As in [`forward`]; `gradients` are those of x, w and b.
+pub fn backward(m: usize, layer: &Dense, x: &[f32], w: &[f32], out: &[f32], d: &[f32], gradients: [&mut [f32]; 3]) {
+    let &Dense { k, n, bias: kind, activation: a } = layer;
+    let [dx, dw, db] = gradients;
     dw.fill(0.0);
     db.fill(0.0);
     if m * n == 0 {
@@ -141,8 +132,26 @@ pub fn backward(
                 }
                 let g = &g[..rows * n];
                 let local = start - first;
-                gemm(Precision::F32, rows, k, n, View::rows(g, n), &wt, k, &mut dx[local * k..], k, Init::Zero, false);
-                gemm(Precision::F32, k, n, rows, View::transposed(&x[start * k..], k), g, n, &mut dw, n, Init::Accumulate, false);
+                gemm(
+                    Precision::F32,
+                    Gemm { m: rows, n: k, k: n, a: View::rows(g, n), b: &wt, ldb: k, ldc: k, init: Init::Zero, relu: false },
+                    &mut dx[local * k..],
+                );
+                gemm(
+                    Precision::F32,
+                    Gemm {
+                        m: k,
+                        n,
+                        k: rows,
+                        a: View::transposed(&x[start * k..], k),
+                        b: g,
+                        ldb: n,
+                        ldc: n,
+                        init: Init::Accumulate,
+                        relu: false,
+                    },
+                    &mut dw,
+                );
                 if per_row {
                     db_rows[local * n..(local + rows) * n].copy_from_slice(g);
                 }

@@ -1,7 +1,7 @@
 //! Products by cubes of 16 × 16 units, each with up to 4 × 4 results of its own, through shared memory. Weight gradients, sums over very many rows, are
 //! formed by slices of rows and then added up.
 
-use super::{Activation, BiasKind};
+use super::{Activation, BiasKind, Dense};
 use crate::gpu::{Buffer, Gpu, Rows, launch};
 use cubecl::prelude::*;
 
@@ -100,50 +100,31 @@ fn add_up(gpu: &Gpu, parts: &Buffer, slices: usize, n: usize, out: Part) {
 }
 
 /// [`forward`] with a weight and bias that lie in a larger buffer.
-#[allow(clippy::too_many_arguments)]
-pub(crate) fn forward_part(
-    gpu: &Gpu,
-    rows: &Rows,
-    (k, n): (usize, usize),
-    x: &Buffer,
-    w: Part,
-    bias: Option<Part>,
-    kind: BiasKind,
-    a: Activation,
-) -> Buffer {
-    let out = gpu.empty(rows.most * n);
-    product(gpu, false, rows, (k, n), x, w, (&out).into());
-    finish(gpu, &out, rows, n, bias, kind, a);
+pub(crate) fn forward_part(gpu: &Gpu, rows: &Rows, layer: &Dense, x: &Buffer, w: Part, bias: Option<Part>) -> Buffer {
+    let out = gpu.empty(rows.most * layer.n);
+    product(gpu, false, rows, (layer.k, layer.n), x, w, (&out).into());
+    finish(gpu, &out, rows, layer, bias);
     out
 }
 
 /// `act(x W + b)`, `[M, N]`, for W `[K, N]`.
-#[allow(clippy::too_many_arguments)]
-pub fn forward(
-    gpu: &Gpu,
-    rows: &Rows,
-    size: (usize, usize),
-    x: &Buffer,
-    w: &Buffer,
-    bias: Option<&Buffer>,
-    kind: BiasKind,
-    a: Activation,
-) -> Buffer {
-    forward_part(gpu, rows, size, x, w.into(), bias.map(Part::from), kind, a)
+pub fn forward(gpu: &Gpu, rows: &Rows, layer: &Dense, x: &Buffer, w: &Buffer, bias: Option<&Buffer>) -> Buffer {
+    forward_part(gpu, rows, layer, x, w.into(), bias.map(Part::from))
 }
 
-/// Adds a bias and activates, in place.
-pub(crate) fn finish(gpu: &Gpu, out: &Buffer, rows: &Rows, n: usize, bias: Option<Part>, kind: BiasKind, a: Activation) {
-    if kind == BiasKind::None && a == Activation::None {
+/// Adds a layer's bias and activates, in place.
+pub(crate) fn finish(gpu: &Gpu, out: &Buffer, rows: &Rows, &Dense { n, bias: kind, activation, .. }: &Dense, bias: Option<Part>) {
+    if kind == BiasKind::None && activation == Activation::None {
         return;
     }
     // Bound where there is no bias to read.
-    let spare = gpu.empty(1);
+    let spare = gpu.empty(0);
     let bias = bias.unwrap_or(Part::from(&spare));
-    let (bias_kind, bias_len) = match kind {
-        BiasKind::None => (0u32, 0),
-        BiasKind::Shared => (1, n),
-        BiasKind::PerRow => (2, rows.most * n),
+    let bias_len = kind.numbers(rows.most, n);
+    let bias_kind = match kind {
+        BiasKind::None => 0u32,
+        BiasKind::Shared => 1,
+        BiasKind::PerRow => 2,
     };
     launch!(
         gpu,
@@ -154,7 +135,7 @@ pub(crate) fn finish(gpu: &Gpu, out: &Buffer, rows: &Rows, n: usize, bias: Optio
         bias.at as u32,
         n as u32,
         bias_kind,
-        code(a),
+        code(activation),
     );
 }
 
@@ -186,22 +167,12 @@ pub struct Gradients {
 }
 
 /// From the layer's output, which gives the slope, and its gradient.
-#[allow(clippy::too_many_arguments)]
-pub fn backward(
-    gpu: &Gpu,
-    rows: &Rows,
-    (k, n): (usize, usize),
-    x: &Buffer,
-    w: &Buffer,
-    kind: BiasKind,
-    a: Activation,
-    out: &Buffer,
-    d_out: &Buffer,
-) -> Gradients {
-    let g = before_activation(gpu, rows, n, a, out, d_out);
+pub fn backward(gpu: &Gpu, rows: &Rows, layer: &Dense, x: &Buffer, w: &Buffer, out: &Buffer, d_out: &Buffer) -> Gradients {
+    let &Dense { k, n, bias, activation } = layer;
+    let g = before_activation(gpu, rows, n, activation, out, d_out);
     let d_w = gpu.empty(k * n);
     let d_x = backward_part(gpu, rows, (k, n), x, w.into(), &g, (&d_w).into());
-    let bias = match kind {
+    let bias = match bias {
         BiasKind::None => None,
         BiasKind::Shared => {
             let out = gpu.empty(n);

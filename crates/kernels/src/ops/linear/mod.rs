@@ -43,3 +43,23 @@ pub enum BiasKind {
     /// `[M, N]`
     PerRow,
 }
+
+impl BiasKind {
+    /// Numbers of the bias of `m` rows of `n` outputs.
+    pub fn numbers(self, m: usize, n: usize) -> usize {
+        match self {
+            BiasKind::None => 0,
+            BiasKind::Shared => n,
+            BiasKind::PerRow => m * n,
+        }
+    }
+}
+
+/// Shape of a layer that maps rows of `k` numbers to rows of `n`, its bias and activation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Dense {
+    pub k: usize,
+    pub n: usize,
+    pub bias: BiasKind,
+    pub activation: Activation,
+}

@@ -55,13 +55,11 @@ pub struct Target<'a> {
 /// Composites packed samples with densities `[S]` and colours `[S, 3]`, compares them, and takes the gradients back to
 /// both, all rays in one launch; adds the step's figures. Also gives the squared error of each ray `[R]`. Gradients
 /// closer than `near_scaling` are scaled as by [`super::scale_near_gradients`].
-#[allow(clippy::too_many_arguments)]
 pub fn composite_and_loss(
     gpu: &Gpu,
     terms: Terms,
     p: &GpuPacked,
-    sigma: &Buffer,
-    rgb: &Buffer,
+    (sigma, rgb): (&Buffer, &Buffer),
     target: Target,
     near_scaling: f32,
     figures: Figures,
@@ -105,7 +103,7 @@ pub fn composite_and_loss(
         by_depth,
     );
     // The values hold the distortion already.
-    add_up(gpu, p, target.left_out, &values, &errors, &values, 0.0, figures);
+    add_up(gpu, p, target.left_out, [&values, &errors, &values], 0.0, figures);
     (g, errors)
 }
 
@@ -146,22 +144,12 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
         let scale = 1.0 / r.max(1) as f32;
         depth_loss::gpu::add(gpu, p, &out.weights, target.distance, target.left_out, (terms.depth, scale), (&values, &weights));
     }
-    add_up(gpu, p, target.left_out, &values, &errors, &spread, terms.distortion, figures);
+    add_up(gpu, p, target.left_out, [&values, &errors, &spread], terms.distortion, figures);
     (GpuComposited { weights, ..d }, errors)
 }
 
 /// Adds a step's figures to `sums`.
-#[allow(clippy::too_many_arguments)]
-fn add_up(
-    gpu: &Gpu,
-    p: &GpuPacked,
-    left_out: &Buffer<u32>,
-    values: &Buffer,
-    errors: &Buffer,
-    spread: &Buffer,
-    distortion: f32,
-    figures: Figures,
-) {
+fn add_up(gpu: &Gpu, p: &GpuPacked, left_out: &Buffer<u32>, [values, errors, spread]: [&Buffer; 3], distortion: f32, figures: Figures) {
     let (r, parts) = (p.rays(), gpu.empty(PARTS * 3));
     launch!(
         gpu,
