@@ -5,6 +5,9 @@
 
 #[cfg(target_arch = "x86_64")]
 mod amx_chain;
+mod api;
+#[cfg(feature = "gpu")]
+pub mod check;
 pub mod device;
 pub mod gemm;
 #[cfg(feature = "gpu")]

@@ -13,7 +13,7 @@ use diorama_geom::contraction;
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, PixelFormat, Pose};
-use diorama_kernels::gpu::check::{Row, Table};
+use diorama_kernels::check::{Row, Table};
 use diorama_kernels::gpu::{Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::composite::{Composited, Packed, cpu as composite, reference};

@@ -3,11 +3,11 @@
 
 mod atomics;
 mod buffer;
-pub mod check;
 pub(crate) mod launch;
 pub(crate) mod random;
+pub(crate) mod table;
 
-use crate::device::Api;
+use crate::api::Api;
 pub use atomics::{Accumulate, Native, Swap};
 pub use buffer::{Buffer, Rows};
 use cubecl::client::Client;

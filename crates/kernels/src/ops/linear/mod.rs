@@ -1,5 +1,7 @@
 //! A fully connected layer, `y = act(x W + b)`, of any width, with one bias for all rows or one per row.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -12,7 +12,7 @@ mod back;
 mod plan;
 
 use super::super::{Head, Mlp};
-use crate::device::Api;
+use crate::api::Api;
 use crate::gpu::{Buffer, CUBE, Gpu, Rows, has_cuda_headers, launch};
 use ahead::forward_tiles;
 use back::backward_tiles;
