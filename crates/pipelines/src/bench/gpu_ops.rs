@@ -16,7 +16,7 @@ use diorama_kernels::ops::field_step::gpu::{Arithmetic, FieldInput, GpuNet};
 use diorama_kernels::ops::fused_mlp::gpu::fused::Element;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
-use diorama_kernels::ops::linear::{self, Activation, BiasKind};
+use diorama_kernels::ops::linear::{self, Activation};
 use diorama_kernels::ops::spherical_harmonics;
 
 /// Samples per ray.
@@ -112,7 +112,7 @@ fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     })?;
     let (p, m, v) = (random(gpu, grid.params_len(), 4), gpu.zeros(grid.params_len()), gpu.zeros(grid.params_len()));
     t.row("adam", "all rows touched", ("parameter", grid.params_len()), 0.0, 32.0, || {
-        adam::gpu::step(gpu, &Adam::default(), (1, false), &p, [&m, &v], &d_table);
+        adam::gpu::step(gpu, &Adam::default(), (1, false), 0..p.len(), &p, [&m, &v], &d_table);
     })?;
     t.row("spherical_harmonics", "degree 4", ("direction", s), 0.0, 76.0, || {
         spherical_harmonics::gpu::forward(gpu, 4, &points);
@@ -122,7 +122,7 @@ fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
 fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let (k, n, rows) = (64, 64, Rows::all(gpu, s));
     let (x, w, d) = (random(gpu, s * k, 1), random(gpu, k * n, 2), random(gpu, s * n, 3));
-    let layer = linear::Dense { k, n, bias: BiasKind::None, activation: Activation::Relu };
+    let layer = linear::Dense::without_bias(k, n, Activation::Relu);
     let flops = (2 * k * n) as f64;
     let shape = format!("{s}x64x64 f32");
     t.row("linear", &shape, ("row", s), flops, 0.0, || {

@@ -3,20 +3,22 @@
 use super::Adam;
 use crate::gpu::{Buffer, Gpu, launch};
 use cubecl::prelude::*;
+use std::ops::Range;
 
-/// One step `t ≥ 1` of parameters `p` with their first and second moments; `sparse` leaves elements without gradient alone. Gradients
-/// are cleared.
-pub fn step(gpu: &Gpu, a: &Adam, (t, sparse): (u32, bool), p: &Buffer, [m, v]: [&Buffer; 2], g: &Buffer) {
-    let n = p.len();
+/// One step `t ≥ 1` of the parameters `p` in `range` with their first and second moments; `sparse` leaves elements without gradient
+/// alone. Their gradients are cleared.
+pub fn step(gpu: &Gpu, a: &Adam, (t, sparse): (u32, bool), range: Range<usize>, p: &Buffer, [m, v]: [&Buffer; 2], g: &Buffer) {
+    let end = range.end;
     let (b1, b2) = (a.beta1 as f64, a.beta2 as f64);
     let scale = (a.rate as f64 / (1.0 - b1.powi(t as i32))) as f32;
     let root = (1.0 / (1.0 - b2.powi(t as i32))).sqrt() as f32;
     launch!(
         gpu,
         adam,
-        n,
-        [p => n, m => n, v => n, g => n],
-        n as u32,
+        range.len(),
+        [p => end, m => end, v => end, g => end],
+        range.start as u32,
+        range.len() as u32,
         scale,
         root,
         a.beta1,
@@ -34,6 +36,7 @@ fn adam(
     m: &mut [f32],
     v: &mut [f32],
     g: &mut [f32],
+    first: u32,
     n: u32,
     scale: f32,
     root: f32,
@@ -43,10 +46,11 @@ fn adam(
     decay: f32,
     #[comptime] sparse: bool,
 ) {
-    let i = ABSOLUTE_POS;
-    if i >= n as usize {
+    let unit = ABSOLUTE_POS;
+    if unit >= n as usize {
         terminate!();
     }
+    let i = first as usize + unit;
     let mut d = g[i];
     if comptime!(sparse) {
         if d == 0.0 {

@@ -4,12 +4,14 @@ use diorama_testkit::{assert_close, random, wide};
 #[test]
 fn dense_matches_the_reference() {
     for c in cases::cases().into_iter().filter(|c| !c.sparse) {
-        let n = c.params.len();
+        let (n, own) = (c.params.len(), &c.range);
         let (mut p, mut m, mut v) = (c.params.clone(), vec![0.0; n], vec![0.0; n]);
         let (mut pr, mut mr, mut vr) = (wide(&p), wide(&m), wide(&v));
         for (t, g) in (1..).zip(&c.gradients) {
-            cpu::dense(&c.adam, t, &mut p, &mut m, &mut v, g);
-            reference::step(&c.adam, t, false, &mut pr, &mut mr, &mut vr, &wide(g));
+            let (p, m, v) = (&mut p[own.clone()], &mut m[own.clone()], &mut v[own.clone()]);
+            cpu::dense(&c.adam, t, p, m, v, &g[own.clone()]);
+            let (pr, mr, vr) = (&mut pr[own.clone()], &mut mr[own.clone()], &mut vr[own.clone()]);
+            reference::step(&c.adam, t, false, pr, mr, vr, &wide(&g[own.clone()]));
         }
         assert_close("p", &p, &pr, 1e-4);
         assert_close("m", &m, &mr, 1e-4);

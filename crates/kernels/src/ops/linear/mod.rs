@@ -65,3 +65,9 @@ pub struct Dense {
     pub bias: BiasKind,
     pub activation: Activation,
 }
+
+impl Dense {
+    pub fn without_bias(k: usize, n: usize, activation: Activation) -> Dense {
+        Dense { k, n, bias: BiasKind::None, activation }
+    }
+}
