@@ -18,12 +18,9 @@ const LONGER: [(&str, usize); 6] = [
 ];
 
 /// The same of functions.
-const LONGER_FUNCTIONS: [(&str, &str, usize); 13] = [
+const LONGER_FUNCTIONS: [(&str, &str, usize); 10] = [
     ("crates/data/src/pickle.rs", "run", 127),
     ("crates/engine/src/on_gpu/check.rs", "losses", 117),
-    ("crates/kernels/src/ops/fused_mlp/gpu/fused/ahead.rs", "forward_tiles", 124),
-    ("crates/kernels/src/ops/fused_mlp/gpu/fused/back.rs", "backward_tiles", 302),
-    ("crates/kernels/src/ops/fused_mlp/gpu/fused/plan.rs", "new", 130),
     ("crates/kernels/src/ops/linear/gpu.rs", "gather", 91),
     ("crates/kernels/src/ops/linear/gpu.rs", "multiply", 95),
     ("crates/kernels/src/ops/march/cpu.rs", "march_ray", 93),

@@ -7,17 +7,17 @@
 //! blocks of 16 rows, each layer to whole blocks of 16 columns. Gradients of the weights stay in registers while a
 //! cube goes from tile to tile, and are added up at the end.
 
-mod ahead;
-mod back;
+mod backward;
+mod forward;
 mod plan;
 
 use super::super::{Head, Mlp};
 use crate::api::Api;
 use crate::gpu::{Buffer, CUBE, Gpu, Rows, has_cuda_headers, launch};
-use ahead::forward_tiles;
-use back::backward_tiles;
+use backward::backward_tiles;
 use cubecl::ir::{ElemType, FloatKind};
 use cubecl::prelude::*;
+use forward::forward_tiles;
 use half::{bf16, f16};
 use plan::Plan;
 
