@@ -4,8 +4,8 @@
 //! second from a copy with channels innermost, in which neighboring taps of a row are neighboring vectors.
 
 use super::bands::{Bands, Scratch, aligned, with_scratch};
-use super::correlate::offset;
 use super::depthwise;
+use super::shapes::{WeightSums, offset};
 use crate::simd;
 use crate::tile::{Kernel, MOST_VECTORS, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
@@ -15,21 +15,6 @@ use std::ops::Range;
 const PIXELS: usize = 768;
 /// Fewest rows of a task, as each copies its input again.
 const FEWEST_ROWS: usize = 32;
-
-/// Shapes of a weight gradient: `d` is `[batch, groups · rows, grid]`, `x` `[batch, groups · columns, input]`.
-#[derive(Clone, Copy, Debug)]
-pub struct WeightSums {
-    pub batch: usize,
-    pub groups: usize,
-    pub rows: usize,
-    pub grid: [usize; 2],
-    pub columns: usize,
-    pub input: [usize; 2],
-    pub kernel: [usize; 2],
-    pub step: [usize; 2],
-    pub padding: [usize; 2],
-    pub dilation: [usize; 2],
-}
 
 /// How the copy of a block of channels lies: `[image, row, column, width]`.
 #[derive(Clone, Copy)]
