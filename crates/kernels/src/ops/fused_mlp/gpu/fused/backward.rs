@@ -166,6 +166,20 @@ fn load_feeds<E: Float>(
     }
 }
 
+/// Adds the columns of G of layer `j` to the units' sums for its bias.
+#[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
+#[cube]
+fn add_bias_sums<E: Float>(g: &Shared<[E]>, bias: &mut Array<f32>, #[comptime] plan: Plan, #[comptime] j: usize) {
+    if comptime!(plan.layers[j].bias.is_some()) {
+        let slot = comptime!(plan.biases_before(j));
+        if (UNIT_POS as usize) < comptime!(plan.layers[j].padded) {
+            for r in 0..comptime!(plan.tile) {
+                bias[slot] += f32::cast_from(g[r * comptime!(plan.g) + UNIT_POS as usize]);
+            }
+        }
+    }
+}
+
 /// Adds `Xᵀ G` of layer `j` to the planes' blocks, on tensor cores.
 #[cube]
 fn add_weight_blocks<E: Float>(
@@ -448,14 +462,7 @@ pub(super) fn backward_tiles<E: Float>(
             layer_gradient::<E>(kept, h0, h1, d0, d1, &gradients, &mut g, first, rows, scale, comptime!(plan.clone()), j);
             load_feeds::<E>(x0, x1, x2, kept, &mut x, first, rows, most, comptime!(plan.clone()), j);
             sync_cube();
-            if comptime!(plan.layers[j].bias.is_some()) {
-                let slot = comptime!(plan.biases_before(j));
-                if (UNIT_POS as usize) < comptime!(plan.layers[j].padded) {
-                    for r in 0..tile {
-                        bias[slot] += f32::cast_from(g[r * comptime!(plan.g) + UNIT_POS as usize]);
-                    }
-                }
-            }
+            add_bias_sums::<E>(&g, &mut bias, comptime!(plan.clone()), j);
             if comptime!(plan.tensor) {
                 add_weight_blocks::<E>(&x, &g, &blocks, comptime!(plan.clone()), j);
             } else {
