@@ -3,7 +3,7 @@
 use crate::gpu::{Gpu, GpuError};
 use crate::ops::{
     adam, composite, depth_loss, distortion, field_step, frequency, fused_mlp, hash_grid, linear, march, marching_cubes,
-    marching_tetrahedra, pixel_gather, ray_aabb, ray_generation, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
+    marching_tetrahedra, pixel_gather, prune, ray_aabb, ray_generation, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
     trilinear_corner_grid,
 };
 
@@ -31,6 +31,7 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         sample_pdf::cases::check,
         trilinear_corner_grid::cases::check,
         pixel_gather::cases::check,
+        prune::cases::check,
         adam::cases::check,
         ray_generation::cases::check,
         ssim::cases::check,

@@ -10,8 +10,8 @@ use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::march::MarchConfig;
-use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays};
+use diorama_kernels::ops::prune::gpu as prune;
 use diorama_kernels::ops::sample_pdf::gpu::strata;
 
 /// Samples that there is room for, and where the CPU plays the device.
@@ -133,7 +133,7 @@ impl GpuTracer {
         batch: &RayBatch,
         (first, n): (usize, usize),
         placement: &Placement,
-        limits: Limits,
+        pruning: Pruning,
         appearance: Option<u32>,
         out: &mut (Traced, Vec<f32>),
     ) -> Result<(), GpuError> {
@@ -148,9 +148,9 @@ impl GpuTracer {
         };
         let view = match (placement, &self.occupancy, &self.coarse) {
             (Placement::March(config), Some(grid), _) => {
-                let Some((view, light)) = self.marched(grid, &rays, config, limits, appearance, n > 1)? else {
-                    self.part(batch, (first, n / 2), placement, limits, appearance, out)?;
-                    return self.part(batch, (first + n / 2, n - n / 2), placement, limits, appearance, out);
+                let Some((view, light)) = self.marched(grid, &rays, config, pruning, appearance, n > 1)? else {
+                    self.part(batch, (first, n / 2), placement, pruning, appearance, out)?;
+                    return self.part(batch, (first + n / 2, n - n / 2), placement, pruning, appearance, out);
                 };
                 out.1.extend(gpu.read(&light)?);
                 view
@@ -180,7 +180,7 @@ impl GpuTracer {
         grid: &GpuOccupancy,
         rays: &GpuRays,
         config: &MarchConfig,
-        limits: Limits,
+        pruning: Pruning,
         appearance: Option<u32>,
         may_split: bool,
     ) -> Result<Option<(GpuComposited, Buffer)>, GpuError> {
@@ -191,7 +191,7 @@ impl GpuTracer {
         }
         let features = f.features(gpu, rays, &marched.packed);
         let sigma = f.shape.net.density(gpu, &f.weights, &features, &marched.packed.rows());
-        let pruned = prune::prune(gpu, &marched.packed, &sigma, limits, &marched.cut, self.room);
+        let pruned = prune::prune(gpu, &marched.packed, &sigma, &pruning, &marched.cut, self.room);
         let features = f.shape.net.take(gpu, &pruned, &features);
         Ok(Some((f.see(gpu, rays, &pruned.packed, &features, appearance), pruned.light)))
     }
@@ -209,9 +209,7 @@ impl Accelerator for GpuTracer {
         pruning: Pruning,
         appearance: Option<u32>,
     ) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
-        let Pruning { stop, min_alpha, thin, min_weight } = pruning;
         let mut out = (Traced::default(), Vec::new());
-        let limits = Limits { stop, min_alpha, thin, min_weight };
         let at_once = match placement {
             Placement::March(_) => batch.len(),
             Placement::Stratified { samples } => self.room / samples.max(&1),
@@ -219,7 +217,7 @@ impl Accelerator for GpuTracer {
         };
         for first in (0..batch.len()).step_by(at_once.max(1)) {
             let n = at_once.max(1).min(batch.len() - first);
-            self.part(batch, (first, n), placement, limits, appearance, &mut out).map_err(unserved)?;
+            self.part(batch, (first, n), placement, pruning, appearance, &mut out).map_err(unserved)?;
         }
         Ok((out.0, matches!(placement, Placement::March(_)).then_some(out.1)))
     }

@@ -2,22 +2,21 @@
 
 use super::shape::Shape;
 use crate::fields::Field;
-use crate::losses::ColorLoss;
 use crate::params::ParamGroup;
 use crate::samplers::occupancy::Occupancy;
 use crate::step::{self, Figures, GivenRays, Loss, Placement, Probes, RaySource, Scene, Step, Trainees};
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
-use diorama_kernels::ops::field_step::gpu::loss::{self, SUMS, Target, Terms};
 use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
 use diorama_kernels::ops::linear::{self, Activation, Dense};
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
-use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuRays};
+use diorama_kernels::ops::photometric_loss::gpu::{self as loss, SUMS, Target, Terms};
 use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, Drawn, GpuPhotographs};
+use diorama_kernels::ops::prune::gpu as prune;
 use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
 use diorama_kernels::ops::sample_pdf::gpu::strata;
 use diorama_kernels::ops::{ray_aabb, spherical_harmonics};
@@ -214,9 +213,8 @@ impl GpuField {
 
     /// What counts, as kernels take it.
     fn terms(&self, t: &crate::losses::Terms) -> Terms {
-        let huber = if let ColorLoss::Huber(width) = t.color { width } else { 0.0 };
         let normalized = self.shape.is_unbounded;
-        Terms { huber, relative: self.shape.relative, distortion: t.distortion, normalized, alpha: t.alpha, depth: t.depth }
+        Terms { color: t.color, relative: self.shape.relative, distortion: t.distortion, normalized, alpha: t.alpha, depth: t.depth }
     }
 }
 
@@ -389,15 +387,14 @@ impl GpuTrainer {
             of.train(gpu, s, &self.sums, r, &on)
         };
         match s.placement {
-            Placement::Occupancy { march: config, pruning: p, room } => {
+            Placement::Occupancy { march: config, pruning, room } => {
                 // All samples in occupied cells: their densities decide which are trained, and keep the grid up to date.
                 let grid = self.occupancy.as_ref().expect("an occupancy grid");
                 let marched = march::march(gpu, &grid.bits, rays, &config, room.0);
                 let (points, features) = self.field.encode(gpu, rays, &marched.packed);
                 let all = marched.packed.rows();
                 let sigma = self.field.shape.net.density(gpu, &self.field.weights.values, &features, &all);
-                let limits = Limits { stop: p.stop, min_alpha: p.min_alpha, thin: p.thin, min_weight: p.min_weight };
-                let pruned = prune::prune(gpu, &marched.packed, &sigma, limits, &marched.cut, room.1);
+                let pruned = prune::prune(gpu, &marched.packed, &sigma, &pruning, &marched.cut, room.1);
                 grid.record(gpu, &all, &marched.cells, &sigma);
                 let on = Samples {
                     packed: &pruned.packed,

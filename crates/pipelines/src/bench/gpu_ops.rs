@@ -11,12 +11,13 @@ use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::composite::gpu::{self as composite, GpuGradients, GpuPacked};
-use diorama_kernels::ops::field_step::gpu::loss::{self, Figures, SUMS, Target, Terms};
 use diorama_kernels::ops::field_step::gpu::{Arithmetic, FieldInput, GpuNet};
 use diorama_kernels::ops::fused_mlp::gpu::fused::Element;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
 use diorama_kernels::ops::linear::{self, Activation};
+use diorama_kernels::ops::photometric_loss::ColorLoss;
+use diorama_kernels::ops::photometric_loss::gpu::{self as loss, Figures, SUMS, Target, Terms};
 use diorama_kernels::ops::spherical_harmonics;
 
 /// Samples per ray.
@@ -184,7 +185,7 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
         let figures = Figures { sums: &sums, marched: &p.offsets, is_main: true };
         loss::composite_and_loss(
             gpu,
-            Terms { huber: 0.0, relative: 0.0, distortion: 0.0, normalized: false, alpha: 0.0, depth: 0.0 },
+            Terms { color: ColorLoss::Mse, relative: 0.0, distortion: 0.0, normalized: false, alpha: 0.0, depth: 0.0 },
             &p,
             (&sigma, &rgb),
             target,

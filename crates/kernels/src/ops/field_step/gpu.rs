@@ -1,7 +1,5 @@
 //! The standard field on the device: encoded positions, network, compositing, and back.
 
-pub mod loss;
-
 use super::FieldNet;
 use crate::gpu::{Accumulate, Buffer, Gpu, Rows, launch};
 use crate::ops::composite::gpu::{self as composite, GpuComposited, GpuGradients, GpuPacked};
@@ -10,7 +8,7 @@ use crate::ops::fused_mlp::gpu::{self as mlp, columns};
 use crate::ops::fused_mlp::{Head, Mlp, reference};
 use crate::ops::linear::gpu as linear;
 use crate::ops::linear::reference::{activate, slope};
-use crate::ops::march::gpu::prune::Pruned;
+use crate::ops::prune::gpu::Pruned;
 use cubecl::prelude::*;
 use diorama_geom::rng::Rng;
 

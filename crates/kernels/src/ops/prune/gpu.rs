@@ -1,23 +1,11 @@
-//! Leaving out samples that cannot matter, before the costly part of a step: those behind opaque matter and
-//! those that hold next to nothing.
+//! One unit per ray: first to decide which samples stay, then, with their places known, to bring them together.
 
-use super::bounded;
+use super::Pruning;
 use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::GpuPacked;
+use crate::ops::march::gpu::bounded;
 use crate::ops::scan;
 use cubecl::prelude::*;
-
-/// Which samples are left out.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Limits {
-    /// Share of light behind which nothing counts.
-    pub stop: f32,
-    /// Opacity below which a sample is left out, unless it is denser than `thin`.
-    pub min_alpha: f32,
-    pub thin: f32,
-    /// Weight in the pixel below which a sample is left out.
-    pub min_weight: f32,
-}
 
 /// The samples that stay.
 pub struct Pruned {
@@ -28,9 +16,9 @@ pub struct Pruned {
     source: Buffer<u32>,
 }
 
-/// Keeps what [`Limits`] leave of samples with densities `[S]`, as many as `capacity` holds; rays that lose others
+/// Keeps what [`Pruning`] leaves of samples with densities `[S]`, as many as `capacity` holds; rays that lose others
 /// for want of room are marked in `cut`. Densities that no light reaches become −1.
-pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: Limits, cut: &Buffer<u32>, capacity: usize) -> Pruned {
+pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: &Pruning, cut: &Buffer<u32>, capacity: usize) -> Pruned {
     let (n, s) = (p.rays(), p.t.len());
     let counts = gpu.empty(n);
     let (kept, light) = (gpu.empty(s), gpu.empty(n));

@@ -1,5 +1,6 @@
-//! The loss of a batch of rays: colour, opacity, distortion and depth, each a mean over the rays.
+//! The loss of a batch of rays: color, opacity, distortion and depth, each a mean over the rays.
 
+use super::ColorLoss;
 use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::{GpuComposited, GpuGradients, GpuPacked};
 use crate::ops::{depth_loss, distortion};
@@ -14,8 +15,7 @@ const PARTS: usize = 256;
 /// What counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Terms {
-    /// Width of the Huber loss's quadratic part; 0: squared error.
-    pub huber: f32,
+    pub color: ColorLoss,
     /// For linear light: what is added to a prediction that its difference is divided by; 0: differences count as they are.
     pub relative: f32,
     /// Weight of the distortion loss.
@@ -26,6 +26,16 @@ pub struct Terms {
     pub alpha: f32,
     /// Weight of the light that ends away from surfaces of known distance ([`depth_loss`]).
     pub depth: f32,
+}
+
+impl ColorLoss {
+    /// Width of the quadratic part as kernels take it; 0: all of it.
+    fn width(self) -> f32 {
+        match self {
+            ColorLoss::Mse => 0.0,
+            ColorLoss::Huber(width) => width,
+        }
+    }
 }
 
 /// Where a step's figures are added.
@@ -54,7 +64,7 @@ pub struct Target<'a> {
 
 /// Composites packed samples with densities `[S]` and colours `[S, 3]`, compares them, and takes the gradients back to
 /// both, all rays in one launch; adds the step's figures. Also gives the squared error of each ray `[R]`. Gradients
-/// closer than `near_scaling` are scaled as by [`super::scale_near_gradients`].
+/// closer than `near_scaling` are scaled as by [`crate::ops::field_step::gpu::scale_near_gradients`].
 pub fn composite_and_loss(
     gpu: &Gpu,
     terms: Terms,
@@ -93,7 +103,7 @@ pub fn composite_and_loss(
         ],
         r as u32,
         1.0 / r as f32,
-        terms.huber,
+        terms.color.width(),
         terms.relative,
         terms.alpha,
         terms.distortion,
@@ -130,7 +140,7 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
         ],
         r as u32,
         1.0 / r as f32,
-        terms.huber,
+        terms.color.width(),
         terms.relative,
         terms.alpha,
         terms.distortion,
