@@ -9,13 +9,7 @@ const APPLICATIONS: [&str; 5] = ["object", "text", "world", "head", "relight"];
 const SHARED: &str = "run";
 
 /// Arrows that close a circle today: (crate, module from, module to). One that is gone leaves the list.
-const CIRCLES: [(&str, &str, &str); 5] = [
-    ("data", "sparse", "colmap"),
-    ("engine", "renderers::volume", "renderers::blocks"),
-    ("engine", "renderers::volume", "renderers::supervised"),
-    ("pipelines", "object::memory", "object::export"),
-    ("viewer", "session", "server"),
-];
+const CIRCLES: [(&str, &str, &str); 0] = [];
 
 /// A source of a crate.
 pub struct Source {

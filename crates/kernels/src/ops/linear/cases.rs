@@ -32,7 +32,7 @@ pub struct Case {
 
 /// Every bias and activation at each size.
 pub fn cases() -> impl Iterator<Item = Case> {
-    let sizes = [(0, 3, 4), (1, 1, 1), (7, 5, 3), (500, 64, 64), (385, 33, 257), (12, 256, 16), (1300, 8, 5)];
+    let sizes = [(0, 3, 4), (1, 1, 1), (7, 5, 3), (500, 64, 64), (385, 33, 257), (12, 256, 16), (1300, 8, 5), (5000, 9, 11)];
     let biases = [BiasKind::None, BiasKind::Shared, BiasKind::PerRow];
     let all = sizes.into_iter().flat_map(move |size| biases.into_iter().flat_map(move |b| ACTIVATIONS.map(|a| (size, b, a))));
     all.map(|((m, k, n), bias, activation)| Case {
@@ -40,7 +40,7 @@ pub fn cases() -> impl Iterator<Item = Case> {
         layer: Dense { k, n, bias, activation },
         x: random(m * k, 1),
         w: random(k * n, 2).iter().map(|w| w / (k as f32).sqrt()).collect(),
-        bias: random(bias.numbers(m, n), 3),
+        bias: random(bias.len(m, n), 3),
         d: random(m * n, 4),
     })
 }

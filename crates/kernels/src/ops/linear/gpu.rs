@@ -66,7 +66,7 @@ pub(crate) fn finish(gpu: &Gpu, out: &Buffer, rows: &Rows, &Dense { n, bias: kin
     // Bound where there is no bias to read.
     let spare = gpu.empty(0);
     let bias = bias.unwrap_or(Part::from(&spare));
-    let bias_len = kind.numbers(rows.most, n);
+    let bias_len = kind.len(rows.most, n);
     let bias_kind = match kind {
         BiasKind::None => 0u32,
         BiasKind::Shared => 1,

@@ -47,8 +47,8 @@ pub enum BiasKind {
 }
 
 impl BiasKind {
-    /// Numbers of the bias of `m` rows of `n` outputs.
-    pub fn numbers(self, m: usize, n: usize) -> usize {
+    /// Numbers of a bias for `m` rows of `n` outputs.
+    pub fn len(self, m: usize, n: usize) -> usize {
         match self {
             BiasKind::None => 0,
             BiasKind::Shared => n,
@@ -57,7 +57,28 @@ impl BiasKind {
     }
 }
 
-/// Shape of a layer that maps rows of `k` numbers to rows of `n`, its bias and activation.
+/// A layer on the CPU: `[rows, inputs] → [rows, outputs]`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Linear {
+    pub rows: usize,
+    pub inputs: usize,
+    pub outputs: usize,
+    pub bias: BiasKind,
+    pub activation: Activation,
+}
+
+/// Destinations of a backward pass, overwritten; what is `None` is not computed.
+#[derive(Default)]
+pub struct Gradients<'a> {
+    /// `[rows, inputs]`
+    pub x: Option<&'a mut [f32]>,
+    /// `[inputs, outputs]`
+    pub w: Option<&'a mut [f32]>,
+    /// As the bias.
+    pub bias: Option<&'a mut [f32]>,
+}
+
+/// Shape of a layer that maps rows of `k` numbers to rows of `n`, whose rows are known elsewhere.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Dense {
     pub k: usize,
@@ -69,5 +90,10 @@ pub struct Dense {
 impl Dense {
     pub fn without_bias(k: usize, n: usize, activation: Activation) -> Dense {
         Dense { k, n, bias: BiasKind::None, activation }
+    }
+
+    /// The layer on so many rows.
+    pub fn of_rows(&self, rows: usize) -> Linear {
+        Linear { rows, inputs: self.k, outputs: self.n, bias: self.bias, activation: self.activation }
     }
 }
