@@ -150,14 +150,8 @@ fn train(device: &mut Device) -> (Vec<f64>, Field) {
     let (mut field, mut occupancy) = (field(), occupancy());
     let march = occupancy.march_config(512);
     let scene = Scene { cameras: Vec::new(), near: 0.05, cube: (0.0, 1.0) };
-    let mut of = Trainees {
-        field: &mut field,
-        coarse: None,
-        learned: None,
-        occupancy: Some(&mut occupancy),
-        corrections: None,
-        error_map: None,
-    };
+    let mut of =
+        Trainees { field: &mut field, coarse: None, learned: None, occupancy: Some(&mut occupancy), corrections: None, error_map: None };
     device.begin(&of, scene, None).unwrap();
     let rays = PATCH * PATCH;
     let (images, jitter, background) = (vec![0; rays], vec![0.5; rays], vec![0.0; rays * CHANNELS]);
