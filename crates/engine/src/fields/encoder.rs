@@ -62,6 +62,11 @@ impl VoxelGrid {
         (self.table_rows * self.features).next_multiple_of(16)
     }
 
+    /// Voxel of each cell, `[resolution³]`, x fastest; voxel 0 stands for all that is empty.
+    pub fn cells(&self) -> &[u32] {
+        &self.cells
+    }
+
     /// Rows of the voxels' corners, `[voxels, 8]`.
     pub fn rows(&self) -> &[u32] {
         &self.rows

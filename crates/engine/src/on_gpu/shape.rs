@@ -9,11 +9,14 @@ use diorama_kernels::ops::field_step::gpu::{Arithmetic, GpuNet};
 use diorama_kernels::ops::frequency::Frequency;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::march::gpu::Space;
-use diorama_kernels::ops::{frequency, spherical_harmonics};
+use diorama_kernels::ops::trilinear_corner_grid::gpu::{GpuVoxels, keep_empty};
+use diorama_kernels::ops::{frequency, spherical_harmonics, triangle_wave};
 
 enum Encoder {
     Hash(GpuHashGrid),
     Frequency(Frequency),
+    TriangleWave { bands: usize },
+    VoxelCorners { voxels: GpuVoxels, features: usize },
 }
 
 /// A field's shape on the device.
@@ -36,45 +39,71 @@ impl Shape {
         let (encoder, per_level) = match &field.encoder {
             FieldEncoder::Hash { grid, .. } => (Encoder::Hash(GpuHashGrid::new(gpu, grid)), grid.config.features),
             FieldEncoder::Frequency(f) => (Encoder::Frequency(*f), 0),
-            other => panic!("no GPU encodes positions by {other:?}"),
+            FieldEncoder::TriangleWave { bands } => (Encoder::TriangleWave { bands: *bands }, 0),
+            FieldEncoder::VoxelCorners { grid, .. } => {
+                let voxels = GpuVoxels::upload(gpu, grid.resolution, grid.cells(), grid.rows());
+                (Encoder::VoxelCorners { voxels, features: grid.features }, 0)
+            }
         };
         // The features' where there is a table or positions move, and the appearance codes'; directions have none.
-        let mut wanted = vec![per_level > 0 || moves];
+        let mut wanted = vec![field.encoder.table().is_some() || moves];
         wanted.extend((field.codes.direction.dims() > 0).then_some(false));
         wanted.extend(field.codes.appearance.as_ref().map(|_| true).into_iter().chain(field.codes.given.iter().map(|_| true)));
-        let space = match (&encoder, field.space) {
-            (Encoder::Hash(_), geom::Space::Contracted(edge)) => Space::Contracted(edge),
-            (Encoder::Hash(_), geom::Space::Cube(edge)) => Space::Cube(edge),
-            (Encoder::Frequency(_), geom::Space::Contracted(edge)) => Space::ContractedCentred(edge),
-            (Encoder::Frequency(_), geom::Space::Cube(edge)) => Space::Centred(edge),
+        let space = match (field.encoder.is_centered(), field.space) {
+            (false, geom::Space::Contracted(edge)) => Space::Contracted(edge),
+            (false, geom::Space::Cube(edge)) => Space::Cube(edge),
+            (true, geom::Space::Contracted(edge)) => Space::ContractedCentred(edge),
+            (true, geom::Space::Cube(edge)) => Space::Centred(edge),
         };
         let net = GpuNet::new(gpu, &field.net, &field.density_net(Precision::F32), per_level, &wanted, arithmetic);
         let is_unbounded = field.is_unbounded();
         Shape { encoder, directions: field.codes.direction, net, space, is_unbounded, relative: relative(field) }
     }
 
-    /// Encoded points `[S, 3]` of the field's space; a hash grid reads its table.
+    /// Encoded points `[S, 3]` of the field's space.
+    ///
+    /// # Panics
+    /// When the encoder has a table and none is given.
     pub fn features(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: Option<&Buffer>) -> Buffer {
-        match (&self.encoder, table) {
-            (Encoder::Hash(grid), Some(table)) => self.net.features(gpu, rows, grid.forward(gpu, rows, points, table)),
-            (Encoder::Frequency(f), _) => frequency::gpu::forward(gpu, f, points),
-            (Encoder::Hash(_), None) => unreachable!("a hash field has a table"),
+        let table = || table.expect("the encoder's table");
+        match &self.encoder {
+            Encoder::Hash(grid) => self.net.features(gpu, rows, grid.forward(gpu, rows, points, table())),
+            Encoder::Frequency(f) => frequency::gpu::forward(gpu, f, points),
+            Encoder::TriangleWave { bands } => triangle_wave::gpu::forward(gpu, *bands, points),
+            Encoder::VoxelCorners { voxels, features } => {
+                let (corners, local) = voxels.locate(gpu, rows, points);
+                corners.forward(gpu, &local, table(), *features)
+            }
         }
     }
 
     /// Gradient of the points.
+    ///
+    /// # Panics
+    /// When the encoder has a table and none is given.
     pub fn points_backward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: Option<&Buffer>, d_features: &Buffer) -> Buffer {
-        match (&self.encoder, table) {
-            (Encoder::Hash(grid), Some(table)) => grid.backward_positions(gpu, rows, points, table, d_features),
-            (Encoder::Frequency(f), _) => frequency::gpu::backward(gpu, f, points, d_features),
-            (Encoder::Hash(_), None) => unreachable!("a hash field has a table"),
+        let table = || table.expect("the encoder's table");
+        match &self.encoder {
+            Encoder::Hash(grid) => grid.backward_positions(gpu, rows, points, table(), d_features),
+            Encoder::Frequency(f) => frequency::gpu::backward(gpu, f, points, d_features),
+            Encoder::TriangleWave { bands } => triangle_wave::gpu::backward(gpu, *bands, points, d_features),
+            Encoder::VoxelCorners { voxels, features } => {
+                let (corners, local) = voxels.locate(gpu, rows, points);
+                corners.places_backward(gpu, &local, table(), *features, d_features, voxels.edge())
+            }
         }
     }
 
     /// Adds to the gradient of the table, where there is one.
     pub fn table_backward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, d_features: &Buffer, d_table: &Buffer) {
-        if let Encoder::Hash(grid) = &self.encoder {
-            grid.backward(gpu, rows, points, d_features, d_table);
+        match &self.encoder {
+            Encoder::Hash(grid) => grid.backward(gpu, rows, points, d_features, d_table),
+            Encoder::VoxelCorners { voxels, features } => {
+                let (corners, local) = voxels.locate(gpu, rows, points);
+                corners.table_backward(gpu, &local, *features, d_features, d_table);
+                keep_empty(gpu, *features, d_table);
+            }
+            Encoder::Frequency(_) | Encoder::TriangleWave { .. } => {}
         }
     }
 

@@ -317,15 +317,17 @@ pub fn look_up_backward(gpu: &Gpu, d: &Buffer, index: &Buffer<u32>, width: usize
     launch!(gpu, add_rows::<Adder>, n, [d => n, index => rows, d_table => d_table.len()], n as u32, width as u32);
 }
 
-/// Scales gradients of samples closer than `reach` by the square of their share of it.
-pub fn scale_near_gradients(gpu: &Gpu, p: &GpuPacked, d_sigma: &Buffer, d_rgb: &Buffer, reach: f32) {
+/// Scales gradients of densities `[S]` and outputs `[S, C]` of samples closer than `reach` by the square of their share of it.
+pub fn scale_near_gradients(gpu: &Gpu, p: &GpuPacked, d_sigma: &Buffer, d_outputs: &Buffer, reach: f32) {
     let (rows, s) = (p.rows(), p.t.len());
+    let channels = d_outputs.len() / s.max(1);
     launch!(
         gpu,
         scale_near,
         s,
-        [rows.live => rows.at + 1, p.t => s, p.dt => s, d_sigma => s, d_rgb => s * 3],
+        [rows.live => rows.at + 1, p.t => s, p.dt => s, d_sigma => s, d_outputs => s * channels],
         rows.place(),
+        channels as u32,
         reach,
     );
 }
@@ -423,7 +425,7 @@ fn add_rows<A: Accumulate>(d: &[f32], index: &[u32], d_table: &[Atomic<A::Cell>]
 }
 
 #[cube(launch_unchecked)]
-fn scale_near(live: &[u32], t: &[f32], dt: &[f32], d_sigma: &mut [f32], d_rgb: &mut [f32], at: u32, reach: f32) {
+fn scale_near(live: &[u32], t: &[f32], dt: &[f32], d_sigma: &mut [f32], d_outputs: &mut [f32], at: u32, channels: u32, reach: f32) {
     let i = ABSOLUTE_POS;
     if i >= live[at as usize] as usize {
         terminate!();
@@ -431,9 +433,8 @@ fn scale_near(live: &[u32], t: &[f32], dt: &[f32], d_sigma: &mut [f32], d_rgb: &
     let share = (t[i] + 0.5 * dt[i]) / reach;
     if share < 1.0 {
         d_sigma[i] *= share * share;
-        #[unroll]
-        for k in 0..3usize {
-            d_rgb[i * 3 + k] *= share * share;
+        for k in 0..channels as usize {
+            d_outputs[i * channels as usize + k] *= share * share;
         }
     }
 }

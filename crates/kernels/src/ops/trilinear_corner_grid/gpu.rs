@@ -1,7 +1,7 @@
 //! One unit per sample and channel; the table's gradient is added atomically.
 
 use super::Corners;
-use crate::gpu::{Accumulate, Buffer, Gpu, launch};
+use crate::gpu::{Accumulate, Buffer, Gpu, Rows, launch};
 use cubecl::prelude::*;
 
 /// Which rows the samples mix, on the device.
@@ -32,18 +32,23 @@ impl GpuCorners {
         out
     }
 
-    /// Gradient of the places; that of the table is added to `d_table`.
-    pub fn backward(&self, gpu: &Gpu, local: &Buffer, table: &Buffer, c: usize, d_out: &Buffer, d_table: &Buffer) -> Buffer {
+    /// Adds the gradient of the table to `d_table`.
+    pub fn table_backward(&self, gpu: &Gpu, local: &Buffer, c: usize, d_out: &Buffer, d_table: &Buffer) {
         let s = self.voxel.len();
-        let d_local = gpu.empty(s * 3);
         launch!(
             gpu,
             unmix::<Adder>,
             s * c,
-            [self.rows => self.rows.len(), self.voxel => s, local => s * 3, d_out => s * c, d_table => table.len()],
+            [self.rows => self.rows.len(), self.voxel => s, local => s * 3, d_out => s * c, d_table => d_table.len()],
             (s * c) as u32,
             c as u32,
         );
+    }
+
+    /// Gradient `[S, 3]` of the places, in voxels whose edge is so long.
+    pub fn places_backward(&self, gpu: &Gpu, local: &Buffer, table: &Buffer, c: usize, d_out: &Buffer, edge: f32) -> Buffer {
+        let s = self.voxel.len();
+        let d_local = gpu.empty(s * 3);
         launch!(
             gpu,
             slope,
@@ -58,9 +63,54 @@ impl GpuCorners {
             ],
             s as u32,
             c as u32,
+            1.0 / edge,
         );
         d_local
     }
+}
+
+/// Which voxels of a cube are occupied, on the device.
+pub struct GpuVoxels {
+    resolution: usize,
+    /// Voxel of each cell, `[resolution³]`, x fastest; 0 where it is empty.
+    cells: Buffer<u32>,
+    /// Rows of the table at each voxel's corners, `[voxels, 8]`.
+    rows: Buffer<u32>,
+}
+
+impl GpuVoxels {
+    /// # Panics
+    /// When there are not `resolution³` cells.
+    pub fn upload(gpu: &Gpu, resolution: usize, cells: &[u32], rows: &[u32]) -> Self {
+        assert_eq!(cells.len(), resolution.pow(3), "voxels: cells");
+        GpuVoxels { resolution, cells: gpu.upload(cells), rows: gpu.upload(rows) }
+    }
+
+    /// Voxels of points `[S, 3]` of `[0, 1]³`, and where in them the points lie, `[S, 3]`; rows that are not live lie in voxel 0.
+    pub fn locate(&self, gpu: &Gpu, rows: &Rows, points: &Buffer) -> (GpuCorners, Buffer) {
+        let s = rows.most;
+        let (voxel, local) = (gpu.empty(s), gpu.empty(s * 3));
+        launch!(
+            gpu,
+            find,
+            s,
+            [rows.live => rows.at + 1, points => s * 3, self.cells => self.cells.len(), voxel => s, local => s * 3],
+            rows.place(),
+            s as u32,
+            self.resolution as u32,
+        );
+        (GpuCorners { rows: self.rows.clone(), voxel }, local)
+    }
+
+    /// Edge of a voxel as a share of the cube's.
+    pub fn edge(&self) -> f32 {
+        1.0 / self.resolution as f32
+    }
+}
+
+/// Sets the gradient of the row that belongs to all that is empty to 0: what is empty stays so.
+pub fn keep_empty(gpu: &Gpu, c: usize, d_table: &Buffer) {
+    launch!(gpu, clear, c, [d_table => c], c as u32);
 }
 
 /// Share of a corner along one axis.
@@ -76,6 +126,42 @@ fn share(u: f32, bit: u32) -> f32 {
 #[cube]
 fn weight(local: &[f32], s: usize, corner: u32) -> f32 {
     share(local[s * 3], corner & 1) * share(local[s * 3 + 1], (corner >> 1) & 1) * share(local[s * 3 + 2], (corner >> 2) & 1)
+}
+
+#[cube(launch_unchecked)]
+fn find(live: &[u32], points: &[f32], cells: &[u32], voxel: &mut [u32], local: &mut [f32], at: u32, most: u32, resolution: u32) {
+    let s = ABSOLUTE_POS;
+    if s >= most as usize {
+        terminate!();
+    }
+    let n = resolution as usize;
+    let is_live = s < live[at as usize] as usize;
+    let mut index = 0usize;
+    let mut stride = 1usize;
+    for k in 0..3usize {
+        let mut v = 0.0f32;
+        if is_live {
+            v = min(max(points[s * 3 + k], 0.0), 1.0) * f32::cast_from(resolution);
+        }
+        let cell = min(u32::cast_from(v), resolution - 1);
+        local[s * 3 + k] = v - f32::cast_from(cell);
+        index += cell as usize * stride;
+        stride *= n;
+    }
+    let mut of = 0u32;
+    if is_live {
+        of = cells[index];
+    }
+    voxel[s] = of;
+}
+
+#[cube(launch_unchecked)]
+fn clear(d_table: &mut [f32], n: u32) {
+    let i = ABSOLUTE_POS;
+    if i >= n as usize {
+        terminate!();
+    }
+    d_table[i] = 0.0;
 }
 
 #[cube(launch_unchecked)]
@@ -111,7 +197,7 @@ fn unmix<A: Accumulate>(rows: &[u32], voxel: &[u32], local: &[f32], d_out: &[f32
 }
 
 #[cube(launch_unchecked)]
-fn slope(rows: &[u32], voxel: &[u32], local: &[f32], table: &[f32], d_out: &[f32], d_local: &mut [f32], n: u32, channels: u32) {
+fn slope(rows: &[u32], voxel: &[u32], local: &[f32], table: &[f32], d_out: &[f32], d_local: &mut [f32], n: u32, channels: u32, scale: f32) {
     let s = ABSOLUTE_POS;
     if s >= n as usize {
         terminate!();
@@ -139,7 +225,7 @@ fn slope(rows: &[u32], voxel: &[u32], local: &[f32], table: &[f32], d_out: &[f32
         gy += v * wx * wz * (2.0 * f32::cast_from(by) - 1.0);
         gz += v * wx * wy * (2.0 * f32::cast_from(bz) - 1.0);
     }
-    d_local[s * 3] = gx;
-    d_local[s * 3 + 1] = gy;
-    d_local[s * 3 + 2] = gz;
+    d_local[s * 3] = scale * gx;
+    d_local[s * 3 + 1] = scale * gy;
+    d_local[s * 3 + 2] = scale * gz;
 }
