@@ -1,6 +1,8 @@
 //! Models of COLMAP: good ones of every camera model, and broken ones.
 
 use super::*;
+use diorama_geom::glam::DVec3;
+use diorama_geom::transform::rotation_from_quaternion;
 
 fn binary(dir: &Path, model: u32, params: &[f64], names: &[&str]) {
     let mut cameras = 1u64.to_le_bytes().to_vec();

@@ -7,6 +7,7 @@ pub mod camera_path_json;
 pub mod checkpoint;
 pub mod collada;
 pub mod colmap;
+mod colmap_model;
 pub mod depth;
 pub mod error;
 pub mod film;

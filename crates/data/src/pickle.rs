@@ -112,115 +112,122 @@ impl Machine<'_> {
                     return Ok(());
                 }
                 b'(' => self.marks.push(self.stack.len()),
-                b'0' => drop(self.pop()?),
-                b'N' => self.push(Node::None),
-                0x88 => self.push(Node::Bool(true)),
-                0x89 => self.push(Node::Bool(false)),
-                b'J' => {
-                    let v = i32::from_le_bytes(self.bytes()?);
-                    self.push(Node::Int(v as i64));
-                }
-                b'K' => {
-                    let [v] = self.bytes()?;
-                    self.push(Node::Int(v as i64));
-                }
-                b'M' => {
-                    let v = u16::from_le_bytes(self.bytes()?);
-                    self.push(Node::Int(v as i64));
-                }
-                0x8a => {
-                    let [n] = self.bytes()?;
-                    let v = self.take(n as usize)?;
-                    self.push(long(&v));
-                }
-                b'G' => {
-                    let v = f64::from_be_bytes(self.bytes()?);
-                    self.push(Node::Float(v));
-                }
-                b'X' => self.text4()?,
-                0x8c => {
-                    let [n] = self.bytes()?;
-                    self.text(n as usize)?;
-                }
-                b'C' | b'U' => {
-                    let [n] = self.bytes()?;
-                    let v = self.take(n as usize)?;
-                    self.push(if op == b'C' { Node::Bytes(v) } else { Node::Text(String::from_utf8_lossy(&v).into_owned()) });
-                }
-                b'B' => {
-                    let n = u32::from_le_bytes(self.bytes()?);
-                    let v = self.take(n as usize)?;
-                    self.push(Node::Bytes(v));
-                }
-                b']' | b')' | 0x8f => self.push(Node::List(Vec::new())),
-                b'}' => self.push(Node::Dict(Vec::new())),
-                b't' | b'l' | 0x91 => {
-                    let v = self.since_mark()?;
-                    self.push(Node::List(v));
-                }
-                0x85..=0x87 => {
-                    let n = (op - 0x84) as usize;
-                    let first = self.stack.len().checked_sub(n).filter(|f| *f >= self.floor()).ok_or_else(short)?;
-                    let v = self.stack.split_off(first);
-                    self.push(Node::List(v));
-                }
-                b'a' => {
-                    let v = self.pop()?;
-                    self.append(vec![v])?;
-                }
-                b'e' | 0x90 => {
-                    let v = self.since_mark()?;
-                    self.append(v)?;
-                }
-                b's' => {
-                    let (v, k) = (self.pop()?, self.pop()?);
-                    self.set(&[k, v])?;
-                }
-                b'u' => {
-                    let v = self.since_mark()?;
-                    self.set(&v)?;
-                }
-                b'c' => {
-                    let (module, name) = (self.line()?, self.line()?);
-                    self.push(Node::Global(format!("{module} {name}")));
-                }
-                0x93 => {
-                    let (name, module) = (self.pop()?, self.pop()?);
-                    let both = self.out.text(module).zip(self.out.text(name)).map(|(m, n)| format!("{m} {n}"));
-                    self.push(Node::Global(both.ok_or("a name that is no text")?));
-                }
-                b'R' | 0x81 => {
-                    let (arguments, function) = (self.pop()?, self.pop()?);
-                    let empty = self.out.list(arguments).is_some_and(<[Id]>::is_empty);
-                    let is_dict = matches!(self.out.get(function), Node::Global(g) if g == "collections OrderedDict");
-                    self.push(if empty && is_dict { Node::Dict(Vec::new()) } else { Node::Call(function, arguments) });
-                }
                 // The state of an object says nothing about its tensors.
-                b'b' => drop(self.pop()?),
-                b'Q' => {
-                    let v = self.pop()?;
-                    self.push(Node::Persistent(v));
-                }
-                b'q' => {
-                    let [i] = self.bytes()?;
-                    self.remember(i as usize)?;
-                }
-                b'r' => {
-                    let i = u32::from_le_bytes(self.bytes()?);
-                    self.remember(i as usize)?;
-                }
-                0x94 => self.remember(self.memo.len())?,
-                b'h' => {
-                    let [i] = self.bytes()?;
-                    self.recall(i as usize)?;
-                }
-                b'j' => {
-                    let i = u32::from_le_bytes(self.bytes()?);
-                    self.recall(i as usize)?;
-                }
+                b'0' | b'b' => drop(self.pop()?),
+                _ if self.push_scalar(op)? || self.fill_container(op)? || self.push_object(op)? || self.use_memo(op)? => {}
                 _ => return Err(format!("pickle opcode 0x{op:02x}, which torch.save does not write")),
             }
         }
+    }
+
+    /// Pushes a number, text or bytes; whether `op` is one of these opcodes.
+    fn push_scalar(&mut self, op: u8) -> Result<bool, String> {
+        let node = match op {
+            b'N' => Node::None,
+            0x88 => Node::Bool(true),
+            0x89 => Node::Bool(false),
+            b'J' => Node::Int(i32::from_le_bytes(self.bytes()?) as i64),
+            b'K' => Node::Int(u8::from_le_bytes(self.bytes()?) as i64),
+            b'M' => Node::Int(u16::from_le_bytes(self.bytes()?) as i64),
+            0x8a => long(&self.short_bytes()?),
+            b'G' => Node::Float(f64::from_be_bytes(self.bytes()?)),
+            b'X' => text(self.long_bytes()?)?,
+            0x8c => text(self.short_bytes()?)?,
+            b'C' => Node::Bytes(self.short_bytes()?),
+            b'U' => Node::Text(String::from_utf8_lossy(&self.short_bytes()?).into_owned()),
+            b'B' => Node::Bytes(self.long_bytes()?),
+            _ => return Ok(false),
+        };
+        self.push(node);
+        Ok(true)
+    }
+
+    /// Makes or fills a tuple, list, set or dictionary; whether `op` is one of these opcodes.
+    fn fill_container(&mut self, op: u8) -> Result<bool, String> {
+        match op {
+            b']' | b')' | 0x8f => self.push(Node::List(Vec::new())),
+            b'}' => self.push(Node::Dict(Vec::new())),
+            b't' | b'l' | 0x91 => {
+                let v = self.since_mark()?;
+                self.push(Node::List(v));
+            }
+            0x85..=0x87 => {
+                let n = (op - 0x84) as usize;
+                let first = self.stack.len().checked_sub(n).filter(|f| *f >= self.floor()).ok_or_else(short)?;
+                let v = self.stack.split_off(first);
+                self.push(Node::List(v));
+            }
+            b'a' => {
+                let v = self.pop()?;
+                self.append(vec![v])?;
+            }
+            b'e' | 0x90 => {
+                let v = self.since_mark()?;
+                self.append(v)?;
+            }
+            b's' => {
+                let (v, k) = (self.pop()?, self.pop()?);
+                self.set(&[k, v])?;
+            }
+            b'u' => {
+                let v = self.since_mark()?;
+                self.set(&v)?;
+            }
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// Names a class or function, notes a call of one, or a reference out of the pickle; whether `op` is one of these opcodes.
+    fn push_object(&mut self, op: u8) -> Result<bool, String> {
+        match op {
+            b'c' => {
+                let (module, name) = (self.line()?, self.line()?);
+                self.push(Node::Global(format!("{module} {name}")));
+            }
+            0x93 => {
+                let (name, module) = (self.pop()?, self.pop()?);
+                let both = self.out.text(module).zip(self.out.text(name)).map(|(m, n)| format!("{m} {n}"));
+                self.push(Node::Global(both.ok_or("a name that is no text")?));
+            }
+            b'R' | 0x81 => {
+                let (arguments, function) = (self.pop()?, self.pop()?);
+                let empty = self.out.list(arguments).is_some_and(<[Id]>::is_empty);
+                let is_dict = matches!(self.out.get(function), Node::Global(g) if g == "collections OrderedDict");
+                self.push(if empty && is_dict { Node::Dict(Vec::new()) } else { Node::Call(function, arguments) });
+            }
+            b'Q' => {
+                let v = self.pop()?;
+                self.push(Node::Persistent(v));
+            }
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// Stores the top of the stack in the memo or pushes what the memo holds; whether `op` is one of these opcodes.
+    fn use_memo(&mut self, op: u8) -> Result<bool, String> {
+        match op {
+            b'q' => {
+                let [i] = self.bytes()?;
+                self.memo_put(i as usize)?;
+            }
+            b'r' => {
+                let i = u32::from_le_bytes(self.bytes()?);
+                self.memo_put(i as usize)?;
+            }
+            0x94 => self.memo_put(self.memo.len())?,
+            b'h' => {
+                let [i] = self.bytes()?;
+                self.memo_get(i as usize)?;
+            }
+            b'j' => {
+                let i = u32::from_le_bytes(self.bytes()?);
+                self.memo_get(i as usize)?;
+            }
+            _ => return Ok(false),
+        }
+        Ok(true)
     }
 
     fn take(&mut self, n: usize) -> Result<Vec<u8>, String> {
@@ -249,15 +256,16 @@ impl Machine<'_> {
         }
     }
 
-    fn text4(&mut self) -> Result<(), String> {
-        let n = u32::from_le_bytes(self.bytes()?);
-        self.text(n as usize)
+    /// Bytes after their number, which is one byte.
+    fn short_bytes(&mut self) -> Result<Vec<u8>, String> {
+        let [n] = self.bytes()?;
+        self.take(n as usize)
     }
 
-    fn text(&mut self, n: usize) -> Result<(), String> {
-        let text = String::from_utf8(self.take(n)?).map_err(|_| "a text that is not UTF-8")?;
-        self.push(Node::Text(text));
-        Ok(())
+    /// Bytes after their number, which is four bytes.
+    fn long_bytes(&mut self) -> Result<Vec<u8>, String> {
+        let n = u32::from_le_bytes(self.bytes()?);
+        self.take(n as usize)
     }
 
     fn push(&mut self, node: Node) {
@@ -265,7 +273,7 @@ impl Machine<'_> {
         self.out.nodes.push(node);
     }
 
-    /// What no opcode but those that look for the mark may take away.
+    /// Height of the stack at the last mark; only opcodes that look for the mark go below it.
     fn floor(&self) -> usize {
         self.marks.last().copied().unwrap_or(0)
     }
@@ -307,7 +315,7 @@ impl Machine<'_> {
         Ok(())
     }
 
-    fn remember(&mut self, i: usize) -> Result<(), String> {
+    fn memo_put(&mut self, i: usize) -> Result<(), String> {
         // Numbers are given one after the other; a gap as wide as the pickle is long is none of torch.save's.
         if i > self.memo.len() + 256 {
             return Err("a memo out of order".into());
@@ -320,11 +328,15 @@ impl Machine<'_> {
         Ok(())
     }
 
-    fn recall(&mut self, i: usize) -> Result<(), String> {
+    fn memo_get(&mut self, i: usize) -> Result<(), String> {
         let id = self.memo.get(i).copied().flatten().ok_or("a memo that was never set")?;
         self.stack.push(id);
         Ok(())
     }
+}
+
+fn text(bytes: Vec<u8>) -> Result<Node, String> {
+    Ok(Node::Text(String::from_utf8(bytes).map_err(|_| "a text that is not UTF-8")?))
 }
 
 fn short() -> String {

@@ -1,6 +1,6 @@
 //! The points of a structure-from-motion model: which photographs see them, and whether they lie where the poses say.
 
-use crate::colmap::{self, Keypoint, Registered};
+use crate::colmap_model::{self, Keypoint, Registered};
 use crate::error::Result;
 use diorama_geom::capture::{Agreement, Frame, FrameAgreement};
 use diorama_geom::glam::DVec2;
@@ -40,7 +40,7 @@ impl Sparse {
     /// The model's points; nobody sees them yet.
     pub fn read(model: &Path) -> Result<Sparse> {
         let mut out = Sparse { index: HashMap::new(), points: Vec::new(), samples: Vec::new(), observations: 0, absent: 0, images: 0 };
-        colmap::each_point(model, &mut |p, _| {
+        colmap_model::each_point(model, &mut |p, _| {
             out.index.insert(p.id, out.points.len() as u32);
             out.points.push(SparsePoint { position: p.position, color: p.rgb, error: p.error.max(0.0) as f32, frames: Vec::new() });
         })?;
@@ -94,7 +94,7 @@ impl Sparse {
         let number: HashMap<u32, u32> = images.iter().enumerate().map(|(n, i)| (i.id, n as u32)).collect();
         let mut shown: Vec<Vec<(u32, u32)>> = vec![Vec::new(); images.len()];
         let mut at = 0;
-        colmap::each_point(model, &mut |_, track| {
+        colmap_model::each_point(model, &mut |_, track| {
             for (image, keypoint) in track {
                 if let Some(n) = number.get(image) {
                     shown[*n as usize].push((at, *keypoint));
@@ -105,7 +105,7 @@ impl Sparse {
         self.points.iter_mut().for_each(|p| p.frames.clear());
         self.samples.clear();
         let mut n = 0;
-        colmap::read_images(model, &mut |image, keypoints| {
+        colmap_model::read_images(model, &mut |image, keypoints| {
             let at_hand = shown[n].iter().filter_map(|(p, k)| keypoints.get(*k as usize).map(|k| (*p, k.px)));
             let at_hand: Vec<(u32, [f64; 2])> = at_hand.collect();
             for (p, _) in &at_hand {

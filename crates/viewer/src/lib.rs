@@ -6,6 +6,7 @@ mod request;
 mod scene;
 mod server;
 mod session;
+mod shared;
 
 pub use server::{Server, ViewerError, ViewerOptions};
 

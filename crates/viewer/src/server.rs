@@ -2,11 +2,12 @@
 
 use crate::request::{self, Request};
 use crate::session;
+use crate::shared::Shared;
 use diorama_geom::view_source::ViewSource;
 use std::io::Write;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener, TcpStream};
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -48,20 +49,6 @@ pub struct Server {
     shared: Arc<Shared>,
 }
 
-/// What all connections know.
-pub(crate) struct Shared {
-    /// What the Host header may be.
-    hosts: Vec<String>,
-    token: Option<String>,
-    pub source: Arc<dyn ViewSource>,
-    /// The mesh made last, where it is a GLB.
-    pub mesh: Mutex<Option<PathBuf>>,
-    /// The camera path saved last.
-    pub path: Mutex<Option<PathBuf>>,
-    pub stop: AtomicBool,
-    open: AtomicUsize,
-}
-
 impl Server {
     /// Binds. Anywhere but on the loopback address a token is needed, which is part of [`Server::address`].
     ///
@@ -84,15 +71,7 @@ impl Server {
             hosts.extend(own_addresses().into_iter().map(|ip| SocketAddr::new(ip, at.port()).to_string()));
         }
         let token = (!options.host.is_loopback()).then(random_token);
-        let shared = Shared {
-            hosts,
-            token,
-            source,
-            mesh: Mutex::new(None),
-            path: Mutex::new(None),
-            stop: AtomicBool::new(false),
-            open: AtomicUsize::new(0),
-        };
+        let shared = Shared::new(hosts, token, source);
         Ok(Server { listener, shared: Arc::new(shared) })
     }
 

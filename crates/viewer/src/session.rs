@@ -2,7 +2,7 @@
 
 use crate::messages::{Ask, Box6, Tell, View};
 use crate::scene;
-use crate::server::Shared;
+use crate::shared::Shared;
 use diorama_geom::view_controls::check_lists;
 use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewRequest, ViewScene};
 use diorama_geom::{Camera, ImageU8, Pose};

@@ -2,7 +2,7 @@
 //! and advance a few samples at a time, so that their rows of the table, features and activations stay in cache and
 //! little is computed behind opaque matter. Neighbouring samples of a ray that together weigh little share one color.
 
-use super::volume::Traced;
+use super::traced::Traced;
 use crate::fields::{Encoder, Field, Pruning};
 use diorama_kernels::math;
 use diorama_kernels::ops::field_step::infer::{Codes, InferBuffers, Inference};
@@ -88,7 +88,7 @@ impl Blocks<'_> {
             .map(|(values, width)| (&values[..], width))
             .collect();
         let n = rays.jitter.len();
-        let mut out = Traced { rgb: vec![0.0; n * 3], opacity: vec![0.0; n], depth: vec![0.0; n] };
+        let mut out = Traced::nothing(n);
         let parts = out.rgb.par_chunks_mut(RAYS * 3).zip(out.opacity.par_chunks_mut(RAYS)).zip(out.depth.par_chunks_mut(RAYS));
         parts.enumerate().for_each(|(block, ((rgb, opacity), depth))| {
             let (first, n) = (block * RAYS, opacity.len());

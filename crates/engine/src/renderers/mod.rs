@@ -1,6 +1,10 @@
 //! From fields to images.
 
+pub mod accelerator;
 mod blocks;
+pub mod quality;
 pub mod splat;
 pub mod supervised;
+pub mod traced;
+pub mod view;
 pub mod volume;

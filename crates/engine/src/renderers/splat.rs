@@ -1,7 +1,7 @@
 //! Gaussian splats to images on the CPU: elliptical weighted averages (Zwicker et al., "EWA splatting", 2002), sorted by depth and composited
 //! front to back, as in Kerbl et al., "3D Gaussian splatting", 2023.
 
-use super::volume::View;
+use super::view::View;
 use diorama_geom::glam::{Mat3, Quat, Vec2, Vec3};
 use diorama_geom::splats::Splats;
 use diorama_geom::{Camera, Image, Pose};

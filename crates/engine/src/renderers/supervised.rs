@@ -1,21 +1,13 @@
 //! Failures of an accelerator: each is said once, and never hidden behind the CPU's own results.
 
-use super::volume::{Accelerator, Placement, Traced};
+pub use super::accelerator::Unserved;
+
+use super::accelerator::{Accelerator, Placement};
+use super::traced::Traced;
 use crate::fields::Pruning;
 use crate::samplers::RayBatch;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
-
-/// Why an accelerator did not serve a call.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Unserved {
-    /// The device failed; the CPU does the work instead.
-    #[error("{0}")]
-    Failed(String),
-    /// The user named a device and it failed: the caller reports that, so nobody has to work for this call.
-    #[error("the device failed before")]
-    Abandoned,
-}
 
 /// Says a failure to the user.
 pub type Say = Box<dyn Fn(&str) + Send + Sync>;

@@ -1,16 +1,22 @@
 //! Volume rendering of whole images.
 
+pub use super::accelerator::{Accelerator, Placement};
+pub use super::quality::Quality;
+pub use super::traced::Traced;
+pub use super::view::View;
+
+use super::accelerator::Unserved;
 use super::blocks::{self, Blocks};
-use super::supervised::Unserved;
+use super::view::{interpolate_between, sort_by_tiles};
 use crate::background::LearnedBackground;
 use crate::fields::{Batch, Encoded, Field, FieldBuffers, Pruning, VisibleSamples};
 use crate::samplers::occupancy::Occupancy;
 use crate::samplers::{RayBatch, pixels, stratified};
+use diorama_geom::OrientedBox;
 use diorama_geom::color::srgb_from_linear;
 use diorama_geom::glam::DVec3;
-use diorama_geom::{Image, OrientedBox};
 use diorama_kernels::ops::composite::Packed;
-use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched};
+use diorama_kernels::ops::march::{self, MarchRays, Marched};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 
 /// What stands behind the scene.
@@ -36,44 +42,6 @@ pub enum Sampling<'a> {
         samples: usize,
         more: usize,
     },
-}
-
-/// How samples are placed, for who has the field and its grid already.
-#[derive(Clone, Copy, Debug)]
-pub enum Placement {
-    March(MarchConfig),
-    Stratified { samples: usize },
-    Hierarchical { samples: usize, more: usize },
-}
-
-/// Evaluates a field elsewhere than on the CPU.
-pub trait Accelerator: Send + Sync {
-    /// What rays come to before black, and of marched ones the share of light that passes each.
-    ///
-    /// # Errors
-    /// When the device failed.
-    fn trace(
-        &self,
-        batch: &RayBatch,
-        placement: &Placement,
-        pruning: Pruning,
-        appearance: Option<u32>,
-    ) -> Result<(Traced, Option<Vec<f32>>), Unserved>;
-
-    /// Densities `[N]` at model points `[N, 3]`.
-    ///
-    /// # Errors
-    /// When the device failed.
-    fn density(&self, model: &[f32]) -> Result<Vec<f32>, Unserved>;
-
-    /// The field's own colours `[N, 3]` at model points, seen along unit directions, wearing the mean appearance.
-    ///
-    /// # Errors
-    /// When the device failed.
-    fn color(&self, model: &[f32], dirs: &[f32]) -> Result<Vec<f32>, Unserved>;
-
-    /// Rays that are worth a call.
-    fn rays(&self) -> usize;
 }
 
 /// A field ready to be looked at.
@@ -103,65 +71,6 @@ pub struct Tracer<'a> {
     pub accelerator: Option<&'a dyn Accelerator>,
 }
 
-/// How much care a view gets.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Quality {
-    /// Every pixel is traced until a thousandth of the light is left, no sample that light reaches is left out.
-    #[default]
-    Full,
-    /// For previews: rays end earlier, faint samples and pixels between like neighbours are left out.
-    Fast,
-}
-
-impl Quality {
-    /// What is left out of a view.
-    pub fn pruning(self) -> Pruning {
-        match self {
-            Quality::Full => Pruning { stop: 1e-3, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
-            Quality::Fast => Pruning { stop: 3e-2, min_alpha: 1e-2, thin: f32::INFINITY, min_weight: 1e-2 },
-        }
-    }
-
-    /// The [`Tracer::shared_weight`].
-    pub fn shared_weight(self) -> f32 {
-        match self {
-            Quality::Full => 1.0 / 16.0,
-            Quality::Fast => 1.0 / 8.0,
-        }
-    }
-
-    /// The [`Tracer::tolerance`].
-    pub fn tolerance(self) -> f32 {
-        match self {
-            Quality::Full => 0.0,
-            Quality::Fast => 0.05,
-        }
-    }
-}
-
-impl std::str::FromStr for Quality {
-    type Err = String;
-
-    fn from_str(s: &str) -> Result<Self, String> {
-        match s {
-            "full" => Ok(Quality::Full),
-            "fast" => Ok(Quality::Fast),
-            _ => Err(format!("quality {s:?}: expected full or fast")),
-        }
-    }
-}
-
-/// Layers of a rendered view.
-#[derive(Clone, Debug)]
-pub struct View {
-    /// sRGB with the background, `[H, W, 3]`.
-    pub rgb: Image,
-    /// `[H, W, 1]`
-    pub opacity: Image,
-    /// Expected distance along the ray in model units, 0 where nothing is hit, `[H, W, 1]`.
-    pub depth: Image,
-}
-
 /// Shortens rays to what lies in a box.
 fn cut_to(crop: &OrientedBox, batch: &mut RayBatch) {
     let vector = |v: &[f32]| DVec3::new(v[0] as f64, v[1] as f64, v[2] as f64);
@@ -179,39 +88,11 @@ const CHUNK_OF_BLOCKS: usize = 1 << 14;
 /// Pixels between those that are traced first where pixels may be interpolated.
 const COARSEST: usize = 4;
 
-/// Colour, opacity and `Σ w t` of rays.
-#[derive(Clone, Debug, Default)]
-pub struct Traced {
-    pub rgb: Vec<f32>,
-    pub opacity: Vec<f32>,
-    pub depth: Vec<f32>,
-}
-
-impl Traced {
-    /// Rays that meet nothing.
-    fn nothing(rays: usize) -> Traced {
-        Traced { rgb: vec![0.0; rays * 3], opacity: vec![0.0; rays], depth: vec![0.0; rays] }
-    }
-
-    /// Scales each ray to the opacity `1 − light` that it has with the samples that were left out.
-    fn make_up(&mut self, light: &[f32], stop: f32) {
-        for (r, light) in light.iter().enumerate() {
-            let full = if *light < stop { 1.0 } else { 1.0 - light };
-            let kept = self.opacity[r];
-            if kept > 1e-3 && full > kept {
-                let by = full / kept;
-                self.rgb[r * 3..r * 3 + 3].iter_mut().for_each(|v| *v *= by);
-                (self.opacity[r], self.depth[r]) = (full, self.depth[r] * by);
-            }
-        }
-    }
-}
-
 impl Tracer<'_> {
     /// Renders the view of a camera that stands in model space; `progress` is told the rows done.
     pub fn view(&self, camera: &PosedCamera, progress: &mut dyn FnMut(usize)) -> View {
         let (w, h) = (camera.camera.width as usize, camera.camera.height as usize);
-        let mut out = View { rgb: Image::zeros(w, h, 3), opacity: Image::zeros(w, h, 1), depth: Image::zeros(w, h, 1) };
+        let mut out = View::empty(w, h);
         let (mut batch, mut buf) = (RayBatch::default(), FieldBuffers::default());
         let mut wanted = Vec::with_capacity(w * h);
         let coarsest = if self.tolerance > 0.0 { COARSEST } else { 1 };
@@ -225,8 +106,8 @@ impl Tracer<'_> {
         let mut stride = coarsest;
         while stride > 1 {
             wanted.clear();
-            between(&mut out, stride, self.tolerance, &mut wanted);
-            in_tiles(&mut wanted, w, blocks::EDGE * stride / 2);
+            interpolate_between(&mut out, stride, self.tolerance, &mut wanted);
+            sort_by_tiles(&mut wanted, w, blocks::EDGE * stride / 2);
             self.pixels(camera, &wanted, &mut batch, &mut buf, &mut out, progress);
             stride /= 2;
         }
@@ -288,7 +169,7 @@ impl Tracer<'_> {
                 if let Some(light) = light
                     && (self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0)
                 {
-                    out.make_up(&light, self.pruning.stop);
+                    out.restore_opacity(&light, self.pruning.stop);
                 }
                 return self.before_backdrop(batch, out);
             }
@@ -317,9 +198,9 @@ impl Tracer<'_> {
                 self.field.visible(&grid.bits, &rays, &march, self.pruning, &mut visible, buf);
                 let VisibleSamples { samples, positions, mut encoded } = visible;
                 self.composite(self.field, batch, &samples, &positions, &mut encoded, buf);
-                let mut out = taken(buf);
+                let mut out = take_traced(buf);
                 if self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0 {
-                    out.make_up(&buf.visible.light(batch.len()), self.pruning.stop);
+                    out.restore_opacity(&buf.visible.light(batch.len()), self.pruning.stop);
                 }
                 out
             }
@@ -327,7 +208,7 @@ impl Tracer<'_> {
                 let mut marched = Marched::default();
                 stratified::stratified(batch, samples, None, &mut marched);
                 self.evaluate(self.field, batch, &marched, buf);
-                taken(buf)
+                take_traced(buf)
             }
             Sampling::Hierarchical { coarse, samples, more } => {
                 let (mut first, mut second) = (Marched::default(), Marched::default());
@@ -335,7 +216,7 @@ impl Tracer<'_> {
                 self.evaluate(coarse, batch, &first, buf);
                 stratified::refine(&first, &buf.out.weights, samples, more, None, &mut second);
                 self.evaluate(self.field, batch, &second, buf);
-                taken(buf)
+                take_traced(buf)
             }
         };
         self.before_backdrop(batch, out)
@@ -383,58 +264,8 @@ impl Tracer<'_> {
     }
 }
 
-/// Orders pixels by square tiles of the given edge, so that neighbours are traced together.
-fn in_tiles(pixels: &mut [u32], width: usize, edge: usize) {
-    let (width, edge) = (width as u32, edge as u32);
-    pixels.sort_by_cached_key(|p| (p / width / edge, p % width / edge, *p));
-}
-
-/// Fills pixels half way between those `stride` apart: interpolated where the corners around them are alike,
-/// else listed in `wanted`.
-fn between(view: &mut View, stride: usize, tolerance: f32, wanted: &mut Vec<u32>) {
-    let (w, h, half) = (view.rgb.width, view.rgb.height, stride / 2);
-    for y in (0..h).step_by(half) {
-        for x in (0..w).step_by(half) {
-            let (dx, dy) = (x % stride, y % stride);
-            if dx == 0 && dy == 0 {
-                continue;
-            }
-            let (x0, y0) = (x - dx, y - dy);
-            let (x1, y1) = (x0 + stride, y0 + stride);
-            let at = y * w + x;
-            if x1 >= w || y1 >= h {
-                wanted.push(at as u32);
-                continue;
-            }
-            let corners = [y0 * w + x0, y0 * w + x1, y1 * w + x0, y1 * w + x1];
-            let alike = |data: &[f32], channels: usize, k: usize, slack: f32| {
-                let v = corners.map(|c| data[c * channels + k]);
-                v.iter().copied().fold(f32::MIN, f32::max) - v.iter().copied().fold(f32::MAX, f32::min) <= slack
-            };
-            let depth = view.depth.data[corners[0]];
-            let flat = (0..3).all(|k| alike(&view.rgb.data, 3, k, tolerance))
-                && alike(&view.opacity.data, 1, 0, tolerance)
-                && alike(&view.depth.data, 1, 0, tolerance * depth);
-            if !flat {
-                wanted.push(at as u32);
-                continue;
-            }
-            let of = |dx: usize| if dx == 0 { [1.0, 0.0] } else { [0.5, 0.5] };
-            let (fx, fy) = (of(dx), of(dy));
-            let weights = [fy[0] * fx[0], fy[0] * fx[1], fy[1] * fx[0], fy[1] * fx[1]];
-            let mix = |data: &mut [f32], channels: usize| {
-                for k in 0..channels {
-                    data[at * channels + k] = corners.iter().zip(weights).map(|(c, w)| w * data[c * channels + k]).sum();
-                }
-            };
-            mix(&mut view.rgb.data, 3);
-            mix(&mut view.opacity.data, 1);
-            mix(&mut view.depth.data, 1);
-        }
-    }
-}
-
-fn taken(buf: &mut FieldBuffers) -> Traced {
+/// Moves what a field rendered out of its buffers.
+fn take_traced(buf: &mut FieldBuffers) -> Traced {
     let o = &mut buf.out;
     Traced { rgb: std::mem::take(&mut o.values), opacity: std::mem::take(&mut o.opacity), depth: std::mem::take(&mut o.depth) }
 }
@@ -556,37 +387,6 @@ mod tests {
         let v = tracer.view(&camera, &mut |_| {});
         let want = [0.5, 1.0, srgb_from_linear(7.0)];
         assert!((0..3).all(|k| (v.rgb.data[k] - want[k]).abs() < 1e-3), "{:?}", &v.rgb.data[..3]);
-    }
-
-    fn picture(w: usize, h: usize, f: impl Fn(usize, usize) -> f32) -> View {
-        let mut v = View { rgb: Image::zeros(w, h, 3), opacity: Image::zeros(w, h, 1), depth: Image::zeros(w, h, 1) };
-        for i in 0..w * h {
-            v.rgb.data[i * 3..i * 3 + 3].fill(f(i % w, i / w));
-            (v.opacity.data[i], v.depth.data[i]) = (1.0, 2.0);
-        }
-        v
-    }
-
-    #[test]
-    fn pixels_are_interpolated_where_neighbours_agree_and_traced_where_not() {
-        let (w, h) = (17, 13);
-        let ramp = |x: usize, y: usize| 0.001 * x as f32 + 0.002 * y as f32;
-        let mut v = picture(w, h, |x, y| if x % 4 == 0 && y % 4 == 0 { ramp(x, y) } else { 9.0 });
-        let mut wanted = Vec::new();
-        for stride in [4, 2] {
-            wanted.clear();
-            between(&mut v, stride, 0.05, &mut wanted);
-            // Lattice cells that reach beyond the picture have no corners to go by.
-            assert!(wanted.iter().all(|&p| p as usize % w >= 16 || p as usize / w >= 12), "{wanted:?}");
-            wanted.iter().for_each(|&p| v.rgb.data[p as usize * 3..][..3].fill(ramp(p as usize % w, p as usize / w)));
-        }
-        for i in (0..w * h).filter(|i| i % w < 16 && i / w < 12) {
-            assert!((v.rgb.data[i * 3] - ramp(i % w, i / w)).abs() < 1e-6, "pixel {i}");
-        }
-        let mut edge = picture(w, h, |x, _| (x > 7) as u8 as f32);
-        wanted.clear();
-        between(&mut edge, 4, 0.05, &mut wanted);
-        assert!(wanted.contains(&(2 * w as u32 + 6)) && !wanted.contains(&(2 * w as u32 + 2)), "{wanted:?}");
     }
 
     #[test]

@@ -160,7 +160,7 @@ pub fn export(
     }
     let grid = Grid { min, max, resolution: o.resolution };
     let texels = o.texture.unwrap_or(if o.format.has_texture() { TEXELS } else { 0 });
-    memory::check_export(model, o, &grid, texels)?.iter().for_each(|n| note(n));
+    memory::check_export(model, &grid, texels, o.normal_map)?.iter().for_each(|n| note(n));
     let level = o.level.unwrap_or_else(|| automatic_level(model, &grid));
     let mut mesh = extract::extract(model, &grid, level, o.method, &mut |i, n| progress("density", i, n));
     model.check_device()?;

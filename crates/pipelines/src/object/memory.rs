@@ -3,8 +3,8 @@
 
 use super::config::{Auto, Config, Method};
 use super::device;
-use super::export::ExportOptions;
-use super::model::{self, ObjectModel};
+use super::field_shape;
+use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
 use diorama_data::{memory, pixel_store};
 use diorama_engine::samplers::stereo;
@@ -106,13 +106,13 @@ pub fn of_training(config: &Config, capture: &Capture, format: PixelFormat, samp
     let decoded = if format == PixelFormat::Unorm8 { DECODED } else { DECODED_IN_FLOATS };
     let at_once = (2 * rayon::current_num_threads()).min(train.len()) as u64;
     // Whether photographs are opaque is not known yet; what they need most for is.
-    let space = model::space(config, capture, false);
+    let space = field_shape::space(config, capture, false);
     // Values, gradients and two moments; a checkpoint copies all but the gradients while it is written.
     let parameters = match config.method {
-        Method::Ngp => HashGrid::new(model::hash_grid(config, capture, space)).params_len() as u64 * (4 * 4 + 3 * 4),
+        Method::Ngp => HashGrid::new(field_shape::hash_grid(config, capture, space)).params_len() as u64 * (4 * 4 + 3 * 4),
         _ => 0,
     };
-    let cells = (config.sampling.occupancy_resolution as u64).saturating_pow(3).saturating_mul(model::cascades(space) as u64);
+    let cells = (config.sampling.occupancy_resolution as u64).saturating_pow(3).saturating_mul(field_shape::cascades(space) as u64);
     let occupancy = if config.method == Method::Ngp { cells.saturating_mul(9) } else { 0 };
     let batch = if config.method == Method::Ngp { (samples as u64).saturating_mul(SAMPLE) } else { 0 };
     // Whether sparse points tell enough is not known yet.
@@ -126,8 +126,8 @@ pub fn of_training(config: &Config, capture: &Capture, format: PixelFormat, samp
     ])
 }
 
-/// What an export takes besides the model, which is there already.
-pub fn of_export(model: &ObjectModel, o: &ExportOptions, grid: &Grid, texels: usize) -> Needs {
+/// Memory of an export besides the model: a mesh sampled on `grid`, a texture `texels` wide (0: none), and its normal map.
+pub fn of_export(model: &ObjectModel, grid: &Grid, texels: usize, normal_map: bool) -> Needs {
     let [nx, ny, nz] = grid.points().map(|n| n as u64);
     let widest = nx.max(ny).max(nz);
     let texels = texels as u64 * texels as u64;
@@ -135,7 +135,7 @@ pub fn of_export(model: &ObjectModel, o: &ExportOptions, grid: &Grid, texels: us
     Needs(vec![
         ("densities", nx * ny * SLICE),
         ("surface", widest * widest * SURFACE),
-        ("texture", texels * (TEXEL + if o.normal_map { NORMAL_TEXEL } else { 0 })),
+        ("texture", texels * (TEXEL + if normal_map { NORMAL_TEXEL } else { 0 })),
         ("depth maps", cameras),
     ])
 }
@@ -163,13 +163,13 @@ pub fn check_training(config: &Config, capture: &Capture) -> Result<Option<Strin
 ///
 /// # Errors
 /// When it does not fit.
-pub fn check_export(model: &ObjectModel, o: &ExportOptions, grid: &Grid, texels: usize) -> Result<Option<String>> {
-    let needs = of_export(model, o, grid, texels);
+pub fn check_export(model: &ObjectModel, grid: &Grid, texels: usize, normal_map: bool) -> Result<Option<String>> {
+    let needs = of_export(model, grid, texels, normal_map);
     let cure = match needs.largest() {
         "texture" => format!("--texture {}", (texels / 2).max(64)),
         // Only a texture asks the cameras.
         "depth maps" => "--texture 0".into(),
-        _ => format!("--resolution {}", (o.resolution / 2).max(16)),
+        _ => format!("--resolution {}", (grid.resolution / 2).max(16)),
     };
     judge("the export", &needs, available()?, &cure)
 }
@@ -188,7 +188,6 @@ fn judge(what: &str, needs: &Needs, available: Option<u64>, cure: &str) -> Resul
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::object::export::{Format, Size};
     use crate::object::{quickstart, recipe};
 
     fn still_life(dir: &std::path::Path, sets: &[(&str, &str)]) -> (Config, Capture) {
@@ -262,23 +261,7 @@ mod tests {
         let (c, capture) = still_life(dir.path(), &[("field.log2_size", "8")]);
         let m = ObjectModel::new(c, capture, false).unwrap();
         let of = |resolution: usize, texels: usize, normal_map: bool| {
-            let options = ExportOptions {
-                format: Format::Glb,
-                out: "a.glb".into(),
-                method: Default::default(),
-                resolution,
-                level: None,
-                faces: None,
-                texture: Some(texels),
-                normal_map,
-                watertight: false,
-                size: Size::Scaled(1.0),
-                unit_m: 1.0,
-                clip: None,
-                floaters: 0.0,
-                keep_unseen: false,
-            };
-            of_export(&m, &options, &Grid { min: [0.0; 3], max: [1.0; 3], resolution }, texels)
+            of_export(&m, &Grid { min: [0.0; 3], max: [1.0; 3], resolution }, texels, normal_map)
         };
         let ordinary = of(320, 2048, false);
         assert!((200 << 20..1 << 30).contains(&ordinary.total()), "{ordinary}");

@@ -1,8 +1,8 @@
 //! A capture with the fields that are fitted to it: what a run folder holds.
 
 use super::config::{Background, Config, Method};
+use super::field_shape::{cascades, hash_grid, space, viewing_distance};
 use crate::error::{PipelineError, Result};
-use diorama_data::checkpoint::{Checkpoint, Entry};
 use diorama_engine::background::LearnedBackground;
 use diorama_engine::fields::{self, DensityQuery, Field, FieldBuffers, Pruning};
 use diorama_engine::losses::{ColorLoss, Terms};
@@ -13,7 +13,7 @@ use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::pixels::ErrorMap;
 use diorama_engine::step::{self, Scene, Trainees};
 use diorama_engine::train::Origin;
-use diorama_geom::capture::{ColorSpace, Split, focus_point};
+use diorama_geom::capture::{ColorSpace, Split};
 use diorama_geom::color::srgb_from_linear;
 use diorama_geom::contraction::Space;
 use diorama_geom::field_query::FieldQuery;
@@ -21,10 +21,8 @@ use diorama_geom::glam::DVec3;
 use diorama_geom::{Capture, Pose, Similarity};
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::adam::Adam;
-use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
-use std::collections::HashMap;
 
 /// Where rays end in space without a bound, in inner cubes: a camera that moves by one sees it move by 0.001 radians.
 const FAR: f32 = 1024.0;
@@ -74,71 +72,6 @@ const HUBER: f32 = 0.1;
 
 /// Weight of the light that ends away from what pixels of known distance show, in unbounded space.
 const DEPTH: f32 = 0.3;
-
-/// Cascades of the occupancy grid of unbounded space: they reach 64 inner cubes far, beyond which a ray has a few samples left.
-const CASCADES: usize = 8;
-
-/// Least and most cells of the finest level, per inner cube.
-const FINEST: (f64, f64) = (512.0, 2048.0);
-
-/// `log2` of training pixels per row of the hash grid's largest levels, and of the fewest and most rows.
-const PIXELS_PER_ROW: f64 = 5.0;
-const ROWS: (f64, f64) = (14.0, 19.0);
-
-/// How far cameras stand from what they look at, in inner cubes.
-fn viewing_distance(capture: &Capture) -> f64 {
-    let poses: Vec<Pose> = capture.frames.iter().map(|f| f.world_from_camera).collect();
-    focus_point(&poses).1 * capture.scene.model_from_world().scale
-}
-
-/// The space that a configuration gives a capture: opaque photographs show the world to its end.
-pub(super) fn space(config: &Config, capture: &Capture, has_alpha: bool) -> Space {
-    let unbounded = match &config.field.space[..] {
-        "auto" => !has_alpha,
-        s => s == "unbounded",
-    };
-    match unbounded {
-        // What lies around the cameras keeps its shape.
-        true => Space::Contracted((2.0 * viewing_distance(capture)).clamp(1.0, 8.0) as f32),
-        false => Space::Cube(capture.scene.aabb_scale.max(1) as f32),
-    }
-}
-
-/// Shape of the hash grid of `ngp`.
-pub(super) fn hash_grid(config: &Config, capture: &Capture, space: Space) -> HashGridConfig {
-    let f = &config.field;
-    let train: Vec<_> =
-        capture.frames.iter().filter(|f| f.split == Split::Train).map(|f| f.camera.downscaled(config.data.downscale)).collect();
-    let finest = match f.finest {
-        0 => {
-            let mut focal: Vec<f64> = train.iter().map(|c| c.fx.max(c.fy)).collect();
-            focal.sort_by(f64::total_cmp);
-            let per_cube = (2.0 * focal[focal.len() / 2] / viewing_distance(capture)).clamp(FINEST.0, FINEST.1);
-            let cubes = match space {
-                Space::Contracted(edge) => 2.0 * edge,
-                Space::Cube(edge) => edge,
-            };
-            (per_cube * cubes as f64) as u32
-        }
-        n => n,
-    };
-    let log2_size = match f.log2_size {
-        0 => {
-            let pixels: f64 = train.iter().map(|c| c.width as f64 * c.height as f64).sum();
-            (pixels.log2() - PIXELS_PER_ROW).round().clamp(ROWS.0, ROWS.1) as u32
-        }
-        n => n,
-    };
-    HashGridConfig { levels: f.levels, features: f.features, log2_size, base: f.base, finest: finest.max(f.base) }
-}
-
-/// Cascades of the occupancy grid, each twice as wide as the one inside it.
-pub(super) fn cascades(space: Space) -> usize {
-    match space {
-        Space::Contracted(_) => CASCADES,
-        Space::Cube(edge) => (edge as u32).ilog2() as usize + 1,
-    }
-}
 
 impl ObjectModel {
     /// An untrained model.
@@ -345,14 +278,14 @@ impl ObjectModel {
         device.map_or("cpu".into(), |a| a.name().to_string())
     }
 
-    fn groups(&self) -> Vec<(String, &ParamGroup)> {
+    pub(super) fn groups(&self) -> Vec<(String, &ParamGroup)> {
         let field = self.field.groups().into_iter().map(|g| (format!("field.{}", g.name), g));
         let coarse = self.coarse.iter().flat_map(|f| f.groups()).map(|g| (format!("coarse.{}", g.name), g));
         let rest = self.learned.iter().map(|l| &l.group).chain(self.corrections.iter()).map(|g| (g.name.to_string(), g));
         field.chain(coarse).chain(rest).collect()
     }
 
-    fn groups_mut(&mut self) -> Vec<(String, &mut ParamGroup)> {
+    pub(super) fn groups_mut(&mut self) -> Vec<(String, &mut ParamGroup)> {
         let field = self.field.groups_mut().into_iter().map(|g| (format!("field.{}", g.name), g));
         let coarse = self.coarse.iter_mut().flat_map(|f| f.groups_mut()).map(|g| (format!("coarse.{}", g.name), g));
         let rest = self.learned.iter_mut().map(|l| &mut l.group).chain(self.corrections.iter_mut()).map(|g| (g.name.to_string(), g));
@@ -384,89 +317,11 @@ impl ObjectModel {
             accelerator: None,
         }
     }
+}
 
-    /// Everything that a checkpoint holds.
-    pub fn entries(&self) -> (Vec<Entry<'_>>, HashMap<String, String>) {
-        let mut entries = Vec::new();
-        let mut add = |name: String, data| entries.push(Entry { name, shape: vec![<[f32]>::len(data)], data });
-        for (name, g) in self.groups() {
-            add(name.clone(), &g.values);
-            add(format!("{name}.moment1"), &g.moment1);
-            add(format!("{name}.moment2"), &g.moment2);
-        }
-        if let Some(o) = &self.occupancy {
-            add("occupancy".into(), &o.density);
-            add("occupancy.fresh".into(), &o.fresh);
-        }
-        if let Some(m) = &self.error_map {
-            add("error_map".into(), &m.errors);
-            add("error_map.drawn".into(), &m.drawn);
-        }
-        let o = &self.origin;
-        let metadata = HashMap::from([
-            ("method".to_string(), self.config.method.to_string()),
-            ("step".into(), o.step.to_string()),
-            ("rays".into(), o.rays.to_string()),
-            ("samples".into(), o.samples.to_string()),
-            ("seconds_bits".into(), o.seconds.to_bits().to_string()),
-            ("samples_per_ray_bits".into(), self.samples_per_ray.to_bits().to_string()),
-            ("rate_scale_bits".into(), self.rate_scale.to_bits().to_string()),
-            ("has_alpha".into(), self.has_alpha.to_string()),
-        ]);
-        (entries, metadata)
-    }
-
-    /// Takes over a checkpoint of the same method and shape.
-    pub fn restore(&mut self, mut c: Checkpoint, file: &std::path::Path) -> Result<()> {
-        let wrong = |what: String| PipelineError::Usage(format!("{}: {what}", file.display()));
-        let method = c.metadata.get("method").cloned().unwrap_or_default();
-        if method != self.config.method.to_string() {
-            return Err(wrong(format!("holds method {method}, but the run is {}; use another run folder", self.config.method)));
-        }
-        fn number<T: std::str::FromStr>(c: &Checkpoint, key: &str) -> Option<T> {
-            c.metadata.get(key).and_then(|v| v.parse().ok())
-        }
-        let missing = |k: &str| wrong(format!("metadata {k} is missing or malformed"));
-        self.origin = Origin {
-            step: number(&c, "step").ok_or_else(|| missing("step"))?,
-            rays: number(&c, "rays").ok_or_else(|| missing("rays"))?,
-            samples: number(&c, "samples").ok_or_else(|| missing("samples"))?,
-            seconds: f64::from_bits(number(&c, "seconds_bits").ok_or_else(|| missing("seconds_bits"))?),
-        };
-        self.samples_per_ray = f64::from_bits(number(&c, "samples_per_ray_bits").ok_or_else(|| missing("samples_per_ray_bits"))?);
-        self.rate_scale = f32::from_bits(number(&c, "rate_scale_bits").ok_or_else(|| missing("rate_scale_bits"))?);
-        self.has_alpha = number(&c, "has_alpha").ok_or_else(|| missing("has_alpha"))?;
-        let mut load = |name: &str, into: &mut Vec<f32>| -> Result<()> {
-            let v = c.take(name).ok_or_else(|| wrong(format!("{name} is missing")))?;
-            if v.len() != into.len() {
-                return Err(wrong(format!(
-                    "{name} has {} numbers where the configuration needs {}; use the configuration that it was trained with",
-                    v.len(),
-                    into.len()
-                )));
-            }
-            *into = v;
-            Ok(())
-        };
-        for (name, g) in self.groups_mut() {
-            load(&name, &mut g.values)?;
-            load(&format!("{name}.moment1"), &mut g.moment1)?;
-            load(&format!("{name}.moment2"), &mut g.moment2)?;
-            g.grads.fill(0.0);
-            g.touched.fill(0);
-        }
-        if let Some(o) = &mut self.occupancy {
-            load("occupancy", &mut o.density)?;
-            load("occupancy.fresh", &mut o.fresh)?;
-            o.refresh();
-        }
-        if let Some(m) = &mut self.error_map {
-            load("error_map", &mut m.errors)?;
-            load("error_map.drawn", &mut m.drawn)?;
-            m.rebuild();
-        }
-        Ok(())
-    }
+/// Whether all photographs hold linear light.
+pub fn is_linear(capture: &Capture) -> bool {
+    !capture.frames.is_empty() && capture.frames.iter().all(|f| f.color_space == ColorSpace::Linear)
 }
 
 impl FieldQuery for ObjectModel {
@@ -500,11 +355,6 @@ impl FieldQuery for ObjectModel {
         }
         self.encode(rgb_srgb);
     }
-}
-
-/// Whether all photographs hold linear light.
-pub fn is_linear(capture: &Capture) -> bool {
-    !capture.frames.is_empty() && capture.frames.iter().all(|f| f.color_space == ColorSpace::Linear)
 }
 
 /// How the last layer becomes color: between 0 and 1, or for linear light any value above 0, at first a middle gray.

@@ -1,0 +1,55 @@
+//! The device that traces rays instead of the CPU, as renderers see it.
+
+use super::traced::Traced;
+use crate::fields::Pruning;
+use crate::samplers::RayBatch;
+use diorama_kernels::ops::march::MarchConfig;
+
+/// Why an accelerator did not serve a call.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Unserved {
+    /// The device failed; the CPU does the work instead.
+    #[error("{0}")]
+    Failed(String),
+    /// The user named a device and it failed: the caller reports that, so nobody has to work for this call.
+    #[error("the device failed before")]
+    Abandoned,
+}
+
+/// Sample placement strategy, borrowed by callers that already hold a field and its occupancy grid.
+#[derive(Clone, Copy, Debug)]
+pub enum Placement {
+    March(MarchConfig),
+    Stratified { samples: usize },
+    Hierarchical { samples: usize, more: usize },
+}
+
+/// Evaluates a field elsewhere than on the CPU.
+pub trait Accelerator: Send + Sync {
+    /// Composites rays in front of black; for marched rays also the transmittance `[R]` behind their last sample.
+    ///
+    /// # Errors
+    /// When the device failed.
+    fn trace(
+        &self,
+        batch: &RayBatch,
+        placement: &Placement,
+        pruning: Pruning,
+        appearance: Option<u32>,
+    ) -> Result<(Traced, Option<Vec<f32>>), Unserved>;
+
+    /// Densities `[N]` at model points `[N, 3]`.
+    ///
+    /// # Errors
+    /// When the device failed.
+    fn density(&self, model: &[f32]) -> Result<Vec<f32>, Unserved>;
+
+    /// The field's colors `[N, 3]` at model points `[N, 3]`, seen along unit directions `[N, 3]`, with the mean appearance code.
+    ///
+    /// # Errors
+    /// When the device failed.
+    fn color(&self, model: &[f32], dirs: &[f32]) -> Result<Vec<f32>, Unserved>;
+
+    /// Number of rays per call that keeps the device busy.
+    fn rays(&self) -> usize;
+}
