@@ -47,6 +47,32 @@ fn stages_of_a_step_add_up() {
     assert_eq!(o.status.code(), Some(2));
 }
 
+#[test]
+fn layers_and_networks_are_measured_forward_and_in_training() {
+    let call =
+        |names: &[&str]| diorama(&[&["bench", "nets", "--threads", "2", "--repeats", "1", "--seconds", "0", "--json"], names].concat());
+    let v = json(&call(&["conv3x3_64_128_b1", "vgg16"]));
+    let keys = |v: &serde_json::Value| v.as_object().unwrap().keys().cloned().collect::<Vec<_>>();
+    assert_eq!(keys(&v), ["threads", "peak_gflops", "layers", "networks"]);
+    assert_eq!(v["threads"], 2);
+    let peak = v["peak_gflops"].as_f64().unwrap();
+    let [layer] = &v["layers"].as_array().unwrap()[..] else { panic!("one layer has this name: {v}") };
+    assert_eq!(keys(layer), ["name", "batch", "forward_gflops", "train_gflops"]);
+    assert_eq!((&layer["name"], &layer["batch"]), (&"conv3x3_64_128".into(), &1.into()));
+    for key in ["forward_gflops", "train_gflops"] {
+        let rate = layer[key].as_f64().unwrap();
+        assert!(rate > 0.01 * peak && rate < 1.3 * peak, "{key}: {rate} of {peak}");
+    }
+    let [network] = &v["networks"].as_array().unwrap()[..] else { panic!("one network has this name: {v}") };
+    assert_eq!(keys(network), ["name", "forward_ms", "train_ms", "peak_bytes"]);
+    // A step holds a forward pass, and the weights alone take 59 MB four times over.
+    assert!(network["forward_ms"].as_f64().unwrap() > 0.0 && network["train_ms"].as_f64() > network["forward_ms"].as_f64(), "{v}");
+    assert!(network["peak_bytes"].as_u64().is_none_or(|b| b > 200 << 20), "{v}");
+    let o = call(&["no such layer"]);
+    assert_eq!(o.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&[o.stdout, o.stderr].concat()).contains("vit_b_32"), "known names are listed");
+}
+
 fn listing(dir: &Path) -> Vec<String> {
     let mut names: Vec<String> = std::fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
     names.sort();
