@@ -14,6 +14,7 @@ use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::field_step::{BatchLoss, FieldNet, Output, RayGradients, RayOutputs};
 use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
 use diorama_kernels::ops::linear::Activation;
+use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::ray_generation::{self, PosedCamera};
 use diorama_kernels::ops::ssim::cpu as ssim;
 use diorama_pipelines::run::device::Device;
@@ -148,7 +149,7 @@ impl BatchLoss for Loosely<'_> {
 /// Losses of all steps, and the field afterwards.
 fn train(device: &mut Device) -> (Vec<f64>, Field) {
     let (mut field, mut occupancy) = (field(), occupancy());
-    let march = occupancy.march_config(512);
+    let march = MarchConfig { cone: 0.0, dt_min: 0.015, dt_max: 0.015, max_samples: 128, ..MarchConfig::default() };
     let scene = Scene { cameras: Vec::new(), near: 0.05, cube: (0.0, 1.0) };
     let mut of =
         Trainees { field: &mut field, coarse: None, learned: None, occupancy: Some(&mut occupancy), corrections: None, error_map: None };
@@ -175,7 +176,7 @@ fn train(device: &mut Device) -> (Vec<f64>, Field) {
             placement: Placement::Occupancy {
                 march,
                 pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 },
-                room: (1 << 18, 1 << 18),
+                room: (1 << 15, 1 << 15),
             },
             probes: None,
             loss: Loss::Batch(&Loosely { wanted: &patch.wanted, step: number }),

@@ -77,7 +77,9 @@ impl DeviceKernels for CornerOp {
         let Some(d) = &d[0] else { return vec![None, None] };
         let corners = GpuCorners { rows: kept[0].cast(), voxel: kept[1].cast() };
         let d_table = gpu.zeros(i[1].data.len());
-        let d_local = corners.backward(gpu, &i[0].data, &i[1].data, i[1].shape[1], d, &d_table);
+        let (local, values, c) = (&i[0].data, &i[1].data, i[1].shape[1]);
+        let d_local = corners.places_backward(gpu, local, values, c, d, 1.0);
+        corners.table_backward(gpu, local, c, d, &d_table);
         vec![Some(d_local), Some(d_table)]
     }
 }

@@ -84,14 +84,7 @@ pub fn train(
     note.into_iter().for_each(|n| events(&Event::Note(n)));
     let held_out = HeldOutPixels::draw(&model)?;
     if resume {
-        if checkpoint::exists(&folder.checkpoints()) {
-            let (c, note) = checkpoint::load(&folder.checkpoints())?;
-            model.restore(c, &checkpoint::latest(&folder.checkpoints()))?;
-            note.into_iter().for_each(|n| events(&Event::Note(n)));
-        } else {
-            events(&Event::Note("the run was stopped before its first checkpoint: it begins again".into()));
-        }
-        folder.cut_metrics(model.origin.step)?;
+        go_on(&mut model, folder)?.into_iter().for_each(|n| events(&Event::Note(n)));
     } else {
         folder.write_description(&model.config, &model.capture)?;
     }
@@ -139,6 +132,18 @@ pub fn train(
         peak_memory_bytes: diorama_data::memory::peak_of_process(),
     })?;
     Ok(Trained { device: trainer.device.name(), model: trainer.model, summary })
+}
+
+/// Takes the model to the run's last checkpoint, or leaves it at its start; what the user is told.
+fn go_on(model: &mut ObjectModel, folder: &mut RunFolder) -> Result<Option<String>> {
+    let mut note = Some("the run was stopped before its first checkpoint: it begins again".into());
+    if checkpoint::exists(&folder.checkpoints()) {
+        let (c, of_loading) = checkpoint::load(&folder.checkpoints())?;
+        model.restore(c, &checkpoint::latest(&folder.checkpoints()))?;
+        note = of_loading;
+    }
+    folder.cut_metrics(model.origin.step)?;
+    Ok(note)
 }
 
 /// What a run that ended with an error leaves, in words.
