@@ -10,4 +10,5 @@ pub mod params;
 pub mod renderers;
 pub mod samplers;
 pub mod stages;
+pub mod step;
 pub mod train;

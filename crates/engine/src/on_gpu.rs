@@ -7,4 +7,4 @@ mod tracer;
 mod trainer;
 
 pub use tracer::GpuTracer;
-pub use trainer::{Figures, GpuStep, GpuTrainer, Placing, Trainees, TraineesMut};
+pub use trainer::GpuTrainer;

@@ -210,3 +210,42 @@ mod x86 {
         Avx512, 16, __m512, _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_max_ps
     );
 }
+
+/// Asks memory for values that are read before long; a hint, which changes no result.
+#[inline]
+pub fn fetch(values: &[f32]) {
+    #[cfg(target_arch = "x86_64")]
+    for line in values.iter().step_by(16) {
+        use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+        // SAFETY: a hint, which may name any address; the set belongs to the architecture.
+        unsafe { _mm_prefetch::<_MM_HINT_T1>(std::ptr::from_ref(line).cast()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = values;
+}
+
+/// The same for floats that are read and written at once.
+#[inline(always)]
+pub fn fetch_now(first: *const f32, floats: usize) {
+    #[cfg(target_arch = "x86_64")]
+    for line in (0..floats).step_by(16) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: as above.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(first.wrapping_add(line).cast::<i8>()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (first, floats);
+}
+
+/// The same for floats that are written before long.
+#[inline]
+pub fn fetch_to_write(first: *mut f32, floats: usize) {
+    #[cfg(target_arch = "x86_64")]
+    for line in (0..floats + 15).step_by(16) {
+        use std::arch::x86_64::{_MM_HINT_ET0, _mm_prefetch};
+        // SAFETY: as above.
+        unsafe { _mm_prefetch::<_MM_HINT_ET0>(first.wrapping_add(line.min(floats)).cast::<i8>()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (first, floats);
+}

@@ -85,6 +85,11 @@ type TileFn = unsafe fn(&Tile);
 pub const MOST_ROWS: usize = 8;
 pub const MOST_VECTORS: usize = 3;
 
+/// Floats of a panel.
+const PANEL: usize = 9 << 10;
+/// Most terms of a pass.
+const MOST_TERMS: usize = 288;
+
 /// The tiles of one instruction set.
 pub struct Kernel {
     /// Floats per vector.
@@ -103,6 +108,11 @@ impl Kernel {
     /// Floats per row of the largest tile.
     pub fn width(&self) -> usize {
         self.lanes * self.vectors
+    }
+
+    /// Terms of a sum per pass, so that a panel of them stays in the first-level cache beside what streams past it.
+    pub fn terms(&self) -> usize {
+        (PANEL / self.width()).min(MOST_TERMS)
     }
 
     /// Computes a tile of `rows` by `vectors`.
@@ -148,9 +158,17 @@ unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(t: &Tile) {
     // SAFETY: `Kernel::run` states what must exist.
     unsafe {
         let mut acc = [[L::splat(0.0); NR]; MR];
-        if let Start::Bias(bias) = t.start {
-            for (r, row) in acc.iter_mut().enumerate() {
-                *row = [L::splat(*bias.add(r)); NR];
+        match t.start {
+            Start::Zero => {}
+            Start::Accumulate => {
+                for r in 0..MR {
+                    simd::fetch_now(t.c.add(r * t.c_row), NR * t.c_vector);
+                }
+            }
+            Start::Bias(bias) => {
+                for (r, row) in acc.iter_mut().enumerate() {
+                    *row = [L::splat(*bias.add(r)); NR];
+                }
             }
         }
         // Unrolled: scalar instructions share ports with the multiply-adds.

@@ -28,6 +28,9 @@ pub enum PipelineError {
     /// A device failed or computed wrongly.
     #[error("{0}")]
     Device(String),
+    /// A network refused its input.
+    #[error(transparent)]
+    Network(#[from] diorama_nets::OpError),
 }
 
 impl PipelineError {
@@ -36,7 +39,7 @@ impl PipelineError {
         match self {
             PipelineError::Data(e) => e.is_input(),
             PipelineError::Usage(_) => true,
-            PipelineError::Diverged { .. } | PipelineError::Memory(_) | PipelineError::Device(_) => false,
+            PipelineError::Diverged { .. } | PipelineError::Memory(_) | PipelineError::Device(_) | PipelineError::Network(_) => false,
         }
     }
 
@@ -49,6 +52,7 @@ impl PipelineError {
             PipelineError::Diverged { .. } => "diverged",
             PipelineError::Memory(_) => "memory",
             PipelineError::Device(_) => "device",
+            PipelineError::Network(_) => "network",
         }
     }
 }

@@ -26,6 +26,15 @@ impl ColorLoss {
     }
 }
 
+/// What counts in [`Photometric`], and how much.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Terms {
+    pub color: ColorLoss,
+    pub distortion: f32,
+    pub depth: f32,
+    pub alpha: f32,
+}
+
 /// Colour, distortion and opacity terms of a batch, each a mean over its rays.
 pub struct Photometric<'a> {
     pub batch: &'a RayBatch,
@@ -76,10 +85,10 @@ impl Photometric<'_> {
 
 impl RayLoss for Photometric<'_> {
     fn ray(&self, r: usize, out: &RayOutput, g: &mut RayGradient) -> f64 {
-        let target = self.target(r);
-        if target[0].is_nan() {
+        if !self.batch.counts[r] {
             return 0.0;
         }
+        let target = self.target(r);
         let scale = 1.0 / self.batch.len() as f32;
         let mut loss = 0.0f32;
         for k in 0..3 {
@@ -161,7 +170,7 @@ mod tests {
         assert_eq!(run(&batch, 0.0, 0.0, ColorLoss::Mse, 0.1), base, "no surface is known");
         batch.distance[0] = 9.0;
         assert!(run(&batch, 0.0, 0.0, ColorLoss::Mse, 0.1) > base, "all light ends before the surface");
-        batch.target[0] = f32::NAN;
+        batch.counts[0] = false;
         assert_eq!(run(&batch, 0.1, 0.1, ColorLoss::Mse, 0.1), 0.0);
     }
 }

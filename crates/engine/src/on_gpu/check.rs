@@ -141,7 +141,7 @@ fn draws(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             table.equal("draw", "images", &shape, &drawn.images, &batch.images)?;
             table.equal("draw", "pixels", &shape, &drawn.pixels, &exact(&batch.pixels))?;
             table.equal("draw", "jitter", &shape, &drawn.jitter, &exact(&batch.jitter))?;
-            let refused: Vec<u32> = batch.target.chunks_exact(4).map(|t| t[0].is_nan() as u32).collect();
+            let refused: Vec<u32> = batch.counts.iter().map(|c| !c as u32).collect();
             table.equal("draw", "left out", &shape, &drawn.left_out, &refused)?;
             table.equal("draw", "distance", &shape, &drawn.distance, &exact(&batch.distance))?;
             let background: Vec<f32> = (0..n * 3).map(|i| back.uniform(first * 3 + i as u64)).collect();
@@ -422,7 +422,7 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let mut batch = RayBatch::default();
         batch.resize(rays);
         batch.target = random_unit(rays * 4, 7);
-        batch.target.chunks_exact_mut(4).skip(2).step_by(9).for_each(|t| t[0] = f32::NAN);
+        batch.counts.iter_mut().skip(2).step_by(9).for_each(|c| *c = false);
         // Every third ray's surface is known.
         batch.distance.iter_mut().step_by(3).zip(random_unit(rays, 10)).for_each(|(d, u)| *d = 0.1 + 3.0 * u);
         let (rgb, background) = (random_unit(s * 3, 8), random_unit(rays * 3, 9));
@@ -464,7 +464,7 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
                 value += photometric.ray(r, &o, &mut g);
                 d_opacity[r] = g.opacity;
                 let target = photometric.target(r);
-                if !target[0].is_nan() {
+                if batch.counts[r] {
                     of_rays[r] = photometric.squared_error(rgb, target) as f64;
                     error += of_rays[r];
                     counted += 1;
@@ -474,9 +474,8 @@ fn losses(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let on_gpu = GpuPacked::upload(gpu, &p);
             let results =
                 GpuComposited { color: up(&out.color), depth: up(&out.depth), opacity: up(&out.opacity), weights: up(&out.weights) };
-            let left_out: Vec<u32> = batch.target.chunks_exact(4).map(|t| t[0].is_nan() as u32).collect();
-            let rgba: Vec<f32> = batch.target.iter().map(|v| if v.is_nan() { 0.3 } else { *v }).collect();
-            let (rgba, background, left_out, sums) = (up(&rgba), up(&background), gpu.upload_u32(&left_out), gpu.zeros(SUMS));
+            let left_out: Vec<u32> = batch.counts.iter().map(|c| !c as u32).collect();
+            let (rgba, background, left_out, sums) = (up(&batch.target), up(&background), gpu.upload_u32(&left_out), gpu.zeros(SUMS));
             let distance = up(&batch.distance);
             let target = Target { rgba: &rgba, background: &background, left_out: &left_out, distance: &distance };
             let figures = Figures { sums: &sums, marched: &on_gpu.offsets, is_main: true };

@@ -1,6 +1,7 @@
 //! What a field is on the device besides its parameters.
 
 use crate::fields::{DirectionCode, Encoder as FieldEncoder, Field};
+use crate::step::relative;
 use diorama_geom::contraction as geom;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::gpu::{Buffer, Gpu, Rows};
@@ -22,6 +23,10 @@ pub struct Shape {
     pub net: GpuNet,
     /// In which positions are encoded.
     pub space: Space,
+    /// Whether space has no bound.
+    pub is_unbounded: bool,
+    /// What differences of linear light are divided by besides the prediction; else 0.
+    pub relative: f32,
 }
 
 impl Shape {
@@ -36,7 +41,7 @@ impl Shape {
         // The features' where there is a table or positions move, and the appearance codes'; directions have none.
         let mut wanted = vec![per_level > 0 || moves];
         wanted.extend((field.codes.direction.dims() > 0).then_some(false));
-        wanted.extend(field.codes.appearance.as_ref().map(|_| true));
+        wanted.extend(field.codes.appearance.as_ref().map(|_| true).into_iter().chain(field.codes.given.iter().map(|_| true)));
         let space = match (&encoder, field.space) {
             (Encoder::Hash(_), geom::Space::Contracted(edge)) => Space::Contracted(edge),
             (Encoder::Hash(_), geom::Space::Cube(edge)) => Space::Cube(edge),
@@ -44,7 +49,8 @@ impl Shape {
             (Encoder::Frequency(_), geom::Space::Cube(edge)) => Space::Centred(edge),
         };
         let net = GpuNet::new(gpu, &field.net, &field.density_net(Precision::F32), per_level, &wanted, arithmetic);
-        Shape { encoder, directions: field.codes.direction, net, space }
+        let is_unbounded = field.is_unbounded();
+        Shape { encoder, directions: field.codes.direction, net, space, is_unbounded, relative: relative(field) }
     }
 
     /// Encoded points `[S, 3]` of the field's space; a hash grid reads its table.

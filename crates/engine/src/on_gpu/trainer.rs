@@ -1,28 +1,27 @@
 //! Training steps that stay on the device.
 
 use super::shape::Shape;
-use crate::background::LearnedBackground;
 use crate::fields::Field;
+use crate::losses::ColorLoss;
 use crate::params::ParamGroup;
 use crate::samplers::occupancy::Occupancy;
-use crate::samplers::pixels::ErrorMap;
-use diorama_geom::rng::Rng;
+use crate::step::{self, Figures, GivenRays, Loss, Placement, Probes, RaySource, Scene, Step, Trainees};
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
-use diorama_kernels::ops::composite::gpu::GpuPacked;
+use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::field_step::gpu as field;
 use diorama_kernels::ops::field_step::gpu::loss::{self, SUMS, Target, Terms};
+use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
 use diorama_kernels::ops::linear::{self, Activation, BiasKind};
-use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuRays};
 use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, Drawn, GpuPhotographs};
-use diorama_kernels::ops::ray_generation::PosedCamera;
 use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
 use diorama_kernels::ops::sample_pdf::gpu::strata;
 use diorama_kernels::ops::{ray_aabb, spherical_harmonics};
+use std::ops::Range;
 
 /// Terms of the learned background per channel.
 const SKY: usize = 16;
@@ -35,6 +34,8 @@ struct GpuGroup {
     adam: Adam,
     sparse: bool,
     frozen: bool,
+    /// Ranges that are trained; none: all.
+    trained: Option<Vec<Range<usize>>>,
 }
 
 impl GpuGroup {
@@ -46,6 +47,7 @@ impl GpuGroup {
             adam: g.adam,
             sparse: !g.touched.is_empty(),
             frozen: g.frozen,
+            trained: g.trained.clone(),
         }
     }
 
@@ -58,9 +60,13 @@ impl GpuGroup {
 
     /// One step `t ≥ 1` along `grads`, which are cleared.
     fn step(&self, gpu: &Gpu, (t, scale): (u32, f32), grads: &Buffer) {
-        if !self.frozen {
-            let a = Adam { rate: self.adam.rate * scale, ..self.adam };
-            adam::gpu::step(gpu, &a, t, self.sparse, &self.values, &self.moment1, &self.moment2, grads);
+        if self.frozen {
+            return;
+        }
+        let a = Adam { rate: self.adam.rate * scale, ..self.adam };
+        let all = std::iter::once(0..self.values.len()).collect();
+        for range in self.trained.as_ref().unwrap_or(&all) {
+            adam::gpu::step(gpu, &a, t, self.sparse, range.clone(), &self.values, &self.moment1, &self.moment2, grads);
         }
     }
 }
@@ -77,25 +83,41 @@ struct GpuField {
 
 /// Samples that a field is trained on.
 struct Samples<'a> {
-    rays: &'a GpuRays,
     packed: &'a GpuPacked,
     /// In the field's space, and encoded.
     points: Buffer,
     features: Buffer,
-    drawn: &'a Drawn,
-    target: Target<'a>,
-    figures: loss::Figures<'a>,
+    /// Offsets of all samples that were marched, `[R + 1]`.
+    marched: &'a Buffer,
+    left_out: &'a Buffer,
+    /// Whether the step is judged by them.
+    is_main: bool,
     wants_weights: bool,
+    /// Whether gradients of positions are wanted.
     moves: bool,
+}
+
+/// The rays of a step, and what belongs to them.
+struct Rays {
+    rays: GpuRays,
+    drawn: Drawn,
+    /// `[R, C]`
+    background: Buffer,
+    /// Given codes, `[R, width]` each.
+    codes: Vec<Buffer>,
 }
 
 /// What training on samples gives besides better parameters.
 struct Learned {
-    /// Squared error of each ray.
-    errors: Buffer,
+    /// Squared error of each ray; none: not compared with photographs.
+    errors: Option<Buffer>,
     background: Buffer,
     weights: Option<Buffer>,
     points: Option<Buffer>,
+    /// Gradients of the given codes.
+    codes: Vec<Buffer>,
+    /// Of a [`BatchLoss`].
+    loss: Option<f64>,
 }
 
 impl GpuField {
@@ -131,27 +153,45 @@ impl GpuField {
     }
 
     /// Evaluates samples, compares them, and steps along the gradients.
-    fn train(&self, gpu: &Gpu, s: &GpuStep, on: &Samples) -> Learned {
+    ///
+    /// # Errors
+    /// When the device was lost while a [`BatchLoss`] waited for it.
+    fn train(&self, gpu: &Gpu, s: &Step, sums: &Buffer, r: &Rays, on: &Samples) -> Result<Learned, GpuError> {
         let (net, weights, packed) = (&self.shape.net, &self.weights.values, on.packed);
-        let direction = self.shape.direction(gpu, &on.rays.dirs);
-        let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &on.drawn.images, *dims));
-        let codes: Vec<&Buffer> = direction.iter().chain(&appearance).collect();
-        let (g, errors, composited) = if !on.wants_weights {
-            let at = net.evaluate(gpu, weights, packed, &on.features, &codes, true);
-            let (d, errors) = loss::composite_and_loss(gpu, s.terms, packed, &at.sigma, &at.outputs, on.target, s.near_scaling, on.figures);
-            (net.gradients(gpu, weights, packed, &at, &d), errors, None)
-        } else {
-            let background = on.target.background;
-            let step = net.forward(gpu, weights, packed, &on.features, &codes, background, true);
-            let (d, errors) = loss::loss(gpu, s.terms, packed, &step.out, on.target, on.figures);
-            let g = net.backward(gpu, weights, packed, background, &step, &d, s.near_scaling);
-            (g, errors, Some(step.out.weights))
+        let direction = self.shape.direction(gpu, &r.rays.dirs);
+        let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &r.drawn.images, *dims));
+        let codes: Vec<&Buffer> = direction.iter().chain(&appearance).chain(&r.codes).collect();
+        let background = &r.background;
+        let (g, errors, composited, loss) = match s.loss {
+            Loss::Batch(loss) => {
+                let step = net.forward(gpu, weights, packed, &on.features, &codes, background, true);
+                let (d, value) = by_batch(gpu, loss, &step.out, net.net.channels(), packed)?;
+                let g = net.backward(gpu, weights, packed, background, &step, &d, s.near_scaling);
+                (g, None, Some(step.out.weights), Some(value))
+            }
+            Loss::Photometric(terms) => {
+                assert_eq!(net.net.channels(), 3, "a photometric loss compares colors alone");
+                let terms = self.terms(&terms);
+                let (rgba, distance) = (&r.drawn.target, &r.drawn.distance);
+                let target = Target { rgba, background, left_out: on.left_out, distance };
+                let figures = loss::Figures { sums, marched: on.marched, is_main: on.is_main };
+                if !on.wants_weights {
+                    let at = net.evaluate(gpu, weights, packed, &on.features, &codes, true);
+                    let (d, errors) = loss::composite_and_loss(gpu, terms, packed, &at.sigma, &at.outputs, target, s.near_scaling, figures);
+                    (net.gradients(gpu, weights, packed, &at, &d), Some(errors), None, None)
+                } else {
+                    let step = net.forward(gpu, weights, packed, &on.features, &codes, background, true);
+                    let (d, errors) = loss::loss(gpu, terms, packed, &step.out, target, figures);
+                    let g = net.backward(gpu, weights, packed, background, &step, &d, s.near_scaling);
+                    (g, Some(errors), Some(step.out.weights), None)
+                }
+            }
         };
         let points = match (&g.features, on.moves) {
             (Some(d), true) => Some(self.shape.points_backward(gpu, &packed.rows(), &on.points, self.table(), d)),
             _ => None,
         };
-        let at = (s.t, s.rate_scale);
+        let at = (s.number as u32 + 1, s.rate_scale);
         self.weights.step(gpu, at, &g.params);
         if let (Some((table, d_table)), Some(d)) = (&self.table, &g.features)
             && !table.frozen
@@ -159,77 +199,44 @@ impl GpuField {
             self.shape.table_backward(gpu, &packed.rows(), &on.points, d, d_table);
             table.step(gpu, at, d_table);
         }
-        if let (Some((group, dims)), Some(Some(d_codes))) = (&self.appearance, g.codes.last()) {
+        let own = codes.len() - r.codes.len();
+        let mut d_codes = g.codes;
+        let d_given = d_codes.split_off(own.min(d_codes.len())).into_iter().flatten().collect();
+        if let (Some((group, dims)), Some(Some(d_codes))) = (&self.appearance, d_codes.last()) {
             let d = gpu.zeros(group.values.len());
-            field::look_up_backward(gpu, d_codes, &on.drawn.images, *dims, &d);
+            field::look_up_backward(gpu, d_codes, &r.drawn.images, *dims, &d);
             group.step(gpu, at, &d);
         }
-        Learned { errors, background: g.background, weights: composited, points }
+        Ok(Learned { errors, background: g.background, weights: composited, points, codes: d_given, loss })
+    }
+
+    /// What counts, as kernels take it.
+    fn terms(&self, t: &crate::losses::Terms) -> Terms {
+        let huber = if let ColorLoss::Huber(width) = t.color { width } else { 0.0 };
+        let normalized = self.shape.is_unbounded;
+        Terms { huber, relative: self.shape.relative, distortion: t.distortion, normalized, alpha: t.alpha, depth: t.depth }
     }
 }
 
-/// How a step's samples are placed.
-#[derive(Clone, Copy, Debug)]
-pub enum Placing {
-    /// In occupied cells, but for those that cannot matter; `room`: samples that there is memory for, before and
-    /// after those are left out.
-    Occupancy { march: MarchConfig, limits: Limits, room: (usize, usize) },
-    /// One per equal interval.
-    Stratified { samples: usize, rng: Rng },
-    /// The coarse field's decide where `more` go for the main one.
-    Hierarchical { samples: usize, more: usize, coarse: Rng, fine: Rng },
-}
-
-/// What a step depends on.
-#[derive(Clone, Copy, Debug)]
-pub struct GpuStep {
-    pub rays: usize,
-    /// Rays drawn before.
-    pub first: u64,
-    pub pixels: Rng,
-    /// Ignored where the background is learned.
-    pub backdrop: Backdrop,
-    pub near: f32,
-    pub placing: Placing,
-    pub terms: Terms,
-    pub near_scaling: f32,
-    /// Number of the optimiser step, from 1.
-    pub t: u32,
-    pub rate_scale: f32,
-    /// Whether draws go by the errors as they are after this step.
-    pub refresh_errors: bool,
-}
-
-/// Means over some steps.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Figures {
-    pub steps: u64,
-    pub loss: f64,
-    pub mse: f64,
-    /// Samples trained and marched, all steps together.
-    pub trained: f64,
-    pub marched: f64,
-}
-
-/// What is trained.
-pub struct Trainees<'a> {
-    pub field: &'a Field,
-    pub coarse: Option<&'a Field>,
-    pub learned: Option<&'a LearnedBackground>,
-    pub occupancy: Option<&'a Occupancy>,
-    /// Of the cameras, `[cameras, 7]`, and whether focal lengths are among what is refined.
-    pub corrections: Option<(&'a ParamGroup, bool)>,
-    pub error_map: Option<&'a ErrorMap>,
-}
-
-/// Where what was trained comes back to.
-pub struct TraineesMut<'a> {
-    pub field: &'a mut Field,
-    pub coarse: Option<&'a mut Field>,
-    pub learned: Option<&'a mut LearnedBackground>,
-    pub occupancy: Option<&'a mut Occupancy>,
-    pub corrections: Option<&'a mut ParamGroup>,
-    pub error_map: Option<&'a mut ErrorMap>,
+/// The gradients that a batch's loss gives for what was composited, and its value.
+fn by_batch(
+    gpu: &Gpu,
+    loss: &dyn BatchLoss,
+    out: &GpuComposited,
+    channels: usize,
+    packed: &GpuPacked,
+) -> Result<(GpuComposited, f64), GpuError> {
+    let (values, opacity, depth) = (gpu.read(&out.color)?, gpu.read(&out.opacity)?, gpu.read(&out.depth)?);
+    let mut g = RayGradients::default();
+    g.clear(packed.rays(), channels);
+    let value = loss.batch(&RayOutputs { values: &values, opacity: &opacity, depth: &depth }, &mut g);
+    let d = GpuComposited {
+        color: gpu.upload(&g.values),
+        depth: gpu.upload(&g.depth),
+        opacity: gpu.upload(&g.opacity),
+        weights: gpu.zeros(packed.t.len()),
+    };
+    Ok((d, value))
 }
 
 /// See the module.
@@ -237,38 +244,43 @@ pub struct GpuTrainer {
     gpu: Gpu,
     field: GpuField,
     coarse: Option<GpuField>,
-    cube: (f32, f32),
+    scene: Scene,
     learned: Option<(GpuGroup, Activation)>,
     occupancy: Option<GpuOccupancyGrid>,
-    photographs: GpuPhotographs,
+    photographs: Option<GpuPhotographs>,
     cameras: GpuCameras,
     corrections: Option<(GpuGroup, bool)>,
     error_map: Option<GpuErrorMap>,
+    /// Sums of steps that are compared on the device.
     sums: Buffer,
+    /// Rays, and sums of steps whose loss is computed on the CPU.
+    on_host: Figures,
+    d_given: Vec<Buffer>,
 }
 
 impl GpuTrainer {
-    /// Uploads all that training needs; `cameras` as they were given, `cube` the scene's outer cube: lowest corner
-    /// and edge.
-    pub fn new(gpu: Gpu, of: &Trainees, photographs: GpuPhotographs, cameras: &[PosedCamera], cube: (f32, f32)) -> Self {
+    /// Uploads all that training needs.
+    pub fn new(gpu: Gpu, scene: Scene, of: &Trainees, photographs: Option<GpuPhotographs>) -> Self {
         let occupancy = |o: &Occupancy| {
             let thresholds: Vec<f32> = (0..o.bits.cascades).map(|c| o.most(c)).collect();
             GpuOccupancyGrid::upload(&gpu, &o.bits, &o.density, &o.fresh, &o.live, o.decay, &thresholds)
         };
-        let cameras = GpuCameras::upload(&gpu, cameras);
-        let corrections = of.corrections.map(|(g, focal)| (GpuGroup::upload(&gpu, g), focal));
+        let cameras = GpuCameras::upload(&gpu, &scene.cameras);
+        let corrections = of.corrections.as_ref().map(|(g, focal)| (GpuGroup::upload(&gpu, g), *focal));
         corrections.iter().for_each(|(g, focal)| cameras.correct(&gpu, &g.values, *focal));
         GpuTrainer {
             field: GpuField::upload(&gpu, of.field, corrections.is_some()),
-            coarse: of.coarse.map(|f| GpuField::upload(&gpu, f, false)),
-            cube,
-            learned: of.learned.map(|l| (GpuGroup::upload(&gpu, &l.group), l.activation)),
-            occupancy: of.occupancy.map(occupancy),
+            coarse: of.coarse.as_ref().map(|f| GpuField::upload(&gpu, f, false)),
+            scene,
+            learned: of.learned.as_ref().map(|l| (GpuGroup::upload(&gpu, &l.group), l.activation)),
+            occupancy: of.occupancy.as_deref().map(occupancy),
             photographs,
             cameras,
             corrections,
-            error_map: of.error_map.map(|m| GpuErrorMap::upload(&gpu, &m.errors, &m.drawn)),
+            error_map: of.error_map.as_ref().map(|m| GpuErrorMap::upload(&gpu, &m.errors, &m.drawn)),
             sums: gpu.zeros(SUMS),
+            on_host: Figures::default(),
+            d_given: Vec::new(),
             gpu,
         }
     }
@@ -277,96 +289,154 @@ impl GpuTrainer {
         &self.gpu
     }
 
-    /// One optimiser step: draw, place samples, encode, evaluate, compare, and back.
+    /// One optimiser step: draw, place samples, encode, evaluate, compare, and back. Nothing waits for the device but a [`BatchLoss`].
+    ///
+    /// # Errors
+    /// When the device was lost while a [`BatchLoss`] waited for it.
     ///
     /// # Panics
-    /// When samples go to occupied cells and there is no grid, or to a coarse field that is not there.
-    pub fn step(&self, s: &GpuStep) {
+    /// When samples go to occupied cells and there is no grid, to a coarse field that is not there, or rays to photographs that are not
+    /// there.
+    pub fn step(&mut self, s: &Step) -> Result<(), GpuError> {
+        if let Some(probes) = &s.probes {
+            self.update_occupancy(probes, s.number);
+        }
+        let mut rays = self.rays(s);
         let gpu = &self.gpu;
-        let drawn = self.photographs.draw(gpu, s.rays, s.first, &s.pixels, self.error_map.as_ref(), s.backdrop);
-        let (origins, dirs) = self.cameras.forward(gpu, &drawn.images, &drawn.pixels);
-        let (low, size) = self.cube;
-        let near_far = ray_aabb::gpu::intersect(gpu, &origins, &dirs, [low; 3], [low + size; 3], s.near);
-        let rays = GpuRays { origins, dirs, near_far, jitter: drawn.jitter.clone(), resumed: false };
         let sky = self.learned.as_ref().map(|(g, activation)| {
-            let every_ray = Rows::all(gpu, s.rays);
-            let codes = spherical_harmonics::gpu::forward(gpu, 4, &rays.dirs);
+            let every_ray = Rows::all(gpu, s.rays.count());
+            let codes = spherical_harmonics::gpu::forward(gpu, 4, &rays.rays.dirs);
             let rgb = linear::gpu::forward(gpu, &every_ray, (SKY, 3), &codes, &g.values, None, BiasKind::None, *activation);
             (every_ray, codes, rgb)
         });
-        let background = sky.as_ref().map_or(&drawn.background, |(_, _, rgb)| rgb);
-        let target = Target { rgba: &drawn.target, background, left_out: &drawn.left_out, distance: &drawn.distance };
-        let moves = self.corrections.is_some();
-        let train = |of: &GpuField, packed: &GpuPacked, (points, features), marched: &Buffer, target, is_main: bool, wants_weights| {
-            let figures = loss::Figures { sums: &self.sums, marched, is_main };
-            let moves = moves && is_main;
-            of.train(gpu, s, &Samples { rays: &rays, packed, points, features, drawn: &drawn, target, figures, wants_weights, moves })
-        };
-
-        let (samples, learned) = match s.placing {
-            Placing::Occupancy { march: config, limits, room } => {
-                // All samples in occupied cells: their densities decide which are trained, and keep the grid up to date.
-                let grid = self.occupancy.as_ref().expect("an occupancy grid");
-                let marched = march::march(gpu, &grid.bits, &rays, &config, room.0);
-                let (points, features) = self.field.encode(gpu, &rays, &marched.packed);
-                let all = marched.packed.rows();
-                let sigma = self.field.shape.net.density(gpu, &self.field.weights.values, &features, &all);
-                let pruned = prune::prune(gpu, &marched.packed, &sigma, limits, &marched.cut, room.1);
-                grid.record(gpu, &all, &marched.cells, &sigma);
-                let encoded = (pruned.take(gpu, &points, 3), self.field.shape.net.take(gpu, &pruned, &features));
-                let left_out = gpu.either(&drawn.left_out, &marched.cut);
-                let target = Target { left_out: &left_out, ..target };
-                let learned = train(&self.field, &pruned.packed, encoded, &marched.packed.offsets, target, true, false);
-                (pruned.packed, learned)
-            }
-            Placing::Stratified { samples, rng } => {
-                let packed = strata::stratified(gpu, &rays.near_far, samples, Some((rng, s.first)));
-                let encoded = self.field.encode(gpu, &rays, &packed);
-                let learned = train(&self.field, &packed, encoded, &packed.offsets, target, true, false);
-                (packed, learned)
-            }
-            Placing::Hierarchical { samples, more, coarse, fine } => {
-                let guide = self.coarse.as_ref().expect("a coarse field");
-                let first = strata::stratified(gpu, &rays.near_far, samples, Some((coarse, s.first)));
-                let encoded = guide.encode(gpu, &rays, &first);
-                let seen = train(guide, &first, encoded, &first.offsets, target, false, true);
-                let weights = seen.weights.expect("weights were asked for");
-                let packed = strata::refine(gpu, &first, &weights, samples, more, Some((fine, s.first)));
-                let encoded = self.field.encode(gpu, &rays, &packed);
-                let learned = train(&self.field, &packed, encoded, &packed.offsets, target, true, false);
-                (packed, learned)
-            }
-        };
-
-        let at = (s.t, s.rate_scale);
+        if let Some((_, _, rgb)) = &sky {
+            rays.background = rgb.clone();
+        }
+        let (samples, marched, learned) = self.place(s, &rays)?;
+        if let Some(loss) = learned.loss {
+            let last = |offsets: &Buffer| gpu.read_u32(offsets).map(|o| o.last().copied().unwrap_or(0) as f64);
+            let (trained, marched) = (last(&samples.offsets)?, last(&marched)?);
+            let f = &mut self.on_host;
+            (f.steps, f.loss, f.trained, f.marched) = (f.steps + 1, f.loss + loss, f.trained + trained, f.marched + marched);
+        }
+        self.on_host.rays += s.rays.count() as u64;
+        let at = (s.number as u32 + 1, s.rate_scale);
         if let (Some((group, activation)), Some((every_ray, codes, rgb))) = (&self.learned, &sky) {
             let (none, d) = (BiasKind::None, &learned.background);
             let d = linear::gpu::backward(gpu, every_ray, (SKY, 3), codes, &group.values, none, *activation, rgb, d);
             group.step(gpu, at, &d.w);
         }
         if let (Some((group, focal)), Some(d_points)) = (&self.corrections, &learned.points) {
-            let (d_origins, d_dirs) = march::positions_backward(gpu, &rays, &samples, d_points, self.field.shape.space);
-            let d = self.cameras.backward(gpu, &drawn.images, &drawn.pixels, &rays.dirs, &d_origins, &d_dirs);
+            let (d_origins, d_dirs) = march::positions_backward(gpu, &rays.rays, &samples, d_points, self.field.shape.space);
+            let d = self.cameras.backward(gpu, &rays.drawn.images, &rays.drawn.pixels, &rays.rays.dirs, &d_origins, &d_dirs);
             group.step(gpu, at, &d);
             self.cameras.correct(gpu, &group.values, *focal);
         }
-        if let Some(map) = &self.error_map {
-            map.record(gpu, &self.photographs, &drawn, &learned.errors);
+        if let (Some(map), Some(errors), Some(photographs)) = (&self.error_map, &learned.errors, &self.photographs) {
+            map.record(gpu, photographs, &rays.drawn, errors);
             if s.refresh_errors {
                 map.refresh(gpu);
+            }
+        }
+        self.d_given = learned.codes;
+        Ok(())
+    }
+
+    /// Gradients of the last step's given codes, `[R, width]` each.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn given_gradients(&self) -> Result<Vec<Vec<f32>>, GpuError> {
+        self.d_given.iter().map(|d| self.gpu.read(d)).collect()
+    }
+
+    /// Draws the step's rays, or uploads the caller's.
+    fn rays(&self, s: &Step) -> Rays {
+        let gpu = &self.gpu;
+        let (drawn, origins, dirs, background, codes) = match &s.rays {
+            RaySource::Photographs { count, rng } => {
+                let from = self.photographs.as_ref().expect("photographs to draw from");
+                let backdrop = match s.backdrop {
+                    step::Backdrop::Color(color) => Backdrop::Color(color),
+                    step::Backdrop::Random(rng) => Backdrop::Random(rng),
+                };
+                let drawn = from.draw(gpu, *count, s.first, rng, self.error_map.as_ref(), backdrop);
+                let (origins, dirs) = self.cameras.forward(gpu, &drawn.images, &drawn.pixels);
+                let background = drawn.background.clone();
+                (drawn, origins, dirs, background, Vec::new())
+            }
+            RaySource::Given(g) => {
+                let codes = g.codes.iter().map(|c| gpu.upload(c)).collect();
+                (given(gpu, g), gpu.upload(g.origins), gpu.upload(g.dirs), gpu.upload(g.background), codes)
+            }
+        };
+        let (low, size) = self.scene.cube;
+        let near_far = ray_aabb::gpu::intersect(gpu, &origins, &dirs, [low; 3], [low + size; 3], self.scene.near);
+        let rays = GpuRays { origins, dirs, near_far, jitter: drawn.jitter.clone(), resumed: false };
+        Rays { rays, drawn, background, codes }
+    }
+
+    /// Places samples and trains on them; the samples, the offsets of all that were marched, and what was learned.
+    fn place(&self, s: &Step, r: &Rays) -> Result<(GpuPacked, Buffer, Learned), GpuError> {
+        let (gpu, rays, left_out) = (&self.gpu, &r.rays, &r.drawn.left_out);
+        let moves = self.corrections.is_some();
+        let all = |of: &GpuField, packed: &GpuPacked, is_main: bool| {
+            let (points, features) = of.encode(gpu, rays, packed);
+            let marched = &packed.offsets;
+            let on = Samples { packed, points, features, marched, left_out, is_main, wants_weights: !is_main, moves: moves && is_main };
+            of.train(gpu, s, &self.sums, r, &on)
+        };
+        match s.placement {
+            Placement::Occupancy { march: config, pruning: p, room } => {
+                // All samples in occupied cells: their densities decide which are trained, and keep the grid up to date.
+                let grid = self.occupancy.as_ref().expect("an occupancy grid");
+                let marched = march::march(gpu, &grid.bits, rays, &config, room.0);
+                let (points, features) = self.field.encode(gpu, rays, &marched.packed);
+                let all = marched.packed.rows();
+                let sigma = self.field.shape.net.density(gpu, &self.field.weights.values, &features, &all);
+                let limits = Limits { stop: p.stop, min_alpha: p.min_alpha, thin: p.thin, min_weight: p.min_weight };
+                let pruned = prune::prune(gpu, &marched.packed, &sigma, limits, &marched.cut, room.1);
+                grid.record(gpu, &all, &marched.cells, &sigma);
+                let on = Samples {
+                    packed: &pruned.packed,
+                    points: pruned.take(gpu, &points, 3),
+                    features: self.field.shape.net.take(gpu, &pruned, &features),
+                    marched: &marched.packed.offsets,
+                    left_out: &gpu.either(left_out, &marched.cut),
+                    is_main: true,
+                    wants_weights: false,
+                    moves,
+                };
+                let learned = self.field.train(gpu, s, &self.sums, r, &on)?;
+                Ok((pruned.packed, marched.packed.offsets, learned))
+            }
+            Placement::Stratified { samples, rng } => {
+                let packed = strata::stratified(gpu, &rays.near_far, samples, Some((rng, s.first)));
+                let learned = all(&self.field, &packed, true)?;
+                Ok((packed.clone(), packed.offsets, learned))
+            }
+            Placement::Hierarchical { samples, more, coarse, fine } => {
+                let guide = self.coarse.as_ref().expect("a coarse field");
+                let first = strata::stratified(gpu, &rays.near_far, samples, Some((coarse, s.first)));
+                let seen = all(guide, &first, false)?;
+                let weights = seen.weights.expect("weights were asked for");
+                let packed = strata::refine(gpu, &first, &weights, samples, more, Some((fine, s.first)));
+                let mut learned = all(&self.field, &packed, true)?;
+                learned.loss = learned.loss.map(|l| l + seen.loss.unwrap_or(0.0));
+                Ok((packed.clone(), packed.offsets, learned))
             }
         }
     }
 
     /// Samples the field at random points of the cells that a camera sees, and decides anew which are occupied.
-    pub fn update_occupancy(&self, rng: &Rng, counter: u64, count: usize, block: usize) {
+    fn update_occupancy(&self, p: &Probes, counter: u64) {
         let (gpu, f) = (&self.gpu, &self.field);
         let Some(grid) = &self.occupancy else { return };
-        let (points, cells) = grid.probe(gpu, rng, counter, count, block, f.shape.space);
-        let rows = Rows::all(gpu, count);
+        let (points, cells) = grid.probe(gpu, &p.rng, counter, p.points, p.block, f.shape.space);
+        let rows = Rows::all(gpu, p.points);
         let features = f.shape.features(gpu, &rows, &points, f.table());
         let sigma = f.shape.net.density(gpu, &f.weights.values, &features, &rows);
-        grid.update(gpu, &cells, &sigma, block);
+        grid.update(gpu, &cells, &sigma, p.block);
     }
 
     /// Waits for the device; means since the last call.
@@ -376,34 +446,51 @@ impl GpuTrainer {
     pub fn figures(&mut self) -> Result<Figures, GpuError> {
         let sums = std::mem::replace(&mut self.sums, self.gpu.zeros(SUMS));
         let sums: Vec<f64> = self.gpu.read(&sums)?.iter().map(|v| *v as f64).collect();
-        let n = sums[4].max(1.0);
-        Ok(Figures { steps: sums[4] as u64, loss: sums[0] / n, mse: sums[1] / n, trained: sums[2], marched: sums[3] })
+        let other = std::mem::take(&mut self.on_host);
+        let steps = sums[4] as u64 + other.steps;
+        let mse = if sums[4] > 0.0 { sums[1] / sums[4] } else { f64::NAN };
+        let loss = (sums[0] + other.loss) / steps.max(1) as f64;
+        Ok(Figures { steps, rays: other.rays, loss, mse, trained: sums[2] + other.trained, marched: sums[3] + other.marched })
     }
 
     /// Brings parameters, moments, occupancy and errors back.
     ///
     /// # Errors
     /// When the device was lost.
-    pub fn download(&self, to: TraineesMut) -> Result<(), GpuError> {
+    pub fn download(&self, to: &mut Trainees) -> Result<(), GpuError> {
         let gpu = &self.gpu;
         self.field.download(gpu, to.field)?;
-        if let (Some(own), Some(f)) = (&self.coarse, to.coarse) {
+        if let (Some(own), Some(f)) = (&self.coarse, &mut to.coarse) {
             own.download(gpu, f)?;
         }
-        if let (Some((own, _)), Some(l)) = (&self.learned, to.learned) {
+        if let (Some((own, _)), Some(l)) = (&self.learned, &mut to.learned) {
             own.download(gpu, &mut l.group)?;
         }
-        if let (Some((own, _)), Some(g)) = (&self.corrections, to.corrections) {
+        if let (Some((own, _)), Some((g, _))) = (&self.corrections, &mut to.corrections) {
             own.download(gpu, g)?;
         }
-        if let (Some(own), Some(m)) = (&self.error_map, to.error_map) {
+        if let (Some(own), Some(m)) = (&self.error_map, &mut to.error_map) {
             (m.errors, m.drawn) = own.read(gpu)?;
             m.rebuild();
         }
-        if let (Some(own), Some(o)) = (&self.occupancy, to.occupancy) {
+        if let (Some(own), Some(o)) = (&self.occupancy, &mut to.occupancy) {
             (o.density, o.fresh) = own.read(gpu)?;
             o.refresh();
         }
         Ok(())
+    }
+}
+
+/// The caller's rays as if they had been drawn.
+fn given(gpu: &Gpu, g: &GivenRays) -> Drawn {
+    let n = g.images.len();
+    Drawn {
+        images: gpu.upload_u32(g.images),
+        pixels: gpu.zeros(n * 2),
+        target: if g.target.is_empty() { gpu.zeros(n * 4) } else { gpu.upload(g.target) },
+        jitter: gpu.upload(g.jitter),
+        left_out: gpu.zeros(n),
+        distance: gpu.zeros(n),
+        background: gpu.zeros(0),
     }
 }

@@ -24,6 +24,8 @@ pub struct RayBatch {
     pub target: Vec<f32>,
     /// Distance of the surface along the ray where it is known, else 0, `[R]`.
     pub distance: Vec<f32>,
+    /// Whether a ray has a pixel to be compared with, `[R]`.
+    pub counts: Vec<bool>,
 }
 
 impl RayBatch {
@@ -40,6 +42,7 @@ impl RayBatch {
         self.images.resize(n, 0);
         self.jitter.resize(n, 0.0);
         self.distance.resize(n, 0.0);
+        self.counts.resize(n, true);
         for (v, c) in [(&mut self.pixels, 2), (&mut self.origins, 3), (&mut self.dirs, 3), (&mut self.near_far, 2), (&mut self.target, 4)] {
             v.resize(n * c, 0.0);
         }

@@ -107,7 +107,8 @@ pub struct DrawOptions<'a> {
 pub fn draw(source: &dyn PixelSource, o: &DrawOptions, batch: &mut RayBatch) {
     let images = source.images() as u64;
     let picked = batch.images.par_iter_mut().zip(batch.pixels.par_chunks_mut(2)).zip(batch.target.par_chunks_mut(4)).zip(&mut batch.jitter);
-    picked.zip(&mut batch.distance).enumerate().with_min_len(256).for_each(|(i, ((((image, pixel), target), jitter), distance))| {
+    let known = batch.distance.par_iter_mut().zip(&mut batch.counts);
+    picked.zip(known).enumerate().with_min_len(256).for_each(|(i, ((((image, pixel), target), jitter), (distance, counts)))| {
         // Sixteen numbers per ray: the draw may be repeated where a mask refuses the pixel.
         let base = (o.first + i as u64) * 16;
         *jitter = o.rng.uniform(base);
@@ -132,12 +133,12 @@ pub fn draw(source: &dyn PixelSource, o: &DrawOptions, batch: &mut RayBatch) {
             *image = img as u32;
             pixel.copy_from_slice(&[x as f32 + 0.5, y as f32 + 0.5]);
             target.copy_from_slice(&source.rgba(img as usize, x, y));
-            if source.counts(img as usize, x, y) {
+            // Masked five times over, a ray is left out.
+            *counts = source.counts(img as usize, x, y);
+            if *counts {
                 return;
             }
         }
-        // Masked five times over: a NaN target tells the loss to leave the ray out.
-        target[0] = f32::NAN;
     });
     rays(o.cameras, o.near, o.cube, batch);
 }
@@ -211,8 +212,8 @@ mod tests {
     fn masked_pixels_are_not_trained_on_and_targets_match_their_pixel() {
         let b = draw_with(None);
         let mut refused = 0;
-        for (p, t) in b.pixels.chunks_exact(2).zip(b.target.chunks_exact(4)) {
-            if t[0].is_nan() {
+        for ((p, t), counts) in b.pixels.chunks_exact(2).zip(b.target.chunks_exact(4)).zip(&b.counts) {
+            if !counts {
                 refused += 1;
                 continue;
             }

@@ -596,7 +596,7 @@ fn pixels(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 }
 
 fn steps(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
-    for (n, sparse) in [(1, false), (999, false), (999, true)] {
+    for (n, sparse, trained) in [(1, false, 0..1), (999, false, 0..999), (999, true, 0..999), (999, false, 300..640)] {
         let a = Adam { weight_decay: 0.1, ..Adam::default() };
         let p = random(n, 1);
         let (pg, mg, vg) = (gpu.upload(&p), gpu.zeros(n), gpu.zeros(n));
@@ -605,12 +605,16 @@ fn steps(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let mut g = random(n, 10 + t as u64);
             g.iter_mut().skip(t as usize % 3).step_by(3).for_each(|g| *g = 0.0);
             let gg = gpu.upload(&g);
-            adam::gpu::step(gpu, &a, t, sparse, &pg, &mg, &vg, &gg);
-            adam::reference::step(&a, t, sparse, &mut pw, &mut mw, &mut vw, &wide(&g));
-            table.close("adam", "gradient cleared", format!("N={n} sparse={sparse}"), &gg, &vec![0.0; n])?;
+            let (own, shape) = (trained.clone(), format!("N={n} sparse={sparse} {trained:?}"));
+            adam::gpu::step(gpu, &a, t, sparse, own.clone(), &pg, &mg, &vg, &gg);
+            let of = wide(&g[own.clone()]);
+            adam::reference::step(&a, t, sparse, &mut pw[own.clone()], &mut mw[own.clone()], &mut vw[own.clone()], &of);
+            let left: Vec<f64> = (0..n).map(|i| if own.contains(&i) { 0.0 } else { g[i] as f64 }).collect();
+            table.close("adam", "gradient cleared", shape, &gg, &left)?;
         }
-        table.close("adam", "parameters", format!("N={n} sparse={sparse}"), &pg, &pw)?;
-        table.close("adam", "moments", format!("N={n} sparse={sparse}"), &vg, &vw)?;
+        let shape = format!("N={n} sparse={sparse} {trained:?}");
+        table.close("adam", "parameters", shape.clone(), &pg, &pw)?;
+        table.close("adam", "moments", shape, &vg, &vw)?;
     }
     Ok(())
 }

@@ -8,7 +8,7 @@ use burn::tensor::Tensor;
 use diorama_kernels::gpu::{Buffer, Gpu, Rows};
 #[cfg(feature = "gpu")]
 use diorama_kernels::ops::linear::gpu as kernels;
-use diorama_kernels::ops::linear::{Activation, BiasKind, cpu};
+use diorama_kernels::ops::linear::{Activation, BiasKind, Gradients, Linear, cpu};
 
 #[derive(Debug)]
 struct LinearOp {
@@ -20,6 +20,11 @@ impl LinearOp {
     /// Rows of x, its width, and that of the result.
     fn size(x: &[usize], weight: &[usize]) -> (usize, usize, usize) {
         (x[..x.len() - 1].iter().product(), weight[0], weight[1])
+    }
+
+    fn layer(&self, x: &[usize], weight: &[usize]) -> Linear {
+        let (rows, inputs, outputs) = Self::size(x, weight);
+        Linear { rows, inputs, outputs, bias: self.bias, activation: self.activation }
     }
 
     fn result(x: &[usize], width: usize) -> Vec<usize> {
@@ -53,9 +58,10 @@ impl SliceOp for LinearOp {
 
     fn forward(&self, x: &[Values], wanted: &[bool]) -> Forward {
         let (m, k, n) = Self::size(x[0].shape(), x[1].shape());
+        super::work::book(m * k * n);
         let mut out = ValuesMut::any(&Self::result(x[0].shape(), n));
         let bias = x.get(2).map_or(&[][..], |b| &b[..]);
-        cpu::forward(m, k, n, &x[0], &x[1], bias, self.bias, self.activation, &mut out);
+        cpu::forward(&self.layer(x[0].shape(), x[1].shape()), &x[0], &x[1], bias, &mut out);
         let out = out.freeze();
         if !wanted.contains(&true) {
             return Forward::one(out, Kept::default());
@@ -69,13 +75,13 @@ impl SliceOp for LinearOp {
     fn backward(&self, kept: &Kept, d: &[Option<Values>], wanted: &[bool]) -> Vec<Option<Values>> {
         let Some(d) = &d[0] else { return vec![None; wanted.len()] };
         let [x, w, out] = [&kept.values[0], &kept.values[1], &kept.values[2]];
-        let (m, k, n) = Self::size(x.shape(), w.shape());
         let bias_shape = kept.values.get(3).map_or(&[0][..], |b| b.shape());
-        let (mut dx, mut dw, mut db) = (ValuesMut::any(x.shape()), ValuesMut::any(w.shape()), ValuesMut::any(bias_shape));
-        cpu::backward(m, k, n, x, w, self.bias, self.activation, out, d, &mut dx, &mut dw, &mut db);
-        let mut all = vec![Some(dx.freeze()), Some(dw.freeze()), Some(db.freeze())];
-        all.truncate(wanted.len());
-        all
+        let shapes = [x.shape(), w.shape(), bias_shape];
+        let mut all: [Option<ValuesMut>; 3] = std::array::from_fn(|i| wanted.get(i).is_some_and(|w| *w).then(|| ValuesMut::any(shapes[i])));
+        let [dx, dw, db] = &mut all;
+        let gradients = Gradients { x: dx.as_deref_mut(), w: dw.as_deref_mut(), bias: db.as_deref_mut() };
+        cpu::backward(&self.layer(x.shape(), w.shape()), x, w, out, d, gradients);
+        all.into_iter().take(wanted.len()).map(|v| v.map(ValuesMut::freeze)).collect()
     }
 
     #[cfg(feature = "gpu")]

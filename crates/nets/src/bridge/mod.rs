@@ -23,6 +23,7 @@ mod spherical_harmonics;
 mod ssim;
 mod triangle_wave;
 mod trilinear_corner_grid;
+pub(crate) mod work;
 
 pub use composite::{Composited, composite};
 pub use distortion::distortion;

@@ -1,6 +1,7 @@
 //! Scaled dot product attention.
 
 use super::by_burn;
+use crate::bridge::work;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
 use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
@@ -41,6 +42,7 @@ impl SliceOp for AttentionOp {
 
     fn forward(&self, x: &[Values], wanted: &[bool]) -> Forward {
         let a = self.attention(x[0].shape(), x[1].shape());
+        work::book(2 * a.batch * a.queries * a.keys * a.width);
         let (mut out, mut logs) = (ValuesMut::any(x[0].shape()), ValuesMut::any(&[a.batch, a.queries]));
         cpu::forward(&a, &x[0], &x[1], &x[2], &mut out, &mut logs);
         let out = out.freeze();

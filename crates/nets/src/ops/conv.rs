@@ -2,6 +2,7 @@
 
 use super::Activation;
 use super::by_burn;
+use crate::bridge::work;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
 use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
@@ -156,6 +157,7 @@ impl SliceOp for ConvOp {
     fn forward(&self, x: &[Values], wanted: &[bool]) -> Forward {
         let (conv, images) = self.conv(x[0].shape(), x[1].shape());
         let o = conv.output(&images);
+        work::book(o.batch * o.pixels() * conv.weights_len());
         let shape = [o.batch, conv.channels_out, o.height, o.width];
         let mut out = ValuesMut::any(&shape);
         let mut before = (wanted.contains(&true) && self.activation.needs_input()).then(|| ValuesMut::any(&shape));

@@ -3,6 +3,7 @@
 use super::Conv;
 use super::by_burn;
 use super::conv::{Wanted, bias, check_conv, fused, unfused};
+use crate::bridge::work;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one};
 use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
@@ -56,6 +57,7 @@ impl SliceOp for ConvTransposeOp {
     fn forward(&self, x: &[Values], wanted: &[bool]) -> Forward {
         let (conv, images) = self.conv(x[0].shape(), x[1].shape());
         let o = conv.output(&images);
+        work::book(images.batch * images.pixels() * conv.weights_len());
         let shape = [o.batch, conv.channels_out, o.height, o.width];
         let mut out = ValuesMut::any(&shape);
         let mut before = (wanted.contains(&true) && self.activation.needs_input()).then(|| ValuesMut::any(&shape));

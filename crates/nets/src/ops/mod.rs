@@ -17,6 +17,7 @@ mod sample;
 #[cfg(test)]
 mod tests;
 
+pub use crate::bridge::work::flops;
 pub use attention::attention;
 pub use conv::{Conv, conv2d};
 pub use conv_transpose::conv_transpose2d;

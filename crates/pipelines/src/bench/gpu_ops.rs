@@ -112,7 +112,7 @@ fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     })?;
     let (p, m, v) = (random(gpu, grid.params_len(), 4), gpu.zeros(grid.params_len()), gpu.zeros(grid.params_len()));
     t.row("adam", "all rows touched", ("parameter", grid.params_len()), 0.0, 32.0, || {
-        adam::gpu::step(gpu, &Adam::default(), 1, false, &p, &m, &v, &d_table);
+        adam::gpu::step(gpu, &Adam::default(), 1, false, 0..p.len(), &p, &m, &v, &d_table);
     })?;
     t.row("spherical_harmonics", "degree 4", ("direction", s), 0.0, 76.0, || {
         spherical_harmonics::gpu::forward(gpu, 4, &points);

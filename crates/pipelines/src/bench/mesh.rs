@@ -4,7 +4,7 @@ use super::median_seconds;
 use crate::error::Result;
 use crate::object::model::ObjectModel;
 use crate::object::{export, extent};
-use diorama_data::{atomic, mesh_text};
+use diorama_data::{atomic, memory, mesh_text};
 use diorama_mesh::extract::{self, Grid};
 use serde::Serialize;
 use std::io::Write;
@@ -39,7 +39,7 @@ pub fn run(model: &ObjectModel, resolution: usize, save: Option<&Path>, repeats:
     let file = folder.join("bench.ply");
     let (mut sizes, mut failed) = ((0, 0), Ok(()));
     let before = resident();
-    reset_peak();
+    memory::reset_peak();
     let seconds = median_seconds(repeats, || {
         let mut mesh = extract::from_densities(&sigma, &grid, level);
         mesh.compute_normals();
@@ -80,8 +80,4 @@ fn resident() -> Option<u64> {
 
 fn peak() -> Option<u64> {
     status("VmHWM:")
-}
-
-fn reset_peak() {
-    let _ = std::fs::write("/proc/self/clear_refs", "5");
 }

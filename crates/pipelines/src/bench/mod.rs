@@ -5,6 +5,7 @@ pub mod check;
 #[cfg(feature = "gpu")]
 pub mod gpu_ops;
 pub mod mesh;
+pub mod nets;
 pub mod ops;
 pub mod render;
 pub mod train;

@@ -10,7 +10,7 @@ use diorama_kernels::ops::composite::{self, Packed};
 use diorama_kernels::ops::frequency::{self, Frequency};
 use diorama_kernels::ops::fused_mlp::{self, Mlp};
 use diorama_kernels::ops::hash_grid::{self, HashGrid, HashGridConfig};
-use diorama_kernels::ops::linear::{self, Activation, BiasKind};
+use diorama_kernels::ops::linear::{self, Activation, BiasKind, Gradients, Linear};
 use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched, OccupancyBits};
 use diorama_kernels::ops::ray_generation::{self, PosedCamera};
 use diorama_kernels::ops::{spherical_harmonics, ssim};
@@ -113,13 +113,11 @@ fn networks(t: &mut Table) {
         let (mut out, mut dx, mut dw) = (vec![0.0; m * n], vec![0.0; m * k], vec![0.0; k * n]);
         let shape = format!("{m}x{width}x{width} f32");
         let flops = (2 * k * n) as f64;
-        t.row("linear", &shape, "row", m, Work::Flops(flops), || {
-            linear::cpu::forward(m, k, n, &x, &w, &[], BiasKind::None, Activation::Relu, &mut out);
-        });
+        let l = Linear { rows: m, inputs: k, outputs: n, bias: BiasKind::None, activation: Activation::Relu };
+        t.row("linear", &shape, "row", m, Work::Flops(flops), || linear::cpu::forward(&l, &x, &w, &[], &mut out));
         t.row("linear, forward and backward", &shape, "row", m, Work::Flops(3.0 * flops), || {
-            linear::cpu::forward(m, k, n, &x, &w, &[], BiasKind::None, Activation::Relu, &mut out);
-            let (kind, a) = (BiasKind::None, Activation::Relu);
-            linear::cpu::backward(m, k, n, &x, &w, kind, a, &out, &d, &mut dx, &mut dw, &mut []);
+            linear::cpu::forward(&l, &x, &w, &[], &mut out);
+            linear::cpu::backward(&l, &x, &w, &out, &d, Gradients { x: Some(&mut dx), w: Some(&mut dw), bias: None });
         });
     }
     for (name, inputs, widths) in [("fused_mlp", 32, &[64, 64, 16][..]), ("fused_mlp", 60, &[256, 256, 256, 16])] {

@@ -2,8 +2,8 @@
 
 use super::config::Method;
 use super::model::ObjectModel;
-use super::recipe::Photographs;
 use crate::error::Result;
+use crate::run::photographs::StoredPhotographs;
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_engine::fields::FieldBuffers;
 use diorama_engine::losses;
@@ -77,7 +77,7 @@ impl HeldOutPixels {
             masks: model.capture.masks,
             white: model.config.data.white,
         };
-        let photographs = Photographs::new(PixelStore::load(&listed, &options, &|| {})?);
+        let photographs = StoredPhotographs::new(PixelStore::load(&listed, &options, &|| {})?);
         let cameras: Vec<_> = frames.iter().map(|&i| model.posed(i)).collect();
         let mut batch = RayBatch::default();
         batch.resize(if model.config.method == Method::Ngp { RAYS } else { SLOW_RAYS });
@@ -103,7 +103,7 @@ impl HeldOutPixels {
         let seen = model.tracer(Quality::Full).trace(&mut batch, &mut FieldBuffers::default());
         let (back, is_linear) = (model.backdrop_color(), model.is_linear());
         let mut sums = vec![(0.0f64, 0usize); self.frames.len()];
-        for (r, t) in batch.target.chunks_exact(4).enumerate().filter(|(_, t)| !t[0].is_nan()) {
+        for (r, t) in batch.target.chunks_exact(4).enumerate().filter(|(r, _)| batch.counts[*r]) {
             let got = [0, 1, 2].map(|k| if is_linear { seen.rgb[r * 3 + k] } else { seen.rgb[r * 3 + k].clamp(0.0, 1.0) });
             let want = [0, 1, 2].map(|k| t[k] * t[3] + back[k] * (1.0 - t[3]));
             let sum = &mut sums[batch.images[r] as usize];

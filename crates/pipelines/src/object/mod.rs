@@ -28,5 +28,6 @@ pub mod run_folder;
 pub mod scored_view;
 pub mod seen_by;
 mod texture;
+mod trainer;
 pub mod viewing;
 pub mod viewing_points;

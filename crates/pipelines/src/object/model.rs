@@ -4,13 +4,14 @@ use super::config::{Background, Config, Method};
 use super::field_shape::{cascades, hash_grid, space, viewing_distance};
 use crate::error::{PipelineError, Result};
 use diorama_engine::background::LearnedBackground;
-use diorama_engine::fields::{self, DensityQuery, Field, FieldBuffers};
-use diorama_engine::losses::ColorLoss;
+use diorama_engine::fields::{self, DensityQuery, Field, FieldBuffers, Pruning};
+use diorama_engine::losses::{ColorLoss, Terms};
 use diorama_engine::params::ParamGroup;
 use diorama_engine::renderers::supervised::{Supervised, Unserved};
 use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Sampling, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::pixels::ErrorMap;
+use diorama_engine::step::{self, Scene, Trainees};
 use diorama_engine::train::Origin;
 use diorama_geom::capture::{ColorSpace, Split};
 use diorama_geom::color::srgb_from_linear;
@@ -50,18 +51,6 @@ pub struct ObjectModel {
     pub rate_scale: f32,
     /// Draws views instead of the CPU.
     pub accelerator: Option<Supervised>,
-}
-
-/// What training counts, and how much.
-#[derive(Clone, Copy, Debug)]
-pub struct Terms {
-    pub color: ColorLoss,
-    pub distortion: f32,
-    /// Of light that ends away from what is known to be there.
-    pub depth: f32,
-    pub alpha: f32,
-    /// Distance within which samples learn more slowly; 0: none.
-    pub near_scaling: f32,
 }
 
 /// Density per inner cube at the start of unbounded fields: light passes most of the inner cube, so that what stands
@@ -172,14 +161,7 @@ impl ObjectModel {
     /// The training cameras with their corrections.
     pub fn cameras(&self) -> Vec<PosedCamera> {
         let base = self.base_cameras();
-        match &self.corrections {
-            None => base,
-            Some(g) => base
-                .iter()
-                .zip(g.values.chunks_exact(CORRECTION))
-                .map(|(c, d)| c.corrected(&std::array::from_fn(|k| d[k] as f64)))
-                .collect(),
-        }
+        self.corrections.as_ref().map_or_else(|| base.clone(), |g| step::corrected(&base, &g.values))
     }
 
     /// Density per inner cube, a little below what the field starts from: what is denser is trained on however short its
@@ -188,11 +170,35 @@ impl ObjectModel {
         0.7 * self.field.net.density.shift.exp()
     }
 
+    /// Which samples of training are left out.
+    pub fn pruning(&self) -> Pruning {
+        let s = &self.config.sampling;
+        Pruning { stop: s.stop, min_alpha: s.min_alpha, thin: self.thin(), min_weight: 0.0 }
+    }
+
+    /// Where rays of training begin and end.
+    pub fn scene(&self) -> Scene {
+        Scene { cameras: self.base_cameras(), near: self.config.sampling.near, cube: self.cube() }
+    }
+
+    /// All that a step trains.
+    pub fn trainees(&mut self) -> Trainees<'_> {
+        let focal = self.config.camera.refine_focal;
+        Trainees {
+            field: &mut self.field,
+            coarse: self.coarse.as_mut(),
+            learned: self.learned.as_mut(),
+            occupancy: self.occupancy.as_mut(),
+            corrections: self.corrections.as_mut().map(|g| (g, focal)),
+            error_map: self.error_map.as_mut(),
+        }
+    }
+
     /// What counts at a training step, and how much.
     pub fn terms(&self, step: u64) -> Terms {
         let l = &self.config.loss;
         let color = if l.color == "huber" { ColorLoss::Huber(HUBER) } else { ColorLoss::Mse };
-        Terms { color, distortion: self.distortion(step), depth: self.depth(), alpha: l.alpha, near_scaling: l.near_scaling }
+        Terms { color, distortion: self.distortion(step), depth: self.depth(), alpha: l.alpha }
     }
 
     /// Weight of the distortion loss at a training step.
@@ -284,19 +290,6 @@ impl ObjectModel {
         let coarse = self.coarse.iter_mut().flat_map(|f| f.groups_mut()).map(|g| (format!("coarse.{}", g.name), g));
         let rest = self.learned.iter_mut().map(|l| &mut l.group).chain(self.corrections.iter_mut()).map(|g| (g.name.to_string(), g));
         field.chain(coarse).chain(rest).collect()
-    }
-
-    /// One optimiser step for every group; corrections follow their own constant rate.
-    pub fn optimise(&mut self, t: u32, scale: f32) {
-        let scale = scale * self.rate_scale;
-        for (_, g) in self.groups_mut() {
-            g.step(t, scale);
-        }
-        if !self.config.camera.refine_focal
-            && let Some(c) = &mut self.corrections
-        {
-            c.values.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);
-        }
     }
 
     /// Whether any parameter is not finite.

@@ -1,7 +1,9 @@
 //! Runs that go wrong.
 
 use super::*;
+use crate::object::config::Method;
 use diorama_engine::renderers::volume::Quality;
+use diorama_engine::train::StepReport;
 use diorama_geom::Reduction;
 use diorama_geom::capture::SparsePoint;
 

@@ -1,10 +1,12 @@
-//! What the runs of all applications share: configuration, folder, kept capture, metrics, summary. It imports no application.
+//! What the runs of all applications share: configuration, device, folder, kept capture, metrics, summary. It imports no application.
 
 pub mod config;
 pub mod description;
+pub mod device;
 pub mod folder;
 pub mod kept_capture;
 pub mod metrics;
+pub mod photographs;
 pub mod profile;
 pub mod summary;
 

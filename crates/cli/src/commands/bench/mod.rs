@@ -2,6 +2,7 @@
 
 mod check;
 mod mesh;
+mod nets;
 mod ops;
 mod render;
 mod train;
@@ -16,6 +17,7 @@ pub enum Bench {
     Train(train::Train),
     Render(render::Render),
     Mesh(mesh::Mesh),
+    Nets(nets::Nets),
     Check(check::Check),
 }
 
@@ -27,6 +29,7 @@ impl Bench {
             Bench::Train(v) => v,
             Bench::Render(v) => v,
             Bench::Mesh(v) => v,
+            Bench::Nets(v) => v,
             Bench::Check(v) => v,
         }
     }

@@ -3,11 +3,12 @@
 use super::Adam;
 use crate::gpu::{Buffer, CUBE, Gpu, units};
 use cubecl::prelude::*;
+use std::ops::Range;
 
-/// One step `t ≥ 1`; `sparse` leaves elements without gradient alone. Gradients are cleared.
+/// One step `t ≥ 1` of the elements in `range`; `sparse` leaves elements without gradient alone. Their gradients are cleared.
 #[allow(clippy::too_many_arguments)]
-pub fn step(gpu: &Gpu, a: &Adam, t: u32, sparse: bool, p: &Buffer, m: &Buffer, v: &Buffer, g: &Buffer) {
-    if p.is_empty() {
+pub fn step(gpu: &Gpu, a: &Adam, t: u32, sparse: bool, range: Range<usize>, p: &Buffer, m: &Buffer, v: &Buffer, g: &Buffer) {
+    if range.is_empty() {
         return;
     }
     let (b1, b2) = (a.beta1 as f64, a.beta2 as f64);
@@ -17,13 +18,14 @@ pub fn step(gpu: &Gpu, a: &Adam, t: u32, sparse: bool, p: &Buffer, m: &Buffer, v
     unsafe {
         adam::launch_unchecked(
             &gpu.client,
-            units(p.len()),
+            units(range.len()),
             CubeDim::new_1d(CUBE),
             p.arg(),
             m.arg(),
             v.arg(),
             g.arg(),
-            p.len() as u32,
+            range.start as u32,
+            range.len() as u32,
             scale,
             root,
             a.beta1,
@@ -42,6 +44,7 @@ fn adam(
     m: &mut [f32],
     v: &mut [f32],
     g: &mut [f32],
+    first: u32,
     n: u32,
     scale: f32,
     root: f32,
@@ -51,10 +54,11 @@ fn adam(
     decay: f32,
     #[comptime] sparse: bool,
 ) {
-    let i = ABSOLUTE_POS;
-    if i >= n as usize {
+    let unit = ABSOLUTE_POS;
+    if unit >= n as usize {
         terminate!();
     }
+    let i = first as usize + unit;
     let mut d = g[i];
     if comptime!(sparse) {
         if d == 0.0 {

@@ -45,6 +45,7 @@ pub struct Scratch {
     pub planes: Vec<f32>,
     pub panel: Vec<f32>,
     pub sums: Vec<f32>,
+    pub taps: Vec<f32>,
     pub segments: Vec<crate::tile::Segment>,
     pub offsets: Vec<(u32, u32)>,
 }

@@ -9,12 +9,14 @@ use crate::tile::{Kernel, Pack, Segment, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Terms of a sum per pass, so that a panel of them stays in the first-level cache.
+/// Floats of the input that a tile reads per pass where it reads the copy itself, so that they stay in the first-level cache.
+const DIRECT: usize = 9 << 10;
+/// Terms of a sum per pass where it reads a panel.
 const TERMS: usize = 288;
-/// The same where the input is read in place of a panel.
-const TERMS_DIRECT: usize = 576;
 /// Floats of sums that a band keeps between passes.
 const SUMS: usize = 96 << 10;
+/// Portions in which the input of a later pass is asked of memory.
+const FETCHES: usize = 1 << 16;
 /// Fewest pixels that a band is cut into to keep all threads busy.
 const FEWEST: usize = 192;
 
@@ -130,12 +132,16 @@ impl Correlation {
         let job = self.job(t, kernel(level));
         let parts = self.features.div_ceil(job.features);
         let tasks = self.groups * job.bands.len() * parts;
-        (0..tasks).into_par_iter().for_each(|i| {
+        let part = |i: usize| {
             let (band, part) = (i / parts % job.bands.len(), i % parts);
             let (images, rows) = job.bands.band(band);
             let features = part * job.features..((part + 1) * job.features).min(self.features);
-            let part = Part { group: i / parts / job.bands.len(), images, rows, features };
-            simd::with_level(level, || with_scratch(|scratch| job.compute(&part, scratch)));
+            Part { group: i / parts / job.bands.len(), images, rows, features }
+        };
+        (0..tasks).into_par_iter().for_each(|i| {
+            // The task that this thread most likely does next, unless it reads the same.
+            let next = (i + 1 < tasks).then(|| part(i + 1)).filter(|_| (i + 1).is_multiple_of(parts));
+            simd::with_level(level, || with_scratch(|scratch| job.compute(&part(i), next.as_ref(), scratch)));
         });
     }
 
@@ -153,8 +159,8 @@ impl Correlation {
         let direct = direct && bands.images == 1;
         planes.fit(bands.images, bands.rows, columns);
         let taps = self.phases.iter().map(|p| p.taps.len()).max().unwrap_or(0).max(1);
-        let most_terms = if direct { TERMS_DIRECT } else { TERMS };
-        let blocks = self.channels.div_ceil((most_terms / taps).max(1)).max(1);
+        let block = if direct { DIRECT / (planes.rows_per_channel() * (kernel.width() + 16)) } else { TERMS / taps };
+        let blocks = self.channels.div_ceil(block.max(1)).max(1);
         let block = self.channels.div_ceil(blocks);
         let channel = if in_place { self.input[0] * self.input[1] } else { planes.channel };
         let terms = self.phases.iter().map(|p| self.terms(p, &planes, block, channel, kernel.width())).collect();
@@ -188,16 +194,16 @@ impl Correlation {
     fn divide(&self, rows: usize, columns: usize, kernel: &Kernel) -> (usize, usize) {
         let taps: usize = self.phases.iter().map(|p| p.taps.len()).sum();
         let all = self.batch * rows * columns;
-        let wanted = 3 * rayon::current_num_threads();
+        let threads = rayon::current_num_threads();
         let budget = |features: usize| SUMS / (features * self.phases.len()).max(1);
         let mut features = self.features;
         let heavy = self.features * taps > all;
         if heavy {
-            let parts = wanted.div_ceil(self.groups).min(self.features.div_ceil(8 * kernel.rows)).max(1);
+            let parts = (3 * threads).div_ceil(self.groups).min(self.features.div_ceil(8 * kernel.rows)).max(1);
             features = self.features.div_ceil(parts).next_multiple_of(kernel.rows);
         }
         let tasks = self.groups * self.features.div_ceil(features.max(1));
-        let share = all.div_ceil(wanted.div_ceil(tasks.max(1)));
+        let share = all.div_ceil((if heavy { 3 } else { 8 } * threads).div_ceil(tasks.max(1)));
         (features, budget(features).min(share.max(FEWEST)).max(1))
     }
 
@@ -223,7 +229,7 @@ struct Cells<'a> {
 
 impl Job<'_> {
     /// Passes over blocks of input channels; the last one finishes the outputs.
-    fn compute(&self, part: &Part, scratch: &mut Scratch) {
+    fn compute(&self, part: &Part, next: Option<&Part>, scratch: &mut Scratch) {
         let (c, width) = (self.c, self.kernel.width());
         let passes = c.channels.div_ceil(self.block.max(1)).max(1);
         let tiles: usize = c.phases.iter().map(|p| self.cells(&self.clip(p, part)).div_ceil(width)).sum();
@@ -241,6 +247,8 @@ impl Job<'_> {
                 let source = Source { data: self.x, image_stride: c.groups * c.channels * pixels, first_channel: part.group * c.channels };
                 self.planes.fill(source, channels.clone(), part.images.clone(), part.rows.start, planes);
             }
+            let ahead = if pass + 1 < passes { Some((part, pass + 1)) } else { next.map(|n| (n, 0)) };
+            let ahead = ahead.filter(|_| !self.in_place);
             let mut tile = 0;
             for (phase, terms) in c.phases.iter().zip(&self.terms) {
                 let cells = self.clip(phase, part);
@@ -250,10 +258,26 @@ impl Job<'_> {
                     let sums = &mut sums[at..at + part.features.len() * width];
                     let step =
                         Step { part, channels: channels.clone(), taps: phase.taps.len(), terms, first, segments, last: pass + 1 == passes };
+                    if let Some((part, pass)) = ahead {
+                        self.fetch(part, pass, tile * FETCHES / tiles..(tile + 1) * FETCHES / tiles);
+                    }
                     self.tile(&step, planes, panel, sums);
                     tile += 1;
                 }
             }
+        }
+    }
+
+    /// Asks memory for a part, in `FETCHES`, of what a later pass copies.
+    fn fetch(&self, part: &Part, pass: usize, share: Range<usize>) {
+        let c = self.c;
+        let channels = pass * self.block..((pass + 1) * self.block).min(c.channels);
+        let planes = part.images.len() * channels.len();
+        for i in share.start * planes / FETCHES..share.end * planes / FETCHES {
+            let (image, channel) = (part.images.start + i / channels.len(), channels.start + i % channels.len());
+            let plane = (image * c.groups + part.group) * c.channels + channel;
+            let rows = self.planes.rows_of(part.rows.clone());
+            simd::fetch(&self.x[(plane * c.input[0] + rows.start) * c.input[1]..(plane * c.input[0] + rows.end) * c.input[1]]);
         }
     }
 
@@ -338,6 +362,9 @@ impl Job<'_> {
                 0 => Start::Bias(self.bias[global..global + rows].as_ptr()),
                 _ => Start::Accumulate,
             };
+            if s.last {
+                self.fetch_outputs(s.segments, global, rows);
+            }
             let sums = &mut sums[i * width..(i + rows) * width];
             let tile = Tile {
                 a: self.weights[weights..].as_ptr(),
@@ -353,6 +380,16 @@ impl Job<'_> {
             unsafe { self.kernel.run(rows, vectors, &tile) };
             if s.last {
                 self.finish(s.segments, global, rows, sums);
+            }
+        }
+    }
+
+    /// Asks memory for the outputs that a tile will write.
+    fn fetch_outputs(&self, segments: &[Segment], channel: usize, rows: usize) {
+        let (pixels, spread) = (self.c.output[0] * self.c.output[1], self.c.spread[1]);
+        for r in 0..rows {
+            for s in segments {
+                simd::fetch_to_write(self.out.0.wrapping_add((channel + r) * pixels + s.to), s.len * spread);
             }
         }
     }

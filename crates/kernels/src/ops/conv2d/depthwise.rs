@@ -8,6 +8,9 @@ use crate::simd;
 use crate::tile::{Dots, MOST_DOTS, Row, Shared, kernel};
 use rayon::prelude::*;
 
+/// Floats of a band's copy.
+const BAND: usize = 6 << 10;
+
 /// A correlation with one input channel per group.
 pub fn run(c: &Correlation, t: Tensors) {
     let level = simd::level();
@@ -15,7 +18,9 @@ pub fn run(c: &Correlation, t: Tensors) {
     let mut planes = Planes::default();
     planes.update(c.input, c.step, c.phases.iter().flat_map(|p| &p.taps).map(|t| t.at));
     let most = |i: usize| c.phases.iter().map(|p| p.size[i]).max().unwrap_or(0);
-    planes.fit(1, most(0), most(1));
+    // Bands whose copy stays in the first-level cache.
+    let band = (BAND / planes.floats_per_row(most(1)).max(1)).clamp(1, most(0).max(1));
+    planes.fit(1, band, most(1));
     let offsets: Vec<Vec<(u32, u32)>> =
         c.phases.iter().map(|p| p.taps.iter().map(|t| (offset(t.weight), offset(planes.offset(t.at)))).collect()).collect();
     let (x, bias, pixels) = (t.x, t.bias, c.output[0] * c.output[1]);
@@ -24,32 +29,42 @@ pub fn run(c: &Correlation, t: Tensors) {
         with_scratch(|scratch| {
             let copy = aligned(&mut scratch.planes, planes.channel + row_len + 64);
             let row = aligned(&mut scratch.sums, row_len);
+            let taps = &mut scratch.taps;
             let source = Source { data: x, image_stride: c.groups * c.input[0] * c.input[1], first_channel: group };
-            planes.fill(source, 0..1, image..image + 1, 0, copy);
-            for feature in 0..c.features {
+            for (first, feature) in (0..most(0)).step_by(band).flat_map(|first| (0..c.features).map(move |f| (first, f))) {
+                if feature == 0 {
+                    planes.fill(source, 0..1, image..image + 1, first, copy);
+                }
                 let channel = group * c.features + feature;
                 let weights = &t.weights[group * c.weight_group + feature * c.weight_feature..];
                 for (phase, offsets) in c.phases.iter().zip(&offsets) {
-                    let taps: Vec<f32> = offsets.iter().map(|o| weights[o.0 as usize]).collect();
-                    for y in 0..phase.size[0] {
-                        let columns = phase.size[1];
+                    taps.clear();
+                    taps.extend(offsets.iter().map(|o| weights[o.0 as usize]));
+                    let columns = phase.size[1];
+                    // Whole tiles are written where they belong.
+                    let in_place = before.is_none() && c.spread[1] == 1 && columns.is_multiple_of(4 * kernel.lanes);
+                    for y in first..(first + band).min(phase.size[0]) {
+                        let at = feature * pixels + (phase.start[0] + y * c.spread[0]) * c.output[1] + phase.start[1];
+                        let target = if in_place { &mut out[at..at + columns] } else { &mut row[..] };
                         let r = Row {
-                            weights: &taps,
+                            weights: taps,
                             offsets,
-                            b: copy[y * planes.pitch..].as_ptr(),
+                            b: copy[(y - first) * planes.pitch..].as_ptr(),
                             columns,
                             start: bias.get(channel).copied().unwrap_or(0.0),
-                            c: row.as_mut_ptr(),
+                            c: target.as_mut_ptr(),
                         };
-                        // SAFETY: the copy goes on for a row more, and the row for a tile more.
+                        // SAFETY: the copy goes on for a row more, and so does the target unless it is a whole number of tiles.
                         unsafe { kernel.row(&r) };
-                        let row = &mut row[..columns];
-                        let at = feature * pixels + (phase.start[0] + y * c.spread[0]) * c.output[1] + phase.start[1];
                         if let Some(before) = &mut before {
-                            spread(row, c.spread[1], &mut before[at..]);
+                            spread(&row[..columns], c.spread[1], &mut before[at..]);
                         }
-                        t.activation.apply(row);
-                        spread(row, c.spread[1], &mut out[at..]);
+                        if in_place {
+                            t.activation.apply(&mut out[at..at + columns]);
+                        } else {
+                            t.activation.apply(&mut row[..columns]);
+                            spread(&row[..columns], c.spread[1], &mut out[at..]);
+                        }
                     }
                 }
             }

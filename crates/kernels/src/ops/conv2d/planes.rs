@@ -1,6 +1,6 @@
 //! Padded copies of input channels, split by stride, in which every tap of a kernel stands at a fixed offset.
 
-use crate::math::multiversion;
+use crate::vector::vectorized;
 use std::ops::Range;
 
 /// Where the padded channels of a band stand: `[channel, image, residue, row, column]`.
@@ -14,6 +14,7 @@ pub struct Planes {
     low: [isize; 2],
     reach: [usize; 2],
     residues: Vec<[usize; 2]>,
+    rows_per_channel: usize,
     rows: usize,
     pub pitch: usize,
     plane: usize,
@@ -39,13 +40,18 @@ impl Planes {
         self.low = taps.clone().fold(first, |a, t| [a[0].min(t[0]), a[1].min(t[1])]);
         self.reach = [0; 2];
         self.residues.clear();
+        let mut rows = Vec::new();
         for tap in taps {
             let (residue, shift) = self.split(tap);
             self.reach = [self.reach[0].max(shift[0]), self.reach[1].max(shift[1])];
             if !self.residues.contains(&residue) {
                 self.residues.push(residue);
             }
+            if !rows.contains(&(residue, shift[0])) {
+                rows.push((residue, shift[0]));
+            }
         }
+        self.rows_per_channel = rows.len().max(1);
         self.residues.sort_unstable();
     }
 
@@ -59,9 +65,27 @@ impl Planes {
         self.channel = (images * self.image).div_ceil(16) / 2 * 32 + 16;
     }
 
+    /// Rows of a channel that the taps of one grid row read.
+    pub fn rows_per_channel(&self) -> usize {
+        self.rows_per_channel
+    }
+
+    /// Floats of a copy for each row of a grid with `columns`.
+    pub fn floats_per_row(&self, columns: usize) -> usize {
+        self.pitch_of(columns) * self.residues.len().max(1)
+    }
+
     /// Floats between rows of a grid with `columns`.
     pub fn pitch_of(&self, columns: usize) -> usize {
         columns + self.reach[1]
+    }
+
+    /// Input rows that a grid's rows read.
+    pub fn rows_of(&self, grid: Range<usize>) -> Range<usize> {
+        let first = self.low[0] + (grid.start * self.step[0]) as isize;
+        let end = self.low[0] + ((grid.end + self.reach[0]) * self.step[0]) as isize;
+        let clip = |row: isize| row.clamp(0, self.input[0] as isize) as usize;
+        clip(first)..clip(end).max(clip(first))
     }
 
     fn split(&self, tap: [isize; 2]) -> ([usize; 2], [usize; 2]) {
@@ -87,32 +111,50 @@ impl Planes {
                 let to = &mut out[at..at + self.image];
                 if self.plane > 0 {
                     for (plane, residue) in to.chunks_exact_mut(self.plane).zip(&self.residues) {
-                        self.fill_plane(from, *residue, first_row, plane);
+                        fill_plane(self, from, *residue, first_row, plane);
                     }
                 }
             }
         }
     }
+}
 
-    fn fill_plane(&self, from: &[f32], residue: [usize; 2], first_row: usize, plane: &mut [f32]) {
-        let [height, width] = self.input;
-        let start = self.low[1] + residue[1] as isize;
+vectorized! {
+    /// Copies the pixels of one residue.
+    fn fill_plane<const F>(p: &Planes, from: &[f32], residue: [usize; 2], first_row: usize, plane: &mut [f32]) {
+        let [height, width] = p.input;
+        let start = p.low[1] + residue[1] as isize;
         // Columns t with 0 ≤ start + step t < width.
-        let step = self.step[1] as isize;
-        let begin = (-start).max(0).div_ceil_by(step).min(self.pitch);
-        let end = (width as isize - start).max(0).div_ceil_by(step).clamp(begin, self.pitch);
-        for (t, row) in plane.chunks_exact_mut(self.pitch).enumerate() {
-            let y = self.low[0] + (residue[0] + (first_row + t) * self.step[0]) as isize;
-            if y < 0 || y >= height as isize {
+        let step = p.step[1] as isize;
+        let begin = (-start).max(0).div_ceil_by(step).min(p.pitch);
+        let end = (width as isize - start).max(0).div_ceil_by(step).clamp(begin, p.pitch);
+        for (t, row) in plane.chunks_exact_mut(p.pitch).enumerate() {
+            let y = p.low[0] + (residue[0] + (first_row + t) * p.step[0]) as isize;
+            if y < 0 || y >= height as isize || begin == end {
                 row.fill(0.0);
                 continue;
             }
-            row[..begin].fill(0.0);
-            row[end..].fill(0.0);
-            if begin < end {
-                let x = (start + begin as isize * step) as usize;
-                let from = &from[y as usize * width + x..(y as usize + 1) * width];
-                every(from, self.step[1], &mut row[begin..end]);
+            row[..begin].iter_mut().for_each(|v| *v = 0.0);
+            row[end..].iter_mut().for_each(|v| *v = 0.0);
+            let x = (start + begin as isize * step) as usize;
+            let from = &from[y as usize * width + x..(y as usize + 1) * width];
+            let row = &mut row[begin..end];
+            match p.step[1] {
+                1 => row.copy_from_slice(&from[..row.len()]),
+                2 => {
+                    let mut done = 0;
+                    // The last block would read one float beyond the row.
+                    for block in row.chunks_exact_mut(16) {
+                        if 2 * done + 32 > from.len() {
+                            break;
+                        }
+                        let pairs: &[f32; 32] = from[2 * done..2 * done + 32].try_into().unwrap_or(&[0.0; 32]);
+                        block.copy_from_slice(&std::array::from_fn::<f32, 16, _>(|i| pairs[2 * i]));
+                        done += 16;
+                    }
+                    row.iter_mut().enumerate().skip(done).for_each(|(i, v)| *v = from[2 * i]);
+                }
+                step => row.iter_mut().enumerate().for_each(|(i, o)| *o = from[i * step]),
             }
         }
     }
@@ -125,24 +167,5 @@ trait DivCeilBy {
 impl DivCeilBy for isize {
     fn div_ceil_by(self, by: isize) -> usize {
         ((self + by - 1) / by) as usize
-    }
-}
-
-/// `out[i] = from[step · i]`
-fn every(from: &[f32], step: usize, out: &mut [f32]) {
-    match step {
-        1 => out.copy_from_slice(&from[..out.len()]),
-        2 => every_second(from, out),
-        _ => out.iter_mut().enumerate().for_each(|(i, o)| *o = from[i * step]),
-    }
-}
-
-multiversion! {
-    fn every_second(from: &[f32], out: &mut [f32]) {
-        let n = out.len();
-        let from = &from[..2 * n - 1];
-        for i in 0..n {
-            out[i] = from[2 * i];
-        }
     }
 }

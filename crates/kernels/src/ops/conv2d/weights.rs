@@ -9,12 +9,15 @@ use super::depthwise;
 use crate::simd;
 use crate::tile::{Kernel, MOST_VECTORS, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
+use std::cell::Cell;
 use std::ops::Range;
 
 /// Pixels per pass.
 const PIXELS: usize = 768;
 /// Fewest rows of a task, as each copies its input again.
 const FEWEST_ROWS: usize = 32;
+/// Tasks at least, as long as there are pixels: what few channels leave is cut by pixels.
+const TASKS: usize = 16;
 
 /// Shapes of a weight gradient: `d` is `[batch, groups · rows, grid]`, `x` `[batch, groups · columns, input]`.
 #[derive(Clone, Copy, Debug)]
@@ -65,20 +68,36 @@ impl WeightSums {
         let wanted = (3 * rayon::current_num_threads()).div_ceil(self.groups * blocks);
         let part = self.rows.div_ceil(wanted).max(FEWEST_ROWS).next_multiple_of(kernel.rows);
         let parts = self.rows.div_ceil(part);
-        let out = Shared(out.as_mut_ptr());
-        (0..self.groups * blocks * parts).into_par_iter().for_each(|i| {
+        let bands = Bands::plan(self.batch, self.grid[0], self.grid[1], PIXELS);
+        // By shapes alone, as it says in which order sums are added.
+        let shares = TASKS.div_ceil(self.groups * blocks * self.rows.div_ceil(FEWEST_ROWS)).min(bands.len()).max(1);
+        let size = out.len();
+        let mut partial = PARTIAL.take();
+        partial.resize((shares - 1) * size, 0.0);
+        let (first, others) = (Shared(out.as_mut_ptr()), Shared(partial.as_mut_ptr()));
+        let tasks = self.groups * blocks * parts;
+        (0..shares * tasks).into_par_iter().for_each(|i| {
+            let (share, i) = (i / tasks, i % tasks);
             let (block, p) = (i / parts % blocks, i % parts);
-            let first = block * layout.channels;
+            let channel = block * layout.channels;
             let task = Task {
                 s: self,
                 kernel,
                 layout,
                 group: i / parts / blocks,
                 rows: p * part..((p + 1) * part).min(self.rows),
-                channels: first..(first + layout.channels).min(self.columns),
+                channels: channel..(channel + layout.channels).min(self.columns),
+                share: share * bands.len() / shares..(share + 1) * bands.len() / shares,
+                bands,
             };
+            // SAFETY: every share but the first has its own part of the partial sums.
+            let out = if share == 0 { first } else { Shared(unsafe { others.at((share - 1) * size) }) };
             simd::with_level(level, || with_scratch(|scratch| task.compute(d, x, out, scratch)));
         });
+        for share in partial.chunks_exact(size) {
+            out.iter_mut().zip(share).for_each(|(o, v)| *o += v);
+        }
+        PARTIAL.set(partial);
     }
 
     fn layout(&self, kernel: &Kernel) -> Layout {
@@ -97,6 +116,10 @@ impl WeightSums {
     }
 }
 
+thread_local! {
+    static PARTIAL: Cell<Vec<f32>> = const { Cell::new(Vec::new()) };
+}
+
 /// Some rows times a block of channels.
 struct Task<'a> {
     s: &'a WeightSums,
@@ -105,6 +128,9 @@ struct Task<'a> {
     group: usize,
     rows: Range<usize>,
     channels: Range<usize>,
+    bands: Bands,
+    /// Bands whose pixels are summed.
+    share: Range<usize>,
 }
 
 impl Task<'_> {
@@ -112,7 +138,7 @@ impl Task<'_> {
         let (s, l) = (self.s, self.layout);
         let runs = s.kernel[0] * s.kernel[1] / l.run;
         let length = l.vectors * self.kernel.lanes;
-        let bands = Bands::plan(s.batch, s.grid[0], s.grid[1], PIXELS);
+        let bands = self.bands;
         let Scratch { planes, sums, offsets, .. } = scratch;
         let height = (bands.rows - 1) * s.step[0] + (s.kernel[0] - 1) * s.dilation[0] + 1;
         let image = height * l.columns * l.width;
@@ -121,7 +147,7 @@ impl Task<'_> {
         let sums = aligned(sums, self.rows.len() * runs * length);
         sums.fill(0.0);
         let mut shape = (0, 0);
-        for band in 0..bands.len() {
+        for band in self.share.clone() {
             let (images, rows) = bands.band(band);
             if shape != (images.len(), rows.len()) {
                 shape = (images.len(), rows.len());

@@ -1,18 +1,23 @@
-//! Blocks of rows through the small matrix product; weight gradients per block group, added in order.
+//! Matrix products with bias and activation while their outputs are in cache. Backward, many rows are cut into groups that keep
+//! the gradient before the activation in cache and have a weight gradient of their own; few rows are cut by columns.
 
-use super::{Activation, BiasKind, LEAK};
-use crate::gemm::{self, Init, Precision, View, gemm};
+use super::{Activation, BiasKind, Gradients, LEAK, Linear};
 use crate::math;
+use crate::ops::matmul::Matmul;
+use crate::ops::matmul::cpu::{matmul, matmul_here, matmul_with};
+use crate::simd;
+use crate::tasks::Parts;
+use crate::vector::vectorized;
 use rayon::prelude::*;
+use std::cell::{Cell, RefCell};
 
-/// Rows per block.
-const BLOCK: usize = 192;
-/// Rows per block backward, where x, the gradient and what is computed of them stay in cache together.
-const BLOCK_BACKWARD: usize = 96;
-/// Groups of blocks with a weight gradient of their own: fixed, so that results do not depend on threads.
+/// Rows per block of a group.
+const BLOCK: usize = 384;
+/// Groups of rows with gradients of weights of their own: fixed, so that results do not depend on threads.
 const GROUPS: usize = 16;
-/// Rows that a group has at least, so that its weight gradient costs less than its products.
-const GROUP_ROWS: usize = 512;
+/// Fewest rows that are cut into groups, and most weights.
+const MANY_ROWS: usize = 4096;
+const FEW_WEIGHTS: usize = 1 << 18;
 
 /// Applies an activation in place.
 pub fn activate(a: Activation, values: &mut [f32]) {
@@ -63,102 +68,166 @@ pub fn slope_from_output(a: Activation, y: f32) -> f32 {
     }
 }
 
+vectorized! {
+    fn add<const F>(sums: &mut [f32], values: &[f32]) {
+        sums.iter_mut().zip(values).for_each(|(s, v)| *s += v);
+    }
+}
+
+vectorized! {
+    fn add_and_clip<const F>(sums: &mut [f32], values: &[f32]) {
+        sums.iter_mut().zip(values).for_each(|(s, v)| *s = (*s + v).max(0.0));
+    }
+}
+
+vectorized! {
+    /// `out = d` where `y` is positive, else 0.
+    fn clip_gradient<const F>(y: &[f32], d: &[f32], out: &mut [f32]) {
+        for ((o, y), d) in out.iter_mut().zip(y).zip(d) {
+            *o = if *y > 0.0 { *d } else { 0.0 };
+        }
+    }
+}
+
+thread_local! {
+    /// The gradient before the activation, of all rows or of a block.
+    static SLOPES: Cell<Vec<f32>> = const { Cell::new(Vec::new()) };
+    /// Gradients of groups: weights, then bias.
+    static PARTIAL: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+}
+
+impl Linear {
+    fn check(&self, x: &[f32], w: &[f32], out: usize) {
+        let (m, k, n) = (self.rows, self.inputs, self.outputs);
+        assert!(x.len() == m * k && w.len() == k * n && out == m * n, "linear: shapes");
+    }
+
+    /// `d` times the slopes of outputs.
+    fn before_activation(&self, out: &[f32], d: &[f32], g: &mut [f32]) {
+        match self.activation {
+            Activation::Relu => clip_gradient(out, d, g),
+            a => g.iter_mut().zip(d).zip(out).for_each(|((g, d), y)| *g = d * slope_from_output(a, *y)),
+        }
+    }
+}
+
 /// `out = act(x W + b)`, all of it written.
 ///
 /// # Shapes
 /// x `[m, k]`, w `[k, n]`, bias empty, `[n]` or `[m, n]`, out `[m, n]`.
-#[allow(clippy::too_many_arguments)]
-pub fn forward(m: usize, k: usize, n: usize, x: &[f32], w: &[f32], bias: &[f32], kind: BiasKind, a: Activation, out: &mut [f32]) {
-    assert!(x.len() == m * k && w.len() == k * n && out.len() == m * n, "linear: shapes");
-    if m * n == 0 {
-        return;
-    }
-    out.par_chunks_mut(BLOCK * n).enumerate().for_each(|(block, out)| {
-        let (first, rows) = (block * BLOCK, out.len() / n);
-        let x = View::rows(&x[first * k..(first + rows) * k], k);
-        let init = match kind {
-            BiasKind::None => Init::Zero,
-            BiasKind::Shared => Init::Bias(bias),
-            BiasKind::PerRow => {
-                out.copy_from_slice(&bias[first * n..(first + rows) * n]);
-                Init::Accumulate
-            }
-        };
-        gemm(Precision::F32, rows, n, k, x, w, n, out, n, init, a == Activation::Relu);
-        if a != Activation::Relu {
-            activate(a, out);
+pub fn forward(l: &Linear, x: &[f32], w: &[f32], bias: &[f32], out: &mut [f32]) {
+    l.check(x, w, out.len());
+    let n = l.outputs;
+    assert_eq!(bias.len(), l.bias.len(l.rows, n), "linear: bias");
+    let finish = |row: usize, column: usize, values: &mut [f32]| {
+        let first = if l.bias == BiasKind::PerRow { row * n + column } else { column };
+        let bias = if l.bias == BiasKind::None { &[][..] } else { &bias[first..first + values.len()] };
+        match l.activation {
+            Activation::Relu if !bias.is_empty() => return add_and_clip(values, bias),
+            _ => add(values, bias),
         }
-    });
+        activate(l.activation, values);
+    };
+    let plain = l.bias == BiasKind::None && l.activation == Activation::None;
+    matmul_with(&Matmul::new(l.rows, n, l.inputs), x, w, out, if plain { None } else { Some(&finish) });
 }
 
-/// Gradients of x, w and b, overwritten, given the layer's output.
-#[allow(clippy::too_many_arguments)]
-pub fn backward(
-    m: usize,
-    k: usize,
-    n: usize,
-    x: &[f32],
-    w: &[f32],
-    kind: BiasKind,
-    a: Activation,
-    out: &[f32],
-    d: &[f32],
-    dx: &mut [f32],
-    dw: &mut [f32],
-    db: &mut [f32],
-) {
-    dw.fill(0.0);
-    db.fill(0.0);
-    if m * n == 0 {
-        return;
+/// Gradients of what is wanted, given the layer's output.
+///
+/// # Shapes
+/// as in [`forward`]; d as `out`.
+pub fn backward(l: &Linear, x: &[f32], w: &[f32], out: &[f32], d: &[f32], gradients: Gradients) {
+    l.check(x, w, d.len());
+    assert_eq!(out.len(), d.len(), "linear: output");
+    if l.rows >= MANY_ROWS && l.inputs * l.outputs <= FEW_WEIGHTS && l.bias != BiasKind::PerRow {
+        return by_rows(l, x, w, out, d, gradients);
     }
-    let mut wt = Vec::new();
-    gemm::transpose(k, n, w, &mut wt);
-    let rows_per_group = m.div_ceil(GROUPS).max(GROUP_ROWS).next_multiple_of(BLOCK_BACKWARD);
-    let per_row = kind == BiasKind::PerRow;
-    let mut empty = [0.0f32; 0];
-    let db_rows = if per_row { &mut *db } else { &mut empty[..] };
-    let mut db_chunks: Vec<&mut [f32]> = db_rows.chunks_mut(rows_per_group * n).collect();
-    db_chunks.resize_with(m.div_ceil(rows_per_group), Default::default);
-    let partial: Vec<(Vec<f32>, Vec<f32>)> = dx
-        .par_chunks_mut((rows_per_group * k).max(1))
-        .zip(db_chunks)
-        .enumerate()
-        .map(|(group, (dx, db_rows))| {
-            let (mut dw, mut db) = (vec![0.0; k * n], vec![0.0; n]);
-            let mut g = vec![0.0; BLOCK_BACKWARD * n];
-            let first = group * rows_per_group;
-            let last = (first + rows_per_group).min(m);
-            for start in (first..last).step_by(BLOCK_BACKWARD) {
-                let rows = BLOCK_BACKWARD.min(last - start);
-                let span = start * n..(start + rows) * n;
-                let slopes = g.iter_mut().zip(&d[span.clone()]).zip(&out[span]);
-                match a {
-                    Activation::Relu => {
-                        slopes.for_each(|((g, d), y)| *g = f32::from_bits(d.to_bits() & ((*y > 0.0) as u32).wrapping_neg()))
-                    }
-                    _ => slopes.for_each(|((g, d), y)| *g = d * slope_from_output(a, *y)),
-                }
-                let g = &g[..rows * n];
-                let local = start - first;
-                gemm(Precision::F32, rows, k, n, View::rows(g, n), &wt, k, &mut dx[local * k..], k, Init::Zero, false);
-                gemm(Precision::F32, k, n, rows, View::transposed(&x[start * k..], k), g, n, &mut dw, n, Init::Accumulate, false);
-                if per_row {
-                    db_rows[local * n..(local + rows) * n].copy_from_slice(g);
-                }
-                if kind == BiasKind::Shared {
-                    for row in g.chunks_exact(n) {
-                        db.iter_mut().zip(row).for_each(|(b, g)| *b += g);
-                    }
-                }
-            }
-            (dw, db)
-        })
-        .collect();
-    for (w, b) in &partial {
-        dw.iter_mut().zip(w).for_each(|(a, b)| *a += b);
-        if kind == BiasKind::Shared {
-            db.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+    if l.activation == Activation::None {
+        return by_columns(l, x, w, d, gradients);
+    }
+    let mut g = SLOPES.take();
+    g.resize(d.len(), 0.0);
+    let (level, chunk) = (simd::level(), BLOCK * l.outputs.max(1));
+    g.par_chunks_mut(chunk).zip(out.par_chunks(chunk)).zip(d.par_chunks(chunk)).for_each(|((g, out), d)| {
+        simd::with_level(level, || l.before_activation(out, d, g));
+    });
+    by_columns(l, x, w, &g, gradients);
+    SLOPES.set(g);
+}
+
+/// Whole products, given the gradient before the activation.
+fn by_columns(l: &Linear, x: &[f32], w: &[f32], g: &[f32], gradients: Gradients) {
+    let s = Matmul::new(l.rows, l.outputs, l.inputs);
+    if let Some(dx) = gradients.x {
+        matmul(&s.gradient_a(), g, w, dx);
+    }
+    if let Some(dw) = gradients.w {
+        matmul(&s.gradient_b(), x, g, dw);
+    }
+    match (gradients.bias, l.bias) {
+        (Some(db), BiasKind::Shared) => {
+            db.fill(0.0);
+            g.chunks_exact(l.outputs.max(1)).for_each(|row| add(db, row));
         }
+        (Some(db), BiasKind::PerRow) => db.copy_from_slice(g),
+        _ => {}
     }
+}
+
+/// Groups of rows, whose gradients of weights and bias are added in order.
+fn by_rows(l: &Linear, x: &[f32], w: &[f32], out: &[f32], d: &[f32], gradients: Gradients) {
+    let (m, k, n) = (l.rows, l.inputs, l.outputs);
+    let (per_group, size, level) = (m.div_ceil(GROUPS), k * n + n, simd::level());
+    let groups = m.div_ceil(per_group);
+    let wanted = [gradients.w.is_some(), gradients.bias.is_some() && l.bias == BiasKind::Shared];
+    let dx = gradients.x.map(|dx| {
+        assert_eq!(dx.len(), m * k, "linear: gradient of the input");
+        Parts::new(dx)
+    });
+    PARTIAL.with_borrow_mut(|partial| {
+        partial.resize(groups * size, 0.0);
+        partial.par_chunks_mut(size).enumerate().for_each(|(group, partial)| {
+            let (dw, db) = partial.split_at_mut(k * n);
+            db.fill(0.0);
+            let end = ((group + 1) * per_group).min(m);
+            let mut g = SLOPES.take();
+            for first in (group * per_group..end).step_by(BLOCK) {
+                let rows = first..(first + BLOCK).min(end);
+                let span = rows.start * n..rows.end * n;
+                simd::with_level(level, || {
+                    let g = if l.activation == Activation::None {
+                        &d[span]
+                    } else {
+                        g.resize(rows.len() * n, 0.0);
+                        l.before_activation(&out[span.clone()], &d[span], &mut g);
+                        &g[..]
+                    };
+                    let s = Matmul::new(rows.len(), n, k);
+                    let inputs = rows.start * k..rows.end * k;
+                    if let Some(dx) = &dx {
+                        // SAFETY: each task has rows of its own.
+                        matmul_here(&s.gradient_a(), g, w, unsafe { dx.range(inputs.clone()) });
+                    }
+                    if wanted[0] {
+                        let accumulate = first > group * per_group;
+                        matmul_here(&Matmul { accumulate, ..s.gradient_b() }, &x[inputs], g, dw);
+                    }
+                    if wanted[1] {
+                        g.chunks_exact(n.max(1)).for_each(|row| add(db, row));
+                    }
+                });
+            }
+            SLOPES.set(g);
+        });
+        let collect = |to: &mut [f32], at: usize| {
+            to.fill(0.0);
+            partial.chunks_exact(size).for_each(|p| add(to, &p[at..at + to.len()]));
+        };
+        if let Some(dw) = gradients.w {
+            collect(dw, 0);
+        }
+        if let Some(db) = gradients.bias.filter(|_| wanted[1]) {
+            collect(db, k * n);
+        }
+    });
 }

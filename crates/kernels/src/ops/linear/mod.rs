@@ -43,3 +43,35 @@ pub enum BiasKind {
     /// `[M, N]`
     PerRow,
 }
+
+impl BiasKind {
+    /// Numbers of a bias for `m` rows of `n` outputs.
+    pub fn len(self, m: usize, n: usize) -> usize {
+        match self {
+            BiasKind::None => 0,
+            BiasKind::Shared => n,
+            BiasKind::PerRow => m * n,
+        }
+    }
+}
+
+/// A layer on the CPU: `[rows, inputs] → [rows, outputs]`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Linear {
+    pub rows: usize,
+    pub inputs: usize,
+    pub outputs: usize,
+    pub bias: BiasKind,
+    pub activation: Activation,
+}
+
+/// Destinations of a backward pass, overwritten; what is `None` is not computed.
+#[derive(Default)]
+pub struct Gradients<'a> {
+    /// `[rows, inputs]`
+    pub x: Option<&'a mut [f32]>,
+    /// `[inputs, outputs]`
+    pub w: Option<&'a mut [f32]>,
+    /// As the bias.
+    pub bias: Option<&'a mut [f32]>,
+}

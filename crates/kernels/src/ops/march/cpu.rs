@@ -229,3 +229,18 @@ pub fn positions(rays: &MarchRays, samples: &Marched, out: &mut Vec<f32>) {
         }
     });
 }
+
+/// Gradients `[R, 3]` of the rays' origins and directions from those of [`positions`] `[S, 3]`, overwritten.
+pub fn positions_backward(samples: &Marched, d_positions: &[f32], d_origins: &mut [f32], d_dirs: &mut [f32]) {
+    d_origins.fill(0.0);
+    d_dirs.fill(0.0);
+    for (r, span) in samples.offsets.windows(2).enumerate() {
+        for i in span[0] as usize..span[1] as usize {
+            let t = samples.t[i] + 0.5 * samples.dt[i];
+            for k in 0..3 {
+                d_origins[r * 3 + k] += d_positions[i * 3 + k];
+                d_dirs[r * 3 + k] += t * d_positions[i * 3 + k];
+            }
+        }
+    }
+}

@@ -195,3 +195,29 @@ fn points_are_normalized_as_space_says() {
         }
     }
 }
+
+#[test]
+fn positions_pass_their_gradients_to_origins_and_directions() {
+    let (g, r) = (sparse_grid(1), rays(9, 0.9));
+    let c = MarchConfig { cone: 0.0, dt_min: 0.01, dt_max: 0.01, max_samples: 30, ..MarchConfig::default() };
+    let samples = run(&g, &r, &c);
+    assert!(!samples.t.is_empty());
+    let d = diorama_testkit::random(samples.t.len() * 3, 5);
+    let (mut d_origins, mut d_dirs) = (vec![9.0; 27], vec![9.0; 27]);
+    cpu::positions_backward(&samples, &d, &mut d_origins, &mut d_dirs);
+    // Positions are linear in both, so that any step shows the slope.
+    let value = |r: &MarchRays| {
+        let mut x = Vec::new();
+        cpu::positions(r, &samples, &mut x);
+        x.iter().zip(&d).map(|(x, d)| (x * d) as f64).sum::<f64>()
+    };
+    let view = r.view();
+    for i in 0..27 {
+        let moved = |v: &[f32], by: f32| v.iter().enumerate().map(|(k, x)| if k == i { x + by } else { *x }).collect::<Vec<f32>>();
+        let of_origin = |by: f32| value(&MarchRays { origins: &moved(view.origins, by), ..r.view() });
+        let of_dir = |by: f32| value(&MarchRays { dirs: &moved(view.dirs, by), ..r.view() });
+        for (got, want) in [(d_origins[i], of_origin(0.5) - of_origin(-0.5)), (d_dirs[i], of_dir(0.5) - of_dir(-0.5))] {
+            assert!((got as f64 - want).abs() < 1e-3 * (1.0 + want.abs()), "{i}: {got} {want}");
+        }
+    }
+}

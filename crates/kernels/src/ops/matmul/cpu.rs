@@ -4,16 +4,24 @@ use super::Matmul;
 use crate::ops::conv2d::bands::{Scratch, aligned, with_scratch};
 use crate::ops::conv2d::weights::interleave;
 use crate::simd;
-use crate::tile::{Kernel, Pack, Segment, Shared, Start, Tile, kernel};
+use crate::tile::{Kernel, Shared, Start, Tile, kernel};
+use crate::vector::vectorized;
 use rayon::prelude::*;
+use std::cell::Cell;
 use std::ops::Range;
 
-/// Terms of a sum per pass.
-const TERMS: usize = 288;
 /// Most rows of a task, whose part of A stays in the second-level cache.
 const ROWS: usize = 384;
 /// Fewest rows of a task, which share the copy of a panel.
 const FEWEST_ROWS: usize = 96;
+/// Parts that a long sum over few outputs is cut into at most, and terms that one has at least.
+const GROUPS: usize = 16;
+const GROUP_TERMS: usize = 2048;
+/// Most outputs of which each part has its own.
+const GROUP_OUTPUTS: usize = 1 << 19;
+
+/// Turns finished sums into outputs, given their row and their first column.
+pub type Finish<'a> = &'a (dyn Fn(usize, usize, &mut [f32]) + Sync);
 
 /// One product of a batch, as all threads see it.
 struct Job<'a> {
@@ -21,35 +29,61 @@ struct Job<'a> {
     kernel: &'static Kernel,
     a: &'a [f32],
     b: &'a [f32],
+    finish: Option<Finish<'a>>,
+}
+
+/// What a task computes, and where that goes.
+struct Part {
+    batch: usize,
+    rows: Range<usize>,
+    columns: Range<usize>,
+    terms: Range<usize>,
     c: Shared,
+    accumulate: bool,
 }
 
 /// `c = a b`, or `c += a b` where the description says so.
 ///
 /// # Shapes
-/// As [`Matmul`] says. Sums run over `k` in blocks of fixed size, so results do not depend on the number of threads.
+/// As [`Matmul`] says. Sums run over `k` in blocks that depend on the shape alone, so results do not depend on the number of threads.
 pub fn matmul(s: &Matmul, a: &[f32], b: &[f32], c: &mut [f32]) {
-    assert_eq!(a.len(), s.batch * s.m * s.k, "matmul: a");
-    assert_eq!(b.len(), s.batch * s.k * s.n, "matmul: b");
-    assert_eq!(c.len(), s.batch * s.m * s.n, "matmul: c");
-    if c.is_empty() {
-        return;
-    }
-    if s.k == 0 {
-        if !s.accumulate {
-            c.fill(0.0);
-        }
-        return;
+    matmul_with(s, a, b, c, None);
+}
+
+/// The same with a bias or an activation, while the outputs are in cache.
+pub fn matmul_with(s: &Matmul, a: &[f32], b: &[f32], c: &mut [f32], finish: Option<Finish>) {
+    let Some(job) = Job::new(s, a, b, c, finish) else { return };
+    let groups = groups(s);
+    if groups > 1 {
+        return job.in_groups(groups, c);
     }
     let level = simd::level();
-    let kernel = kernel(level);
-    let (rows, columns) = divide(s, kernel);
+    let (rows, columns) = divide(s, job.kernel);
     let (down, across) = (s.m.div_ceil(rows), s.n.div_ceil(columns));
-    let job = Job { s: *s, kernel, a, b, c: Shared(c.as_mut_ptr()) };
+    let c = Shared(c.as_mut_ptr());
     (0..s.batch * down * across).into_par_iter().for_each(|i| {
         let (row, column) = (i / across % down * rows, i % across * columns);
-        let part = (row..(row + rows).min(s.m), column..(column + columns).min(s.n));
-        simd::with_level(level, || with_scratch(|scratch| job.compute(i / across / down, part, scratch)));
+        let part = Part {
+            batch: i / across / down,
+            rows: row..(row + rows).min(s.m),
+            columns: column..(column + columns).min(s.n),
+            terms: 0..s.k,
+            c,
+            accumulate: s.accumulate,
+        };
+        simd::with_level(level, || with_scratch(|scratch| job.compute(&part, scratch)));
+    });
+}
+
+/// The same on this thread, for tasks that cut a larger problem.
+pub(crate) fn matmul_here(s: &Matmul, a: &[f32], b: &[f32], c: &mut [f32]) {
+    let Some(job) = Job::new(s, a, b, c, None) else { return };
+    let c = Shared(c.as_mut_ptr());
+    with_scratch(|scratch| {
+        for (batch, row) in (0..s.batch).flat_map(|b| (0..s.m).step_by(ROWS).map(move |r| (b, r))) {
+            let rows = row..(row + ROWS).min(s.m);
+            job.compute(&Part { batch, rows, columns: 0..s.n, terms: 0..s.k, c, accumulate: s.accumulate }, scratch);
+        }
     });
 }
 
@@ -61,49 +95,140 @@ fn divide(s: &Matmul, kernel: &Kernel) -> (usize, usize) {
     (rows, s.n.div_ceil(across).next_multiple_of(kernel.width()))
 }
 
-impl Job<'_> {
-    fn compute(&self, batch: usize, (rows, columns): (Range<usize>, Range<usize>), scratch: &mut Scratch) {
-        let (s, width) = (&self.s, self.kernel.width());
-        let a = &self.a[batch * s.m * s.k..][..s.m * s.k];
-        let b = &self.b[batch * s.k * s.n..][..s.k * s.n];
-        let (row, term) = if s.a_transposed { (1, s.m) } else { (s.k, 1) };
-        let Scratch { panel, sums, offsets, .. } = scratch;
-        let panel = aligned(panel, (TERMS + 1) * width);
-        let edge = aligned(sums, self.kernel.rows * width);
-        assert!(u32::try_from(TERMS * term).is_ok(), "matmul: {} rows of a transposed matrix", s.m);
+/// Parts that sums are cut into: one, but where there are few outputs and many terms.
+fn groups(s: &Matmul) -> usize {
+    if s.batch == 1 && s.m * s.n <= GROUP_OUTPUTS { (s.k / GROUP_TERMS).clamp(1, GROUPS) } else { 1 }
+}
+
+thread_local! {
+    static PARTIAL: Cell<Vec<f32>> = const { Cell::new(Vec::new()) };
+}
+
+vectorized! {
+    fn add<const F>(sums: &mut [f32], values: &[f32]) {
+        sums.iter_mut().zip(values).for_each(|(s, v)| *s += v);
+    }
+}
+
+impl<'a> Job<'a> {
+    /// None where there is nothing to multiply; outputs of empty sums are written.
+    fn new(s: &Matmul, a: &'a [f32], b: &'a [f32], c: &mut [f32], finish: Option<Finish<'a>>) -> Option<Job<'a>> {
+        assert_eq!(a.len(), s.batch * s.m * s.k, "matmul: a");
+        assert_eq!(b.len(), s.batch * s.k * s.n, "matmul: b");
+        assert_eq!(c.len(), s.batch * s.m * s.n, "matmul: c");
+        if c.is_empty() {
+            return None;
+        }
+        if s.k == 0 {
+            if !s.accumulate {
+                c.fill(0.0);
+            }
+            if let Some(finish) = finish {
+                c.chunks_exact_mut(s.n).enumerate().for_each(|(i, row)| finish(i % s.m, 0, row));
+            }
+            return None;
+        }
+        Some(Job { s: *s, kernel: kernel(simd::level()), a, b, finish })
+    }
+
+    /// Sums of parts of the terms, added in order.
+    fn in_groups(&self, groups: usize, c: &mut [f32]) {
+        let (s, level) = (&self.s, simd::level());
+        let per = s.k.div_ceil(groups);
+        let mut partial = PARTIAL.take();
+        partial.resize((groups - 1) * c.len(), 0.0);
+        let (first, others, size) = (Shared(c.as_mut_ptr()), Shared(partial.as_mut_ptr()), c.len());
+        let sums = Job { finish: None, ..*self };
+        let down = s.m.div_ceil(ROWS);
+        (0..groups * down).into_par_iter().for_each(|i| {
+            let (group, row) = (i / down, i % down * ROWS);
+            // SAFETY: every group but the first has its own part of the partial sums.
+            let c = if group == 0 { first } else { Shared(unsafe { others.at((group - 1) * size) }) };
+            let part = Part {
+                batch: 0,
+                rows: row..(row + ROWS).min(s.m),
+                columns: 0..s.n,
+                terms: (group * per).min(s.k)..((group + 1) * per).min(s.k),
+                c,
+                accumulate: group == 0 && s.accumulate,
+            };
+            simd::with_level(level, || with_scratch(|scratch| sums.compute(&part, scratch)));
+        });
+        c.par_chunks_mut(s.n).enumerate().for_each(|(row, c)| {
+            simd::with_level(level, || {
+                partial.chunks_exact(size).for_each(|p| add(c, &p[row * s.n..][..s.n]));
+                if let Some(finish) = self.finish {
+                    finish(row, 0, c);
+                }
+            });
+        });
+        PARTIAL.set(partial);
+    }
+
+    fn compute(&self, part: &Part, scratch: &mut Scratch) {
+        let (s, width, height) = (&self.s, self.kernel.width(), self.kernel.rows);
+        let a = &self.a[part.batch * s.m * s.k..][..s.m * s.k];
+        let b = &self.b[part.batch * s.k * s.n..][..s.k * s.n];
+        let most = self.kernel.terms().min(part.terms.len());
+        let Scratch { planes, panel, sums, offsets, .. } = scratch;
+        let panel = aligned(panel, (most + 1) * width);
+        let edge = aligned(sums, height * width);
+        let rows = aligned(planes, if s.a_transposed { part.rows.len().next_multiple_of(height) * most } else { 0 });
+        let (row, term) = if s.a_transposed { (1, height as u32) } else { (s.k, 1) };
         offsets.clear();
-        offsets.extend((0..TERMS.min(s.k)).map(|p| ((p * term) as u32, (p * width) as u32)));
-        for p in (0..s.k).step_by(TERMS) {
-            let terms = TERMS.min(s.k - p);
-            for j in columns.clone().step_by(width) {
-                let count = width.min(columns.end - j);
-                self.pack(b, p..p + terms, j..j + count, panel);
-                for i in rows.clone().step_by(self.kernel.rows) {
-                    let height = self.kernel.rows.min(rows.end - i);
-                    let to = (batch * s.m + i) * s.n + j;
+        offsets.extend((0..most as u32).map(|p| (p * term, p * width as u32)));
+        for p in part.terms.clone().step_by(most.max(1)) {
+            let terms = p..(p + most).min(part.terms.end);
+            if s.a_transposed {
+                self.pack_rows(a, part.rows.clone(), terms.clone(), rows);
+            }
+            let add = p > part.terms.start || part.accumulate;
+            let finish = self.finish.filter(|_| terms.end == part.terms.end);
+            for j in part.columns.clone().step_by(width) {
+                let count = width.min(part.columns.end - j);
+                self.pack(b, terms.clone(), j..j + count, panel);
+                for i in part.rows.clone().step_by(height) {
+                    let a = if s.a_transposed { &rows[(i - part.rows.start) * terms.len()..] } else { &a[i * s.k + terms.start..] };
+                    let tall = height.min(part.rows.end - i);
+                    let to = (part.batch * s.m + i) * s.n + j;
                     let tile = Tile {
-                        a: a[i * row + p * term..].as_ptr(),
+                        a: a.as_ptr(),
                         row,
                         b: panel.as_ptr(),
-                        offsets: &offsets[..terms],
+                        offsets: &offsets[..terms.len()],
                         c: edge.as_mut_ptr(),
                         c_row: width,
                         c_vector: self.kernel.lanes,
                         start: Start::Zero,
                     };
-                    let add = p > 0 || s.accumulate;
                     let vectors = count.div_ceil(self.kernel.lanes);
-                    // SAFETY: rows and terms of A exist from there; the panel has all terms; C's columns are this task's own.
+                    // SAFETY: the blocks of A and the panel hold all terms; C's columns are this task's own.
                     unsafe {
                         if count.is_multiple_of(self.kernel.lanes) {
                             let start = if add { Start::Accumulate } else { Start::Zero };
-                            self.kernel.run(height, vectors, &Tile { c: self.c.at(to), c_row: s.n, start, ..tile });
+                            self.kernel.run(tall, vectors, &Tile { c: part.c.at(to), c_row: s.n, start, ..tile });
                         } else {
-                            self.kernel.run(height, vectors, &tile);
-                            self.store(&edge[..height * width], count, to, add);
+                            self.kernel.run(tall, vectors, &tile);
+                            store(&edge[..tall * width], width, count, part.c.at(to), s.n, add);
+                        }
+                        if let Some(finish) = finish {
+                            for r in 0..tall {
+                                finish(i + r, j, std::slice::from_raw_parts_mut(part.c.at(to + r * s.n), count));
+                            }
                         }
                     }
                 }
+            }
+        }
+    }
+
+    /// Copies some terms of some rows of a transposed A: blocks of as many rows as a tile has, `[terms, rows]` each.
+    fn pack_rows(&self, a: &[f32], rows: Range<usize>, terms: Range<usize>, out: &mut [f32]) {
+        let (s, height) = (&self.s, self.kernel.rows);
+        for (i, block) in rows.clone().step_by(height).zip(out.chunks_exact_mut(height * terms.len())) {
+            let tall = height.min(rows.end - i);
+            for (p, to) in terms.clone().zip(block.chunks_exact_mut(height)) {
+                to[..tall].copy_from_slice(&a[p * s.m + i..][..tall]);
             }
         }
     }
@@ -115,23 +240,44 @@ impl Job<'_> {
             let from = &b[columns.start * s.k + terms.start..];
             return interleave(from, s.k, columns.len(), width, &mut panel[..terms.len() * width]);
         }
-        let segment = [Segment { from: columns.start, at: 0, len: columns.len(), to: 0 }];
-        for (p, to) in terms.zip(panel.chunks_exact_mut(width)) {
-            let pack =
-                Pack { from: b[p * s.n..].as_ptr(), offsets: &[(0, 0)], segments: &segment, panel: to.as_mut_ptr(), width, exact: true };
-            // SAFETY: the columns of row p exist, and no more is read.
-            unsafe { self.kernel.pack(&pack) };
+        copy_columns(&b[terms.start * s.n + columns.start..], s.n, columns.len(), width, &mut panel[..terms.len() * width]);
+    }
+}
+
+/// Rows ahead of a copy that are asked of memory.
+const AHEAD: usize = 12;
+
+vectorized! {
+    /// `out[p, ..count] = from[p · stride ..]` for rows of `width`.
+    fn copy_columns<const F>(from: &[f32], stride: usize, count: usize, width: usize, out: &mut [f32]) {
+        for (p, to) in out.chunks_exact_mut(width).enumerate() {
+            #[cfg(target_arch = "x86_64")]
+            for line in (0..count).step_by(16) {
+                use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+                // SAFETY: a hint, which may name any address.
+                unsafe { _mm_prefetch::<_MM_HINT_T0>(from.as_ptr().wrapping_add((p + AHEAD) * stride + line).cast()) };
+            }
+            let from = &from[p * stride..p * stride + count];
+            if count == 48 && width == 48 {
+                // A known size becomes a few vectors.
+                to[..48].copy_from_slice(&from[..48]);
+            } else {
+                to[..count].copy_from_slice(from);
+            }
         }
     }
+}
 
-    /// Writes the first `count` columns of a tile.
-    unsafe fn store(&self, tile: &[f32], count: usize, to: usize, add: bool) {
-        for (r, row) in tile.chunks_exact(self.kernel.width()).enumerate() {
-            // SAFETY: the caller vouches for the rows of C.
-            let out = unsafe { std::slice::from_raw_parts_mut(self.c.at(to + r * self.s.n), count) };
-            for (o, v) in out.iter_mut().zip(row) {
-                *o = if add { *o + v } else { *v };
-            }
+/// Writes the first `count` columns of a tile.
+///
+/// # Safety
+/// The rows of C, `stride` apart, have as many columns.
+unsafe fn store(tile: &[f32], width: usize, count: usize, to: *mut f32, stride: usize, add: bool) {
+    for (r, row) in tile.chunks_exact(width).enumerate() {
+        // SAFETY: the caller vouches for the rows of C.
+        let out = unsafe { std::slice::from_raw_parts_mut(to.add(r * stride), count) };
+        for (o, v) in out.iter_mut().zip(row) {
+            *o = if add { *o + v } else { *v };
         }
     }
 }

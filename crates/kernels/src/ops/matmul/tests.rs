@@ -14,6 +14,7 @@ fn cases() -> Vec<Matmul> {
         (1, 101, 150, 300),
         (1, 9, 48, 600),
         (1, 200, 33, 17),
+        (1, 20, 33, 4500),
     ] {
         for flags in 0..8 {
             let [a_transposed, b_transposed, accumulate] = [1, 2, 4].map(|b| flags & b > 0);
@@ -60,5 +61,26 @@ fn reference_gradients_match_central_differences() {
         let (da, db) = reference::backward(&s, &a, &b, &d);
         assert_gradient("a", &da, &a, 1e-6, |a| loss(a, &b));
         assert_gradient("b", &db, &b, 1e-6, |b| loss(&a, b));
+    }
+}
+
+#[test]
+fn results_do_not_depend_on_the_number_of_threads_and_finish_sees_every_output_once() {
+    for s in [Matmul::new(130, 100, 700), Matmul::new(9, 50, 5000), Matmul::new(3, 4, 0)] {
+        let (a, b) = (random(s.m * s.k, 1), random(s.k * s.n, 2));
+        let run = |threads: usize| {
+            rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(|| {
+                let (mut c, mut finished) = (vec![9.0; s.m * s.n], vec![9.0; s.m * s.n]);
+                cpu::matmul(&s, &a, &b, &mut c);
+                let finish = |row: usize, column: usize, values: &mut [f32]| {
+                    values.iter_mut().enumerate().for_each(|(i, v)| *v += (row * s.n + column + i) as f32);
+                };
+                cpu::matmul_with(&s, &a, &b, &mut finished, Some(&finish));
+                assert!(finished.iter().zip(&c).enumerate().all(|(i, (f, c))| *f == c + i as f32), "{s:?}");
+                c
+            })
+        };
+        let one = run(1);
+        assert!(one == run(2) && one == run(5), "{s:?}");
     }
 }

@@ -1,0 +1,170 @@
+//! A training step, described once: where rays come from, how samples are placed on them, what is compared, and how parameters follow.
+//! [`CpuTrainer`] carries it out here, `on_gpu::GpuTrainer` on a device.
+
+mod cpu;
+
+pub use cpu::CpuTrainer;
+#[cfg(feature = "gpu")]
+pub(crate) use cpu::relative;
+
+use crate::background::LearnedBackground;
+use crate::fields::{Field, Pruning};
+use crate::losses::Terms;
+use crate::params::ParamGroup;
+use crate::samplers::occupancy::Occupancy;
+use crate::samplers::pixels::{ErrorMap, Observation, PixelSource};
+use diorama_geom::rng::Rng;
+use diorama_kernels::ops::field_step::BatchLoss;
+use diorama_kernels::ops::march::MarchConfig;
+use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
+
+/// What a step depends on besides what is trained.
+#[derive(Clone, Copy)]
+pub struct Step<'a> {
+    /// Number of the step, from 0.
+    pub number: u64,
+    pub rays: RaySource<'a>,
+    /// Rays of the steps before, from which random numbers are counted on.
+    pub first: u64,
+    /// Ignored where a background is learned.
+    pub backdrop: Backdrop,
+    pub placement: Placement,
+    /// Where the occupancy grid is sampled before the step; none: nowhere.
+    pub probes: Option<Probes>,
+    pub loss: Loss<'a>,
+    /// Distance within which samples learn more slowly; 0: none.
+    pub near_scaling: f32,
+    /// Times each group's own rate.
+    pub rate_scale: f32,
+    /// Whether draws go by the errors as they are after this step.
+    pub refresh_errors: bool,
+}
+
+/// Where the rays of a step come from.
+#[derive(Clone, Copy)]
+pub enum RaySource<'a> {
+    /// Random pixels of the training photographs, half of them where errors are high if there is an [`ErrorMap`].
+    Photographs { count: usize, rng: Rng },
+    /// Rays of the caller's, for example of whole patches that generated cameras see.
+    Given(GivenRays<'a>),
+}
+
+impl RaySource<'_> {
+    /// Rays of the step.
+    pub fn count(&self) -> usize {
+        match self {
+            RaySource::Photographs { count, .. } => *count,
+            RaySource::Given(g) => g.images.len(),
+        }
+    }
+}
+
+/// Rays in model space with what belongs to each; lengths must agree.
+#[derive(Clone, Copy, Debug)]
+pub struct GivenRays<'a> {
+    /// Row of the appearance codes, `[R]`.
+    pub images: &'a [u32],
+    /// `[R, 3]`
+    pub origins: &'a [f32],
+    /// Unit length, `[R, 3]`.
+    pub dirs: &'a [f32],
+    /// Where in a marching step the first sample lies, in `[0, 1)`, `[R]`.
+    pub jitter: &'a [f32],
+    /// Straight RGBA `[R, 4]`; may be empty where a [`BatchLoss`] knows what to compare with.
+    pub target: &'a [f32],
+    /// What the field's channels are composited on, `[R, C]`.
+    pub background: &'a [f32],
+    /// Vectors of [`crate::fields::RayCodes::given`], `[R, width]` each.
+    pub codes: &'a [&'a [f32]],
+}
+
+/// What photographs' transparent pixels, and the field, are composited on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Backdrop {
+    Color([f32; 3]),
+    /// Another color for every ray.
+    Random(Rng),
+}
+
+/// How samples are placed on rays.
+#[derive(Clone, Copy, Debug)]
+pub enum Placement {
+    /// In occupied cells, but for those that cannot matter. `room`: samples that a device has memory for, before and after those are
+    /// left out; rays beyond it are left out of the step.
+    Occupancy { march: MarchConfig, pruning: Pruning, room: (usize, usize) },
+    /// One in each of equal intervals.
+    Stratified { samples: usize, rng: Rng },
+    /// As many for the coarse field, whose weights decide where `more` go for the main one.
+    Hierarchical { samples: usize, more: usize, coarse: Rng, fine: Rng },
+}
+
+/// Random points at which the occupancy grid is sampled.
+#[derive(Clone, Copy, Debug)]
+pub struct Probes {
+    pub rng: Rng,
+    pub points: usize,
+    /// Edge of the blocks of cells that share a point.
+    pub block: usize,
+}
+
+/// What a step minimizes.
+#[derive(Clone, Copy)]
+pub enum Loss<'a> {
+    /// Of colors `[R, 3]` against photographs, ray by ray.
+    Photometric(Terms),
+    /// A function of all rays' outputs `[R, C]`, computed on the CPU; the network is evaluated once more for its gradients.
+    Batch(&'a dyn BatchLoss),
+}
+
+/// What a step draws from.
+#[derive(Clone, Copy)]
+pub struct Photographs<'a> {
+    pub pixels: &'a dyn PixelSource,
+    /// Pixels of known distance.
+    pub observations: &'a [Observation],
+}
+
+/// Where rays begin and end, and the training cameras as they were given.
+#[derive(Clone, Debug)]
+pub struct Scene {
+    pub cameras: Vec<PosedCamera>,
+    /// Distance from the camera at which rays begin, in model space.
+    pub near: f32,
+    /// The outer cube in model space: lowest corner and edge.
+    pub cube: (f32, f32),
+}
+
+/// All that a step trains.
+pub struct Trainees<'a> {
+    pub field: &'a mut Field,
+    /// Places samples for the main field ([`Placement::Hierarchical`]).
+    pub coarse: Option<&'a mut Field>,
+    pub learned: Option<&'a mut LearnedBackground>,
+    pub occupancy: Option<&'a mut Occupancy>,
+    /// Of the cameras, `[cameras, 7]`, and whether focal lengths are among what is refined.
+    pub corrections: Option<(&'a mut ParamGroup, bool)>,
+    pub error_map: Option<&'a mut ErrorMap>,
+}
+
+/// What steps came to.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Figures {
+    pub steps: u64,
+    pub rays: u64,
+    /// Means over the steps.
+    pub loss: f64,
+    /// Squared color error of the rays; not a number without photographs.
+    pub mse: f64,
+    /// Samples trained and marched, all steps together.
+    pub trained: f64,
+    pub marched: f64,
+}
+
+/// Cameras with their corrections `[cameras, 7]`.
+pub fn corrected(cameras: &[PosedCamera], corrections: &[f32]) -> Vec<PosedCamera> {
+    let rows = corrections.chunks_exact(CORRECTION);
+    cameras.iter().zip(rows).map(|(c, d)| c.corrected(&std::array::from_fn(|k| d[k] as f64))).collect()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,210 @@
+use super::*;
+use crate::fields::{self, DirectionCode, Encoder, RayCodes, VoxelGrid};
+use crate::losses::ColorLoss;
+use diorama_geom::contraction::Space;
+use diorama_geom::glam::DVec3;
+use diorama_geom::{Camera, Pose};
+use diorama_kernels::ops::adam::Adam;
+use diorama_kernels::ops::field_step::{FieldNet, Output, RayGradients, RayOutputs};
+use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
+use diorama_kernels::ops::hash_grid::HashGridConfig;
+use diorama_kernels::ops::linear::Activation;
+use diorama_kernels::ops::pixel_gather::OBSERVED_EVERY;
+use diorama_testkit::random_unit;
+
+/// One photograph per camera, each of one color.
+struct Plain([[f32; 4]; 2]);
+
+impl PixelSource for Plain {
+    fn images(&self) -> usize {
+        2
+    }
+    fn size(&self, _: usize) -> (u32, u32) {
+        (8, 8)
+    }
+    fn rgba(&self, image: usize, _: u32, _: u32) -> [f32; 4] {
+        self.0[image]
+    }
+    fn counts(&self, _: usize, x: u32, _: u32) -> bool {
+        x < 6
+    }
+}
+
+fn scene() -> Scene {
+    let camera = |at: DVec3| PosedCamera { camera: Camera::pinhole(8, 8, 1.0), pose: Pose::look_at(at, DVec3::splat(0.5), DVec3::Z) };
+    Scene { cameras: vec![camera(DVec3::new(2.0, 0.5, 0.5)), camera(DVec3::new(-1.0, 0.5, 0.5))], near: 0.05, cube: (0.0, 1.0) }
+}
+
+fn hash_field() -> Field {
+    let config = HashGridConfig { levels: 2, features: 2, log2_size: 8, base: 4, finest: 8 };
+    fields::ngp(config, Space::Cube(1.0), 1e-2, 2, 0, 3)
+}
+
+fn step(number: u64, placement: Placement, loss: Loss<'_>) -> Step<'_> {
+    Step {
+        number,
+        rays: RaySource::Photographs { count: 64, rng: Rng::new(1, 1) },
+        first: number * 64,
+        backdrop: Backdrop::Color([0.0; 3]),
+        placement,
+        probes: None,
+        loss,
+        near_scaling: 0.0,
+        rate_scale: 1.0,
+        refresh_errors: false,
+    }
+}
+
+fn stratified() -> Placement {
+    Placement::Stratified { samples: 16, rng: Rng::new(1, 2) }
+}
+
+fn photometric(color: ColorLoss) -> Loss<'static> {
+    Loss::Photometric(Terms { color, distortion: 0.0, depth: 0.0, alpha: 0.0 })
+}
+
+fn of(field: &mut Field) -> Trainees<'_> {
+    Trainees { field, coarse: None, learned: None, occupancy: None, corrections: None, error_map: None }
+}
+
+#[test]
+fn every_placement_learns_the_colors_of_photographs() {
+    let pixels = Plain([[0.8, 0.3, 0.1, 1.0]; 2]);
+    let photographs = Photographs { pixels: &pixels, observations: &[] };
+    let march = MarchConfig { cone: 0.0, dt_min: 0.06, dt_max: 0.06, max_samples: 64, ..MarchConfig::default() };
+    let pruning = Pruning { stop: 1e-4, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 };
+    let hierarchical = Placement::Hierarchical { samples: 8, more: 8, coarse: Rng::new(1, 3), fine: Rng::new(1, 4) };
+    for placement in [stratified(), hierarchical, Placement::Occupancy { march, pruning, room: (0, 0) }] {
+        let (mut field, mut coarse, mut occupancy) = (hash_field(), hash_field(), Occupancy::new(8, 1, false));
+        let mut of = Trainees { coarse: Some(&mut coarse), occupancy: Some(&mut occupancy), ..of(&mut field) };
+        let mut trainer = CpuTrainer::new(scene(), &of);
+        let mut run = |i: u64| {
+            let probes = (i > 0 && i.is_multiple_of(16)).then_some(Probes { rng: Rng::new(1, 5), points: 256, block: 1 });
+            trainer.step(&mut of, Some(&photographs), &Step { probes, ..step(i, placement, photometric(ColorLoss::Mse)) })
+        };
+        let first = run(0);
+        let last = (1..120).map(run).last().unwrap();
+        assert!(last.loss < 0.1 * first.loss && last.mse < 0.1 * first.mse, "{placement:?}: {first:?} {last:?}");
+        assert!(last.trained > 0.0 && last.marched >= last.trained && (last.steps, last.rays) == (1, 64));
+    }
+}
+
+#[test]
+fn a_loss_that_is_not_finite_changes_nothing() {
+    let pixels = Plain([[f32::NAN; 4]; 2]);
+    let photographs = Photographs { pixels: &pixels, observations: &[] };
+    let mut field = hash_field();
+    let before = field.weights.values.clone();
+    let mut of = of(&mut field);
+    let figures = CpuTrainer::new(scene(), &of).step(&mut of, Some(&photographs), &step(0, stratified(), photometric(ColorLoss::Mse)));
+    assert!(figures.loss.is_nan() && of.field.weights.values == before);
+}
+
+#[test]
+fn cameras_follow_their_corrections_and_keep_focal_lengths_that_are_not_refined() {
+    let pixels = Plain([[0.9, 0.1, 0.1, 1.0], [0.1, 0.1, 0.9, 1.0]]);
+    let photographs = Photographs { pixels: &pixels, observations: &[] };
+    for focal in [false, true] {
+        let mut field = hash_field();
+        let mut group = ParamGroup::dense("corrections", vec![0.0; 2 * CORRECTION], Adam::default());
+        let mut of = Trainees { corrections: Some((&mut group, focal)), ..of(&mut field) };
+        let mut trainer = CpuTrainer::new(scene(), &of);
+        for i in 0..20 {
+            trainer.step(&mut of, Some(&photographs), &step(i, stratified(), photometric(ColorLoss::Mse)));
+        }
+        let moved = |k: usize| group.values.iter().skip(k).step_by(CORRECTION).any(|v| *v != 0.0);
+        assert!(moved(0) && moved(3), "{:?}", group.values);
+        assert_eq!(moved(6), focal);
+        let poses = |all: &[PosedCamera]| all.iter().map(|c| format!("{c:?}")).collect::<Vec<_>>();
+        assert_eq!(poses(&trainer.cameras), poses(&corrected(&scene().cameras, &group.values)));
+    }
+}
+
+/// Voxel corners with a color and as many feature channels.
+fn voxel_field(features: usize) -> Field {
+    use Source::{Input, Layer as L};
+    let grid = VoxelGrid::new(4, 8, |_, _, _| true);
+    let table = ParamGroup::sparse("table", random_unit(grid.params_len(), 1), Adam { rate: 1e-2, ..Adam::default() });
+    let layers = vec![
+        Layer::new(vec![Input(0), Input(1)], 32, Activation::Relu, true),
+        Layer::new(vec![L(0)], 16, Activation::None, true),
+        Layer::new(vec![L(0)], features.next_multiple_of(16), Activation::None, true),
+    ];
+    let head = |layer, channel, activation| Head { layer, channel, activation, shift: 0.0 };
+    let net = FieldNet {
+        density: head(1, 3, Activation::Softplus),
+        outputs: vec![
+            Output { head: head(1, 0, Activation::Sigmoid), channels: 3 },
+            Output { head: head(2, 0, Activation::None), channels: features },
+        ],
+        mlp: Mlp::new(vec![8, 5], layers),
+    };
+    let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(1, 1)), Adam { rate: 1e-2, ..Adam::default() });
+    let codes = RayCodes { given: vec![5], ..RayCodes::new(DirectionCode::None, None) };
+    Field { encoder: Encoder::VoxelCorners { grid, table }, codes, net, space: Space::Cube(1.0), weights }
+}
+
+/// Mean squared distance of every channel from one value, which is known only of all rays together: their mean is subtracted.
+struct Spread(f32);
+
+impl BatchLoss for Spread {
+    fn batch(&self, out: &RayOutputs, g: &mut RayGradients) -> f64 {
+        let n = out.values.len() as f32;
+        let mean = out.values.iter().sum::<f32>() / n;
+        g.values.fill(2.0 * (mean - self.0) / n);
+        ((mean - self.0) as f64).powi(2)
+    }
+}
+
+#[test]
+fn rays_of_the_callers_train_any_outputs_by_a_loss_of_the_batch_but_frozen_layers() {
+    let mut field = voxel_field(40);
+    field.freeze_layers(|l| l == 1);
+    let before = field.weights.values.clone();
+    let frozen: Vec<bool> = {
+        let trained = field.weights.trained.clone().expect("ranges");
+        (0..before.len()).map(|i| !trained.iter().any(|r| r.contains(&i))).collect()
+    };
+    let rays = 32;
+    let dirs: Vec<f32> = [-1.0, 0.0, 0.0].repeat(rays);
+    let origins: Vec<f32> = random_unit(rays * 3, 2).chunks_exact(3).flat_map(|p| [2.0, p[1], p[2]]).collect();
+    let (images, jitter, background, style) = (vec![0; rays], vec![0.5; rays], vec![0.0; rays * 43], random_unit(rays * 5, 3));
+    let given = GivenRays {
+        images: &images,
+        origins: &origins,
+        dirs: &dirs,
+        jitter: &jitter,
+        target: &[],
+        background: &background,
+        codes: &[&style],
+    };
+    let mut of = of(&mut field);
+    let mut trainer = CpuTrainer::new(Scene { cameras: Vec::new(), near: 0.05, cube: (0.0, 1.0) }, &of);
+    let mut run = |i: u64| {
+        let described = step(i, stratified(), Loss::Batch(&Spread(0.7)));
+        trainer.step(&mut of, None, &Step { rays: RaySource::Given(given), ..described })
+    };
+    let first = run(0);
+    let last = (1..60).map(&mut run).last().unwrap();
+    assert!(last.loss < 0.05 * first.loss && last.mse.is_nan(), "{first:?} {last:?}");
+    assert!(trainer.given_gradients()[0].iter().any(|d| *d != 0.0), "the given codes get gradients");
+    let moved: Vec<bool> = of.field.weights.values.iter().zip(&before).map(|(a, b)| a != b).collect();
+    assert!(moved.iter().zip(&frozen).all(|(m, f)| !(*m && *f)), "frozen layers moved");
+    assert!(frozen.contains(&true) && moved.contains(&true));
+}
+
+#[test]
+fn rays_through_pixels_of_known_distance_and_masked_ones_are_told_apart() {
+    let pixels = Plain([[0.5, 0.5, 0.5, 1.0]; 2]);
+    let seen = [Observation { image: 1, x: 2, y: 3, distance: 1.5 }, Observation { image: 0, x: 7, y: 3, distance: 1.5 }];
+    let photographs = Photographs { pixels: &pixels, observations: &seen };
+    let mut field = hash_field();
+    let of = of(&mut field);
+    let mut trainer = CpuTrainer::new(scene(), &of);
+    trainer.draw(&of, Some(&photographs), &step(0, stratified(), photometric(ColorLoss::Mse)));
+    let b = &trainer.batch;
+    assert!(b.distance.iter().filter(|d| **d > 0.0).count() <= 64 / OBSERVED_EVERY as usize && b.distance.iter().any(|d| *d > 0.0));
+    for (p, counts) in b.pixels.chunks_exact(2).zip(&b.counts) {
+        assert_eq!(p[0] < 6.0, *counts);
+    }
+}
