@@ -64,6 +64,12 @@ impl ParamGroup {
         }
     }
 
+    /// Marks the lines of a sparse group that have a gradient.
+    pub fn touch(&mut self) {
+        let lines = self.grads.chunks_exact(adam::LINE);
+        self.touched.iter_mut().zip(lines).for_each(|(t, line)| *t |= line.iter().any(|g| *g != 0.0) as u8);
+    }
+
     /// A copy to look at, which cannot be trained.
     pub fn values_only(&self) -> ParamGroup {
         ParamGroup {

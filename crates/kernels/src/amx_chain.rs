@@ -1,7 +1,7 @@
 //! A chain of layers on AMX tiles: `y = relu(… relu(x W₀) …) Wₙ`, 32 rows at a time. The activations between two
 //! layers stay in tile form, in the first-level cache.
 
-use crate::amx::{self, BLOCK, K, Line};
+use crate::gemm::amx::{self, BLOCK, K, Line};
 use std::arch::x86_64::*;
 use std::mem::MaybeUninit;
 

@@ -9,16 +9,7 @@ const APPLICATIONS: [&str; 5] = ["object", "text", "world", "head", "relight"];
 const SHARED: &str = "run";
 
 /// Arrows that close a circle today: (crate, module from, module to). One that is gone leaves the list.
-const CIRCLES: [(&str, &str, &str); 8] = [
-    ("graph", "bridge", "on_gpu"),
-    ("kernels", "amx", "gemm"),
-    ("kernels", "device", "gpu"),
-    ("kernels", "gpu", "ops"),
-    ("kernels", "ops::conv2d::correlate", "ops::conv2d::depthwise"),
-    ("kernels", "ops::conv2d::depthwise", "ops::conv2d::weights"),
-    ("pipelines", "object::device", "object::recipe"),
-    ("pipelines", "object::held_out", "object::recipe"),
-];
+const CIRCLES: [(&str, &str, &str); 0] = [];
 
 /// A source of a crate.
 pub struct Source {

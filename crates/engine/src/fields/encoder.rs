@@ -207,6 +207,7 @@ impl Encoder {
                 );
                 // What is empty stays so.
                 table.grads[..grid.features].fill(0.0);
+                table.touch();
             }
             _ => {}
         }

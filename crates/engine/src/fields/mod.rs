@@ -5,10 +5,11 @@ mod presets;
 mod ray_codes;
 mod visible;
 
+pub use diorama_kernels::ops::prune::Pruning;
 pub use encoder::{Encoded, Encoder, VoxelGrid};
 pub use presets::{baseline, mlp, nerf, ngp};
 pub use ray_codes::{Appearance, DirectionCode, RayCodes};
-pub use visible::{Pruning, VisibleBuffers, VisibleSamples};
+pub use visible::{VisibleBuffers, VisibleSamples};
 
 use crate::params::ParamGroup;
 use crate::stages::Stages;

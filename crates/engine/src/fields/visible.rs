@@ -1,38 +1,19 @@
-//! Marching that leaves out samples that cannot matter before the costly part of a step: those behind
-//! opaque matter (instant-ngp ends rays where the transmittance falls below 1e-4) and those that hold next
-//! to nothing (nerfacc, Li et al. 2023, the alpha threshold). Rays advance in waves, each one marched,
-//! encoded and put through the density layers, so that hidden samples are not even encoded.
+//! Marching that leaves out samples that cannot matter before the costly part of a step ([`prune`]). Rays advance in waves, each one
+//! marched, encoded and put through the density layers, so that hidden samples are not even encoded.
 
 use super::{Encoded, Field, FieldBuffers};
-use diorama_kernels::math;
 use diorama_kernels::ops::fused_mlp::Mlp;
 use diorama_kernels::ops::fused_mlp::cpu::{Activations, forward_block};
 use diorama_kernels::ops::linear;
 use diorama_kernels::ops::march::{self, MarchConfig, MarchRays, Marched, OccupancyBits};
+use diorama_kernels::ops::prune::{self, Pruning};
 use rayon::prelude::*;
 
-/// Rows per block of the density network, samples and rays per task.
+/// Rows per block of the density network, and samples per task.
 const BLOCK: usize = 256;
 const TASK: usize = 4096;
-const RAYS: usize = 64;
 /// Samples per ray in the first wave and at most.
 const WAVE: (usize, usize) = (24, 96);
-
-/// Stands for a sample that is left out, and for the density of one that no light reaches.
-const DROPPED: f32 = -1.0;
-
-/// Which samples are left out.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Pruning {
-    /// Samples behind which less than this share of light arrives.
-    pub stop: f32,
-    /// Samples of less opacity than this, unless they are denser than `thin`.
-    pub min_alpha: f32,
-    /// Density per inner cube from which a sample is never left out for its opacity, however short its step.
-    pub thin: f32,
-    /// Samples of less weight in the pixel than this.
-    pub min_weight: f32,
-}
 
 /// Rays that still have light, and where they go on.
 #[derive(Default)]
@@ -57,7 +38,7 @@ struct Wave {
     positions: Vec<f32>,
     encoded: Encoded,
     sigma: Vec<f32>,
-    /// Opacities, or [`DROPPED`].
+    /// Opacities, or [`prune::DROPPED`].
     alpha: Vec<f32>,
     /// Samples that stay, per ray.
     counts: Vec<u32>,
@@ -150,7 +131,7 @@ impl Field {
             wave.alpha.resize(n, 0.0);
             self.sigma(&net, &wave.encoded, &mut wave.sigma, &mut v.pool);
             buf.stages.done("density");
-            wave.walk(pruning);
+            wave.prune(pruning);
             buf.stages.done("prune");
             done += size;
             size = (size * 2).min(WAVE.1);
@@ -254,40 +235,18 @@ impl Wave {
     }
 
     /// Lets light through: opacities, what is dropped, and the light that is left.
-    fn walk(&mut self, pruning: Pruning) {
+    fn prune(&mut self, pruning: Pruning) {
         self.counts.clear();
         self.counts.resize(self.crew.rays.len(), 0);
-        let offsets = &self.marched.offsets;
-        let (mut sigma, mut alpha) = (&mut self.sigma[..], &mut self.alpha[..]);
-        let mut tasks = Vec::with_capacity(self.counts.len().div_ceil(RAYS));
-        for (k, (light, counts)) in self.light.chunks_mut(RAYS).zip(self.counts.chunks_mut(RAYS)).enumerate() {
-            let offsets = &offsets[k * RAYS..=k * RAYS + light.len()];
-            let n = (offsets[light.len()] - offsets[0]) as usize;
-            let (own_sigma, rest_sigma) = sigma.split_at_mut(n);
-            let (own_alpha, rest_alpha) = alpha.split_at_mut(n);
-            (sigma, alpha) = (rest_sigma, rest_alpha);
-            tasks.push((offsets, light, counts, own_sigma, own_alpha));
-        }
-        let dt = &self.marched.dt;
-        tasks.into_par_iter().for_each(|(offsets, light, counts, sigma, alpha)| {
-            let first = offsets[0] as usize;
-            math::alphas(sigma, &dt[first..first + sigma.len()], alpha);
-            for (r, span) in offsets.windows(2).enumerate() {
-                for i in span[0] as usize - first..span[1] as usize - first {
-                    if light[r] < pruning.stop {
-                        (sigma[i], alpha[i]) = (DROPPED, DROPPED);
-                        continue;
-                    }
-                    let weight = light[r] * alpha[i];
-                    light[r] -= weight;
-                    if alpha[i] < pruning.min_alpha.min(pruning.thin * dt[first + i]) || weight < pruning.min_weight {
-                        alpha[i] = DROPPED;
-                    } else {
-                        counts[r] += 1;
-                    }
-                }
-            }
-        });
+        let samples = prune::cpu::Samples {
+            offsets: &self.marched.offsets,
+            dt: &self.marched.dt,
+            sigma: &mut self.sigma,
+            alpha: &mut self.alpha,
+            light: &mut self.light,
+            counts: &mut self.counts,
+        };
+        prune::cpu::prune(&pruning, samples);
     }
 }
 

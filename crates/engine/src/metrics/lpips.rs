@@ -254,7 +254,11 @@ impl Convolution {
                 }
             }
             let a = View::rows(rows, depth);
-            gemm::gemm(Precision::F32, n, to, depth, a, &self.weights, to, out, to, Init::Bias(&self.bias), true);
+            gemm::gemm(
+                Precision::F32,
+                gemm::Gemm { m: n, n: to, k: depth, a, b: &self.weights, ldb: to, ldc: to, init: Init::Bias(&self.bias), relu: true },
+                out,
+            );
         });
         Some(Features { width: w, height: h, channels: to, data })
     }

@@ -8,10 +8,10 @@ use crate::samplers::RayBatch;
 use crate::samplers::occupancy::Occupancy;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
-use diorama_kernels::ops::field_step::gpu as field;
+use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::march::MarchConfig;
-use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays};
+use diorama_kernels::ops::prune::gpu as prune;
 use diorama_kernels::ops::sample_pdf::gpu::strata;
 
 /// Samples that there is room for, and where the CPU plays the device.
@@ -51,11 +51,11 @@ impl Looks {
         let direction = self.shape.direction(gpu, &rays.dirs);
         let code = self.appearance.as_ref().map(|(codes, dims)| {
             let mean = (codes.len() / dims - 1) as u32;
-            field::look_up(gpu, codes, &gpu.upload_u32(&vec![appearance.unwrap_or(mean); n]), *dims)
+            field::look_up(gpu, codes, &gpu.upload(&vec![appearance.unwrap_or(mean); n]), *dims)
         });
         let codes: Vec<&Buffer> = direction.iter().chain(&code).collect();
         let black = gpu.zeros(n * 3);
-        self.shape.net.forward(gpu, &self.weights, packed, features, &codes, &black, false).out
+        self.shape.net.forward(gpu, &self.weights, &FieldInput { packed, features, codes: &codes }, &black, false).out
     }
 }
 
@@ -115,8 +115,8 @@ impl GpuTracer {
         for (points, dirs) in model.chunks(self.room * 3).zip(dirs.chunks(self.room * 3)) {
             let n = points.len() / 3;
             // One sample per ray, so long that it is opaque.
-            let offsets = gpu.upload_u32(&(0..=n as u32).collect::<Vec<_>>());
-            let packed = GpuPacked { offsets, t: gpu.zeros(n), dt: gpu.upload(&vec![1e30; n]) };
+            let offsets = gpu.upload(&(0..=n as u32).collect::<Vec<_>>());
+            let packed = GpuPacked { offsets, t: gpu.zeros(n), dt: gpu.upload(&vec![1e30f32; n]) };
             let points = gpu.upload(points);
             let (near_far, jitter) = (gpu.zeros(n * 2), gpu.zeros(n));
             let rays = GpuRays { origins: points.clone(), dirs: gpu.upload(dirs), near_far, jitter, resumed: false };
@@ -133,7 +133,7 @@ impl GpuTracer {
         batch: &RayBatch,
         (first, n): (usize, usize),
         placement: &Placement,
-        limits: Limits,
+        pruning: Pruning,
         appearance: Option<u32>,
         out: &mut (Traced, Vec<f32>),
     ) -> Result<(), GpuError> {
@@ -148,9 +148,9 @@ impl GpuTracer {
         };
         let view = match (placement, &self.occupancy, &self.coarse) {
             (Placement::March(config), Some(grid), _) => {
-                let Some((view, light)) = self.marched(grid, &rays, config, limits, appearance, n > 1)? else {
-                    self.part(batch, (first, n / 2), placement, limits, appearance, out)?;
-                    return self.part(batch, (first + n / 2, n - n / 2), placement, limits, appearance, out);
+                let Some((view, light)) = self.marched(grid, &rays, config, pruning, appearance, n > 1)? else {
+                    self.part(batch, (first, n / 2), placement, pruning, appearance, out)?;
+                    return self.part(batch, (first + n / 2, n - n / 2), placement, pruning, appearance, out);
                 };
                 out.1.extend(gpu.read(&light)?);
                 view
@@ -180,18 +180,18 @@ impl GpuTracer {
         grid: &GpuOccupancy,
         rays: &GpuRays,
         config: &MarchConfig,
-        limits: Limits,
+        pruning: Pruning,
         appearance: Option<u32>,
         may_split: bool,
     ) -> Result<Option<(GpuComposited, Buffer)>, GpuError> {
         let (gpu, f) = (&self.gpu, &self.field);
         let marched = march::march(gpu, grid, rays, config, self.room);
-        if may_split && gpu.read_u32(&marched.cut)?.contains(&1) {
+        if may_split && gpu.read(&marched.cut)?.contains(&1) {
             return Ok(None);
         }
         let features = f.features(gpu, rays, &marched.packed);
         let sigma = f.shape.net.density(gpu, &f.weights, &features, &marched.packed.rows());
-        let pruned = prune::prune(gpu, &marched.packed, &sigma, limits, &marched.cut, self.room);
+        let pruned = prune::prune(gpu, &marched.packed, &sigma, &pruning, &marched.cut, self.room);
         let features = f.shape.net.take(gpu, &pruned, &features);
         Ok(Some((f.see(gpu, rays, &pruned.packed, &features, appearance), pruned.light)))
     }
@@ -209,9 +209,7 @@ impl Accelerator for GpuTracer {
         pruning: Pruning,
         appearance: Option<u32>,
     ) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
-        let Pruning { stop, min_alpha, thin, min_weight } = pruning;
         let mut out = (Traced::default(), Vec::new());
-        let limits = Limits { stop, min_alpha, thin, min_weight };
         let at_once = match placement {
             Placement::March(_) => batch.len(),
             Placement::Stratified { samples } => self.room / samples.max(&1),
@@ -219,7 +217,7 @@ impl Accelerator for GpuTracer {
         };
         for first in (0..batch.len()).step_by(at_once.max(1)) {
             let n = at_once.max(1).min(batch.len() - first);
-            self.part(batch, (first, n), placement, limits, appearance, &mut out).map_err(unserved)?;
+            self.part(batch, (first, n), placement, pruning, appearance, &mut out).map_err(unserved)?;
         }
         Ok((out.0, matches!(placement, Placement::March(_)).then_some(out.1)))
     }

@@ -2,22 +2,21 @@
 
 use super::shape::Shape;
 use crate::fields::Field;
-use crate::losses::ColorLoss;
 use crate::params::ParamGroup;
 use crate::samplers::occupancy::Occupancy;
 use crate::step::{self, Figures, GivenRays, Loss, Placement, Probes, RaySource, Scene, Step, Trainees};
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
-use diorama_kernels::ops::field_step::gpu as field;
-use diorama_kernels::ops::field_step::gpu::loss::{self, SUMS, Target, Terms};
+use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
-use diorama_kernels::ops::linear::{self, Activation, BiasKind};
+use diorama_kernels::ops::linear::{self, Activation, Dense};
 use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
-use diorama_kernels::ops::march::gpu::prune::{self, Limits};
 use diorama_kernels::ops::march::gpu::{self as march, GpuRays};
+use diorama_kernels::ops::photometric_loss::gpu::{self as loss, SUMS, Target, Terms};
 use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, Drawn, GpuPhotographs};
+use diorama_kernels::ops::prune::gpu as prune;
 use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
 use diorama_kernels::ops::sample_pdf::gpu::strata;
 use diorama_kernels::ops::{ray_aabb, spherical_harmonics};
@@ -66,7 +65,7 @@ impl GpuGroup {
         let a = Adam { rate: self.adam.rate * scale, ..self.adam };
         let all = std::iter::once(0..self.values.len()).collect();
         for range in self.trained.as_ref().unwrap_or(&all) {
-            adam::gpu::step(gpu, &a, t, self.sparse, range.clone(), &self.values, &self.moment1, &self.moment2, grads);
+            adam::gpu::step(gpu, &a, (t, self.sparse), range.clone(), &self.values, [&self.moment1, &self.moment2], grads);
         }
     }
 }
@@ -88,8 +87,8 @@ struct Samples<'a> {
     points: Buffer,
     features: Buffer,
     /// Offsets of all samples that were marched, `[R + 1]`.
-    marched: &'a Buffer,
-    left_out: &'a Buffer,
+    marched: &'a Buffer<u32>,
+    left_out: &'a Buffer<u32>,
     /// Whether the step is judged by them.
     is_main: bool,
     wants_weights: bool,
@@ -162,11 +161,12 @@ impl GpuField {
         let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &r.drawn.images, *dims));
         let codes: Vec<&Buffer> = direction.iter().chain(&appearance).chain(&r.codes).collect();
         let background = &r.background;
+        let input = FieldInput { packed, features: &on.features, codes: &codes };
         let (g, errors, composited, loss) = match s.loss {
             Loss::Batch(loss) => {
-                let step = net.forward(gpu, weights, packed, &on.features, &codes, background, true);
+                let step = net.forward(gpu, weights, &input, background, true);
                 let (d, value) = by_batch(gpu, loss, &step.out, net.net.channels(), packed)?;
-                let g = net.backward(gpu, weights, packed, background, &step, &d, s.near_scaling);
+                let g = net.backward(gpu, weights, &step, &d, s.near_scaling);
                 (g, None, Some(step.out.weights), Some(value))
             }
             Loss::Photometric(terms) => {
@@ -176,13 +176,14 @@ impl GpuField {
                 let target = Target { rgba, background, left_out: on.left_out, distance };
                 let figures = loss::Figures { sums, marched: on.marched, is_main: on.is_main };
                 if !on.wants_weights {
-                    let at = net.evaluate(gpu, weights, packed, &on.features, &codes, true);
-                    let (d, errors) = loss::composite_and_loss(gpu, terms, packed, &at.sigma, &at.outputs, target, s.near_scaling, figures);
-                    (net.gradients(gpu, weights, packed, &at, &d), Some(errors), None, None)
+                    let at = net.evaluate(gpu, weights, &input, true);
+                    let (d, errors) =
+                        loss::composite_and_loss(gpu, terms, packed, (&at.sigma, &at.outputs), target, s.near_scaling, figures);
+                    (net.gradients(gpu, weights, &at, &d), Some(errors), None, None)
                 } else {
-                    let step = net.forward(gpu, weights, packed, &on.features, &codes, background, true);
+                    let step = net.forward(gpu, weights, &input, background, true);
                     let (d, errors) = loss::loss(gpu, terms, packed, &step.out, target, figures);
-                    let g = net.backward(gpu, weights, packed, background, &step, &d, s.near_scaling);
+                    let g = net.backward(gpu, weights, &step, &d, s.near_scaling);
                     (g, Some(errors), Some(step.out.weights), None)
                 }
             }
@@ -212,9 +213,8 @@ impl GpuField {
 
     /// What counts, as kernels take it.
     fn terms(&self, t: &crate::losses::Terms) -> Terms {
-        let huber = if let ColorLoss::Huber(width) = t.color { width } else { 0.0 };
         let normalized = self.shape.is_unbounded;
-        Terms { huber, relative: self.shape.relative, distortion: t.distortion, normalized, alpha: t.alpha, depth: t.depth }
+        Terms { color: t.color, relative: self.shape.relative, distortion: t.distortion, normalized, alpha: t.alpha, depth: t.depth }
     }
 }
 
@@ -306,7 +306,7 @@ impl GpuTrainer {
         let sky = self.learned.as_ref().map(|(g, activation)| {
             let every_ray = Rows::all(gpu, s.rays.count());
             let codes = spherical_harmonics::gpu::forward(gpu, 4, &rays.rays.dirs);
-            let rgb = linear::gpu::forward(gpu, &every_ray, (SKY, 3), &codes, &g.values, None, BiasKind::None, *activation);
+            let rgb = linear::gpu::forward(gpu, &every_ray, &Dense::without_bias(SKY, 3, *activation), &codes, &g.values, None);
             (every_ray, codes, rgb)
         });
         if let Some((_, _, rgb)) = &sky {
@@ -314,7 +314,7 @@ impl GpuTrainer {
         }
         let (samples, marched, learned) = self.place(s, &rays)?;
         if let Some(loss) = learned.loss {
-            let last = |offsets: &Buffer| gpu.read_u32(offsets).map(|o| o.last().copied().unwrap_or(0) as f64);
+            let last = |offsets: &Buffer<u32>| gpu.read(offsets).map(|o| o.last().copied().unwrap_or(0) as f64);
             let (trained, marched) = (last(&samples.offsets)?, last(&marched)?);
             let f = &mut self.on_host;
             (f.steps, f.loss, f.trained, f.marched) = (f.steps + 1, f.loss + loss, f.trained + trained, f.marched + marched);
@@ -322,8 +322,8 @@ impl GpuTrainer {
         self.on_host.rays += s.rays.count() as u64;
         let at = (s.number as u32 + 1, s.rate_scale);
         if let (Some((group, activation)), Some((every_ray, codes, rgb))) = (&self.learned, &sky) {
-            let (none, d) = (BiasKind::None, &learned.background);
-            let d = linear::gpu::backward(gpu, every_ray, (SKY, 3), codes, &group.values, none, *activation, rgb, d);
+            let layer = Dense::without_bias(SKY, 3, *activation);
+            let d = linear::gpu::backward(gpu, every_ray, &layer, codes, &group.values, rgb, &learned.background);
             group.step(gpu, at, &d.w);
         }
         if let (Some((group, focal)), Some(d_points)) = (&self.corrections, &learned.points) {
@@ -377,7 +377,7 @@ impl GpuTrainer {
     }
 
     /// Places samples and trains on them; the samples, the offsets of all that were marched, and what was learned.
-    fn place(&self, s: &Step, r: &Rays) -> Result<(GpuPacked, Buffer, Learned), GpuError> {
+    fn place(&self, s: &Step, r: &Rays) -> Result<(GpuPacked, Buffer<u32>, Learned), GpuError> {
         let (gpu, rays, left_out) = (&self.gpu, &r.rays, &r.drawn.left_out);
         let moves = self.corrections.is_some();
         let all = |of: &GpuField, packed: &GpuPacked, is_main: bool| {
@@ -387,15 +387,14 @@ impl GpuTrainer {
             of.train(gpu, s, &self.sums, r, &on)
         };
         match s.placement {
-            Placement::Occupancy { march: config, pruning: p, room } => {
+            Placement::Occupancy { march: config, pruning, room } => {
                 // All samples in occupied cells: their densities decide which are trained, and keep the grid up to date.
                 let grid = self.occupancy.as_ref().expect("an occupancy grid");
                 let marched = march::march(gpu, &grid.bits, rays, &config, room.0);
                 let (points, features) = self.field.encode(gpu, rays, &marched.packed);
                 let all = marched.packed.rows();
                 let sigma = self.field.shape.net.density(gpu, &self.field.weights.values, &features, &all);
-                let limits = Limits { stop: p.stop, min_alpha: p.min_alpha, thin: p.thin, min_weight: p.min_weight };
-                let pruned = prune::prune(gpu, &marched.packed, &sigma, limits, &marched.cut, room.1);
+                let pruned = prune::prune(gpu, &marched.packed, &sigma, &pruning, &marched.cut, room.1);
                 grid.record(gpu, &all, &marched.cells, &sigma);
                 let on = Samples {
                     packed: &pruned.packed,
@@ -485,7 +484,7 @@ impl GpuTrainer {
 fn given(gpu: &Gpu, g: &GivenRays) -> Drawn {
     let n = g.images.len();
     Drawn {
-        images: gpu.upload_u32(g.images),
+        images: gpu.upload(g.images),
         pixels: gpu.zeros(n * 2),
         target: if g.target.is_empty() { gpu.zeros(n * 4) } else { gpu.upload(g.target) },
         jitter: gpu.upload(g.jitter),

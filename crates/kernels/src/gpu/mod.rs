@@ -2,23 +2,24 @@
 //! `ops/<op>/gpu.rs`; data stays in [`Buffer`]s on the device until it is read.
 
 mod atomics;
-pub mod check;
+mod buffer;
+pub(crate) mod launch;
 pub(crate) mod random;
+pub(crate) mod table;
 
-use crate::device::Api;
+use crate::api::Api;
 pub use atomics::{Accumulate, Native, Swap};
+pub use buffer::{Buffer, Rows};
 use cubecl::client::Client;
 use cubecl::device::{WgpuBackend, WgpuDevice, WgpuDeviceKind};
 use cubecl::ir::features::AtomicUsage;
 use cubecl::prelude::*;
-use cubecl::server::Handle;
+pub(crate) use launch::launch;
 
 /// Units per cube of the kernels that treat one element per unit.
 pub const CUBE: u32 = 256;
 /// What `stubs/cuda-on-cpu` calls itself.
 const CUDA_ON_CPU: &str = "CPU playing CUDA";
-/// Most cubes along one axis that every API allows.
-const MAX_CUBES: u32 = 65_535;
 
 /// Why a device cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -51,77 +52,6 @@ pub struct Gpu {
     /// Whether kernels use memory shared by a cube. Mesa's software Vulkan before 23 crashes on it as SPIR-V
     /// declares it, and gains nothing from it.
     pub(crate) shared: bool,
-}
-
-/// Numbers of four bytes each in the memory of a device.
-#[derive(Clone, Debug)]
-pub struct Buffer {
-    handle: Handle,
-    len: usize,
-}
-
-impl Buffer {
-    /// `len` numbers in memory that is there already.
-    ///
-    /// # Panics
-    /// When the memory holds fewer.
-    pub fn of(handle: Handle, len: usize) -> Buffer {
-        assert!(handle.size_in_used() >= 4 * len as u64, "{len} numbers in {} bytes", handle.size_in_used());
-        Buffer { handle, len }
-    }
-
-    /// The memory, for another library on the same device.
-    pub fn handle(self) -> Handle {
-        self.handle
-    }
-
-    pub fn len(&self) -> usize {
-        self.len
-    }
-
-    pub fn is_empty(&self) -> bool {
-        self.len == 0
-    }
-
-    /// For a launch.
-    pub(crate) fn arg(&self) -> BufferArg {
-        // SAFETY: `len` is the length that the handle was made with.
-        unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len.max(1)) }
-    }
-
-    /// For a launch that takes the memory for `n` elements of two or four bytes.
-    pub(crate) fn arg_of(&self, n: usize) -> BufferArg {
-        assert!(n <= self.len * 2, "{n} elements in {} numbers", self.len);
-        // SAFETY: the kernel's element is at most as large as the handle has room for.
-        unsafe { BufferArg::from_raw_parts(self.handle.clone(), n.max(1)) }
-    }
-}
-
-/// Rows of a matrix of which only the device knows how many are in use.
-#[derive(Clone)]
-pub struct Rows {
-    /// As many as there is memory for.
-    pub most: usize,
-    live: Buffer,
-    at: usize,
-}
-
-impl Rows {
-    /// All of `n` rows.
-    pub fn all(gpu: &Gpu, n: usize) -> Rows {
-        Rows { most: n, live: gpu.upload_u32(&[n as u32]), at: 0 }
-    }
-
-    /// As many as number `at` of `live` says, which is at most `most`.
-    pub fn counted(most: usize, live: &Buffer, at: usize) -> Rows {
-        assert!(at < live.len(), "rows: no number {at}");
-        Rows { most, live: live.clone(), at }
-    }
-
-    /// The count and its place, for a launch.
-    pub(crate) fn arg(&self) -> (BufferArg, u32) {
-        (self.live.arg(), self.at as u32)
-    }
 }
 
 impl Gpu {
@@ -213,42 +143,35 @@ impl Gpu {
     }
 
     /// Memory for `len` numbers of unknown value.
-    pub fn empty(&self, len: usize) -> Buffer {
-        Buffer { handle: self.client.empty(len.max(1) * 4), len }
+    pub fn empty<T>(&self, len: usize) -> Buffer<T> {
+        Buffer::of(self.client.empty((len * size_of::<T>()).next_multiple_of(4).max(4)), len)
     }
 
-    pub fn zeros(&self, len: usize) -> Buffer {
+    pub fn zeros<T>(&self, len: usize) -> Buffer<T> {
         let out = self.empty(len);
-        if len > 0 {
-            // SAFETY: every unit checks its position against the length.
-            unsafe { clear::launch_unchecked(&self.client, units(len), CubeDim::new_1d(CUBE), out.arg(), len as u32) };
-        }
+        let words: Buffer<u32> = out.cast();
+        launch!(self, clear, words.len(), [words => words.len()], words.len() as u32);
         out
     }
 
     /// Copies as many numbers as both buffers hold.
-    pub fn copy(&self, from: &Buffer, to: &Buffer) {
-        let n = from.len.min(to.len);
-        if n > 0 {
-            // SAFETY: every unit checks its position against the length.
-            unsafe { duplicate::launch_unchecked(&self.client, units(n), CubeDim::new_1d(CUBE), from.arg(), to.arg(), n as u32) };
-        }
+    pub fn copy<T>(&self, from: &Buffer<T>, to: &Buffer<T>) {
+        let (from, to): (Buffer<u32>, Buffer<u32>) = (from.cast(), to.cast());
+        let n = from.len().min(to.len());
+        launch!(self, duplicate, n, [from => n, to => n], n as u32);
     }
 
     /// Marks that are set in either buffer.
-    pub fn either(&self, a: &Buffer, b: &Buffer) -> Buffer {
-        let n = a.len.min(b.len);
+    pub fn either(&self, a: &Buffer<u32>, b: &Buffer<u32>) -> Buffer<u32> {
+        let n = a.len().min(b.len());
         let out = self.empty(n);
-        if n > 0 {
-            // SAFETY: every unit checks its position against the length.
-            unsafe { unite::launch_unchecked(&self.client, units(n), CubeDim::new_1d(CUBE), a.arg(), b.arg(), out.arg(), n as u32) };
-        }
+        launch!(self, unite, n, [a => n, b => n, out => n], n as u32);
         out
     }
 
-    pub fn upload(&self, data: &[f32]) -> Buffer {
-        let bytes = if data.is_empty() { &[0.0][..] } else { data };
-        Buffer { handle: self.client.create_from_slice(f32::as_bytes(bytes)), len: data.len() }
+    pub fn upload<T: CubeElement>(&self, data: &[T]) -> Buffer<T> {
+        let bytes = if data.is_empty() { &[0; 4] } else { T::as_bytes(data) };
+        Buffer::of(self.client.create_from_slice(bytes), data.len())
     }
 
     /// [`Gpu::upload`], without bringing zeros there where there is nothing else.
@@ -256,25 +179,13 @@ impl Gpu {
         if data.iter().all(|v| v.to_bits() == 0) { self.zeros(data.len()) } else { self.upload(data) }
     }
 
-    pub fn upload_u32(&self, data: &[u32]) -> Buffer {
-        let bytes = if data.is_empty() { &[0][..] } else { data };
-        Buffer { handle: self.client.create_from_slice(u32::as_bytes(bytes)), len: data.len() }
-    }
-
     /// Waits for the device and brings numbers back.
     ///
     /// # Errors
     /// When the device was lost or ran out of memory.
-    pub fn read(&self, buffer: &Buffer) -> Result<Vec<f32>, GpuError> {
-        let bytes = self.client.read_one(buffer.handle.clone()).map_err(|e| self.lost(&e))?;
-        Ok(f32::from_bytes(&bytes)[..buffer.len].to_vec())
-    }
-
-    /// # Errors
-    /// As [`Gpu::read`].
-    pub fn read_u32(&self, buffer: &Buffer) -> Result<Vec<u32>, GpuError> {
-        let bytes = self.client.read_one(buffer.handle.clone()).map_err(|e| self.lost(&e))?;
-        Ok(u32::from_bytes(&bytes)[..buffer.len].to_vec())
+    pub fn read<T: CubeElement>(&self, buffer: &Buffer<T>) -> Result<Vec<T>, GpuError> {
+        let bytes = self.client.read_one(buffer.memory()).map_err(|e| self.lost(&e))?;
+        Ok(T::from_bytes(&bytes)[..buffer.len()].to_vec())
     }
 
     /// Waits until all work is done.
@@ -368,21 +279,15 @@ fn quietly<T>(f: impl FnOnce() -> T) -> Result<T, String> {
     })
 }
 
-/// As many cubes as give one unit to each of `n` elements.
-pub(crate) fn units(n: usize) -> CubeCount {
-    let cubes = (n as u32).div_ceil(CUBE).max(1);
-    if cubes <= MAX_CUBES { CubeCount::Static(cubes, 1, 1) } else { CubeCount::Static(MAX_CUBES, cubes.div_ceil(MAX_CUBES), 1) }
-}
-
 #[cube(launch_unchecked)]
-fn clear(out: &mut [f32], n: u32) {
+fn clear(out: &mut [u32], n: u32) {
     if ABSOLUTE_POS < n as usize {
-        out[ABSOLUTE_POS] = 0.0;
+        out[ABSOLUTE_POS] = 0u32;
     }
 }
 
 #[cube(launch_unchecked)]
-fn duplicate(from: &[f32], to: &mut [f32], n: u32) {
+fn duplicate(from: &[u32], to: &mut [u32], n: u32) {
     if ABSOLUTE_POS < n as usize {
         to[ABSOLUTE_POS] = from[ABSOLUTE_POS];
     }

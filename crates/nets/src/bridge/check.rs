@@ -4,8 +4,8 @@
 use super::{Composited, composite, distortion, frequency, fused_mlp, hash_grid, linear, scan, spherical_harmonics, ssim, triangle_wave};
 use super::{read_values, tensors, trilinear_corner_grid};
 use burn::tensor::{Device, Tensor, TensorData};
+use diorama_kernels::check::{Row, TOLERANCE, Table};
 use diorama_kernels::gpu::Gpu;
-use diorama_kernels::gpu::check::{Row, TOLERANCE, Table};
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::frequency::Frequency;
 use diorama_kernels::ops::fused_mlp::Mlp;

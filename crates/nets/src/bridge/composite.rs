@@ -97,13 +97,13 @@ impl DeviceKernels for CompositeOp {
         let p = GpuPacked::upload(gpu, &self.packed());
         let out = kernels::forward(gpu, &p, &i[0].data, &i[1].data, c, &i[2].data);
         let GpuComposited { color, depth, opacity, weights } = out;
-        let kept = vec![p.offsets, p.t, p.dt, color.clone(), depth.clone(), opacity.clone(), weights.clone()];
+        let kept = vec![p.offsets.cast(), p.t, p.dt, color.clone(), depth.clone(), opacity.clone(), weights.clone()];
         DeviceOutputs { outputs: vec![(color, vec![r, c]), (depth, vec![r]), (opacity, vec![r]), (weights, vec![self.t.len()])], kept }
     }
 
     fn backward_on(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let at = |k: usize| kept[k].clone();
-        let p = GpuPacked { offsets: at(0), t: at(1), dt: at(2) };
+        let p = GpuPacked { offsets: at(0).cast(), t: at(1), dt: at(2) };
         let out = GpuComposited { color: at(3), depth: at(4), opacity: at(5), weights: at(6) };
         let of = |k: usize, like: &Buffer| d[k].clone().unwrap_or_else(|| gpu.zeros(like.len()));
         let d = GpuComposited {

@@ -70,11 +70,11 @@ pub fn distortion(samples: Packed, weights: Tensor<1>) -> Result<Tensor<1>, OpEr
 impl DeviceKernels for DistortionOp {
     fn forward_on(&self, gpu: &Gpu, i: &[OnDevice]) -> DeviceOutputs {
         let p = GpuPacked::upload(gpu, &Packed { offsets: &self.offsets, t: &self.t, dt: &self.dt });
-        DeviceOutputs { outputs: vec![(kernels::forward(gpu, &p, &i[0].data), vec![p.rays()])], kept: vec![p.offsets, p.t, p.dt] }
+        DeviceOutputs { outputs: vec![(kernels::forward(gpu, &p, &i[0].data), vec![p.rays()])], kept: vec![p.offsets.cast(), p.t, p.dt] }
     }
 
     fn backward_on(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        let p = GpuPacked { offsets: kept[0].clone(), t: kept[1].clone(), dt: kept[2].clone() };
+        let p = GpuPacked { offsets: kept[0].cast(), t: kept[1].clone(), dt: kept[2].clone() };
         vec![d[0].as_ref().map(|d| kernels::backward(gpu, &p, &i[0].data, d))]
     }
 }

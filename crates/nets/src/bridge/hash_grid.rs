@@ -66,12 +66,12 @@ impl DeviceKernels for HashGridOp {
     fn forward_on(&self, gpu: &Gpu, i: &[OnDevice]) -> DeviceOutputs {
         let (g, s) = (GpuHashGrid::new(gpu, &self.0), i[0].shape[0]);
         let out = g.forward(gpu, &Rows::all(gpu, s), &i[0].data, &i[1].data);
-        DeviceOutputs { outputs: vec![(out, vec![self.0.levels.len(), s, self.0.config.features])], kept: vec![g.levels] }
+        DeviceOutputs { outputs: vec![(out, vec![self.0.levels.len(), s, self.0.config.features])], kept: vec![g.levels.cast()] }
     }
 
     fn backward_on(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let Some(d) = &d[0] else { return vec![None, None] };
-        let g = GpuHashGrid { grid: self.0.clone(), levels: kept[0].clone() };
+        let g = GpuHashGrid { grid: self.0.clone(), levels: kept[0].cast() };
         let rows = Rows::all(gpu, i[0].shape[0]);
         let d_table = gpu.zeros(self.0.params_len());
         g.backward(gpu, &rows, &i[0].data, d, &d_table);

@@ -8,7 +8,7 @@ use burn::tensor::Tensor;
 use diorama_kernels::gpu::{Buffer, Gpu, Rows};
 #[cfg(feature = "gpu")]
 use diorama_kernels::ops::linear::gpu as kernels;
-use diorama_kernels::ops::linear::{Activation, BiasKind, Gradients, Linear, cpu};
+use diorama_kernels::ops::linear::{Activation, BiasKind, Dense, Gradients, Linear, cpu};
 
 #[derive(Debug)]
 struct LinearOp {
@@ -23,8 +23,12 @@ impl LinearOp {
     }
 
     fn layer(&self, x: &[usize], weight: &[usize]) -> Linear {
-        let (rows, inputs, outputs) = Self::size(x, weight);
-        Linear { rows, inputs, outputs, bias: self.bias, activation: self.activation }
+        let (rows, k, n) = Self::size(x, weight);
+        self.dense(k, n).of_rows(rows)
+    }
+
+    fn dense(&self, k: usize, n: usize) -> Dense {
+        Dense { k, n, bias: self.bias, activation: self.activation }
     }
 
     fn result(x: &[usize], width: usize) -> Vec<usize> {
@@ -123,14 +127,14 @@ impl DeviceKernels for LinearOp {
     fn forward_on(&self, gpu: &Gpu, i: &[OnDevice]) -> DeviceOutputs {
         let (m, k, n) = Self::size(&i[0].shape, &i[1].shape);
         let (rows, bias) = (Rows::all(gpu, m), i.get(2).map(|b| &b.data));
-        let out = kernels::forward(gpu, &rows, (k, n), &i[0].data, &i[1].data, bias, self.bias, self.activation);
+        let out = kernels::forward(gpu, &rows, &self.dense(k, n), &i[0].data, &i[1].data, bias);
         DeviceOutputs { outputs: vec![(out.clone(), Self::result(&i[0].shape, n))], kept: vec![out] }
     }
 
     fn backward_on(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let Some(d) = &d[0] else { return vec![None; i.len()] };
         let (m, k, n) = Self::size(&i[0].shape, &i[1].shape);
-        let g = kernels::backward(gpu, &Rows::all(gpu, m), (k, n), &i[0].data, &i[1].data, self.bias, self.activation, &kept[0], d);
+        let g = kernels::backward(gpu, &Rows::all(gpu, m), &self.dense(k, n), &i[0].data, &i[1].data, &kept[0], d);
         vec![Some(g.x), Some(g.w), g.bias]
     }
 }
@@ -150,7 +154,8 @@ mod tests {
         let (x, w, b) = (random(20, 1), random(12, 2), random(3, 3));
         let (xt, wt, bt) = (t(&x, 5, 4), t(&w, 4, 3), t(&b, 1, 3));
         let grads = linear(xt.clone(), wt.clone(), Some(bt.clone()), Activation::Sigmoid).unwrap().sum().backward();
-        let (dx, dw, db) = reference::backward(5, 4, 3, &wide(&x), &wide(&w), &wide(&b), BiasKind::Shared, Activation::Sigmoid, &[1.0; 15]);
+        let layer = Dense { k: 4, n: 3, bias: BiasKind::Shared, activation: Activation::Sigmoid };
+        let (dx, dw, db) = reference::backward(5, &layer, &wide(&x), &wide(&w), &wide(&b), &[1.0; 15]);
         assert_close("x", &read_values(xt.grad(&grads).unwrap()), &dx, 1e-4);
         assert_close("w", &read_values(wt.grad(&grads).unwrap()), &dw, 1e-4);
         assert_close("b", &read_values(bt.grad(&grads).unwrap()), &db, 1e-4);

@@ -55,12 +55,12 @@ pub fn scan(offsets: &[u32], values: Tensor<1>) -> Result<Tensor<1>, OpError> {
 #[cfg(feature = "gpu")]
 impl DeviceKernels for ScanOp {
     fn forward_on(&self, gpu: &Gpu, i: &[OnDevice]) -> DeviceOutputs {
-        let offsets = gpu.upload_u32(&self.0);
-        DeviceOutputs { outputs: vec![(kernels::inclusive(gpu, &offsets, &i[0].data), i[0].shape.clone())], kept: vec![offsets] }
+        let offsets = gpu.upload(&self.0);
+        DeviceOutputs { outputs: vec![(kernels::inclusive(gpu, &offsets, &i[0].data), i[0].shape.clone())], kept: vec![offsets.cast()] }
     }
 
     fn backward_on(&self, gpu: &Gpu, _: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
-        vec![d[0].as_ref().map(|d| kernels::inclusive_backward(gpu, &kept[0], d))]
+        vec![d[0].as_ref().map(|d| kernels::inclusive_backward(gpu, &kept[0].cast(), d))]
     }
 }
 

@@ -60,14 +60,16 @@ pub fn ssim(x: Tensor<3>, y: Tensor<3>) -> Result<Tensor<1>, OpError> {
 impl DeviceKernels for SsimOp {
     fn forward_on(&self, gpu: &Gpu, i: &[OnDevice]) -> DeviceOutputs {
         let [h, w, c] = [i[0].shape[0], i[0].shape[1], i[0].shape[2]];
-        let (mean, kept) = kernels::mean(gpu, (w, h, c), &i[0].data, &i[1].data);
+        let (mean, kept) = kernels::mean(gpu, kernels::Pair { size: (w, h, c), x: &i[0].data, y: &i[1].data });
         DeviceOutputs { outputs: vec![(mean, vec![1])], kept: kept.into() }
     }
 
     fn backward_on(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let Some(d) = &d[0] else { return vec![None, None] };
         let [h, w, c] = [i[0].shape[0], i[0].shape[1], i[0].shape[2]];
-        vec![Some(kernels::mean_backward(gpu, (w, h, c), &i[0].data, &i[1].data, [&kept[0], &kept[1]], d)), None]
+        let pair = kernels::Pair { size: (w, h, c), x: &i[0].data, y: &i[1].data };
+        let kept = [kept[0].clone(), kept[1].clone()];
+        vec![Some(kernels::mean_backward(gpu, pair, &kept, d)), None]
     }
 }
 

@@ -70,12 +70,12 @@ impl DeviceKernels for CornerOp {
         let c = i[1].shape[1];
         let corners = GpuCorners::upload(gpu, &self.corners());
         let out = corners.forward(gpu, &i[0].data, &i[1].data, c);
-        DeviceOutputs { outputs: vec![(out, vec![i[0].shape[0], c])], kept: vec![corners.rows, corners.voxel] }
+        DeviceOutputs { outputs: vec![(out, vec![i[0].shape[0], c])], kept: vec![corners.rows.cast(), corners.voxel.cast()] }
     }
 
     fn backward_on(&self, gpu: &Gpu, i: &[OnDevice], kept: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
         let Some(d) = &d[0] else { return vec![None, None] };
-        let corners = GpuCorners { rows: kept[0].clone(), voxel: kept[1].clone() };
+        let corners = GpuCorners { rows: kept[0].cast(), voxel: kept[1].cast() };
         let d_table = gpu.zeros(i[1].data.len());
         let d_local = corners.backward(gpu, &i[0].data, &i[1].data, i[1].shape[1], d, &d_table);
         vec![Some(d_local), Some(d_table)]

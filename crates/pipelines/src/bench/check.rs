@@ -36,7 +36,8 @@ pub struct Report {
 /// When the device is unknown, not part of the build, absent or lost; wrong results are lines with a fault.
 #[cfg(feature = "gpu")]
 pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
-    use diorama_kernels::gpu::{Gpu, GpuError, check};
+    use diorama_kernels::check;
+    use diorama_kernels::gpu::{Gpu, GpuError};
     use diorama_kernels::ops::fused_mlp::gpu::fused::tensor_element;
     let begin = std::time::Instant::now();
     let told = |e: GpuError| match e {

@@ -11,12 +11,13 @@ use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::composite::gpu::{self as composite, GpuGradients, GpuPacked};
-use diorama_kernels::ops::field_step::gpu::loss::{self, Figures, SUMS, Target, Terms};
-use diorama_kernels::ops::field_step::gpu::{Arithmetic, GpuNet};
+use diorama_kernels::ops::field_step::gpu::{Arithmetic, FieldInput, GpuNet};
 use diorama_kernels::ops::fused_mlp::gpu::fused::Element;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
-use diorama_kernels::ops::linear::{self, Activation, BiasKind};
+use diorama_kernels::ops::linear::{self, Activation};
+use diorama_kernels::ops::photometric_loss::ColorLoss;
+use diorama_kernels::ops::photometric_loss::gpu::{self as loss, Figures, SUMS, Target, Terms};
 use diorama_kernels::ops::spherical_harmonics;
 
 /// Samples per ray.
@@ -88,7 +89,7 @@ pub fn run(device: &str, repeats: usize, progress: &mut dyn FnMut(&OpFigure)) ->
     let samples = if gpu.software { 1 << 14 } else { 1 << 20 };
     let mut table = Table { gpu: &gpu, repeats, ops: Vec::new(), progress };
     let n = samples * 32;
-    let (from, to) = (gpu.zeros(n), gpu.empty(n));
+    let (from, to): (Buffer, Buffer) = (gpu.zeros(n), gpu.empty(n));
     let copy_gb_per_s = n as f64 * 8.0 / table.seconds(|| gpu.copy(&from, &to))? / 1e9;
     encodings(&gpu, samples, &mut table)?;
     networks(&gpu, samples, &mut table)?;
@@ -112,7 +113,7 @@ fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     })?;
     let (p, m, v) = (random(gpu, grid.params_len(), 4), gpu.zeros(grid.params_len()), gpu.zeros(grid.params_len()));
     t.row("adam", "all rows touched", ("parameter", grid.params_len()), 0.0, 32.0, || {
-        adam::gpu::step(gpu, &Adam::default(), 1, false, 0..p.len(), &p, &m, &v, &d_table);
+        adam::gpu::step(gpu, &Adam::default(), (1, false), 0..p.len(), &p, [&m, &v], &d_table);
     })?;
     t.row("spherical_harmonics", "degree 4", ("direction", s), 0.0, 76.0, || {
         spherical_harmonics::gpu::forward(gpu, 4, &points);
@@ -122,14 +123,15 @@ fn encodings(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
 fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let (k, n, rows) = (64, 64, Rows::all(gpu, s));
     let (x, w, d) = (random(gpu, s * k, 1), random(gpu, k * n, 2), random(gpu, s * n, 3));
-    let (kind, a, flops) = (BiasKind::None, Activation::Relu, (2 * k * n) as f64);
+    let layer = linear::Dense::without_bias(k, n, Activation::Relu);
+    let flops = (2 * k * n) as f64;
     let shape = format!("{s}x64x64 f32");
     t.row("linear", &shape, ("row", s), flops, 0.0, || {
-        linear::gpu::forward(gpu, &rows, (k, n), &x, &w, None, kind, a);
+        linear::gpu::forward(gpu, &rows, &layer, &x, &w, None);
     })?;
     t.row("linear, forward and backward", &shape, ("row", s), 3.0 * flops, 0.0, || {
-        let out = linear::gpu::forward(gpu, &rows, (k, n), &x, &w, None, kind, a);
-        linear::gpu::backward(gpu, &rows, (k, n), &x, &w, kind, a, &out, &d);
+        let out = linear::gpu::forward(gpu, &rows, &layer, &x, &w, None);
+        linear::gpu::backward(gpu, &rows, &layer, &x, &w, &out, &d);
     })?;
     // The standard field's network: layer by layer, in one launch, and on tensor cores.
     let grid = HashGridConfig { levels: 16, features: 2, log2_size: 4, base: 4, finest: 16 };
@@ -139,6 +141,7 @@ fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let p = evenly(gpu, s);
     let direction = random(gpu, p.rays() * 16, 5);
     let g = GpuGradients { sigma: random(gpu, s, 6), features: random(gpu, s * 3, 7), background: gpu.zeros(p.rays() * 3) };
+    let input = FieldInput { packed: &p, features: &features, codes: &[&direction] };
     for (arithmetic, name) in [(Arithmetic::Layers, "layers"), (Arithmetic::Exact, "one launch"), (Arithmetic::Best, "tensor cores")] {
         let net = GpuNet::new(gpu, net, &density, 2, &[true, false], arithmetic);
         let element = net.element();
@@ -147,11 +150,11 @@ fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
         }
         let shape = format!("32 -> 64 -> 16, 32 -> 64 -> 64 -> 16 {name}");
         t.row("field network", &shape, ("sample", s), flops, 0.0, || {
-            net.evaluate(gpu, &params, &p, &features, &[&direction], false);
+            net.evaluate(gpu, &params, &input, false);
         })?;
         t.row("field network, forward and backward", &shape, ("sample", s), 3.0 * flops, 0.0, || {
-            let at = net.evaluate(gpu, &params, &p, &features, &[&direction], true);
-            net.gradients(gpu, &params, &p, &at, &g);
+            let at = net.evaluate(gpu, &params, &input, true);
+            net.gradients(gpu, &params, &at, &g);
         })?;
     }
     Ok(())
@@ -175,16 +178,16 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     t.row("composite, backward", "3 channels, 32 samples per ray", ("sample", s), 0.0, 52.0, || {
         composite::backward(gpu, &p, &rgb, 3, &background, &out, &d);
     })?;
-    let (target, left_out, sums) = (random(gpu, p.rays() * 4, 8), gpu.upload_u32(&vec![0; p.rays()]), gpu.zeros(SUMS));
-    let target = Target { rgba: &target, background: &background, left_out: &left_out, distance: &left_out };
+    let (target, left_out, sums) = (random(gpu, p.rays() * 4, 8), gpu.upload(&vec![0u32; p.rays()]), gpu.zeros(SUMS));
+    let distance = gpu.empty(0);
+    let target = Target { rgba: &target, background: &background, left_out: &left_out, distance: &distance };
     t.row("composite, loss and backward", "3 channels, 32 samples per ray", ("sample", s), 0.0, 64.0, || {
         let figures = Figures { sums: &sums, marched: &p.offsets, is_main: true };
         loss::composite_and_loss(
             gpu,
-            Terms { huber: 0.0, relative: 0.0, distortion: 0.0, normalized: false, alpha: 0.0, depth: 0.0 },
+            Terms { color: ColorLoss::Mse, relative: 0.0, distortion: 0.0, normalized: false, alpha: 0.0, depth: 0.0 },
             &p,
-            &sigma,
-            &rgb,
+            (&sigma, &rgb),
             target,
             0.0,
             figures,

@@ -1,40 +1,32 @@
 //! One unit per parameter.
 
 use super::Adam;
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, launch};
 use cubecl::prelude::*;
 use std::ops::Range;
 
-/// One step `t ≥ 1` of the elements in `range`; `sparse` leaves elements without gradient alone. Their gradients are cleared.
-#[allow(clippy::too_many_arguments)]
-pub fn step(gpu: &Gpu, a: &Adam, t: u32, sparse: bool, range: Range<usize>, p: &Buffer, m: &Buffer, v: &Buffer, g: &Buffer) {
-    if range.is_empty() {
-        return;
-    }
+/// One step `t ≥ 1` of the parameters `p` in `range` with their first and second moments; `sparse` leaves elements without gradient
+/// alone. Their gradients are cleared.
+pub fn step(gpu: &Gpu, a: &Adam, (t, sparse): (u32, bool), range: Range<usize>, p: &Buffer, [m, v]: [&Buffer; 2], g: &Buffer) {
+    let end = range.end;
     let (b1, b2) = (a.beta1 as f64, a.beta2 as f64);
     let scale = (a.rate as f64 / (1.0 - b1.powi(t as i32))) as f32;
     let root = (1.0 / (1.0 - b2.powi(t as i32))).sqrt() as f32;
-    // SAFETY: units past the length stop.
-    unsafe {
-        adam::launch_unchecked(
-            &gpu.client,
-            units(range.len()),
-            CubeDim::new_1d(CUBE),
-            p.arg(),
-            m.arg(),
-            v.arg(),
-            g.arg(),
-            range.start as u32,
-            range.len() as u32,
-            scale,
-            root,
-            a.beta1,
-            a.beta2,
-            a.epsilon,
-            a.weight_decay,
-            sparse,
-        );
-    }
+    launch!(
+        gpu,
+        adam,
+        range.len(),
+        [p => end, m => end, v => end, g => end],
+        range.start as u32,
+        range.len() as u32,
+        scale,
+        root,
+        a.beta1,
+        a.beta2,
+        a.epsilon,
+        a.weight_decay,
+        sparse,
+    );
 }
 
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]

@@ -4,6 +4,8 @@
 //! `m̂ = m / (1 − β₁ᵗ)`, `v̂ = v / (1 − β₂ᵗ)`. The sparse form leaves elements with `g = 0` alone,
 //! moments included (as instant-ngp does for its table), and clears the gradients it has used.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -3,14 +3,15 @@ use diorama_testkit::{assert_close, random, wide};
 
 #[test]
 fn dense_matches_the_reference() {
-    for n in [0, 1, 1000, 70_001] {
-        let a = Adam { weight_decay: 1e-3, ..Adam::default() };
-        let (mut p, mut m, mut v) = (random(n, 1), vec![0.0; n], vec![0.0; n]);
+    for c in cases::cases().into_iter().filter(|c| !c.sparse) {
+        let (n, own) = (c.params.len(), &c.range);
+        let (mut p, mut m, mut v) = (c.params.clone(), vec![0.0; n], vec![0.0; n]);
         let (mut pr, mut mr, mut vr) = (wide(&p), wide(&m), wide(&v));
-        for t in 1..4 {
-            let g = random(n, 10 + t as u64);
-            cpu::dense(&a, t, &mut p, &mut m, &mut v, &g);
-            reference::step(&a, t, false, &mut pr, &mut mr, &mut vr, &wide(&g));
+        for (t, g) in (1..).zip(&c.gradients) {
+            let (p, m, v) = (&mut p[own.clone()], &mut m[own.clone()], &mut v[own.clone()]);
+            cpu::dense(&c.adam, t, p, m, v, &g[own.clone()]);
+            let (pr, mr, vr) = (&mut pr[own.clone()], &mut mr[own.clone()], &mut vr[own.clone()]);
+            reference::step(&c.adam, t, false, pr, mr, vr, &wide(&g[own.clone()]));
         }
         assert_close("p", &p, &pr, 1e-4);
         assert_close("m", &m, &mr, 1e-4);

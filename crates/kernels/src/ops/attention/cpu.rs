@@ -1,7 +1,7 @@
 //! Tiles of 64 queries by some hundred keys, kept transposed, so that all queries of a tile lie side by side in vectors.
 
 use super::Attention;
-use crate::gemm::{Init, Precision, View, gemm};
+use crate::gemm::{Gemm, Init, Precision, View, gemm};
 use crate::tasks::{self, Parts};
 use crate::vector::{exp, vectorized};
 
@@ -14,7 +14,7 @@ const TASKS: usize = 8;
 
 /// `c = a b`, or `c += a b`: a `[m, k]`, b `[k, n]`, c `[m, n]`, the latter two row by row.
 fn product([m, n, k]: [usize; 3], a: View, b: &[f32], c: &mut [f32], add: bool) {
-    gemm(Precision::F32, m, n, k, a, b, n, c, n, if add { Init::Accumulate } else { Init::Zero }, false);
+    gemm(Precision::F32, Gemm { m, n, k, a, b, ldb: n, ldc: n, init: if add { Init::Accumulate } else { Init::Zero }, relu: false }, c);
 }
 
 /// The transpose of a tile, for which every query lies in a row of `QUERIES`.

@@ -1,19 +1,19 @@
 //! One unit per ray for weights and densities, one per ray and channel for colours.
 
-use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
+use crate::gpu::{Buffer, Gpu, Rows, launch};
 use cubecl::prelude::*;
 
 /// Packed samples on the device: offsets `[R + 1]`, starts and lengths `[S]`.
 #[derive(Clone)]
 pub struct GpuPacked {
-    pub offsets: Buffer,
+    pub offsets: Buffer<u32>,
     pub t: Buffer,
     pub dt: Buffer,
 }
 
 impl GpuPacked {
     pub fn upload(gpu: &Gpu, p: &super::Packed) -> Self {
-        GpuPacked { offsets: gpu.upload_u32(p.offsets), t: gpu.upload(p.t), dt: gpu.upload(p.dt) }
+        GpuPacked { offsets: gpu.upload(p.offsets), t: gpu.upload(p.t), dt: gpu.upload(p.dt) }
     }
 
     pub fn rays(&self) -> usize {
@@ -43,40 +43,23 @@ pub struct GpuGradients {
 
 /// Forward for `c` channels.
 pub fn forward(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, features: &Buffer, c: usize, background: &Buffer) -> GpuComposited {
-    let r = p.rays();
-    let out = GpuComposited { color: gpu.empty(r * c), depth: gpu.empty(r), opacity: gpu.empty(r), weights: gpu.empty(sigma.len()) };
-    if r == 0 {
-        return out;
-    }
-    // SAFETY: units past the rays stop; offsets bound the samples.
-    unsafe {
-        weigh::launch_unchecked(
-            &gpu.client,
-            units(r),
-            CubeDim::new_1d(CUBE),
-            p.offsets.arg(),
-            p.t.arg(),
-            p.dt.arg(),
-            sigma.arg(),
-            out.weights.arg(),
-            out.depth.arg(),
-            out.opacity.arg(),
-            r as u32,
-        );
-        blend::launch_unchecked(
-            &gpu.client,
-            units(r * c),
-            CubeDim::new_1d(CUBE),
-            p.offsets.arg(),
-            out.weights.arg(),
-            out.opacity.arg(),
-            features.arg(),
-            background.arg(),
-            out.color.arg(),
-            (r * c) as u32,
-            c as u32,
-        );
-    }
+    let (r, s) = (p.rays(), p.t.len());
+    let out = GpuComposited { color: gpu.empty(r * c), depth: gpu.empty(r), opacity: gpu.empty(r), weights: gpu.empty(s) };
+    launch!(
+        gpu,
+        weigh,
+        r,
+        [p.offsets => r + 1, p.t => s, p.dt => s, sigma => s, out.weights => s, out.depth => r, out.opacity => r],
+        r as u32,
+    );
+    launch!(
+        gpu,
+        blend,
+        r * c,
+        [p.offsets => r + 1, out.weights => s, out.opacity => r, features => s * c, background => r * c, out.color => r * c],
+        (r * c) as u32,
+        c as u32,
+    );
     out
 }
 
@@ -90,46 +73,37 @@ pub fn backward(
     out: &GpuComposited,
     d: &GpuComposited,
 ) -> GpuGradients {
-    let r = p.rays();
-    let g = GpuGradients { sigma: gpu.empty(p.t.len()), features: gpu.empty(features.len()), background: gpu.empty(r * c) };
-    if r == 0 {
-        return g;
-    }
-    // SAFETY: as in `forward`.
-    unsafe {
-        unblend::launch_unchecked(
-            &gpu.client,
-            units(r * c),
-            CubeDim::new_1d(CUBE),
-            p.offsets.arg(),
-            out.weights.arg(),
-            out.opacity.arg(),
-            d.color.arg(),
-            g.features.arg(),
-            g.background.arg(),
-            (r * c) as u32,
-            c as u32,
-        );
-        unweigh::launch_unchecked(
-            &gpu.client,
-            units(r),
-            CubeDim::new_1d(CUBE),
-            p.offsets.arg(),
-            p.t.arg(),
-            p.dt.arg(),
-            features.arg(),
-            background.arg(),
-            out.weights.arg(),
-            out.opacity.arg(),
-            d.color.arg(),
-            d.depth.arg(),
-            d.opacity.arg(),
-            d.weights.arg(),
-            g.sigma.arg(),
-            r as u32,
-            c as u32,
-        );
-    }
+    let (r, s) = (p.rays(), p.t.len());
+    let g = GpuGradients { sigma: gpu.empty(s), features: gpu.empty(s * c), background: gpu.empty(r * c) };
+    launch!(
+        gpu,
+        unblend,
+        r * c,
+        [p.offsets => r + 1, out.weights => s, out.opacity => r, d.color => r * c, g.features => s * c, g.background => r * c],
+        (r * c) as u32,
+        c as u32,
+    );
+    launch!(
+        gpu,
+        unweigh,
+        r,
+        [
+            p.offsets => r + 1,
+            p.t => s,
+            p.dt => s,
+            features => s * c,
+            background => r * c,
+            out.weights => s,
+            out.opacity => r,
+            d.color => r * c,
+            d.depth => r,
+            d.opacity => r,
+            d.weights => s,
+            g.sigma => s,
+        ],
+        r as u32,
+        c as u32,
+    );
     g
 }
 

@@ -1,6 +1,8 @@
 //! Volume rendering by quadrature (Max 1995; NeRF eq. 3) over packed samples:
 //! `w_i = T_i (1 − e^{−σ_i δ_i})`, `T_{i+1} = T_i e^{−σ_i δ_i}`, `Ĉ = Σ w_i c_i + T_out · background`.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -1,62 +1,25 @@
+use super::cases::scene;
 use super::*;
 use diorama_testkit::{assert_close, assert_gradient, random, random_unit, wide};
 
-pub(crate) struct Scene {
-    pub offsets: Vec<u32>,
-    pub t: Vec<f32>,
-    pub dt: Vec<f32>,
-    pub sigma: Vec<f32>,
-}
-
-/// Ragged rays, empty ones among them, some opaque.
-pub(crate) fn scene(rays: usize, seed: u64) -> Scene {
-    let n = random_unit(rays, seed);
-    let mut offsets = vec![0u32];
-    let (mut t, mut dt) = (Vec::new(), Vec::new());
-    for r in 0..rays {
-        let count = if r % 5 == 1 { 0 } else { (n[r] * 40.0) as u32 + 1 };
-        let steps = random_unit(count as usize, seed + r as u64 + 7);
-        let mut at = 0.1;
-        for s in steps {
-            t.push(at);
-            dt.push(0.02 + 0.05 * s);
-            at += 0.1;
-        }
-        offsets.push(t.len() as u32);
-    }
-    let sigma = random_unit(t.len(), seed + 1).iter().map(|s| s * s * 40.0).collect();
-    Scene { offsets, t, dt, sigma }
-}
-
-impl Scene {
-    pub fn packed(&self) -> Packed<'_> {
-        Packed { offsets: &self.offsets, t: &self.t, dt: &self.dt }
-    }
-}
-
 #[test]
 fn matches_the_reference_both_ways_for_any_channel_count() {
-    for rays in [0, 1, 3, 130] {
-        for c in [1, 3, 19, 512] {
-            let s = scene(rays, 3);
-            let n = s.t.len();
-            let (f, b) = (random(n * c, 1), random(rays * c, 2));
-            let out = cpu::forward(&s.packed(), &s.sigma, &f, c, &b);
-            let (sd, fd, bd) = (wide(&s.sigma), wide(&f), wide(&b));
-            let want = reference::forward(&s.packed(), &sd, &fd, c, &bd);
-            assert_close("color", &out.color, &want.color, 1e-4);
-            assert_close("depth", &out.depth, &want.depth, 1e-4);
-            assert_close("opacity", &out.opacity, &want.opacity, 1e-4);
-            assert_close("weights", &out.weights, &want.weights, 1e-4);
-            let (dc, dd, d_o, dw) = (random(rays * c, 4), random(rays, 5), random(rays, 6), random(n, 7));
-            let d = cpu::Upstream { color: Some(&dc), depth: Some(&dd), opacity: Some(&d_o), weights: Some(&dw) };
-            let g = cpu::backward(&s.packed(), &s.sigma, &f, c, &b, &d);
-            let wide_d = Composited { color: wide(&dc), depth: wide(&dd), opacity: wide(&d_o), weights: wide(&dw) };
-            let (ds, df, db) = reference::backward(&s.packed(), &sd, &fd, c, &bd, &wide_d);
-            assert_close("sigma", &g.sigma, &ds, 1e-4);
-            assert_close("features", &g.features, &df, 1e-4);
-            assert_close("background", &g.background, &db, 1e-4);
-        }
+    for case in cases::cases() {
+        let (p, c, s) = (case.scene.packed(), case.channels, &case.scene);
+        let out = cpu::forward(&p, &s.sigma, &case.features, c, &case.background);
+        let (sd, fd, bd) = (wide(&s.sigma), wide(&case.features), wide(&case.background));
+        let want = reference::forward(&p, &sd, &fd, c, &bd);
+        assert_close("color", &out.color, &want.color, 1e-4);
+        assert_close("depth", &out.depth, &want.depth, 1e-4);
+        assert_close("opacity", &out.opacity, &want.opacity, 1e-4);
+        assert_close("weights", &out.weights, &want.weights, 1e-4);
+        let [color, depth, opacity, weights] = case.d.each_ref().map(|v| Some(&v[..]));
+        let g = cpu::backward(&p, &s.sigma, &case.features, c, &case.background, &cpu::Upstream { color, depth, opacity, weights });
+        let [color, depth, opacity, weights] = case.d.each_ref().map(|v| wide(v));
+        let (ds, df, db) = reference::backward(&p, &sd, &fd, c, &bd, &Composited { color, depth, opacity, weights });
+        assert_close("sigma", &g.sigma, &ds, 1e-4);
+        assert_close("features", &g.features, &df, 1e-4);
+        assert_close("background", &g.background, &db, 1e-4);
     }
 }
 

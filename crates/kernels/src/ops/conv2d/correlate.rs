@@ -4,6 +4,7 @@ use super::Activation;
 use super::bands::{Bands, Scratch, aligned, with_scratch};
 use super::depthwise;
 use super::planes::{Planes, Source};
+use super::shapes::{Correlation, Phase, Tensors, offset};
 use crate::simd;
 use crate::tile::{Kernel, Pack, Segment, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
@@ -19,58 +20,6 @@ const SUMS: usize = 96 << 10;
 const FETCHES: usize = 1 << 16;
 /// Fewest pixels that a band is cut into to keep all threads busy.
 const FEWEST: usize = 192;
-
-/// A weight and the input pixel that it multiplies, seen from a grid cell.
-#[derive(Clone, Copy, Debug)]
-pub struct Tap {
-    /// Offset from the first weight of a channel.
-    pub weight: usize,
-    /// Input pixel: `step · grid + at`.
-    pub at: [isize; 2],
-}
-
-/// Outputs that share their taps: pixels `start + spread · grid`.
-#[derive(Clone, Debug, Default)]
-pub struct Phase {
-    pub start: [usize; 2],
-    /// Cells of the grid.
-    pub size: [usize; 2],
-    pub taps: Vec<Tap>,
-}
-
-/// `out[n, g, f, start + spread · grid] = act(bias[g, f] + Σ_{c, tap} w[g, f, c, tap] x[n, g, c, step · grid + at])`.
-#[derive(Clone, Debug)]
-pub struct Correlation {
-    pub batch: usize,
-    pub groups: usize,
-    /// Input channels per group.
-    pub channels: usize,
-    /// Size of the input.
-    pub input: [usize; 2],
-    /// Output channels per group.
-    pub features: usize,
-    /// Size of the output.
-    pub output: [usize; 2],
-    pub step: [usize; 2],
-    pub spread: [usize; 2],
-    pub phases: Vec<Phase>,
-    /// Weights between groups, output channels and input channels.
-    pub weight_group: usize,
-    pub weight_feature: usize,
-    pub weight_channel: usize,
-}
-
-/// Tensors of a [`Correlation`].
-pub struct Tensors<'a> {
-    pub x: &'a [f32],
-    pub weights: &'a [f32],
-    /// Empty for none.
-    pub bias: &'a [f32],
-    pub activation: Activation,
-    pub out: &'a mut [f32],
-    /// Values before the activation.
-    pub before: Option<&'a mut [f32]>,
-}
 
 /// Per term of a pass, where weight and input stand: in the input's planes, and in a panel.
 #[derive(Clone, Debug, Default)]
@@ -108,11 +57,6 @@ struct Part {
     images: Range<usize>,
     rows: Range<usize>,
     features: Range<usize>,
-}
-
-/// Of a term, which tables hold in 32 bits.
-pub(super) fn offset(v: usize) -> u32 {
-    u32::try_from(v).expect("an image has less than 2³² floats")
 }
 
 impl Correlation {

@@ -1,7 +1,6 @@
 //! Forward and backward passes: correlations of the input and of the output's gradient, depthwise layers on their own.
 
-use super::correlate::{Correlation, Phase, Tap, Tensors};
-use super::weights::WeightSums;
+use super::shapes::{Correlation, Phase, Tap, Tensors, WeightSums};
 use super::{Activation, Conv2d, Gradients, Images};
 use crate::math::multiversion;
 use crate::simd;

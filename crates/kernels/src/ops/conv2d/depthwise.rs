@@ -1,9 +1,8 @@
 //! Layers whose outputs have one input channel each: whole rows at a time, vectors along pixels.
 
 use super::bands::{aligned, with_scratch};
-use super::correlate::{Correlation, Tensors, offset};
 use super::planes::{Planes, Source};
-use super::weights::WeightSums;
+use super::shapes::{Correlation, Tensors, WeightSums, offset};
 use crate::simd;
 use crate::tile::{Dots, MOST_DOTS, Row, Shared, kernel};
 use rayon::prelude::*;

@@ -7,6 +7,7 @@ pub mod cpu;
 mod depthwise;
 pub(crate) mod planes;
 pub mod reference;
+pub(crate) mod shapes;
 #[cfg(test)]
 mod tests;
 pub(crate) mod weights;

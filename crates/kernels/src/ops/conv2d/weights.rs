@@ -4,8 +4,8 @@
 //! second from a copy with channels innermost, in which neighboring taps of a row are neighboring vectors.
 
 use super::bands::{Bands, Scratch, aligned, with_scratch};
-use super::correlate::offset;
 use super::depthwise;
+use super::shapes::{WeightSums, offset};
 use crate::simd;
 use crate::tile::{Kernel, MOST_VECTORS, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
@@ -18,21 +18,6 @@ const PIXELS: usize = 768;
 const FEWEST_ROWS: usize = 32;
 /// Tasks at least, as long as there are pixels: what few channels leave is cut by pixels.
 const TASKS: usize = 16;
-
-/// Shapes of a weight gradient: `d` is `[batch, groups · rows, grid]`, `x` `[batch, groups · columns, input]`.
-#[derive(Clone, Copy, Debug)]
-pub struct WeightSums {
-    pub batch: usize,
-    pub groups: usize,
-    pub rows: usize,
-    pub grid: [usize; 2],
-    pub columns: usize,
-    pub input: [usize; 2],
-    pub kernel: [usize; 2],
-    pub step: [usize; 2],
-    pub padding: [usize; 2],
-    pub dilation: [usize; 2],
-}
 
 /// How the copy of a block of channels lies: `[image, row, column, width]`.
 #[derive(Clone, Copy)]
@@ -271,7 +256,7 @@ unsafe fn interleave16(from: *const f32, stride: usize, pixels: usize, out: *mut
             let count = (pixels - i).min(16);
             let mask = (((1u32 << count) - 1) & 0xffff) as u16;
             let v: [__m512i; 16] = std::array::from_fn(|c| _mm512_maskz_loadu_epi32(mask, from.add(c * stride + i).cast()));
-            let t = crate::amx::transpose16(v);
+            let t = crate::gemm::amx::transpose16(v);
             for (p, t) in t.iter().enumerate().take(count) {
                 _mm512_storeu_si512(out.add((i + p) * width).cast(), *t);
             }

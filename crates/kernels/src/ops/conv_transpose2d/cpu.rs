@@ -1,9 +1,8 @@
 //! The passes of the adjoint convolution, exchanged.
 
 use super::{Activation, ConvTranspose2d, Gradients, Images};
-use crate::ops::conv2d::correlate::Tensors;
 use crate::ops::conv2d::cpu::{bias_gradient, with_slopes};
-use crate::ops::conv2d::weights::WeightSums;
+use crate::ops::conv2d::shapes::{Tensors, WeightSums};
 
 fn check(c: &ConvTranspose2d, images: &Images, x: &[f32], weights: &[f32], out: usize) -> Images {
     let output = c.output(images);

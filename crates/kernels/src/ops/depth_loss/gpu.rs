@@ -1,7 +1,7 @@
 //! One unit per ray.
 
 use super::{EXACT, MOST};
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::GpuPacked;
 use cubecl::prelude::*;
 
@@ -12,41 +12,27 @@ pub fn away(middle: f32, surface: f32) -> f32 {
 }
 
 /// Adds `depth` times the loss of each ray that counts and whose surface is known (`surface` not 0, `[R]`) to `values` `[R]`,
-/// and `depth · scale` times its gradient to that of the weights `[S]`.
-#[allow(clippy::too_many_arguments)]
+/// and `depth · scale` times its gradient to that of the weights `[S]`: `to` holds both.
 pub fn add(
     gpu: &Gpu,
     p: &GpuPacked,
     weights: &Buffer,
     surface: &Buffer,
-    left_out: &Buffer,
-    depth: f32,
-    scale: f32,
-    values: &Buffer,
-    d_weights: &Buffer,
+    left_out: &Buffer<u32>,
+    (depth, scale): (f32, f32),
+    to: (&Buffer, &Buffer),
 ) {
-    let r = p.rays();
-    if r > 0 {
-        // SAFETY: units past the rays stop; offsets bound the samples.
-        unsafe {
-            judge::launch_unchecked(
-                &gpu.client,
-                units(r),
-                CubeDim::new_1d(CUBE),
-                p.offsets.arg(),
-                p.t.arg(),
-                p.dt.arg(),
-                weights.arg(),
-                surface.arg(),
-                left_out.arg(),
-                values.arg(),
-                d_weights.arg(),
-                r as u32,
-                depth,
-                scale,
-            );
-        }
-    }
+    let (r, s) = (p.rays(), p.t.len());
+    let (values, d_weights) = to;
+    launch!(
+        gpu,
+        judge,
+        r,
+        [p.offsets => r + 1, p.t => s, p.dt => s, weights => s, surface => r, left_out => r, values => r, d_weights => s],
+        r as u32,
+        depth,
+        scale,
+    );
 }
 
 #[cube(launch_unchecked)]

@@ -1,6 +1,6 @@
 //! One unit per ray, by running sums as on the CPU.
 
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::GpuPacked;
 use cubecl::prelude::*;
 
@@ -16,54 +16,24 @@ pub fn backward(gpu: &Gpu, p: &GpuPacked, weights: &Buffer, d_loss: &Buffer) -> 
 
 /// Loss per ray `[R]` and gradient of the weights `[S]` at once.
 pub fn both(gpu: &Gpu, p: &GpuPacked, weights: &Buffer, d_loss: &Buffer) -> (Buffer, Buffer) {
-    let (loss, g) = (gpu.empty(p.rays()), gpu.empty(weights.len()));
-    run(gpu, p, weights, d_loss, &loss, &g);
+    let (r, s) = (p.rays(), p.t.len());
+    let (loss, g) = (gpu.empty(r), gpu.empty(s));
+    launch!(
+        gpu,
+        spread,
+        r,
+        [p.offsets => r + 1, p.t => s, p.dt => s, weights => s, d_loss => r, loss => r, g => s],
+        r as u32,
+    );
     (loss, g)
 }
 
 /// Samples in [`super::normalized_distance`].
 pub fn normalized(gpu: &Gpu, p: &GpuPacked) -> GpuPacked {
-    let (s, ds) = (gpu.empty(p.t.len()), gpu.empty(p.t.len()));
-    let r = p.rays();
-    if r > 0 {
-        // SAFETY: units past the rays stop; offsets bound the samples.
-        unsafe {
-            normalize::launch_unchecked(
-                &gpu.client,
-                units(r),
-                CubeDim::new_1d(CUBE),
-                p.offsets.arg(),
-                p.t.arg(),
-                p.dt.arg(),
-                s.arg(),
-                ds.arg(),
-                r as u32,
-            );
-        }
-    }
-    GpuPacked { offsets: p.offsets.clone(), t: s, dt: ds }
-}
-
-fn run(gpu: &Gpu, p: &GpuPacked, weights: &Buffer, d_loss: &Buffer, loss: &Buffer, g: &Buffer) {
-    let r = p.rays();
-    if r > 0 {
-        // SAFETY: units past the rays stop; offsets bound the samples.
-        unsafe {
-            spread::launch_unchecked(
-                &gpu.client,
-                units(r),
-                CubeDim::new_1d(CUBE),
-                p.offsets.arg(),
-                p.t.arg(),
-                p.dt.arg(),
-                weights.arg(),
-                d_loss.arg(),
-                loss.arg(),
-                g.arg(),
-                r as u32,
-            );
-        }
-    }
+    let (r, s) = (p.rays(), p.t.len());
+    let (starts, lengths) = (gpu.empty(s), gpu.empty(s));
+    launch!(gpu, normalize, r, [p.offsets => r + 1, p.t => s, p.dt => s, starts => s, lengths => s], r as u32);
+    GpuPacked { offsets: p.offsets.clone(), t: starts, dt: lengths }
 }
 
 #[cube(launch_unchecked)]

@@ -1,6 +1,8 @@
 //! Distortion loss (Barron et al. 2022, mip-NeRF 360, eq. 15), which pulls a ray's weights together:
 //! `Σ_ij w_i w_j |m_i − m_j| + ⅓ Σ_i w_i² δ_i` with interval midpoints `m` and lengths `δ`.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

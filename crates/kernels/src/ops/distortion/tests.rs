@@ -1,14 +1,11 @@
 use super::*;
-use crate::ops::composite::{Packed, tests::scene};
+use crate::ops::composite::{Packed, cases::scene};
 use diorama_testkit::{assert_close, assert_gradient, random_unit, wide};
 
 #[test]
 fn matches_the_reference_both_ways() {
-    for rays in [0, 1, 77] {
-        let s = scene(rays, 3);
-        let p = s.packed();
-        let (w, d) = (random_unit(s.t.len(), 1), random_unit(rays, 2));
-        let mut g = vec![0.0; w.len()];
+    for cases::Case { rays, scene, weights: w, d } in cases::cases() {
+        let (p, mut g) = (scene.packed(), vec![0.0; w.len()]);
         let loss: Vec<f32> = (0..rays).map(|r| cpu::ray(&p, r, &w[p.range(r)], d[r], &mut g[p.range(r)])).collect();
         assert_close("loss", &loss, &reference::forward(&p, &wide(&w)), 1e-4);
         assert_close("weights", &g, &reference::backward(&p, &wide(&w), &wide(&d)), 1e-4);

@@ -1,16 +1,14 @@
 //! The standard field on the device: encoded positions, network, compositing, and back.
 
-pub mod loss;
-
 use super::FieldNet;
-use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Rows, Swap, units};
+use crate::gpu::{Accumulate, Buffer, Gpu, Rows, launch};
 use crate::ops::composite::gpu::{self as composite, GpuComposited, GpuGradients, GpuPacked};
 use crate::ops::fused_mlp::gpu::fused::{Element, Fused, Kept, tensor_element};
 use crate::ops::fused_mlp::gpu::{self as mlp, columns};
 use crate::ops::fused_mlp::{Head, Mlp, reference};
 use crate::ops::linear::gpu as linear;
 use crate::ops::linear::reference::{activate, slope};
-use crate::ops::march::gpu::prune::Pruned;
+use crate::ops::prune::gpu::Pruned;
 use cubecl::prelude::*;
 use diorama_geom::rng::Rng;
 
@@ -34,6 +32,17 @@ pub struct GpuNet {
     per_level: usize,
     /// The whole network, and what its density needs.
     fused: Option<[Fused; 2]>,
+}
+
+/// Samples as a network reads them.
+///
+/// # Shapes
+/// features: as [`GpuNet::features`] gives them; codes: `[R, K_i]`.
+#[derive(Clone, Copy)]
+pub struct FieldInput<'a> {
+    pub packed: &'a GpuPacked,
+    pub features: &'a Buffer,
+    pub codes: &'a [&'a Buffer],
 }
 
 impl GpuNet {
@@ -71,7 +80,7 @@ impl GpuNet {
 
     /// Features of a hash grid `[L, S, F]` as the network reads them.
     pub fn features(&self, gpu: &Gpu, rows: &Rows, levels: Buffer) -> Buffer {
-        if self.in_levels() { levels } else { turn(gpu, rows, &levels, self.per_level, self.net.mlp.input_widths[0], true) }
+        if self.in_levels() { levels } else { transpose_levels(gpu, rows, &levels, self.per_level, self.net.mlp.input_widths[0], true) }
     }
 
     /// Features of the samples that stay.
@@ -92,15 +101,12 @@ impl GpuNet {
     }
 
     /// Densities and colours of packed samples; with `keep` ready for [`GpuNet::gradients`].
-    ///
-    /// # Shapes
-    /// features: as the network reads them; codes: `[R, K_i]`.
-    pub fn evaluate(&self, gpu: &Gpu, params: &Buffer, p: &GpuPacked, features: &Buffer, codes: &[&Buffer], keep: bool) -> Evaluated {
-        let rows = p.rows();
-        let mut inputs = vec![features.clone()];
-        for (code, width) in codes.iter().zip(&self.net.mlp.input_widths[1..]) {
+    pub fn evaluate(&self, gpu: &Gpu, params: &Buffer, input: &FieldInput, keep: bool) -> Evaluated {
+        let (p, rows) = (input.packed, input.packed.rows());
+        let mut inputs = vec![input.features.clone()];
+        for (code, width) in input.codes.iter().zip(&self.net.mlp.input_widths[1..]) {
             let per_sample = gpu.empty(rows.most * width);
-            along(gpu, p, code, &per_sample, *width, true);
+            expand_ray_code(gpu, p, code, &per_sample, *width, true);
             inputs.push(per_sample);
         }
         let refs: Vec<&Buffer> = inputs.iter().collect();
@@ -117,7 +123,7 @@ impl GpuNet {
                 (Values::Layers(values), sigma, outputs)
             }
         };
-        Evaluated { inputs, values, sigma, outputs }
+        Evaluated { packed: p.clone(), inputs, values, sigma, outputs }
     }
 
     /// Activated channels of all outputs, `[S, C]`.
@@ -136,31 +142,21 @@ impl GpuNet {
     }
 
     /// [`GpuNet::evaluate`], composited on a background `[R, C]`.
-    #[allow(clippy::too_many_arguments)]
-    pub fn forward(
-        &self,
-        gpu: &Gpu,
-        params: &Buffer,
-        p: &GpuPacked,
-        features: &Buffer,
-        codes: &[&Buffer],
-        background: &Buffer,
-        keep: bool,
-    ) -> GpuStep {
-        let at = self.evaluate(gpu, params, p, features, codes, keep);
-        let out = composite::forward(gpu, p, &at.sigma, &at.outputs, self.net.channels(), background);
-        GpuStep { out, at }
+    pub fn forward(&self, gpu: &Gpu, params: &Buffer, input: &FieldInput, background: &Buffer, keep: bool) -> GpuStep {
+        let at = self.evaluate(gpu, params, input, keep);
+        let out = composite::forward(gpu, &at.packed, &at.sigma, &at.outputs, self.net.channels(), background);
+        GpuStep { out, at, background: background.clone() }
     }
 
     /// Gradients of parameters, features and codes, given those of densities and colours.
-    pub fn gradients(&self, gpu: &Gpu, params: &Buffer, p: &GpuPacked, at: &Evaluated, g: &GpuGradients) -> GpuStepGradients {
-        let (rows, net) = (p.rows(), &self.net);
+    pub fn gradients(&self, gpu: &Gpu, params: &Buffer, at: &Evaluated, g: &GpuGradients) -> GpuStepGradients {
+        let (p, rows, net) = (&at.packed, at.packed.rows(), &self.net);
         let inputs: Vec<&Buffer> = at.inputs.iter().collect();
         let (d_params, d_inputs) = match (&self.fused, &at.values) {
             (Some([whole, _]), Values::Kept(kept)) => {
                 // The loss is a mean over rays.
                 let scale = (p.rays().max(1) as f32 * HALF_SCALE).log2().floor().exp2();
-                whole.backward(gpu, params, &inputs, kept, &rows, &[&g.sigma, &g.features], scale)
+                whole.backward(gpu, params, &inputs, kept, &rows, (&[&g.sigma, &g.features], scale))
             }
             (_, Values::Layers(values)) => {
                 let mut seeds: Vec<Option<Buffer>> = net.mlp.layers.iter().map(|_| None).collect();
@@ -190,12 +186,12 @@ impl GpuNet {
         let mut d_inputs = d_inputs.into_iter();
         let features = d_inputs.next().flatten().map(|d| {
             let turned = self.per_level > 0 && !self.in_levels();
-            if turned { turn(gpu, &rows, &d, self.per_level, net.mlp.input_widths[0], false) } else { d }
+            if turned { transpose_levels(gpu, &rows, &d, self.per_level, net.mlp.input_widths[0], false) } else { d }
         });
         let codes = d_inputs.zip(&net.mlp.input_widths[1..]).map(|(d, width)| {
             d.map(|d| {
                 let sum = gpu.empty(p.rays() * width);
-                along(gpu, p, &sum, &d, *width, false);
+                expand_ray_code(gpu, p, &sum, &d, *width, false);
                 sum
             })
         });
@@ -203,22 +199,13 @@ impl GpuNet {
     }
 
     /// [`GpuNet::gradients`], given those of what compositing gave; see [`super::StepInput::near_scaling`].
-    #[allow(clippy::too_many_arguments)]
-    pub fn backward(
-        &self,
-        gpu: &Gpu,
-        params: &Buffer,
-        p: &GpuPacked,
-        background: &Buffer,
-        step: &GpuStep,
-        d: &GpuComposited,
-        near_scaling: f32,
-    ) -> GpuStepGradients {
-        let g = composite::backward(gpu, p, &step.at.outputs, self.net.channels(), background, &step.out, d);
+    pub fn backward(&self, gpu: &Gpu, params: &Buffer, step: &GpuStep, d: &GpuComposited, near_scaling: f32) -> GpuStepGradients {
+        let p = &step.at.packed;
+        let g = composite::backward(gpu, p, &step.at.outputs, self.net.channels(), &step.background, &step.out, d);
         if near_scaling > 0.0 {
-            soften(gpu, p, &g.sigma, &g.features, near_scaling);
+            scale_near_gradients(gpu, p, &g.sigma, &g.features, near_scaling);
         }
-        self.gradients(gpu, params, p, &step.at, &g)
+        self.gradients(gpu, params, &step.at, &g)
     }
 }
 
@@ -259,19 +246,12 @@ fn agrees(gpu: &Gpu, net: &FieldNet, whole: &Fused, per_level: usize) -> bool {
     let (rows, params) = (Rows::all(gpu, ROWS), up(&params));
     let mut on_gpu: Vec<Buffer> = inputs.iter().map(|v| up(v)).collect();
     if per_level > 0 {
-        on_gpu[0] = turn(gpu, &rows, &on_gpu[0], per_level, mlp.input_widths[0], false);
+        on_gpu[0] = transpose_levels(gpu, &rows, &on_gpu[0], per_level, mlp.input_widths[0], false);
     }
     let refs: Vec<&Buffer> = on_gpu.iter().collect();
     let kept = whole.forward(gpu, &params, &refs, &rows, true);
-    let (got, _) = whole.backward(
-        gpu,
-        &params,
-        &refs,
-        &kept,
-        &rows,
-        &d.iter().map(|d| up(d)).collect::<Vec<_>>().iter().collect::<Vec<_>>(),
-        HALF_SCALE,
-    );
+    let d: Vec<Buffer> = d.iter().map(|d| up(d)).collect();
+    let (got, _) = whole.backward(gpu, &params, &refs, &kept, &rows, (&d.iter().collect::<Vec<_>>(), HALF_SCALE));
     let energy = |v: &mut dyn Iterator<Item = f64>| v.map(|x| x * x).sum::<f64>().sqrt();
     let close = |got: &Buffer, want: &[f64]| {
         gpu.read(got).is_ok_and(|got| {
@@ -293,6 +273,7 @@ enum Values {
 
 /// Densities `[S]` and outputs `[S, C]`, and what a backward pass needs beside them.
 pub struct Evaluated {
+    packed: GpuPacked,
     inputs: Vec<Buffer>,
     values: Values,
     pub sigma: Buffer,
@@ -303,6 +284,7 @@ pub struct Evaluated {
 pub struct GpuStep {
     pub out: GpuComposited,
     at: Evaluated,
+    background: Buffer,
 }
 
 /// Gradients of a step.
@@ -321,106 +303,64 @@ fn head(gpu: &Gpu, net: &FieldNet, h: Head, values: &mlp::Values, rows: &Rows, c
 }
 
 /// Rows `[R, width]` of `table` `[N, width]` named by `index` `[R]`.
-pub fn look_up(gpu: &Gpu, table: &Buffer, index: &Buffer, width: usize) -> Buffer {
-    let out = gpu.empty(index.len() * width);
-    if !out.is_empty() {
-        // SAFETY: units past the length stop; `index` names rows of the table.
-        unsafe {
-            read_rows::launch_unchecked(
-                &gpu.client,
-                units(out.len()),
-                CubeDim::new_1d(CUBE),
-                table.arg(),
-                index.arg(),
-                out.arg(),
-                out.len() as u32,
-                width as u32,
-            );
-        }
-    }
+pub fn look_up(gpu: &Gpu, table: &Buffer, index: &Buffer<u32>, width: usize) -> Buffer {
+    let rows = index.len();
+    let (n, out) = (rows * width, gpu.empty(rows * width));
+    launch!(gpu, read_rows, n, [table => table.len(), index => rows, out => n], n as u32, width as u32);
     out
 }
 
 /// Adds rows `d` `[R, width]` to the gradient of the table.
-pub fn look_up_backward(gpu: &Gpu, d: &Buffer, index: &Buffer, width: usize, d_table: &Buffer) {
-    if d.is_empty() {
-        return;
-    }
-    let launch = if gpu.native_atomics { add_rows::launch_unchecked::<Native> } else { add_rows::launch_unchecked::<Swap> };
-    // SAFETY: as in `look_up`.
-    unsafe {
-        launch(&gpu.client, units(d.len()), CubeDim::new_1d(CUBE), d.arg(), index.arg(), d_table.arg(), d.len() as u32, width as u32);
-    }
+pub fn look_up_backward(gpu: &Gpu, d: &Buffer, index: &Buffer<u32>, width: usize, d_table: &Buffer) {
+    let rows = index.len();
+    let n = rows * width;
+    launch!(gpu, add_rows::<Adder>, n, [d => n, index => rows, d_table => d_table.len()], n as u32, width as u32);
 }
 
 /// Scales gradients of samples closer than `reach` by the square of their share of it.
-pub fn soften(gpu: &Gpu, p: &GpuPacked, d_sigma: &Buffer, d_rgb: &Buffer, reach: f32) {
-    let (live, at) = p.rows().arg();
-    if p.t.is_empty() {
-        return;
-    }
-    // SAFETY: units past the samples stop.
-    unsafe {
-        scale_near::launch_unchecked(
-            &gpu.client,
-            units(p.t.len()),
-            CubeDim::new_1d(CUBE),
-            live,
-            p.t.arg(),
-            p.dt.arg(),
-            d_sigma.arg(),
-            d_rgb.arg(),
-            at,
-            reach,
-        );
-    }
+pub fn scale_near_gradients(gpu: &Gpu, p: &GpuPacked, d_sigma: &Buffer, d_rgb: &Buffer, reach: f32) {
+    let (rows, s) = (p.rows(), p.t.len());
+    launch!(
+        gpu,
+        scale_near,
+        s,
+        [rows.live => rows.at + 1, p.t => s, p.dt => s, d_sigma => s, d_rgb => s * 3],
+        rows.place(),
+        reach,
+    );
 }
 
 /// Level-major to row-major features, or back.
-fn turn(gpu: &Gpu, rows: &Rows, from: &Buffer, per_level: usize, dims: usize, to_rows: bool) -> Buffer {
-    let to = gpu.empty(from.len());
-    if !from.is_empty() {
-        let (live, at) = rows.arg();
-        // SAFETY: units past the rows stop.
-        unsafe {
-            transpose::launch_unchecked(
-                &gpu.client,
-                units(from.len()),
-                CubeDim::new_1d(CUBE),
-                live,
-                from.arg(),
-                to.arg(),
-                at,
-                rows.most as u32,
-                per_level as u32,
-                dims as u32,
-                to_rows,
-            );
-        }
-    }
+fn transpose_levels(gpu: &Gpu, rows: &Rows, from: &Buffer, per_level: usize, dims: usize, to_rows: bool) -> Buffer {
+    let n = rows.most * dims;
+    let to = gpu.empty(n);
+    launch!(
+        gpu,
+        transpose,
+        n,
+        [rows.live => rows.at + 1, from => n, to => n],
+        rows.place(),
+        rows.most as u32,
+        per_level as u32,
+        dims as u32,
+        to_rows,
+    );
     to
 }
 
 /// Copies each ray's code `[R, K]` to its samples `[S, K]`, or sums them back.
-fn along(gpu: &Gpu, p: &GpuPacked, code: &Buffer, samples: &Buffer, width: usize, spread: bool) {
-    let n = p.rays() * width;
-    if n == 0 {
-        return;
-    }
-    // SAFETY: units past `n` stop; offsets bound the samples.
-    unsafe {
-        share::launch_unchecked(
-            &gpu.client,
-            units(n),
-            CubeDim::new_1d(CUBE),
-            p.offsets.arg(),
-            code.arg(),
-            samples.arg(),
-            n as u32,
-            width as u32,
-            spread,
-        );
-    }
+fn expand_ray_code(gpu: &Gpu, p: &GpuPacked, code: &Buffer, samples: &Buffer, width: usize, spread: bool) {
+    let (rays, s) = (p.rays(), p.t.len());
+    let n = rays * width;
+    launch!(
+        gpu,
+        share,
+        n,
+        [p.offsets => rays + 1, code => n, samples => s * width],
+        n as u32,
+        width as u32,
+        spread,
+    );
 }
 
 #[cube(launch_unchecked)]

@@ -4,10 +4,10 @@
 
 use super::{FieldNet, Output};
 #[cfg(target_arch = "x86_64")]
-use crate::amx::Line;
-#[cfg(target_arch = "x86_64")]
 use crate::amx_chain::Chain;
 use crate::gemm::Precision;
+#[cfg(target_arch = "x86_64")]
+use crate::gemm::amx::Line;
 use crate::ops::fused_mlp::cpu::{Activations, forward_block};
 use crate::ops::fused_mlp::{Head, Layer, Mlp, Source};
 use crate::ops::hash_grid::{self, HashGrid};

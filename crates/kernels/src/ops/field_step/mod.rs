@@ -9,6 +9,8 @@
 //! [`BatchLoss`]; gradients that come from elsewhere, for example from an image network, are [`InjectedGradients`].
 //! The reference is the composition of the others'.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 mod disjoint;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -69,6 +69,16 @@ struct Group {
     loss: f64,
 }
 
+impl StepOutput {
+    /// Room for `r` rays of `c` channels and `s` samples.
+    fn resize(&mut self, r: usize, s: usize, c: usize) {
+        let StepOutput { values, opacity, depth, weights, d_background, .. } = self;
+        for (v, n) in [(values, r * c), (opacity, r), (depth, r), (weights, s), (d_background, r * c)] {
+            v.resize(n, 0.0);
+        }
+    }
+}
+
 /// Per-ray and per-sample arrays that blocks write to.
 struct Shared<'a> {
     features: Option<(Disjoint<'a>, usize, usize)>,
@@ -99,10 +109,7 @@ pub fn run(
     assert!(input.background.len() == r * c && input.params.len() == mlp.params_len(), "field: shapes");
     assert_eq!(codes.len() + 1, mlp.input_widths.len(), "field: codes");
     assert!(c > 0 && input.net.heads().all(|(h, _)| h.activation.is_monotonic()), "field: heads");
-    let StepOutput { values, opacity, depth, weights, d_background, .. } = &mut *out;
-    for (v, n) in [(values, r * c), (opacity, r), (depth, r), (weights, s), (d_background, r * c)] {
-        v.resize(n, 0.0);
-    }
+    out.resize(r, s, c);
     let shared = Shared {
         features: None,
         encoded: None,

@@ -1,8 +1,9 @@
+use super::cases::ngp_net;
 use super::*;
-use crate::ops::composite::{Composited, Packed, tests::scene};
+use crate::ops::composite::{Composited, Packed, cases::scene};
 use crate::ops::frequency;
 use crate::ops::fused_mlp::{Layer, Source};
-use crate::ops::hash_grid::{HashGrid, HashGridConfig, cpu as hash, reference as hash_reference};
+use crate::ops::hash_grid::{HashGrid, HashGridConfig, cpu as hash};
 use crate::ops::linear::Activation;
 use diorama_geom::rng::Rng;
 use diorama_testkit::{assert_close, random, random_unit, wide};
@@ -38,19 +39,6 @@ impl RayLoss for Linear {
     }
 }
 
-fn ngp_net(features: usize) -> FieldNet {
-    let l =
-        |inputs: Vec<Source>, width, relu: bool| Layer::new(inputs, width, if relu { Activation::Relu } else { Activation::None }, false);
-    use Source::{Input, Layer as L};
-    let layers =
-        vec![l(vec![Input(0)], 32, true), l(vec![L(0)], 16, false), l(vec![L(1), Input(1), Input(2)], 32, true), l(vec![L(2)], 16, false)];
-    FieldNet::of_color(
-        Mlp::new(vec![features, 16, 5], layers),
-        Head { layer: 1, channel: 0, activation: Activation::TruncatedExp, shift: 0.5 },
-        Head { layer: 3, channel: 0, activation: Activation::Sigmoid, shift: 0.0 },
-    )
-}
-
 fn expand(p: &Packed, code: &[f32], width: usize) -> Vec<f64> {
     (0..p.rays()).flat_map(|r| p.range(r).map(move |_| r)).flat_map(|r| wide(&code[r * width..(r + 1) * width])).collect()
 }
@@ -60,48 +48,34 @@ fn fold(p: &Packed, d: &[f64], width: usize) -> Vec<f64> {
 }
 
 #[test]
-fn fused_equals_composed_with_hash_features_codes_and_all_gradients() {
-    let grid = HashGrid::new(HashGridConfig { levels: 4, features: 2, log2_size: 9, base: 4, finest: 32 });
-    let net = ngp_net(grid.output_dims());
-    for rays in [0, 1, 90] {
-        let s = scene(rays, 3);
-        let (p, n) = (s.packed(), s.t.len());
-        let points = random_unit(n * 3, 5);
-        let table = random(grid.params_len(), 6);
-        let params = net.mlp.init(&Rng::new(1, 1));
-        let (sh, emb, bg) = (random(rays * 16, 7), random(rays * 5, 8), random(rays * 3, 9));
-        let mut features = vec![0.0; n * grid.output_dims()];
-        hash::forward(&grid, &points, &table, &mut features);
-        let loss = Linear::new(rays, 3, n);
-        let (mut d_sh, mut d_emb) = (vec![9.0; sh.len()], vec![9.0; emb.len()]);
-        let mut d_params = vec![0.0; params.len()];
-        let mut out = StepOutput::default();
-        let input = StepInput { net: &net, params: &params, samples: p, background: &bg, near_scaling: 0.0 };
-        let mut codes =
-            [RayCode { values: &sh, width: 16, gradient: Some(&mut d_sh) }, RayCode { values: &emb, width: 5, gradient: Some(&mut d_emb) }];
-        let positions = Positions::Features { data: &mut features, levels: 4, width: 2 };
+fn fused_equals_composed_with_features_codes_and_all_gradients() {
+    for c in cases::cases() {
+        let (net, p, channels) = (&c.net, c.scene.packed(), c.net.channels());
+        let mut features = c.features.clone();
+        let [color, depth, opacity, weights] = c.d.clone();
+        let loss = Linear { color, depth, opacity, weights };
+        let (mut d_first, mut d_second) = (vec![9.0; c.codes[0].len()], vec![9.0; c.codes[1].len()]);
+        let (mut out, mut d_params) = (StepOutput::default(), vec![0.0; c.params.len()]);
+        let input = StepInput { net, params: &c.params, samples: p, background: &c.background, near_scaling: 0.0 };
+        let [first, second] = cases::CODES;
+        let mut codes = [
+            RayCode { values: &c.codes[0], width: first, gradient: Some(&mut d_first) },
+            RayCode { values: &c.codes[1], width: second, gradient: Some(&mut d_second) },
+        ];
+        let (levels, width) = cases::LEVELS;
+        let positions = Positions::Features { data: &mut features, levels, width };
         run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
-
-        let level_major = hash_reference::forward(&grid, &wide(&points), &wide(&table));
-        let rows: Vec<f64> = (0..n * 8).map(|e| level_major[(e % 8 / 2 * n + e / 8) * 2 + e % 2]).collect();
-        let inputs = [rows, expand(&p, &sh, 16), expand(&p, &emb, 5)];
-        let views: Vec<&[f64]> = inputs.iter().map(|v| &v[..]).collect();
-        let want = reference::step(&net, &wide(&params), &p, &views, &wide(&bg), &loss.wide());
-        assert_close("rgb", &out.values, &want.out.color, 1e-4);
+        let want = c.want();
+        assert_eq!(out.values.len(), c.rays * channels);
+        assert_close("values", &out.values, &want.out.color, 1e-4);
         assert_close("depth", &out.depth, &want.out.depth, 1e-4);
         assert_close("opacity", &out.opacity, &want.out.opacity, 1e-4);
         assert_close("weights", &out.weights, &want.out.weights, 1e-4);
         assert_close("d background", &out.d_background, &want.d_background, 1e-4);
         assert_close("d params", &d_params, &want.d_params, 1e-4);
-        assert_close("d direction code", &d_sh, &fold(&p, &want.d_inputs[1], 16), 1e-4);
-        assert_close("d embedding", &d_emb, &fold(&p, &want.d_inputs[2], 5), 1e-4);
-        let d_rows: Vec<f64> = (0..n * 8).map(|e| want.d_inputs[0][(e / 2 % n.max(1)) * 8 + e / 2 / n.max(1) * 2 + e % 2]).collect();
-        assert_close("d features", &features, &d_rows, 1e-4);
-        // And on to the table and the points.
-        let mut d_table = vec![0.0; table.len()];
-        hash::backward(&grid, &points, &features, &mut d_table, None);
-        let (_, rt) = hash_reference::backward(&grid, &wide(&points), &wide(&table), &d_rows);
-        assert_close("d table", &d_table, &rt, 1e-4);
+        assert_close("d first code", &d_first, &c.want_code(&want, 0), 1e-4);
+        assert_close("d second code", &d_second, &c.want_code(&want, 1), 1e-4);
+        assert_close("d features", &features, &c.want_features(&want), 1e-4);
     }
 }
 

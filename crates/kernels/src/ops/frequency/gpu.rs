@@ -1,7 +1,7 @@
 //! One unit per number of the input.
 
 use super::Frequency;
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, launch};
 use cubecl::prelude::*;
 
 /// Weights of the bands, after the window.
@@ -15,50 +15,37 @@ fn scale(f: &Frequency) -> f32 {
 
 /// `[N, dims]` to `[N, output_dims]`.
 pub fn forward(gpu: &Gpu, f: &Frequency, x: &Buffer) -> Buffer {
-    let out = gpu.empty(x.len() / f.dims * f.output_dims());
-    if !x.is_empty() {
-        // SAFETY: units past the length stop.
-        unsafe {
-            waves::launch_unchecked(
-                &gpu.client,
-                units(x.len()),
-                CubeDim::new_1d(CUBE),
-                x.arg(),
-                band_weights(gpu, f).arg(),
-                out.arg(),
-                x.len() as u32,
-                scale(f),
-                f.dims,
-                f.bands,
-                f.include_input,
-            );
-        }
-    }
+    let (n, n_out) = (x.len(), x.len() / f.dims * f.output_dims());
+    let (bands, out) = (band_weights(gpu, f), gpu.empty(n_out));
+    launch!(
+        gpu,
+        waves,
+        n,
+        [x => n, bands => f.bands, out => n_out],
+        n as u32,
+        scale(f),
+        f.dims,
+        f.bands,
+        f.include_input,
+    );
     out
 }
 
 /// Gradient of the input.
 pub fn backward(gpu: &Gpu, f: &Frequency, x: &Buffer, d_out: &Buffer) -> Buffer {
-    let out = gpu.empty(x.len());
-    if !x.is_empty() {
-        // SAFETY: units past the length stop.
-        unsafe {
-            slopes::launch_unchecked(
-                &gpu.client,
-                units(x.len()),
-                CubeDim::new_1d(CUBE),
-                x.arg(),
-                band_weights(gpu, f).arg(),
-                d_out.arg(),
-                out.arg(),
-                x.len() as u32,
-                scale(f),
-                f.dims,
-                f.bands,
-                f.include_input,
-            );
-        }
-    }
+    let (n, n_out) = (x.len(), x.len() / f.dims * f.output_dims());
+    let (bands, out) = (band_weights(gpu, f), gpu.empty(n));
+    launch!(
+        gpu,
+        slopes,
+        n,
+        [x => n, bands => f.bands, d_out => n_out, out => n],
+        n as u32,
+        scale(f),
+        f.dims,
+        f.bands,
+        f.include_input,
+    );
     out
 }
 

@@ -2,6 +2,8 @@
 //! `γ(x) = (x, sin(2⁰ s x), cos(2⁰ s x), …, sin(2ᴸ⁻¹ s x), cos(2ᴸ⁻¹ s x))` with `s = π` or 1, the raw
 //! input optional, and a band window for coarse-to-fine training (Park et al. 2021, eq. 8).
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -1,7 +1,7 @@
 //! One block of rows at a time; [`forward_block`] and [`backward_block`] are what fused ops call.
 
 use super::{Layer, Mlp, Source};
-use crate::gemm::{self, Init, View, gemm};
+use crate::gemm::{self, Gemm, Init, View, gemm};
 use crate::ops::linear::Activation;
 use crate::ops::linear::cpu::{activate, scale_by_slope};
 use rayon::prelude::*;
@@ -105,7 +105,11 @@ pub fn forward_block(mlp: &Mlp, params: &[f32], inputs: &[&[f32]], n: usize, act
             let x = &mut acts.scaled[j][..n * k];
             join(mlp, layer, inputs, before, x);
             scale_rows(x, k, inputs[m], k + width);
-            gemm(mlp.precision, n, width, k, View::rows(x, k), &params[at..], width, out, width, start, false);
+            gemm(
+                mlp.precision,
+                Gemm { m: n, n: width, k, a: View::rows(x, k), b: &params[at..], ldb: width, ldc: width, init: start, relu: false },
+                out,
+            );
             for (o, row) in out.chunks_exact_mut(width).zip(inputs[m].chunks_exact(k + width)) {
                 o.iter_mut().zip(&row[k..]).for_each(|(o, b)| *o += b);
             }
@@ -115,7 +119,11 @@ pub fn forward_block(mlp: &Mlp, params: &[f32], inputs: &[&[f32]], n: usize, act
                 let init = if q == 0 { start } else { Init::Accumulate };
                 let relu = is_relu && q + 1 == layer.inputs.len();
                 let x = read(*s, inputs, before);
-                gemm(mlp.precision, n, width, k, View::rows(x, k), &params[at..], width, out, width, init, relu);
+                gemm(
+                    mlp.precision,
+                    Gemm { m: n, n: width, k, a: View::rows(x, k), b: &params[at..], ldb: width, ldc: width, init, relu },
+                    out,
+                );
                 at += k * width;
             }
         }
@@ -216,7 +224,11 @@ impl Block<'_> {
             let k = mlp.source_width(*s);
             if !layer.frozen {
                 let x = View::transposed(read(*s, self.inputs, &acts.values), k);
-                gemm(precision, k, width, n, x, g, width, &mut d_params[at..at + k * width], width, Init::Accumulate, false);
+                gemm(
+                    precision,
+                    Gemm { m: k, n: width, k: n, a: x, b: g, ldb: width, ldc: width, init: Init::Accumulate, relu: false },
+                    &mut d_params[at..at + k * width],
+                );
             }
             let (target, seeded) = match *s {
                 Source::Input(i) => (d_inputs[i].as_deref_mut(), &mut acts.input_seeded[i]),
@@ -224,7 +236,11 @@ impl Block<'_> {
             };
             if let Some(target) = target {
                 let init = if *seeded { Init::Accumulate } else { Init::Zero };
-                gemm(precision, n, k, width, View::rows(g, width), &wt[first..], total, target, k, init, false);
+                gemm(
+                    precision,
+                    Gemm { m: n, n: k, k: width, a: View::rows(g, width), b: &wt[first..], ldb: total, ldc: k, init, relu: false },
+                    target,
+                );
                 *seeded = true;
             }
             at += k * width;
@@ -241,12 +257,30 @@ impl Block<'_> {
         if !layer.frozen {
             let x = View::transposed(&acts.scaled[j], total);
             let d_weight = &mut d_params[at..at + total * width];
-            gemm(precision, total, width, n, x, g, width, d_weight, width, Init::Accumulate, false);
+            gemm(
+                precision,
+                Gemm { m: total, n: width, k: n, a: x, b: g, ldb: width, ldc: width, init: Init::Accumulate, relu: false },
+                d_weight,
+            );
         }
         // Of the scaled rows; that of the rows themselves after another scaling.
         acts.d_scaled.resize(n * total, 0.0);
         let d = &mut acts.d_scaled[..];
-        gemm(precision, n, total, width, View::rows(g, width), &self.prepared.transposed[j], total, d, total, Init::Zero, false);
+        gemm(
+            precision,
+            Gemm {
+                m: n,
+                n: total,
+                k: width,
+                a: View::rows(g, width),
+                b: &self.prepared.transposed[j],
+                ldb: total,
+                ldc: total,
+                init: Init::Zero,
+                relu: false,
+            },
+            d,
+        );
         if let Some(d_code) = d_inputs[m].as_deref_mut() {
             let x = &mut acts.scaled[j][..n * total];
             join(mlp, layer, self.inputs, &acts.values, x);

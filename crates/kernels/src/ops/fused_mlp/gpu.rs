@@ -3,9 +3,9 @@
 pub mod fused;
 
 use super::{Mlp, Source};
-use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
+use crate::gpu::{Buffer, Gpu, Rows, launch};
 use crate::ops::linear::gpu::{self as linear, Part};
-use crate::ops::linear::{Activation, BiasKind};
+use crate::ops::linear::{Activation, BiasKind, Dense};
 use cubecl::prelude::*;
 
 /// Activations of a network for the way back.
@@ -23,8 +23,9 @@ pub fn forward(gpu: &Gpu, mlp: &Mlp, params: &Buffer, inputs: &[&Buffer], rows: 
         let x = joined(gpu, mlp, j, inputs, &values.layers, rows);
         let (k, n) = (mlp.fan_in(j), layer.width);
         let (w, bias) = parts(mlp, j, params);
+        let dense = Dense { k, n, bias: kind(mlp, j), activation: layer.activation };
         if layer.modulation.is_none() && layer.activation.is_monotonic() {
-            values.layers.push(linear::forward_part(gpu, rows, (k, n), &x, w, bias, kind(mlp, j), layer.activation));
+            values.layers.push(linear::forward_part(gpu, rows, &dense, &x, w, bias));
             values.pre.push(None);
             continue;
         }
@@ -33,7 +34,7 @@ pub fn forward(gpu: &Gpu, mlp: &Mlp, params: &Buffer, inputs: &[&Buffer], rows: 
             multiply(gpu, rows, k, (&x, k, 0), (inputs[m], k + n, 0), (&scaled, k, 0), false);
             scaled
         });
-        let out = linear::forward_part(gpu, rows, (k, n), &x, w, bias, kind(mlp, j), Activation::None);
+        let out = linear::forward_part(gpu, rows, &Dense { activation: Activation::None, ..dense }, &x, w, bias);
         if let Some(m) = layer.modulation {
             columns(gpu, rows, n, (inputs[m], k + n, k), (&out, n, 0), true);
         }
@@ -42,7 +43,7 @@ pub fn forward(gpu: &Gpu, mlp: &Mlp, params: &Buffer, inputs: &[&Buffer], rows: 
             gpu.copy(&out, &pre);
             pre
         }));
-        linear::finish(gpu, &out, rows, n, None, BiasKind::None, layer.activation);
+        linear::finish(gpu, &out, rows, &Dense { bias: BiasKind::None, ..dense }, None);
         values.layers.push(out);
     }
     values
@@ -132,68 +133,47 @@ fn joined(gpu: &Gpu, mlp: &Mlp, j: usize, inputs: &[&Buffer], values: &[Buffer],
     out
 }
 
-/// Copies or adds `width` columns between matrices given as (buffer, width, first column).
-pub(crate) fn columns(gpu: &Gpu, rows: &Rows, width: usize, from: (&Buffer, usize, usize), to: (&Buffer, usize, usize), add: bool) {
-    if rows.most * width == 0 {
-        return;
-    }
-    let (live, at) = rows.arg();
-    // SAFETY: units past the rows stop; the columns lie within both matrices.
-    unsafe {
-        copy::launch_unchecked(
-            &gpu.client,
-            units(rows.most * width),
-            CubeDim::new_1d(CUBE),
-            live,
-            from.0.arg(),
-            to.0.arg(),
-            at,
-            width as u32,
-            from.1 as u32,
-            from.2 as u32,
-            to.1 as u32,
-            to.2 as u32,
-            add,
-        );
-    }
+/// Columns of a matrix: its buffer, its width, and the first of them.
+pub(crate) type Columns<'a> = (&'a Buffer, usize, usize);
+
+/// Copies or adds `width` columns.
+pub(crate) fn columns(gpu: &Gpu, rows: &Rows, width: usize, from: Columns, to: Columns, add: bool) {
+    assert!(from.2 + width <= from.1 && to.2 + width <= to.1, "columns beyond a matrix");
+    let m = rows.most;
+    launch!(
+        gpu,
+        copy,
+        m * width,
+        [rows.live => rows.at + 1, from.0 => m * from.1, to.0 => m * to.1],
+        rows.place(),
+        width as u32,
+        from.1 as u32,
+        from.2 as u32,
+        to.1 as u32,
+        to.2 as u32,
+        add,
+    );
 }
 
-/// Multiplies `width` columns of two matrices, each given as (buffer, width, first column), into those of a third, or adds the
-/// products to them.
-fn multiply(
-    gpu: &Gpu,
-    rows: &Rows,
-    width: usize,
-    a: (&Buffer, usize, usize),
-    b: (&Buffer, usize, usize),
-    to: (&Buffer, usize, usize),
-    add: bool,
-) {
-    if rows.most * width == 0 {
-        return;
-    }
-    let (live, at) = rows.arg();
-    // SAFETY: units past the rows stop; the columns lie within the matrices.
-    unsafe {
-        product::launch_unchecked(
-            &gpu.client,
-            units(rows.most * width),
-            CubeDim::new_1d(CUBE),
-            live,
-            a.0.arg(),
-            b.0.arg(),
-            to.0.arg(),
-            at,
-            width as u32,
-            a.1 as u32,
-            a.2 as u32,
-            b.1 as u32,
-            b.2 as u32,
-            to.1 as u32,
-            to.2 as u32,
-            add,
-        );
-    }
+/// Multiplies `width` columns of two matrices into those of a third, or adds the products to them.
+fn multiply(gpu: &Gpu, rows: &Rows, width: usize, a: Columns, b: Columns, to: Columns, add: bool) {
+    assert!([a, b, to].iter().all(|m| m.2 + width <= m.1), "columns beyond a matrix");
+    let m = rows.most;
+    launch!(
+        gpu,
+        product,
+        m * width,
+        [rows.live => rows.at + 1, a.0 => m * a.1, b.0 => m * b.1, to.0 => m * to.1],
+        rows.place(),
+        width as u32,
+        a.1 as u32,
+        a.2 as u32,
+        b.1 as u32,
+        b.2 as u32,
+        to.1 as u32,
+        to.2 as u32,
+        add,
+    );
 }
 
 #[cube(launch_unchecked)]

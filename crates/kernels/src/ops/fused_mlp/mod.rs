@@ -2,6 +2,8 @@
 //! cache on the way forward and back. Layers read any of the inputs and earlier layers, joined side
 //! by side, which covers skip connections and split heads.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

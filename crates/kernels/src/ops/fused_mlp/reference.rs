@@ -1,7 +1,7 @@
 //! Layer after layer through the `linear` reference, in f64.
 
 use super::{Layer, Mlp, Source};
-use crate::ops::linear::{BiasKind, reference as linear};
+use crate::ops::linear::{BiasKind, Dense, reference as linear};
 
 /// What a layer reads, side by side, `[N, K]`, scaled where it is modulated.
 fn joined(mlp: &Mlp, layer: &Layer, inputs: &[&[f64]], values: &[Vec<f64>], n: usize) -> Vec<f64> {
@@ -28,6 +28,11 @@ fn weight<'a>(mlp: &Mlp, j: usize, params: &'a [f64]) -> &'a [f64] {
     &params[mlp.offsets[j]..mlp.offsets[j] + mlp.fan_in(j) * mlp.layers[j].width]
 }
 
+/// Layer `j` with its bias spread over the rows.
+fn dense(mlp: &Mlp, j: usize) -> Dense {
+    Dense { k: mlp.fan_in(j), n: mlp.layers[j].width, bias: BiasKind::PerRow, activation: mlp.layers[j].activation }
+}
+
 /// The bias of each row, `[N, width]`: the layer's own and that of its modulation.
 fn row_bias(mlp: &Mlp, j: usize, params: &[f64], inputs: &[&[f64]], n: usize) -> Vec<f64> {
     let (layer, k) = (&mlp.layers[j], mlp.fan_in(j));
@@ -48,7 +53,7 @@ pub fn forward(mlp: &Mlp, params: &[f64], inputs: &[&[f64]], n: usize) -> Vec<Ve
     for (j, layer) in mlp.layers.iter().enumerate() {
         let x = joined(mlp, layer, inputs, &values, n);
         let (w, b) = (weight(mlp, j, params), row_bias(mlp, j, params, inputs, n));
-        values.push(linear::forward(n, mlp.fan_in(j), layer.width, &x, w, &b, BiasKind::PerRow, layer.activation));
+        values.push(linear::forward(n, &dense(mlp, j), &x, w, &b));
     }
     values
 }
@@ -64,7 +69,7 @@ pub fn backward(mlp: &Mlp, params: &[f64], inputs: &[&[f64]], n: usize, d_layers
         let plain = joined(mlp, &Layer { modulation: None, ..layer.clone() }, inputs, &values, n);
         let (w, b) = (weight(mlp, j, params), row_bias(mlp, j, params, inputs, n));
         let (k, width) = (mlp.fan_in(j), layer.width);
-        let (mut dx, dw, db) = linear::backward(n, k, width, &x, w, &b, BiasKind::PerRow, layer.activation, &d[j]);
+        let (mut dx, dw, db) = linear::backward(n, &dense(mlp, j), &x, w, &b, &d[j]);
         if !layer.frozen {
             d_params[mlp.offsets[j]..][..k * width].copy_from_slice(&dw);
             for (e, g) in db.iter().enumerate().filter(|_| layer.bias) {

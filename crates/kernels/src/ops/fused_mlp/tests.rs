@@ -1,72 +1,34 @@
 use super::*;
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
-/// A chain, a network with two inputs, a skip connection and a split head, one with every activation, and a modulated one
-/// with a frozen layer.
-fn nets() -> Vec<Mlp> {
-    let layer = |inputs: Vec<Source>, width, relu: bool, bias| {
-        Layer::new(inputs, width, if relu { Activation::Relu } else { Activation::None }, bias)
-    };
-    use Source::{Input, Layer as L};
-    let curved = [Activation::LeakyRelu, Activation::Softplus, Activation::Sigmoid, Activation::Tanh, Activation::Silu];
-    let curved = curved.iter().enumerate().map(|(j, a)| Layer::new(vec![if j == 0 { Input(0) } else { L(j - 1) }], 19, *a, true));
-    let modulated = |inputs, width, activation| Layer { modulation: Some(1), ..Layer::new(inputs, width, activation, true) };
-    vec![
-        Mlp::chain(vec![32], &[64, 16], false),
-        Mlp::new(
-            vec![5, 3],
-            vec![
-                layer(vec![Input(0)], 24, true, true),
-                layer(vec![Input(0), L(0)], 17, true, true),
-                layer(vec![L(1)], 1, false, true),
-                layer(vec![L(1), Input(1), L(2)], 4, false, false),
-            ],
-        ),
-        Mlp::new(vec![6], curved.collect()),
-        Mlp::new(
-            vec![7, 17],
-            vec![
-                modulated(vec![Input(0)], 10, Activation::Silu),
-                Layer { frozen: true, ..layer(vec![L(0)], 12, true, true) },
-                modulated(vec![L(0)], 7, Activation::LeakyRelu),
-                layer(vec![L(1), L(2), Input(0)], 5, false, true),
-            ],
-        ),
-    ]
-}
-
 #[test]
 fn matches_the_reference_both_ways() {
-    for mlp in nets() {
-        for n in [0, 1, 6, 401] {
-            let params = mlp.init(&Rng::new(1, 2));
-            let inputs: Vec<Vec<f32>> = mlp.input_widths.iter().map(|k| random(n * k, *k as u64)).collect();
-            let views: Vec<&[f32]> = inputs.iter().map(|v| &v[..]).collect();
-            let wides: Vec<Vec<f64>> = inputs.iter().map(|v| wide(v)).collect();
-            let wide_views: Vec<&[f64]> = wides.iter().map(|v| &v[..]).collect();
-            let width = mlp.layers.last().unwrap().width;
-            let mut out = vec![9.0; n * width];
-            cpu::forward(&mlp, &params, &views, n, &mut out);
-            let want = reference::forward(&mlp, &wide(&params), &wide_views, n);
-            assert_close("forward", &out, want.last().unwrap(), 1e-4);
-            let d = random(n * width, 8);
-            let mut seeds: Vec<Vec<f64>> = mlp.layers.iter().map(|l| vec![0.0; n * l.width]).collect();
-            *seeds.last_mut().unwrap() = wide(&d);
-            let (rp, ri) = reference::backward(&mlp, &wide(&params), &wide_views, n, &seeds);
-            let mut dp = vec![9.0; params.len()];
-            let mut di: Vec<Vec<f32>> = inputs.iter().map(|v| vec![0.0; v.len()]).collect();
-            cpu::backward(&mlp, &params, &views, n, &d, &mut dp, &mut di);
-            assert_close("params", &dp, &rp, 1e-4);
-            for (a, b) in di.iter().zip(&ri) {
-                assert_close("input", a, b, 1e-4);
-            }
+    for c in cases::cases() {
+        let (mlp, n) = (&c.mlp, c.n);
+        let views: Vec<&[f32]> = c.inputs.iter().map(|v| &v[..]).collect();
+        let wides: Vec<Vec<f64>> = c.inputs.iter().map(|v| wide(v)).collect();
+        let wide_views: Vec<&[f64]> = wides.iter().map(|v| &v[..]).collect();
+        let d = c.d.last().unwrap();
+        let mut out = vec![9.0; d.len()];
+        cpu::forward(mlp, &c.params, &views, n, &mut out);
+        let want = reference::forward(mlp, &wide(&c.params), &wide_views, n);
+        assert_close("forward", &out, want.last().unwrap(), 1e-4);
+        let mut seeds: Vec<Vec<f64>> = mlp.layers.iter().map(|l| vec![0.0; n * l.width]).collect();
+        *seeds.last_mut().unwrap() = wide(d);
+        let (rp, ri) = reference::backward(mlp, &wide(&c.params), &wide_views, n, &seeds);
+        let mut dp = vec![9.0; c.params.len()];
+        let mut di: Vec<Vec<f32>> = c.inputs.iter().map(|v| vec![0.0; v.len()]).collect();
+        cpu::backward(mlp, &c.params, &views, n, d, &mut dp, &mut di);
+        assert_close("params", &dp, &rp, 1e-4);
+        for (a, b) in di.iter().zip(&ri) {
+            assert_close("input", a, b, 1e-4);
         }
     }
 }
 
 #[test]
 fn reference_gradients_match_central_differences() {
-    for mlp in nets() {
+    for mlp in cases::networks() {
         let params = wide(&mlp.init(&Rng::new(3, 2)));
         let inputs: Vec<Vec<f64>> = mlp.input_widths.iter().map(|k| wide(&random(2 * k, *k as u64))).collect();
         let views: Vec<&[f64]> = inputs.iter().map(|v| &v[..]).collect();
@@ -92,7 +54,7 @@ fn reference_gradients_match_central_differences() {
 
 #[test]
 fn frozen_layers_have_no_gradient_and_what_lies_below_them_still_has() {
-    let mlp = &nets()[3];
+    let mlp = &cases::networks()[3];
     let (frozen, n) = (mlp.offsets[1]..mlp.offsets[2], 40);
     assert_eq!(mlp.trained(), [0..frozen.start, frozen.end..mlp.params_len()]);
     let (x, code, params) = (random(n * 7, 1), random(n * 17, 2), mlp.init(&Rng::new(1, 2)));

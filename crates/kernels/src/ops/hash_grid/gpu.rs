@@ -1,7 +1,7 @@
 //! One unit per level and point; the table's gradient is added atomically.
 
 use super::HashGrid;
-use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Rows, Swap, units};
+use crate::gpu::{Accumulate, Buffer, Gpu, Rows, launch};
 use cubecl::prelude::*;
 
 /// Numbers that describe a level to the kernels: cells, dense, first row, rows.
@@ -11,15 +11,16 @@ const LEVEL: usize = 4;
 pub struct GpuHashGrid {
     pub grid: HashGrid,
     /// What the kernels know of each level.
-    pub levels: Buffer,
+    pub levels: Buffer<u32>,
 }
 
 impl GpuHashGrid {
     pub fn new(gpu: &Gpu, grid: &HashGrid) -> Self {
         let levels: Vec<u32> = grid.levels.iter().flat_map(|l| [l.cells, l.dense as u32, l.offset as u32, l.rows as u32]).collect();
-        GpuHashGrid { grid: grid.clone(), levels: gpu.upload_u32(&levels) }
+        GpuHashGrid { grid: grid.clone(), levels: gpu.upload(&levels) }
     }
 
+    /// Points, and points times levels.
     fn work(&self, points: &Buffer) -> (usize, usize) {
         let s = points.len() / 3;
         (s, s * self.grid.levels.len())
@@ -27,86 +28,116 @@ impl GpuHashGrid {
 
     /// Features `[L, S, F]` of points `[S, 3]`.
     pub fn forward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: &Buffer) -> Buffer {
-        let out = gpu.empty(self.work(points).0 * self.grid.output_dims());
-        self.each(gpu, rows, points, table, &out, encode::launch_unchecked);
+        let ((s, n), f) = (self.work(points), self.grid.config.features);
+        let out = gpu.empty(n * f);
+        launch!(
+            gpu,
+            encode,
+            n,
+            [
+                rows.live => rows.at + 1,
+                points => s * 3,
+                self.levels => self.grid.levels.len() * LEVEL,
+                table => self.grid.params_len(),
+                out => n * f,
+            ],
+            rows.place(),
+            s as u32,
+            n as u32,
+            f,
+        );
         out
     }
 
     /// Adds to the gradient of the table.
     pub fn backward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, d_out: &Buffer, d_table: &Buffer) {
-        let kernel = if gpu.native_atomics { scatter::launch_unchecked::<Native> } else { scatter::launch_unchecked::<Swap> };
-        self.each(gpu, rows, points, d_out, d_table, kernel);
+        let ((s, n), f) = (self.work(points), self.grid.config.features);
+        launch!(
+            gpu,
+            scatter::<Adder>,
+            n,
+            [
+                rows.live => rows.at + 1,
+                points => s * 3,
+                self.levels => self.grid.levels.len() * LEVEL,
+                d_out => n * f,
+                d_table => self.grid.params_len(),
+            ],
+            rows.place(),
+            s as u32,
+            n as u32,
+            f,
+        );
     }
 
     /// `∂features/∂point`, `[L, S, F, 3]`.
     pub fn jacobian(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: &Buffer) -> Buffer {
-        let out = gpu.empty(self.work(points).0 * self.grid.output_dims() * 3);
-        self.each(gpu, rows, points, table, &out, differentiate::launch_unchecked);
+        let ((s, n), f) = (self.work(points), self.grid.config.features);
+        let out = gpu.empty(n * f * 3);
+        launch!(
+            gpu,
+            differentiate,
+            n,
+            [
+                rows.live => rows.at + 1,
+                points => s * 3,
+                self.levels => self.grid.levels.len() * LEVEL,
+                table => self.grid.params_len(),
+                out => n * f * 3,
+            ],
+            rows.place(),
+            s as u32,
+            n as u32,
+            f,
+        );
         out
     }
 
     /// Adds to the gradient of the table, given that of the Jacobian.
     pub fn jacobian_backward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, d_jacobian: &Buffer, d_table: &Buffer) {
-        let kernel = if gpu.native_atomics { scatter_slopes::launch_unchecked::<Native> } else { scatter_slopes::launch_unchecked::<Swap> };
-        self.each(gpu, rows, points, d_jacobian, d_table, kernel);
+        let ((s, n), f) = (self.work(points), self.grid.config.features);
+        launch!(
+            gpu,
+            scatter_slopes::<Adder>,
+            n,
+            [
+                rows.live => rows.at + 1,
+                points => s * 3,
+                self.levels => self.grid.levels.len() * LEVEL,
+                d_jacobian => n * f * 3,
+                d_table => self.grid.params_len(),
+            ],
+            rows.place(),
+            s as u32,
+            n as u32,
+            f,
+        );
     }
 
     /// Gradient of the points `[S, 3]`.
     pub fn backward_positions(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: &Buffer, d_out: &Buffer) -> Buffer {
-        let (s, _) = self.work(points);
+        let ((s, n), f) = (self.work(points), self.grid.config.features);
         let out = gpu.empty(s * 3);
-        if s > 0 {
-            let (live, at) = rows.arg();
-            // SAFETY: units past the points in use stop; rows come from the grid that sized the table.
-            unsafe {
-                slope::launch_unchecked(
-                    &gpu.client,
-                    units(s),
-                    CubeDim::new_1d(CUBE),
-                    live,
-                    points.arg(),
-                    self.levels.arg(),
-                    table.arg(),
-                    d_out.arg(),
-                    out.arg(),
-                    at,
-                    s as u32,
-                    self.grid.levels.len() as u32,
-                    self.grid.config.features,
-                );
-            }
-        }
+        launch!(
+            gpu,
+            slope,
+            s,
+            [
+                rows.live => rows.at + 1,
+                points => s * 3,
+                self.levels => self.grid.levels.len() * LEVEL,
+                table => self.grid.params_len(),
+                d_out => n * f,
+                out => s * 3,
+            ],
+            rows.place(),
+            s as u32,
+            self.grid.levels.len() as u32,
+            f,
+        );
         out
     }
-
-    /// Launches a kernel with one unit per level and point, which reads `from` and writes `to`.
-    fn each(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, from: &Buffer, to: &Buffer, kernel: Kernel) {
-        let (s, n) = self.work(points);
-        if n > 0 {
-            let (live, at) = rows.arg();
-            // SAFETY: units past the points in use stop; rows come from the grid that sized the table.
-            unsafe {
-                kernel(
-                    &gpu.client,
-                    units(n),
-                    CubeDim::new_1d(CUBE),
-                    live,
-                    points.arg(),
-                    self.levels.arg(),
-                    from.arg(),
-                    to.arg(),
-                    at,
-                    s as u32,
-                    n as u32,
-                    self.grid.config.features,
-                );
-            }
-        }
-    }
 }
-
-/// Points in use, points, levels, what is read, what is written, place of the first, points, units, features per row.
-type Kernel = unsafe fn(&Client, CubeCount, CubeDim, BufferArg, BufferArg, BufferArg, BufferArg, BufferArg, u32, u32, u32, usize);
 
 /// A coordinate's cell, the place in it, and its slope: cells per unit, 0 where it was clamped.
 #[derive(CubeType)]

@@ -7,6 +7,8 @@
 //!
 //! Features are level-major, `[L, S, F]`, so that a level's slice of the table stays in cache.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -1,21 +1,5 @@
 use super::*;
-use diorama_testkit::{assert_close, assert_gradient, random, random_unit, wide};
-
-fn grids() -> Vec<HashGrid> {
-    [1, 2, 4, 8]
-        .into_iter()
-        .map(|features| HashGrid::new(HashGridConfig { levels: 4, features, log2_size: 9, base: 3, finest: 40 }))
-        .collect()
-}
-
-/// Points inside, on the border and outside of the cube.
-fn points(s: usize) -> Vec<f32> {
-    let mut p = random_unit(s * 3, 11);
-    if s > 3 {
-        p[..9].copy_from_slice(&[0.0, 1.0, 0.5, -0.3, 0.4, 1.7, 1.0, 1.0, 1.0]);
-    }
-    p
-}
+use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
 #[test]
 fn levels_grow_from_base_to_finest() {
@@ -26,40 +10,35 @@ fn levels_grow_from_base_to_finest() {
 
 #[test]
 fn matches_the_reference_both_ways() {
-    for grid in grids() {
-        for s in [0, 1, 5, 16, 67] {
-            let (p, t) = (points(s), random(grid.params_len(), 2));
-            let d = random(s * grid.output_dims(), 3);
-            let mut out = vec![7.0; s * grid.output_dims()];
-            cpu::forward(&grid, &p, &t, &mut out);
-            assert_close("forward", &out, &reference::forward(&grid, &wide(&p), &wide(&t)), 1e-4);
-            let (dp, dt) = reference::backward(&grid, &wide(&p), &wide(&t), &wide(&d));
-            let mut d_table = vec![0.0; grid.params_len()];
-            let mut touched = vec![0u8; grid.params_len() / cpu::LINE];
-            cpu::backward(&grid, &p, &d, &mut d_table, Some(&mut touched));
-            assert_close("table", &d_table, &dt, 1e-4);
-            for (i, line) in d_table.chunks(cpu::LINE).enumerate() {
-                assert!(touched[i] == 1 || line.iter().all(|&g| g == 0.0), "line {i} has a gradient but no mark");
-            }
-            let mut d_points = vec![7.0; s * 3];
-            cpu::backward_positions(&grid, &p, &t, &d, &mut d_points);
-            assert_close("points", &d_points, &dp, 1e-4);
+    for c in cases::cases() {
+        let (p, t, d) = (wide(&c.points), wide(&c.table), wide(&c.d));
+        let mut out = vec![7.0; c.d.len()];
+        cpu::forward(&c.grid, &c.points, &c.table, &mut out);
+        assert_close("forward", &out, &reference::forward(&c.grid, &p, &t), 1e-4);
+        let (dp, dt) = reference::backward(&c.grid, &p, &t, &d);
+        let mut d_table = vec![0.0; c.table.len()];
+        let mut touched = vec![0u8; c.table.len() / cpu::LINE];
+        cpu::backward(&c.grid, &c.points, &c.d, &mut d_table, Some(&mut touched));
+        assert_close("table", &d_table, &dt, 1e-4);
+        for (i, line) in d_table.chunks(cpu::LINE).enumerate() {
+            assert!(touched[i] == 1 || line.iter().all(|&g| g == 0.0), "line {i} has a gradient but no mark");
         }
+        let mut d_points = vec![7.0; c.points.len()];
+        cpu::backward_positions(&c.grid, &c.points, &c.table, &c.d, &mut d_points);
+        assert_close("points", &d_points, &dp, 1e-4);
     }
 }
 
 #[test]
 fn jacobian_matches_the_reference_both_ways() {
-    for grid in grids() {
-        let (p, t) = (points(33), random(grid.params_len(), 2));
-        let n = 33 * grid.output_dims() * 3;
-        let mut jac = vec![0.0; n];
-        cpu::jacobian(&grid, &p, &t, &mut jac);
-        assert_close("jacobian", &jac, &reference::jacobian(&grid, &wide(&p), &wide(&t)), 1e-4);
-        let d = random(n, 5);
-        let mut dt = vec![0.0; grid.params_len()];
-        cpu::jacobian_backward(&grid, &p, &d, &mut dt);
-        assert_close("jacobian backward", &dt, &reference::jacobian_backward(&grid, &wide(&p), &wide(&d)), 1e-4);
+    for c in cases::cases() {
+        let (p, t) = (wide(&c.points), wide(&c.table));
+        let mut jac = vec![0.0; c.d_jacobian.len()];
+        cpu::jacobian(&c.grid, &c.points, &c.table, &mut jac);
+        assert_close("jacobian", &jac, &reference::jacobian(&c.grid, &p, &t), 1e-4);
+        let mut dt = vec![0.0; c.table.len()];
+        cpu::jacobian_backward(&c.grid, &c.points, &c.d_jacobian, &mut dt);
+        assert_close("jacobian backward", &dt, &reference::jacobian_backward(&c.grid, &p, &wide(&c.d_jacobian)), 1e-4);
     }
 }
 

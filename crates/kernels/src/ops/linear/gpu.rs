@@ -1,14 +1,14 @@
 //! Products by cubes of 16 × 16 units, each with up to 4 × 4 results of its own, through shared memory. Weight gradients, sums over very many rows, are
 //! formed by slices of rows and then added up.
 
-use super::{Activation, BiasKind};
-use crate::gpu::{Buffer, CUBE, Gpu, Rows, units};
-use cubecl::prelude::*;
+mod product;
 
-/// Edge of a cube.
-const TILE: usize = 16;
-/// Most rows of tiles in one launch.
-const MAX_TILES: usize = 65_535;
+use super::{Activation, BiasKind, Dense};
+use crate::gpu::{Buffer, Gpu, Rows, launch};
+use cubecl::prelude::*;
+use product::{outer, product};
+
+pub(crate) use product::add_outer;
 
 /// Rows per slice of a sum over rows, and most slices.
 const SLICE: usize = 1024;
@@ -40,191 +40,68 @@ impl<'a> From<&'a Buffer> for Part<'a> {
     }
 }
 
-/// Results of a unit along an axis of length `n`.
-fn per_unit(n: usize) -> usize {
-    if n > 2 * TILE {
-        4
-    } else if n > TILE {
-        2
-    } else {
-        1
-    }
-}
-
-/// `A B`, `[M, K] [K, N]`, or with the second factor turned `A Bᵀ`, `[M, K] [N, K]`.
-fn product(gpu: &Gpu, second_turned: bool, rows: &Rows, (k, n): (usize, usize), a: &Buffer, b: Part, out: Part) {
-    let m = rows.most;
-    if m * n == 0 {
-        return;
-    }
-    assert!(a.len() == m * k && b.buffer.len() >= b.at + k * n && out.buffer.len() >= out.at + m * n, "linear: {m} x {k} x {n}");
-    let (mr, nr) = (per_unit(m), per_unit(n));
-    let (tiles_m, tiles_n) = (m.div_ceil(TILE * mr), n.div_ceil(TILE * nr));
-    assert!(tiles_n <= MAX_TILES && tiles_m <= MAX_TILES * MAX_TILES, "linear: {m} x {n}");
-    let count = CubeCount::Static(tiles_n as u32, tiles_m.min(MAX_TILES) as u32, tiles_m.div_ceil(MAX_TILES) as u32);
-    let (live, at) = rows.arg();
-    // SAFETY: the kernel checks rows and columns against the sizes.
-    unsafe {
-        multiply::launch_unchecked(
-            &gpu.client,
-            count,
-            CubeDim::new_2d(TILE as u32, TILE as u32),
-            live,
-            a.arg(),
-            b.buffer.arg(),
-            out.buffer.arg(),
-            at,
-            b.at as u32,
-            out.at as u32,
-            k as u32,
-            n as u32,
-            mr,
-            nr,
-            second_turned,
-            gpu.shared,
-        );
-    }
-}
-
-/// `Xᵀ G`, `[K, N]` for X `[M, K]` and G `[M, N]`.
-fn outer(gpu: &Gpu, rows: &Rows, (k, n): (usize, usize), x: &Buffer, g: &Buffer, out: Part) {
-    assert!(x.len() == rows.most * k && g.len() == rows.most * n && out.buffer.len() >= out.at + k * n, "linear: {k} x {n}");
-    if k * n == 0 {
-        return;
-    }
-    let slices = (rows.most / SLICE).clamp(1, MAX_SLICES);
-    let parts = gpu.empty(slices * k * n);
-    let (kr, nr) = (per_unit(k), per_unit(n));
-    let count = CubeCount::Static(n.div_ceil(TILE * nr) as u32, k.div_ceil(TILE * kr) as u32, slices as u32);
-    let (live, at) = rows.arg();
-    // SAFETY: the kernel checks rows and columns against the sizes.
-    unsafe {
-        gather::launch_unchecked(
-            &gpu.client,
-            count,
-            CubeDim::new_2d(TILE as u32, TILE as u32),
-            live,
-            x.arg(),
-            g.arg(),
-            parts.arg(),
-            at,
-            k as u32,
-            n as u32,
-            slices as u32,
-            kr,
-            nr,
-            gpu.shared,
-        );
-    }
-    add_up(gpu, &parts, slices, k * n, out);
-}
-
 /// Sums of `slices` rows of `n` numbers.
 fn add_up(gpu: &Gpu, parts: &Buffer, slices: usize, n: usize, out: Part) {
-    // SAFETY: units past `n` stop.
-    unsafe {
-        total::launch_unchecked(
-            &gpu.client,
-            units(n),
-            CubeDim::new_1d(CUBE),
-            parts.arg(),
-            out.buffer.arg(),
-            out.at as u32,
-            slices as u32,
-            n as u32,
-        );
-    }
+    launch!(gpu, total, n, [parts => slices * n, out.buffer => out.at + n], out.at as u32, slices as u32, n as u32);
 }
 
 /// [`forward`] with a weight and bias that lie in a larger buffer.
-#[allow(clippy::too_many_arguments)]
-pub(crate) fn forward_part(
-    gpu: &Gpu,
-    rows: &Rows,
-    (k, n): (usize, usize),
-    x: &Buffer,
-    w: Part,
-    bias: Option<Part>,
-    kind: BiasKind,
-    a: Activation,
-) -> Buffer {
-    let out = gpu.empty(rows.most * n);
-    product(gpu, false, rows, (k, n), x, w, (&out).into());
-    finish(gpu, &out, rows, n, bias, kind, a);
+pub(crate) fn forward_part(gpu: &Gpu, rows: &Rows, layer: &Dense, x: &Buffer, w: Part, bias: Option<Part>) -> Buffer {
+    let out = gpu.empty(rows.most * layer.n);
+    product(gpu, false, rows, (layer.k, layer.n), x, w, (&out).into());
+    finish(gpu, &out, rows, layer, bias);
     out
 }
 
 /// `act(x W + b)`, `[M, N]`, for W `[K, N]`.
-#[allow(clippy::too_many_arguments)]
-pub fn forward(
-    gpu: &Gpu,
-    rows: &Rows,
-    size: (usize, usize),
-    x: &Buffer,
-    w: &Buffer,
-    bias: Option<&Buffer>,
-    kind: BiasKind,
-    a: Activation,
-) -> Buffer {
-    forward_part(gpu, rows, size, x, w.into(), bias.map(Part::from), kind, a)
+pub fn forward(gpu: &Gpu, rows: &Rows, layer: &Dense, x: &Buffer, w: &Buffer, bias: Option<&Buffer>) -> Buffer {
+    forward_part(gpu, rows, layer, x, w.into(), bias.map(Part::from))
 }
 
-/// Adds a bias and activates, in place.
-pub(crate) fn finish(gpu: &Gpu, out: &Buffer, rows: &Rows, n: usize, bias: Option<Part>, kind: BiasKind, a: Activation) {
-    if out.is_empty() || (kind == BiasKind::None && a == Activation::None) {
+/// Adds a layer's bias and activates, in place.
+pub(crate) fn finish(gpu: &Gpu, out: &Buffer, rows: &Rows, &Dense { n, bias: kind, activation, .. }: &Dense, bias: Option<Part>) {
+    if kind == BiasKind::None && activation == Activation::None {
         return;
     }
     // Bound where there is no bias to read.
-    let spare = gpu.empty(1);
+    let spare = gpu.empty(0);
     let bias = bias.unwrap_or(Part::from(&spare));
+    let bias_len = kind.len(rows.most, n);
     let bias_kind = match kind {
         BiasKind::None => 0u32,
         BiasKind::Shared => 1,
         BiasKind::PerRow => 2,
     };
-    let (live, at) = rows.arg();
-    // SAFETY: units past the rows stop.
-    unsafe {
-        activate::launch_unchecked(
-            &gpu.client,
-            units(out.len()),
-            CubeDim::new_1d(CUBE),
-            live,
-            bias.buffer.arg(),
-            out.arg(),
-            at,
-            bias.at as u32,
-            n as u32,
-            bias_kind,
-            code(a),
-        );
-    }
+    launch!(
+        gpu,
+        activate,
+        rows.most * n,
+        [rows.live => rows.at + 1, bias.buffer => bias.at + bias_len, out => rows.most * n],
+        rows.place(),
+        bias.at as u32,
+        n as u32,
+        bias_kind,
+        code(activation),
+    );
 }
 
 /// Channels of a layer's output `[M, width]`, shifted and activated, `[M, channels]`.
 pub(crate) fn head(gpu: &Gpu, rows: &Rows, from: (&Buffer, usize, usize), channels: usize, shift: f32, a: Activation) -> Buffer {
-    let out = gpu.empty(rows.most * channels);
+    let n = rows.most * channels;
+    let out = gpu.empty(n);
     let (values, width, first) = from;
-    if !out.is_empty() {
-        let (live, at) = rows.arg();
-        // SAFETY: units past the rows stop; the channels lie within the width.
-        unsafe {
-            pick::launch_unchecked(
-                &gpu.client,
-                units(out.len()),
-                CubeDim::new_1d(CUBE),
-                live,
-                values.arg(),
-                out.arg(),
-                at,
-                width as u32,
-                first as u32,
-                channels as u32,
-                shift,
-                code(a),
-            );
-        }
-    }
+    launch!(
+        gpu,
+        pick,
+        n,
+        [rows.live => rows.at + 1, values => rows.most * width, out => n],
+        rows.place(),
+        width as u32,
+        first as u32,
+        channels as u32,
+        shift,
+        code(a),
+    );
     out
 }
 
@@ -236,22 +113,12 @@ pub struct Gradients {
 }
 
 /// From the layer's output, which gives the slope, and its gradient.
-#[allow(clippy::too_many_arguments)]
-pub fn backward(
-    gpu: &Gpu,
-    rows: &Rows,
-    (k, n): (usize, usize),
-    x: &Buffer,
-    w: &Buffer,
-    kind: BiasKind,
-    a: Activation,
-    out: &Buffer,
-    d_out: &Buffer,
-) -> Gradients {
-    let g = before_activation(gpu, rows, n, a, out, d_out);
+pub fn backward(gpu: &Gpu, rows: &Rows, layer: &Dense, x: &Buffer, w: &Buffer, out: &Buffer, d_out: &Buffer) -> Gradients {
+    let &Dense { k, n, bias, activation } = layer;
+    let g = before_activation(gpu, rows, n, activation, out, d_out);
     let d_w = gpu.empty(k * n);
     let d_x = backward_part(gpu, rows, (k, n), x, w.into(), &g, (&d_w).into());
-    let bias = match kind {
+    let bias = match bias {
         BiasKind::None => None,
         BiasKind::Shared => {
             let out = gpu.empty(n);
@@ -265,25 +132,17 @@ pub fn backward(
 
 /// `d_out · act'`, from the activated output; for SiLU from its input.
 pub(crate) fn before_activation(gpu: &Gpu, rows: &Rows, n: usize, a: Activation, out: &Buffer, d_out: &Buffer) -> Buffer {
-    let g = gpu.empty(out.len());
-    if !out.is_empty() {
-        let (live, at) = rows.arg();
-        // SAFETY: units past the rows stop.
-        unsafe {
-            chain::launch_unchecked(
-                &gpu.client,
-                units(out.len()),
-                CubeDim::new_1d(CUBE),
-                live,
-                out.arg(),
-                d_out.arg(),
-                g.arg(),
-                at,
-                n as u32,
-                code(a),
-            );
-        }
-    }
+    let all = rows.most * n;
+    let g = gpu.empty(all);
+    launch!(
+        gpu,
+        chain,
+        all,
+        [rows.live => rows.at + 1, out => all, d_out => all, g => all],
+        rows.place(),
+        n as u32,
+        code(a),
+    );
     g
 }
 
@@ -304,230 +163,16 @@ pub(crate) fn input_gradient(gpu: &Gpu, rows: &Rows, (k, n): (usize, usize), w: 
 pub(crate) fn sum_rows_part(gpu: &Gpu, rows: &Rows, n: usize, g: &Buffer, out: Part) {
     let slices = (rows.most / SLICE).clamp(1, MAX_SLICES);
     let parts = gpu.empty(slices * n);
-    let (live, at) = rows.arg();
-    // SAFETY: units past the slices stop.
-    unsafe {
-        sum_rows::launch_unchecked(
-            &gpu.client,
-            units(slices * n),
-            CubeDim::new_1d(CUBE),
-            live,
-            g.arg(),
-            parts.arg(),
-            at,
-            slices as u32,
-            n as u32,
-        );
-    }
+    launch!(
+        gpu,
+        sum_rows,
+        slices * n,
+        [rows.live => rows.at + 1, g => rows.most * n, parts => slices * n],
+        rows.place(),
+        slices as u32,
+        n as u32,
+    );
     add_up(gpu, &parts, slices, n, out);
-}
-
-#[cube(launch_unchecked)]
-fn multiply(
-    live: &[u32],
-    a: &[f32],
-    b: &[f32],
-    out: &mut [f32],
-    at: u32,
-    b_at: u32,
-    out_at: u32,
-    k: u32,
-    n: u32,
-    #[comptime] mr: usize,
-    #[comptime] nr: usize,
-    #[comptime] second_turned: bool,
-    #[comptime] shared: bool,
-) {
-    let m = live[at as usize] as usize;
-    let k = k as usize;
-    let n = n as usize;
-    let b_at = b_at as usize;
-    let tx = UNIT_POS_X as usize;
-    let ty = UNIT_POS_Y as usize;
-    let first = (CUBE_POS_Y as usize + CUBE_POS_Z as usize * 65_535usize) * comptime!(16 * mr);
-    if first >= m {
-        terminate!();
-    }
-    let row = first + ty;
-    let col = CUBE_POS_X as usize * comptime!(16 * nr) + tx;
-    let mut sums = Array::<f32>::new(comptime!(mr * nr));
-    let mut left = Array::<f32>::new(mr);
-    let mut right = Array::<f32>::new(nr);
-    #[unroll]
-    for e in 0..comptime!(mr * nr) {
-        sums[e] = 0.0;
-    }
-    if comptime!(shared) {
-        let mut lefts = Shared::<[f32]>::new_slice(comptime!(256 * mr));
-        let mut rights = Shared::<[f32]>::new_slice(comptime!(256 * nr));
-        for step in 0..k.div_ceil(16usize) {
-            let ka = step * 16usize + tx;
-            let kb = step * 16usize + ty;
-            #[unroll]
-            for i in 0..mr {
-                let r = row + i * 16;
-                let mut v = 0.0f32;
-                if r < m && ka < k {
-                    v = a[r * k + ka];
-                }
-                lefts[(ty + i * 16) * 16usize + tx] = v;
-            }
-            #[unroll]
-            for j in 0..nr {
-                let c = col + j * 16;
-                let mut v = 0.0f32;
-                if kb < k && c < n {
-                    v = right_factor(b, b_at, kb, c, k, n, second_turned);
-                }
-                rights[ty * comptime!(16 * nr) + tx + j * 16] = v;
-            }
-            sync_cube();
-            for p in 0..16usize {
-                #[unroll]
-                for i in 0..mr {
-                    left[i] = lefts[(ty + i * 16) * 16usize + p];
-                }
-                #[unroll]
-                for j in 0..nr {
-                    right[j] = rights[p * comptime!(16 * nr) + tx + j * 16];
-                }
-                add_outer(&mut sums, &left, &right, mr, nr);
-            }
-            sync_cube();
-        }
-    } else {
-        for p in 0..k {
-            #[unroll]
-            for i in 0..mr {
-                left[i] = a[min(row + i * 16, m - 1) * k + p];
-            }
-            #[unroll]
-            for j in 0..nr {
-                right[j] = right_factor(b, b_at, p, min(col + j * 16, n - 1), k, n, second_turned);
-            }
-            add_outer(&mut sums, &left, &right, mr, nr);
-        }
-    }
-    #[unroll]
-    for i in 0..mr {
-        #[unroll]
-        for j in 0..nr {
-            if row + i * 16 < m && col + j * 16 < n {
-                out[out_at as usize + (row + i * 16) * n + col + j * 16] = sums[i * nr + j];
-            }
-        }
-    }
-}
-
-#[cube]
-fn right_factor(b: &[f32], at: usize, i: usize, col: usize, k: usize, n: usize, #[comptime] turned: bool) -> f32 {
-    if comptime!(turned) { b[at + col * k + i] } else { b[at + i * n + col] }
-}
-
-/// `sums += left rightᵀ`
-#[cube]
-pub(crate) fn add_outer(sums: &mut Array<f32>, left: &Array<f32>, right: &Array<f32>, #[comptime] mr: usize, #[comptime] nr: usize) {
-    #[unroll]
-    for i in 0..mr {
-        #[unroll]
-        for j in 0..nr {
-            sums[i * nr + j] += left[i] * right[j];
-        }
-    }
-}
-
-/// A slice's part of `Xᵀ G`.
-#[cube(launch_unchecked)]
-fn gather(
-    live: &[u32],
-    x: &[f32],
-    g: &[f32],
-    parts: &mut [f32],
-    at: u32,
-    k: u32,
-    n: u32,
-    slices: u32,
-    #[comptime] kr: usize,
-    #[comptime] nr: usize,
-    #[comptime] shared: bool,
-) {
-    let m = live[at as usize] as usize;
-    let k = k as usize;
-    let n = n as usize;
-    let tx = UNIT_POS_X as usize;
-    let ty = UNIT_POS_Y as usize;
-    let first_row = CUBE_POS_Y as usize * comptime!(16 * kr);
-    let row = first_row + ty;
-    let col = CUBE_POS_X as usize * comptime!(16 * nr) + tx;
-    let per = m.div_ceil(slices as usize);
-    let first = min(CUBE_POS_Z as usize * per, m);
-    let end = min(first + per, m);
-    let mut sums = Array::<f32>::new(comptime!(kr * nr));
-    let mut left = Array::<f32>::new(kr);
-    let mut right = Array::<f32>::new(nr);
-    #[unroll]
-    for e in 0..comptime!(kr * nr) {
-        sums[e] = 0.0;
-    }
-    if comptime!(shared) {
-        let mut lefts = Shared::<[f32]>::new_slice(comptime!(256 * kr));
-        let mut rights = Shared::<[f32]>::new_slice(comptime!(256 * nr));
-        for step in 0..(end - first).div_ceil(16usize) {
-            let i = first + step * 16usize + ty;
-            #[unroll]
-            for e in 0..kr {
-                let c = first_row + tx + e * 16;
-                let mut v = 0.0f32;
-                if i < end && c < k {
-                    v = x[i * k + c];
-                }
-                lefts[ty * comptime!(16 * kr) + tx + e * 16] = v;
-            }
-            #[unroll]
-            for e in 0..nr {
-                let c = col + e * 16;
-                let mut v = 0.0f32;
-                if i < end && c < n {
-                    v = g[i * n + c];
-                }
-                rights[ty * comptime!(16 * nr) + tx + e * 16] = v;
-            }
-            sync_cube();
-            for p in 0..16usize {
-                #[unroll]
-                for e in 0..kr {
-                    left[e] = lefts[p * comptime!(16 * kr) + ty + e * 16];
-                }
-                #[unroll]
-                for e in 0..nr {
-                    right[e] = rights[p * comptime!(16 * nr) + tx + e * 16];
-                }
-                add_outer(&mut sums, &left, &right, kr, nr);
-            }
-            sync_cube();
-        }
-    } else {
-        for i in first..end {
-            #[unroll]
-            for e in 0..kr {
-                left[e] = x[i * k + min(row + e * 16, k - 1)];
-            }
-            #[unroll]
-            for e in 0..nr {
-                right[e] = g[i * n + min(col + e * 16, n - 1)];
-            }
-            add_outer(&mut sums, &left, &right, kr, nr);
-        }
-    }
-    #[unroll]
-    for i in 0..kr {
-        #[unroll]
-        for j in 0..nr {
-            if row + i * 16 < k && col + j * 16 < n {
-                parts[(CUBE_POS_Z as usize * k + row + i * 16) * n + col + j * 16] = sums[i * nr + j];
-            }
-        }
-    }
 }
 
 #[cube(launch_unchecked)]

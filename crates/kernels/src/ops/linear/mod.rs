@@ -1,5 +1,7 @@
 //! A fully connected layer, `y = act(x W + b)`, of any width, with one bias for all rows or one per row.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;
@@ -74,4 +76,24 @@ pub struct Gradients<'a> {
     pub w: Option<&'a mut [f32]>,
     /// As the bias.
     pub bias: Option<&'a mut [f32]>,
+}
+
+/// Shape of a layer that maps rows of `k` numbers to rows of `n`, whose rows are known elsewhere.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Dense {
+    pub k: usize,
+    pub n: usize,
+    pub bias: BiasKind,
+    pub activation: Activation,
+}
+
+impl Dense {
+    pub fn without_bias(k: usize, n: usize, activation: Activation) -> Dense {
+        Dense { k, n, bias: BiasKind::None, activation }
+    }
+
+    /// The layer on so many rows.
+    pub fn of_rows(&self, rows: usize) -> Linear {
+        Linear { rows, inputs: self.k, outputs: self.n, bias: self.bias, activation: self.activation }
+    }
 }

@@ -1,6 +1,6 @@
 //! Plain loops in f64.
 
-use super::{Activation, BiasKind, LEAK};
+use super::{Activation, BiasKind, Dense, LEAK};
 
 /// Value of an activation.
 pub fn activate(a: Activation, x: f64) -> f64 {
@@ -42,11 +42,11 @@ pub fn slope(a: Activation, x: f64) -> f64 {
     }
 }
 
-fn pre(m: usize, k: usize, n: usize, x: &[f64], w: &[f64], b: &[f64], kind: BiasKind) -> Vec<f64> {
+fn pre(m: usize, &Dense { k, n, bias, .. }: &Dense, x: &[f64], w: &[f64], b: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; m * n];
     for i in 0..m {
         for j in 0..n {
-            let start = match kind {
+            let start = match bias {
                 BiasKind::None => 0.0,
                 BiasKind::Shared => b[j],
                 BiasKind::PerRow => b[i * n + j],
@@ -58,34 +58,23 @@ fn pre(m: usize, k: usize, n: usize, x: &[f64], w: &[f64], b: &[f64], kind: Bias
 }
 
 /// `[M, N]`
-#[allow(clippy::too_many_arguments)]
-pub fn forward(m: usize, k: usize, n: usize, x: &[f64], w: &[f64], b: &[f64], kind: BiasKind, a: Activation) -> Vec<f64> {
-    pre(m, k, n, x, w, b, kind).into_iter().map(|v| activate(a, v)).collect()
+pub fn forward(m: usize, layer: &Dense, x: &[f64], w: &[f64], b: &[f64]) -> Vec<f64> {
+    pre(m, layer, x, w, b).into_iter().map(|v| activate(layer.activation, v)).collect()
 }
 
 /// Gradients of x, w and b.
-#[allow(clippy::too_many_arguments)]
-pub fn backward(
-    m: usize,
-    k: usize,
-    n: usize,
-    x: &[f64],
-    w: &[f64],
-    b: &[f64],
-    kind: BiasKind,
-    a: Activation,
-    d: &[f64],
-) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
-    let pre = pre(m, k, n, x, w, b, kind);
+pub fn backward(m: usize, layer: &Dense, x: &[f64], w: &[f64], b: &[f64], d: &[f64]) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
+    let pre = pre(m, layer, x, w, b);
+    let &Dense { k, n, bias, activation } = layer;
     let (mut dx, mut dw, mut db) = (vec![0.0; m * k], vec![0.0; k * n], vec![0.0; b.len()]);
     for i in 0..m {
         for j in 0..n {
-            let g = d[i * n + j] * slope(a, pre[i * n + j]);
+            let g = d[i * n + j] * slope(activation, pre[i * n + j]);
             for p in 0..k {
                 dx[i * k + p] += g * w[p * n + j];
                 dw[p * n + j] += g * x[i * k + p];
             }
-            match kind {
+            match bias {
                 BiasKind::None => {}
                 BiasKind::Shared => db[j] += g,
                 BiasKind::PerRow => db[i * n + j] += g,

@@ -2,13 +2,16 @@
 //! to write them. The walk is the CPU's.
 
 pub mod occupancy;
-pub mod prune;
+mod positions;
 
 use super::{MarchConfig, OccupancyBits};
-use crate::gpu::{Buffer, CUBE, Gpu, GpuError, units};
+use crate::gpu::{Buffer, Gpu, GpuError, launch};
 use crate::ops::composite::gpu::GpuPacked;
 use crate::ops::scan;
 use cubecl::prelude::*;
+use positions::put;
+
+pub use positions::{Space, positions, positions_backward, to_space};
 
 const _: () = assert!(super::BLOCK == 8, "the kernel's blocks are 8 cells wide");
 
@@ -16,19 +19,23 @@ const _: () = assert!(super::BLOCK == 8, "the kernel's blocks are 8 cells wide")
 pub struct GpuOccupancy {
     resolution: usize,
     cascades: usize,
-    bits: Buffer,
-    blocks: Buffer,
+    bits: Buffer<u32>,
+    blocks: Buffer<u32>,
 }
 
 impl GpuOccupancy {
     pub fn upload(gpu: &Gpu, grid: &OccupancyBits) -> Self {
         let bits: Vec<u32> = grid.bits.iter().flat_map(|w| [*w as u32, (*w >> 32) as u32]).collect();
         let blocks: Vec<u32> = grid.blocks.iter().map(|b| *b as u32).collect();
-        GpuOccupancy { resolution: grid.resolution, cascades: grid.cascades, bits: gpu.upload_u32(&bits), blocks: gpu.upload_u32(&blocks) }
+        GpuOccupancy { resolution: grid.resolution, cascades: grid.cascades, bits: gpu.upload(&bits), blocks: gpu.upload(&blocks) }
     }
 }
 
 impl GpuOccupancy {
+    fn cells(&self) -> usize {
+        self.resolution.pow(3) * self.cascades
+    }
+
     /// Words of bits and blocks in which this differs from another grid.
     ///
     /// # Errors
@@ -37,7 +44,7 @@ impl GpuOccupancy {
         let other = GpuOccupancy::upload(gpu, other);
         let mut wrong = 0;
         for (a, b) in [(&self.bits, &other.bits), (&self.blocks, &other.blocks)] {
-            wrong += gpu.read_u32(a)?.iter().zip(gpu.read_u32(b)?).filter(|(a, b)| **a != *b).count();
+            wrong += gpu.read(a)?.iter().zip(gpu.read(b)?).filter(|(a, b)| **a != *b).count();
         }
         Ok(wrong)
     }
@@ -68,37 +75,9 @@ impl GpuRays {
 pub struct GpuMarched {
     pub packed: GpuPacked,
     /// Cells `[capacity]` that the samples lie in.
-    pub cells: Buffer,
+    pub cells: Buffer<u32>,
     /// 1 for each ray that lost samples because they found no room, `[R]`.
-    pub cut: Buffer,
-}
-
-/// Coordinates in which positions are given.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Space {
-    /// As the rays'.
-    Model,
-    /// The cube of this width around the model cube's centre as `[0, 1]³`.
-    Cube(f32),
-    /// All of space, contracted beyond the cube of this width, as `[0, 1]³`.
-    Contracted(f32),
-    /// As [`Space::Cube`], but as `[−1, 1]³`.
-    Centred(f32),
-    /// As [`Space::Contracted`], but as `[−1, 1]³`.
-    ContractedCentred(f32),
-}
-
-impl Space {
-    /// Kind and width, for a launch.
-    fn arg(self) -> (u32, f32) {
-        match self {
-            Space::Model => (0, 1.0),
-            Space::Cube(width) => (1, width),
-            Space::Contracted(width) => (2, width),
-            Space::Centred(width) => (3, width),
-            Space::ContractedCentred(width) => (4, width),
-        }
-    }
+    pub cut: Buffer<u32>,
 }
 
 /// Packed samples. Those that find no room are left out, the last rays' first.
@@ -106,23 +85,24 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
     let n = rays.jitter.len();
     let counts = gpu.empty(n);
     let (t, dt, cells) = (gpu.empty(capacity), gpu.empty(capacity), gpu.empty(capacity));
-    // SAFETY: units past the rays stop; samples beyond the capacity are not written.
-    let launch = |offsets: &Buffer, write: bool| unsafe {
-        walk::launch_unchecked(
-            &gpu.client,
-            units(n),
-            CubeDim::new_1d(CUBE),
-            grid.bits.arg(),
-            grid.blocks.arg(),
-            rays.origins.arg(),
-            rays.dirs.arg(),
-            rays.near_far.arg(),
-            rays.jitter.arg(),
-            offsets.arg(),
-            counts.arg(),
-            t.arg(),
-            dt.arg(),
-            cells.arg(),
+    let pass = |offsets: &Buffer<u32>, write: bool| {
+        launch!(
+            gpu,
+            walk,
+            n,
+            [
+                grid.bits => grid.cells() / 32,
+                grid.blocks => grid.cells() / 512,
+                rays.origins => n * 3,
+                rays.dirs => n * 3,
+                rays.near_far => n * 2,
+                rays.jitter => n,
+                offsets => n + 1,
+                counts => n,
+                t => capacity,
+                dt => capacity,
+                cells => capacity,
+            ],
             n as u32,
             grid.resolution as u32,
             grid.cascades as u32,
@@ -137,61 +117,19 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
             write,
         );
     };
-    if n > 0 {
-        launch(&gpu.zeros(n + 1), false);
-    }
+    pass(&gpu.zeros(n + 1), false);
     let whole = scan::gpu::exclusive(gpu, &counts);
     let cut = gpu.zeros(n);
-    if n > 0 {
-        launch(&whole, true);
-    }
+    pass(&whole, true);
     let offsets = bounded(gpu, &whole, &cut, capacity);
     GpuMarched { packed: GpuPacked { offsets, t, dt }, cells, cut }
 }
 
 /// Offsets that end where the memory does, so that no reader passes it; rays that lose samples are marked.
-fn bounded(gpu: &Gpu, offsets: &Buffer, cut: &Buffer, capacity: usize) -> Buffer {
-    let out = gpu.empty(offsets.len());
-    // SAFETY: units past the offsets stop.
-    unsafe {
-        bound::launch_unchecked(
-            &gpu.client,
-            units(offsets.len()),
-            CubeDim::new_1d(CUBE),
-            offsets.arg(),
-            out.arg(),
-            cut.arg(),
-            offsets.len() as u32,
-            capacity as u32,
-        );
-    }
-    out
-}
-
-/// Midpoints of packed samples `[S, 3]`.
-pub fn positions(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked, space: Space) -> Buffer {
-    let out = gpu.empty(samples.t.len() * 3);
-    let n = samples.rays();
-    if n > 0 {
-        let (kind, width) = space.arg();
-        // SAFETY: offsets bound the samples.
-        unsafe {
-            place::launch_unchecked(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                samples.offsets.arg(),
-                samples.t.arg(),
-                samples.dt.arg(),
-                rays.origins.arg(),
-                rays.dirs.arg(),
-                out.arg(),
-                n as u32,
-                width,
-                kind,
-            );
-        }
-    }
+pub(crate) fn bounded(gpu: &Gpu, offsets: &Buffer<u32>, cut: &Buffer<u32>, capacity: usize) -> Buffer<u32> {
+    let n = offsets.len();
+    let out = gpu.empty(n);
+    launch!(gpu, bound, n, [offsets => n, out => n, cut => n - 1], n as u32, capacity as u32);
     out
 }
 
@@ -329,206 +267,5 @@ fn bound(offsets: &[u32], out: &mut [u32], cut: &mut [u32], n: u32, capacity: u3
     out[i] = min(offsets[i], capacity);
     if i > 0 && offsets[i] > capacity {
         cut[i - 1] = 1u32;
-    }
-}
-
-/// Model points `[N, 3]` as coordinates of a space.
-pub fn to_space(gpu: &Gpu, points: &Buffer, space: Space) -> Buffer {
-    let (out, n) = (gpu.empty(points.len()), points.len() / 3);
-    if n > 0 {
-        let (kind, width) = space.arg();
-        // SAFETY: units past the points stop.
-        unsafe {
-            convert::launch_unchecked(&gpu.client, units(n), CubeDim::new_1d(CUBE), points.arg(), out.arg(), n as u32, width, kind);
-        }
-    }
-    out
-}
-
-/// Gradients of origins and directions `[R, 3]`, given those of positions `[S, 3]` in a space.
-pub fn positions_backward(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked, d: &Buffer, space: Space) -> (Buffer, Buffer) {
-    let n = samples.rays();
-    let (d_origins, d_dirs) = (gpu.empty(n * 3), gpu.empty(n * 3));
-    if n > 0 {
-        let (kind, width) = space.arg();
-        // SAFETY: offsets bound the samples.
-        unsafe {
-            pull::launch_unchecked(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                samples.offsets.arg(),
-                samples.t.arg(),
-                samples.dt.arg(),
-                rays.origins.arg(),
-                rays.dirs.arg(),
-                d.arg(),
-                d_origins.arg(),
-                d_dirs.arg(),
-                n as u32,
-                width,
-                kind,
-            );
-        }
-    }
-    (d_origins, d_dirs)
-}
-
-/// Writes a model point as coordinates of a space.
-#[cube]
-fn put(out: &mut [f32], at: usize, x: f32, y: f32, z: f32, width: f32, #[comptime] kind: u32) {
-    if comptime!(kind == 0) {
-        out[at] = x;
-        out[at + 1] = y;
-        out[at + 2] = z;
-    }
-    if comptime!(kind == 1) {
-        out[at] = (x - 0.5) / width + 0.5;
-        out[at + 1] = (y - 0.5) / width + 0.5;
-        out[at + 2] = (z - 0.5) / width + 0.5;
-    }
-    if comptime!(kind == 2 || kind == 4) {
-        let cx = 2.0 / width * (x - 0.5);
-        let cy = 2.0 / width * (y - 0.5);
-        let cz = 2.0 / width * (z - 0.5);
-        let m = max(max(cx.abs(), cy.abs()), cz.abs());
-        let mut s = 0.25f32;
-        let mut middle = 0.5f32;
-        if comptime!(kind == 4) {
-            s = 0.5f32;
-            middle = 0.0f32;
-        }
-        if m > 1.0 {
-            s *= (2.0 - 1.0 / m) / m;
-        }
-        out[at] = cx * s + middle;
-        out[at + 1] = cy * s + middle;
-        out[at + 2] = cz * s + middle;
-    }
-    if comptime!(kind == 3) {
-        out[at] = 2.0 * (x - 0.5) / width;
-        out[at + 1] = 2.0 * (y - 0.5) / width;
-        out[at + 2] = 2.0 * (z - 0.5) / width;
-    }
-}
-
-#[cube(launch_unchecked)]
-fn convert(points: &[f32], out: &mut [f32], n: u32, width: f32, #[comptime] kind: u32) {
-    let i = ABSOLUTE_POS;
-    if i >= n as usize {
-        terminate!();
-    }
-    put(out, i * 3, points[i * 3], points[i * 3 + 1], points[i * 3 + 2], width, kind);
-}
-
-/// The sum of `d · ∂put/∂point` over a ray's samples, and the same times their distances.
-#[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
-#[cube(launch_unchecked)]
-fn pull(
-    offsets: &[u32],
-    t: &[f32],
-    dt: &[f32],
-    origins: &[f32],
-    dirs: &[f32],
-    d: &[f32],
-    d_origins: &mut [f32],
-    d_dirs: &mut [f32],
-    rays: u32,
-    width: f32,
-    #[comptime] kind: u32,
-) {
-    let r = ABSOLUTE_POS;
-    if r >= rays as usize {
-        terminate!();
-    }
-    let mut near = Array::<f32>::new(3usize);
-    let mut far = Array::<f32>::new(3usize);
-    let mut point = Array::<f32>::new(3usize);
-    #[unroll]
-    for k in 0..3usize {
-        near[k] = 0.0;
-        far[k] = 0.0;
-    }
-    for i in offsets[r] as usize..offsets[r + 1] as usize {
-        let mid = t[i] + 0.5 * dt[i];
-        let mut scale = 1.0f32;
-        let mut greatest = 0usize;
-        let mut pulled = 0.0f32;
-        if comptime!(kind == 1) {
-            scale = 1.0 / width;
-        }
-        if comptime!(kind == 3) {
-            scale = 2.0 / width;
-        }
-        if comptime!(kind == 2 || kind == 4) {
-            // Contracted: c = s(m) x with m the greatest coordinate's size, which has a slope of its own.
-            let mut m = 0.0f32;
-            let mut along = 0.0f32;
-            #[unroll]
-            for k in 0..3usize {
-                let x = 2.0 / width * (origins[r * 3 + k] + mid * dirs[r * 3 + k] - 0.5);
-                point[k] = x;
-                along += d[i * 3 + k] * x;
-                if x.abs() >= m {
-                    m = x.abs();
-                    greatest = k;
-                }
-            }
-            scale = 0.5 / width;
-            if comptime!(kind == 4) {
-                scale = 1.0 / width;
-            }
-            if m > 1.0 {
-                pulled = scale * (2.0 / m - 2.0) / (m * m) * along;
-                scale *= (2.0 - 1.0 / m) / m;
-                if point[greatest] < 0.0 {
-                    pulled = -pulled;
-                }
-            }
-        }
-        #[unroll]
-        for k in 0..3usize {
-            let mut g = scale * d[i * 3 + k];
-            if comptime!(kind == 2 || kind == 4) {
-                if greatest == k {
-                    g += pulled;
-                }
-            }
-            near[k] += g;
-            far[k] += mid * g;
-        }
-    }
-    #[unroll]
-    for k in 0..3usize {
-        d_origins[r * 3 + k] = near[k];
-        d_dirs[r * 3 + k] = far[k];
-    }
-}
-
-#[cube(launch_unchecked)]
-fn place(
-    offsets: &[u32],
-    t: &[f32],
-    dt: &[f32],
-    origins: &[f32],
-    dirs: &[f32],
-    out: &mut [f32],
-    rays: u32,
-    width: f32,
-    #[comptime] kind: u32,
-) {
-    let r = ABSOLUTE_POS;
-    if r >= rays as usize {
-        terminate!();
-    }
-    let ox = origins[r * 3];
-    let oy = origins[r * 3 + 1];
-    let oz = origins[r * 3 + 2];
-    let dx = dirs[r * 3];
-    let dy = dirs[r * 3 + 1];
-    let dz = dirs[r * 3 + 2];
-    for i in offsets[r] as usize..offsets[r + 1] as usize {
-        let mid = t[i] + 0.5 * dt[i];
-        put(out, i * 3, ox + mid * dx, oy + mid * dy, oz + mid * dz, width, kind);
     }
 }

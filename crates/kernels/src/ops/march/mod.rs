@@ -5,6 +5,8 @@
 //! cascade `c` is `2^c` times as large. A sample reads the finest cascade that contains its midpoint
 //! and whose cells are no smaller than its step.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

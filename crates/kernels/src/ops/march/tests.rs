@@ -1,36 +1,7 @@
+use super::cases::{Rays, rays, sparse_grid};
 use super::*;
 use diorama_geom::contraction::Space;
-use diorama_testkit::{random, random_unit};
-
-struct Rays {
-    origins: Vec<f32>,
-    dirs: Vec<f32>,
-    near_far: Vec<f32>,
-    jitter: Vec<f32>,
-}
-
-fn rays(n: usize, half: f32) -> Rays {
-    let mut dirs = random(n * 3, 2);
-    for d in dirs.chunks_exact_mut(3) {
-        let l = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt();
-        d.iter_mut().for_each(|v| *v /= l);
-    }
-    let origins = random_unit(n * 3, 1).iter().map(|v| 0.5 + (v - 0.5) * half).collect();
-    Rays { origins, dirs, near_far: (0..n).flat_map(|_| [0.05, 3.0]).collect(), jitter: random_unit(n, 3) }
-}
-
-impl Rays {
-    fn view(&self) -> MarchRays<'_> {
-        MarchRays { origins: &self.origins, dirs: &self.dirs, near_far: &self.near_far, jitter: &self.jitter, resumed: false }
-    }
-}
-
-fn sparse_grid(cascades: usize) -> OccupancyBits {
-    let mut g = OccupancyBits::full(16, cascades);
-    let u = random_unit(g.cells(), 9);
-    g.fill_with(|i| u[i] < 0.3);
-    g
-}
+use diorama_testkit::random;
 
 fn run(g: &OccupancyBits, r: &Rays, c: &MarchConfig) -> Marched {
     let mut out = Marched::default();
@@ -40,29 +11,21 @@ fn run(g: &OccupancyBits, r: &Rays, c: &MarchConfig) -> Marched {
 
 #[test]
 fn matches_the_reference_up_to_ties() {
-    let bounded = MarchConfig { dt_min: 0.005, dt_max: 0.08, max_samples: 200, ..MarchConfig::default() };
-    let growing = MarchConfig { cone: 1.0 / 256.0, ..bounded };
-    let unbounded = MarchConfig { dt_max: 1e6, disparity_from: 0.7, unbounded: true, max_samples: 600, ..growing };
-    for (cascades, c) in [(1, bounded), (3, growing), (3, unbounded)] {
-        for n in [0, 1, 300] {
-            let (g, mut r) = (sparse_grid(cascades), rays(n, 1.0));
-            if c.unbounded {
-                r.near_far.iter_mut().skip(1).step_by(2).for_each(|far| *far = 1000.0);
-            }
-            let (got, want) = (run(&g, &r, &c), reference::march(&g, &r.view(), &c));
-            assert_eq!(got.offsets.len(), n + 1);
-            // A sample whose midpoint lies on a cell wall may fall to either side: such rays are
-            // counted, the others must agree sample by sample.
-            let mut ties = 0;
-            for i in 0..n {
-                let a = got.offsets[i] as usize..got.offsets[i + 1] as usize;
-                let b = want.offsets[i] as usize..want.offsets[i + 1] as usize;
-                let same = a.len() == b.len() && got.t[a].iter().zip(&want.t[b]).all(|(a, b)| (a - b).abs() < 1e-4 * b.max(1.0));
-                ties += !same as usize;
-            }
-            assert!(ties * 50 <= n, "{ties} of {n} rays differ");
-        }
+    for cases::Case { grid, config, rays } in cases::cases() {
+        cases::compare_rays(&run(&grid, &rays, &config), &reference::march(&grid, &rays.view(), &config)).unwrap();
     }
+}
+
+#[test]
+fn other_samples_are_told() {
+    let c = &cases::cases()[2];
+    let want = reference::march(&c.grid, &c.rays.view(), &c.config);
+    let mut off = Marched { t: want.t.iter().map(|t| t + 1e-3).collect(), ..want.clone() };
+    assert!(cases::compare_rays(&off, &want).is_err());
+    off.t.clone_from(&want.t);
+    assert_eq!(cases::compare_rays(&off, &want), Ok(0.0));
+    off.cells.iter_mut().for_each(|c| *c += 1);
+    assert!(cases::compare_rays(&off, &want).is_err());
 }
 
 #[test]

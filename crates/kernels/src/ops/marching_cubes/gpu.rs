@@ -3,12 +3,13 @@
 #![allow(clippy::collapsible_if)] // the outer one is decided when a kernel is made, the inner one when it runs
 
 use super::CaseTable;
-use crate::gpu::{Buffer, CUBE, Gpu, GpuError, units};
+use crate::gpu::{Buffer, Gpu, GpuError, launch};
 use crate::ops::scan;
 use cubecl::prelude::*;
 
 /// Numbers per case: how many triangles, and the edges of at most twelve.
 const CASE: usize = 40;
+const CASES: usize = 256;
 
 /// Vertices `[V, 3]` in grid coordinates (x, y, z) and faces `[T, 3]` of densities `[nz, ny, nx]`.
 ///
@@ -20,70 +21,60 @@ pub fn extract(
     density: &Buffer,
     (nx, ny, nz): (usize, usize, usize),
     level: f32,
-) -> Result<(Buffer, Buffer), GpuError> {
+) -> Result<(Buffer, Buffer<u32>), GpuError> {
     let n = nx * ny * nz;
     assert_eq!(density.len(), n, "marching cubes: {nx} x {ny} x {nz}");
-    let mut cases = vec![0u32; 256 * CASE];
+    let mut cases = vec![0u32; CASES * CASE];
     for (case, triangles) in table.triangles.iter().enumerate() {
         cases[case * CASE] = triangles.len() as u32;
         for (i, e) in triangles.iter().flatten().enumerate() {
             cases[case * CASE + 1 + i] = (e.corner * 8 + e.direction) as u32;
         }
     }
-    let cases = gpu.upload_u32(&cases);
+    let cases = gpu.upload(&cases);
     // Vertices lie along the axes, or along all seven directions.
     let diagonals = table.directions.len() > 3;
     let (crossings, triangles) = (gpu.empty(n), gpu.empty(n));
-    let (cubes, cube) = (units(n), CubeDim::new_1d(CUBE));
     let size = (nx as u32, ny as u32, nz as u32);
-    if n > 0 {
-        // SAFETY: units past the points stop; neighbours are read inside the grid.
-        unsafe {
-            count::launch_unchecked(
-                &gpu.client,
-                cubes.clone(),
-                cube,
-                density.arg(),
-                cases.arg(),
-                crossings.arg(),
-                triangles.arg(),
-                size.0,
-                size.1,
-                size.2,
-                level,
-                diagonals,
-            );
-        }
-    }
+    launch!(
+        gpu,
+        count,
+        n,
+        [density => n, cases => CASES * CASE, crossings => n, triangles => n],
+        size.0,
+        size.1,
+        size.2,
+        level,
+        diagonals,
+    );
     let (first_vertex, first_face) = (scan::gpu::exclusive(gpu, &crossings), scan::gpu::exclusive(gpu, &triangles));
     let (v, t) = (last(gpu, &first_vertex)?, last(gpu, &first_face)?);
     let (vertices, faces) = (gpu.empty(v * 3), gpu.empty(t * 3));
     if v > 0 {
-        // SAFETY: as above; what is written was counted.
-        unsafe {
-            write::launch_unchecked(
-                &gpu.client,
-                cubes,
-                cube,
-                density.arg(),
-                cases.arg(),
-                first_vertex.arg(),
-                first_face.arg(),
-                vertices.arg(),
-                faces.arg(),
-                size.0,
-                size.1,
-                size.2,
-                level,
-                diagonals,
-            );
-        }
+        launch!(
+            gpu,
+            write,
+            n,
+            [
+                density => n,
+                cases => CASES * CASE,
+                first_vertex => n + 1,
+                first_face => n + 1,
+                vertices => v * 3,
+                faces => t * 3,
+            ],
+            size.0,
+            size.1,
+            size.2,
+            level,
+            diagonals,
+        );
     }
     Ok((vertices, faces))
 }
 
-fn last(gpu: &Gpu, offsets: &Buffer) -> Result<usize, GpuError> {
-    Ok(gpu.read_u32(offsets)?.last().copied().unwrap_or(0) as usize)
+fn last(gpu: &Gpu, offsets: &Buffer<u32>) -> Result<usize, GpuError> {
+    Ok(gpu.read(offsets)?.last().copied().unwrap_or(0) as usize)
 }
 
 /// Whether the edge from point `i` in a direction lies in the grid and crosses the level.

@@ -5,6 +5,8 @@
 //! Vertices lie where the density crosses `level` linearly along an edge, in grid coordinates;
 //! triangles wind counter-clockwise seen from the side below `level`.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -13,6 +13,15 @@ pub use super::marching_cubes::cpu;
 
 use super::marching_cubes::{CaseTable, Edge};
 
+/// The surfaces of [`super::marching_cubes::cases`].
+///
+/// # Errors
+/// When the device is lost.
+#[cfg(feature = "gpu")]
+pub(crate) fn check(gpu: &crate::gpu::Gpu, table: &mut crate::gpu::table::Table) -> Result<(), crate::gpu::GpuError> {
+    super::marching_cubes::cases::check_surface(gpu, table, "marching tetrahedra", &case_table())
+}
+
 /// Corners of the six tetrahedra; bit `k` of a corner is the step along axis `k`.
 pub const TETRAHEDRA: [[usize; 4]; 6] = [[0, 1, 3, 7], [0, 1, 5, 7], [0, 2, 3, 7], [0, 2, 6, 7], [0, 4, 5, 7], [0, 4, 6, 7]];
 

@@ -5,29 +5,16 @@ pub mod error_map;
 use self::error_map::GpuErrorMap;
 use super::{OBSERVED_EVERY, words_per_pixel};
 use crate::gpu::random::{Wide, below, bits, halves, key, product, sum, uniform, widened};
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, launch};
 use cubecl::prelude::*;
 use diorama_geom::PixelFormat;
 use diorama_geom::rng::Rng;
 
 /// `[R, 4]` for the pixels `at` `[R]` of packed RGBA.
-pub fn gather(gpu: &Gpu, format: PixelFormat, pixels: &Buffer, at: &Buffer) -> Buffer {
-    let out = gpu.empty(at.len() * 4);
-    if !at.is_empty() {
-        // SAFETY: units past the length stop; `at` indexes the pixels.
-        unsafe {
-            unpack::launch_unchecked(
-                &gpu.client,
-                units(at.len()),
-                CubeDim::new_1d(CUBE),
-                pixels.arg(),
-                at.arg(),
-                out.arg(),
-                at.len() as u32,
-                code(format),
-            );
-        }
-    }
+pub fn gather(gpu: &Gpu, format: PixelFormat, pixels: &Buffer<u32>, at: &Buffer<u32>) -> Buffer {
+    let n = at.len();
+    let out = gpu.empty(n * 4);
+    launch!(gpu, unpack, n, [pixels => pixels.len(), at => n, out => n * 4], n as u32, code(format));
     out
 }
 
@@ -80,19 +67,19 @@ pub struct GpuPhotographs {
     /// One of each `stride × stride` pixels is there.
     stride: u32,
     /// [`PHOTOGRAPH`] numbers of each: width, height, first pixel, and the key by which pixels were kept.
-    sizes: Buffer,
-    pixels: Buffer,
+    sizes: Buffer<u32>,
+    pixels: Buffer<u32>,
     format: PixelFormat,
     /// One bit per pixel that may be trained on; none: all may.
-    mask: Option<Buffer>,
+    mask: Option<Buffer<u32>>,
     /// [`OBSERVATION`] numbers of each pixel of known distance.
-    observations: Option<Buffer>,
+    observations: Option<Buffer<u32>>,
 }
 
 /// Drawn pixels.
 pub struct Drawn {
     /// `[R]`
-    pub images: Buffer,
+    pub images: Buffer<u32>,
     /// Centres, `[R, 2]`.
     pub pixels: Buffer,
     /// Straight RGBA, `[R, 4]`.
@@ -100,7 +87,7 @@ pub struct Drawn {
     /// In `[0, 1)`, `[R]`.
     pub jitter: Buffer,
     /// 1 where masks refused every draw, `[R]`.
-    pub left_out: Buffer,
+    pub left_out: Buffer<u32>,
     /// Distance of the surface along the ray, 0 where it is not known, `[R]`.
     pub distance: Buffer,
     /// `[R, 3]`
@@ -138,12 +125,12 @@ impl GpuPhotographs {
             first += w.div_ceil(stride) * h.div_ceil(stride);
         }
         assert_eq!(first as usize * words_per_pixel(format), pixels.len(), "photographs: pixels");
-        let mask = mask.map(|m| gpu.upload_u32(m));
+        let mask = mask.map(|m| gpu.upload(m));
         GpuPhotographs {
             count: sizes.len(),
             stride,
-            sizes: gpu.upload_u32(&rows),
-            pixels: gpu.upload_u32(pixels),
+            sizes: gpu.upload(&rows),
+            pixels: gpu.upload(pixels),
             format,
             mask,
             observations: None,
@@ -153,7 +140,7 @@ impl GpuPhotographs {
     /// Draws some rays through pixels of known distance: image, x, y and distance of each.
     pub fn observe(&mut self, gpu: &Gpu, observations: &[(u32, u32, u32, f32)]) {
         let words: Vec<u32> = observations.iter().flat_map(|(image, x, y, d)| [*image, *x, *y, d.to_bits()]).collect();
-        self.observations = (!words.is_empty()).then(|| gpu.upload_u32(&words));
+        self.observations = (!words.is_empty()).then(|| gpu.upload(&words));
     }
 
     /// `n` random training pixels, half of them where `errors` are high; `first` counts those drawn before.
@@ -176,56 +163,55 @@ impl GpuPhotographs {
         // Bound where there is no mask to read.
         let mask = self.mask.as_ref().unwrap_or(&self.sizes);
         let observations = self.observations.as_ref().unwrap_or(&self.sizes);
-        let none = gpu.empty(1);
+        let none = gpu.empty(0);
         let cdf = errors.map_or(&none, |e| e.cdf());
-        if n > 0 {
-            // SAFETY: units past `n` stop; draws stay within the photographs.
-            unsafe {
-                choose::launch_unchecked(
-                    &gpu.client,
-                    units(n),
-                    CubeDim::new_1d(CUBE),
-                    self.sizes.arg(),
-                    self.pixels.arg(),
-                    mask.arg(),
-                    cdf.arg(),
-                    observations.arg(),
-                    d.images.arg(),
-                    d.pixels.arg(),
-                    d.target.arg(),
-                    d.jitter.arg(),
-                    d.left_out.arg(),
-                    d.distance.arg(),
-                    n as u32,
-                    self.count as u32,
-                    (observations.len() / OBSERVATION) as u32,
-                    key_high,
-                    key_low,
-                    high,
-                    low,
-                    self.stride,
-                    self.mask.is_some(),
-                    errors.is_some(),
-                    self.observations.is_some(),
-                    code(self.format),
-                );
-                back::launch_unchecked(
-                    &gpu.client,
-                    units(n * 3),
-                    CubeDim::new_1d(CUBE),
-                    d.background.arg(),
-                    (n * 3) as u32,
-                    color[0],
-                    color[1],
-                    color[2],
-                    back_high,
-                    back_low,
-                    third_high,
-                    third_low,
-                    is_random,
-                );
-            }
-        }
+        let n_masked = if self.mask.is_some() { (self.pixels.len() / words_per_pixel(self.format)).div_ceil(32) } else { 0 };
+        let n_cells = if errors.is_some() { self.count * CELLS * CELLS } else { 0 };
+        launch!(
+            gpu,
+            choose,
+            n,
+            [
+                self.sizes => self.count * PHOTOGRAPH,
+                self.pixels => self.pixels.len(),
+                mask => n_masked,
+                cdf => n_cells,
+                observations => observations.len(),
+                d.images => n,
+                d.pixels => n * 2,
+                d.target => n * 4,
+                d.jitter => n,
+                d.left_out => n,
+                d.distance => n,
+            ],
+            n as u32,
+            self.count as u32,
+            (observations.len() / OBSERVATION) as u32,
+            key_high,
+            key_low,
+            high,
+            low,
+            self.stride,
+            self.mask.is_some(),
+            errors.is_some(),
+            self.observations.is_some(),
+            code(self.format),
+        );
+        launch!(
+            gpu,
+            back,
+            n * 3,
+            [d.background => n * 3],
+            (n * 3) as u32,
+            color[0],
+            color[1],
+            color[2],
+            back_high,
+            back_low,
+            third_high,
+            third_low,
+            is_random,
+        );
         d
     }
 }

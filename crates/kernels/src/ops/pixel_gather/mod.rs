@@ -2,6 +2,8 @@
 //!
 //! A pixel is one word of 8-bit values, or two words of 16-bit values or half floats; red is lowest.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -1,29 +1,13 @@
 //! One unit per ray.
 
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, launch};
 use cubecl::prelude::*;
 
 /// `[R, 2]` for origins and dirs `[R, 3]`; near ≥ far where a ray misses.
 pub fn intersect(gpu: &Gpu, origins: &Buffer, dirs: &Buffer, min: [f32; 3], max: [f32; 3], near_plane: f32) -> Buffer {
     let n = origins.len() / 3;
-    let out = gpu.empty(n * 2);
-    if n > 0 {
-        let bounds = gpu.upload(&[min[0], min[1], min[2], max[0], max[1], max[2]]);
-        // SAFETY: units past `n` stop.
-        unsafe {
-            clip::launch_unchecked(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                origins.arg(),
-                dirs.arg(),
-                bounds.arg(),
-                out.arg(),
-                n as u32,
-                near_plane,
-            );
-        }
-    }
+    let (out, bounds) = (gpu.empty(n * 2), gpu.upload(&[min, max].concat()));
+    launch!(gpu, clip, n, [origins => n * 3, dirs => n * 3, bounds => 6, out => n * 2], n as u32, near_plane);
     out
 }
 

@@ -1,7 +1,7 @@
 //! One unit per ray; lenses are inverted by Newton's method in f32.
 
 use super::{CORRECTION, PosedCamera};
-use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Swap, units};
+use crate::gpu::{Accumulate, Buffer, Gpu, launch};
 use cubecl::prelude::*;
 use diorama_geom::Lens;
 use std::f32::consts::{PI, TAU};
@@ -53,68 +53,49 @@ impl GpuCameras {
     /// focal lengths are `refined`, their corrections are taken back to 0.
     pub fn correct(&self, gpu: &Gpu, corrections: &Buffer, refined: bool) {
         assert_eq!(corrections.len(), self.count * CORRECTION, "cameras: corrections");
-        if self.count > 0 {
-            // SAFETY: units past the cameras stop.
-            unsafe {
-                adjust::launch_unchecked(
-                    &gpu.client,
-                    units(self.count),
-                    CubeDim::new_1d(CUBE),
-                    self.base.arg(),
-                    corrections.arg(),
-                    self.numbers.arg(),
-                    self.count as u32,
-                    refined,
-                );
-            }
-        }
+        let n = self.count;
+        launch!(
+            gpu,
+            adjust,
+            n,
+            [self.base => n * CAMERA, corrections => n * CORRECTION, self.numbers => n * CAMERA],
+            n as u32,
+            refined,
+        );
     }
 
     /// Origins and unit directions `[R, 3]` of the rays through `pixels` `[R, 2]` of cameras `index` `[R]`.
-    pub fn forward(&self, gpu: &Gpu, index: &Buffer, pixels: &Buffer) -> (Buffer, Buffer) {
+    pub fn forward(&self, gpu: &Gpu, index: &Buffer<u32>, pixels: &Buffer) -> (Buffer, Buffer) {
         let n = index.len();
         let (origins, dirs) = (gpu.empty(n * 3), gpu.empty(n * 3));
-        if n > 0 {
-            // SAFETY: units past `n` stop; `index` names cameras.
-            unsafe {
-                cast::launch_unchecked(
-                    &gpu.client,
-                    units(n),
-                    CubeDim::new_1d(CUBE),
-                    self.numbers.arg(),
-                    index.arg(),
-                    pixels.arg(),
-                    origins.arg(),
-                    dirs.arg(),
-                    n as u32,
-                );
-            }
-        }
+        launch!(
+            gpu,
+            cast,
+            n,
+            [self.numbers => self.count * CAMERA, index => n, pixels => n * 2, origins => n * 3, dirs => n * 3],
+            n as u32,
+        );
         (origins, dirs)
     }
 
     /// Gradient of the corrections `[cameras, 7]` at zero.
-    pub fn backward(&self, gpu: &Gpu, index: &Buffer, pixels: &Buffer, dirs: &Buffer, d_origins: &Buffer, d_dirs: &Buffer) -> Buffer {
+    pub fn backward(&self, gpu: &Gpu, index: &Buffer<u32>, pixels: &Buffer, dirs: &Buffer, d_origins: &Buffer, d_dirs: &Buffer) -> Buffer {
         let (n, out) = (index.len(), gpu.zeros(self.count * CORRECTION));
-        if n > 0 {
-            let launch = if gpu.native_atomics { correct::launch_unchecked::<Native> } else { correct::launch_unchecked::<Swap> };
-            // SAFETY: as in `forward`.
-            unsafe {
-                launch(
-                    &gpu.client,
-                    units(n),
-                    CubeDim::new_1d(CUBE),
-                    self.numbers.arg(),
-                    index.arg(),
-                    pixels.arg(),
-                    dirs.arg(),
-                    d_origins.arg(),
-                    d_dirs.arg(),
-                    out.arg(),
-                    n as u32,
-                );
-            }
-        }
+        launch!(
+            gpu,
+            correct::<Adder>,
+            n,
+            [
+                self.numbers => self.count * CAMERA,
+                index => n,
+                pixels => n * 2,
+                dirs => n * 3,
+                d_origins => n * 3,
+                d_dirs => n * 3,
+                out => self.count * CORRECTION,
+            ],
+            n as u32,
+        );
         out
     }
 }

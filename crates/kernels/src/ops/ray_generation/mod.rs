@@ -5,6 +5,8 @@
 //! `ω = 0` of a further rotation on the left, which is exact for the update `ω ← log(exp(dω) exp(ω))`
 //! and first order otherwise.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -3,29 +3,22 @@
 pub mod strata;
 
 use super::FLOOR;
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, launch};
 use cubecl::prelude::*;
 
 /// Distances `[R, M]` for edges `[R, N + 1]`, weights `[R, N]` and numbers `u` `[R, M]` in [0, 1).
 pub fn sample(gpu: &Gpu, n: usize, edges: &Buffer, weights: &Buffer, m: usize, u: &Buffer) -> Buffer {
-    let out = gpu.empty(u.len());
-    if !u.is_empty() {
-        // SAFETY: units past the length stop.
-        unsafe {
-            invert::launch_unchecked(
-                &gpu.client,
-                units(u.len()),
-                CubeDim::new_1d(CUBE),
-                edges.arg(),
-                weights.arg(),
-                u.arg(),
-                out.arg(),
-                u.len() as u32,
-                n as u32,
-                m as u32,
-            );
-        }
-    }
+    let (len, rays) = (u.len(), u.len() / m.max(1));
+    let out = gpu.empty(len);
+    launch!(
+        gpu,
+        invert,
+        len,
+        [edges => rays * (n + 1), weights => rays * n, u => len, out => len],
+        len as u32,
+        n as u32,
+        m as u32,
+    );
     out
 }
 

@@ -1,6 +1,8 @@
 //! Importance sampling of new distances from a coarse pass (NeRF, section 5.2): inverse transform of
 //! the piecewise-constant density given by weights over bins. Not differentiated, as in NeRF.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -1,16 +1,12 @@
 use super::*;
-use diorama_testkit::{assert_close, random_unit, wide};
+use diorama_testkit::{assert_close, wide};
 
 #[test]
 fn matches_the_reference() {
-    for (r, n, m) in [(0, 4, 3), (1, 1, 1), (50, 16, 33)] {
-        let edges: Vec<f32> = (0..r).flat_map(|_| (0..=n).map(|i| i as f32 * 0.3 + 1.0)).collect();
-        let mut w = random_unit(r * n, 1);
-        w.iter_mut().step_by(3).for_each(|w| *w = 0.0);
-        let u = random_unit(r * m, 2);
-        let mut out = vec![9.0; r * m];
-        cpu::sample(n, &edges, &w, m, &u, &mut out);
-        assert_close("t", &out, &reference::sample(n, &wide(&edges), &wide(&w), m, &wide(&u)), 1e-4);
+    for cases::Case { rays, n, m, edges, weights, u } in cases::cases() {
+        let mut out = vec![9.0; rays * m];
+        cpu::sample(n, &edges, &weights, m, &u, &mut out);
+        assert_close("t", &out, &reference::sample(n, &wide(&edges), &wide(&weights), m, &wide(&u)), 1e-4);
     }
 }
 

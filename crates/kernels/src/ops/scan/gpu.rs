@@ -1,47 +1,30 @@
 //! Sums over all rays in one cube, sums within rays by one unit each.
 
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, CUBE, Gpu, launch};
 use cubecl::prelude::*;
 
 /// `offsets[r] = Σ_{q<r} counts[q]`, `[R + 1]`.
-pub fn exclusive(gpu: &Gpu, counts: &Buffer) -> Buffer {
-    let out = gpu.empty(counts.len() + 1);
-    // SAFETY: each unit stays within its part of the counts.
-    unsafe {
-        let (one, cube) = (CubeCount::Static(1, 1, 1), CubeDim::new_1d(CUBE));
-        offsets::launch_unchecked(&gpu.client, one, cube, counts.arg(), out.arg(), counts.len() as u32, gpu.shared);
-    }
+pub fn exclusive(gpu: &Gpu, counts: &Buffer<u32>) -> Buffer<u32> {
+    let n = counts.len();
+    let out = gpu.empty(n + 1);
+    launch!(gpu, offsets, ([1; 3], CubeDim::new_1d(CUBE)), [counts => n, out => n + 1], n as u32, gpu.shared);
     out
 }
 
 /// `out[i] = Σ_{j≤i, same ray} x[j]`.
-pub fn inclusive(gpu: &Gpu, offsets: &Buffer, x: &Buffer) -> Buffer {
+pub fn inclusive(gpu: &Gpu, offsets: &Buffer<u32>, x: &Buffer) -> Buffer {
     within(gpu, offsets, x, false)
 }
 
 /// `g[j] = Σ_{i≥j, same ray} d[i]`.
-pub fn inclusive_backward(gpu: &Gpu, offsets: &Buffer, d: &Buffer) -> Buffer {
+pub fn inclusive_backward(gpu: &Gpu, offsets: &Buffer<u32>, d: &Buffer) -> Buffer {
     within(gpu, offsets, d, true)
 }
 
-fn within(gpu: &Gpu, offsets: &Buffer, x: &Buffer, from_the_end: bool) -> Buffer {
-    let out = gpu.empty(x.len());
-    let rays = offsets.len().saturating_sub(1);
-    if rays > 0 {
-        // SAFETY: offsets bound the samples.
-        unsafe {
-            running::launch_unchecked(
-                &gpu.client,
-                units(rays),
-                CubeDim::new_1d(CUBE),
-                offsets.arg(),
-                x.arg(),
-                out.arg(),
-                rays as u32,
-                from_the_end,
-            );
-        }
-    }
+fn within(gpu: &Gpu, offsets: &Buffer<u32>, x: &Buffer, from_the_end: bool) -> Buffer {
+    let (rays, n) = (offsets.len().saturating_sub(1), x.len());
+    let out = gpu.empty(n);
+    launch!(gpu, running, rays, [offsets => rays + 1, x => n, out => n], rays as u32, from_the_end);
     out
 }
 

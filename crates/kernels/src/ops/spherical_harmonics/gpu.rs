@@ -1,17 +1,14 @@
 //! One unit per direction, the CPU's polynomials.
 
 use super::cpu::{C1, C2, C3, C20, C22, C30, C31, C32, C33};
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, launch};
 use cubecl::prelude::*;
 
 /// `[N, 3]` to `[N, degree²]`.
 pub fn forward(gpu: &Gpu, degree: usize, dirs: &Buffer) -> Buffer {
     let n = dirs.len() / 3;
     let out = gpu.empty(n * degree * degree);
-    if n > 0 {
-        // SAFETY: units past `n` stop.
-        unsafe { encode::launch_unchecked(&gpu.client, units(n), CubeDim::new_1d(CUBE), dirs.arg(), out.arg(), n as u32, degree) };
-    }
+    launch!(gpu, encode, n, [dirs => n * 3, out => n * degree * degree], n as u32, degree);
     out
 }
 
@@ -19,12 +16,7 @@ pub fn forward(gpu: &Gpu, degree: usize, dirs: &Buffer) -> Buffer {
 pub fn backward(gpu: &Gpu, degree: usize, dirs: &Buffer, d_out: &Buffer) -> Buffer {
     let n = dirs.len() / 3;
     let out = gpu.empty(n * 3);
-    if n > 0 {
-        // SAFETY: units past `n` stop.
-        unsafe {
-            slope::launch_unchecked(&gpu.client, units(n), CubeDim::new_1d(CUBE), dirs.arg(), d_out.arg(), out.arg(), n as u32, degree);
-        }
-    }
+    launch!(gpu, slope, n, [dirs => n * 3, d_out => n * degree * degree, out => n * 3], n as u32, degree);
     out
 }
 

@@ -1,97 +1,102 @@
 //! One unit per window and channel for the factors, one per pixel for the gradient.
 
 use super::{C1, C2, WINDOW, gaussian};
-use crate::gpu::Rows;
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, Rows, launch};
 use crate::ops::linear::gpu as linear;
 use cubecl::prelude::*;
 
+/// Images `[h, w, c]` that are compared.
+#[derive(Clone, Copy)]
+pub struct Pair<'a> {
+    /// Width, height and channels.
+    pub size: (usize, usize, usize),
+    pub x: &'a Buffer,
+    pub y: &'a Buffer,
+}
+
+impl Pair<'_> {
+    fn len(&self) -> usize {
+        self.size.0 * self.size.1 * self.size.2
+    }
+
+    /// Windows that fit, times channels.
+    fn windows(&self) -> usize {
+        let (w, h, c) = self.size;
+        (w + 1).saturating_sub(WINDOW) * (h + 1).saturating_sub(WINDOW) * c
+    }
+}
+
+/// What the gradient takes besides the images: three factors per window and channel `[windows, C, 3]`, and the window.
+pub type Kept = [Buffer; 2];
+
 /// SSIM of every window `[windows, C]` and, of its slope `α + β x + γ y`, the three factors `[windows, C, 3]`.
-fn windows(gpu: &Gpu, (w, h, c): (usize, usize, usize), x: &Buffer, y: &Buffer) -> (Buffer, Buffer, Buffer) {
-    let n = (w + 1).saturating_sub(WINDOW) * (h + 1).saturating_sub(WINDOW) * c;
+fn windows(gpu: &Gpu, p: Pair) -> (Buffer, Kept) {
+    let ((w, _, c), len, n) = (p.size, p.len(), p.windows());
     let (values, slopes) = (gpu.empty(n), gpu.empty(n * 3));
     let g = gpu.upload(&gaussian().map(|v| v as f32));
-    if n > 0 {
-        // SAFETY: units past `n` stop; windows lie within the image.
-        unsafe {
-            judge::launch_unchecked(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                x.arg(),
-                y.arg(),
-                g.arg(),
-                values.arg(),
-                slopes.arg(),
-                n as u32,
-                w as u32,
-                c as u32,
-                C1 as f32,
-                C2 as f32,
-            );
-        }
-    }
-    (values, slopes, g)
+    launch!(
+        gpu,
+        judge,
+        n,
+        [p.x => len, p.y => len, g => WINDOW, values => n, slopes => n * 3],
+        n as u32,
+        w as u32,
+        c as u32,
+        C1 as f32,
+        C2 as f32,
+    );
+    (values, [slopes, g])
 }
 
 /// SSIM of every window and channel; the image's is their mean.
-pub fn forward(gpu: &Gpu, size: (usize, usize, usize), x: &Buffer, y: &Buffer) -> Buffer {
-    windows(gpu, size, x, y).0
+pub fn forward(gpu: &Gpu, p: Pair) -> Buffer {
+    windows(gpu, p).0
 }
 
 /// Gradient of the mean with respect to x, `[h, w, c]`.
-pub fn backward(gpu: &Gpu, size: (usize, usize, usize), x: &Buffer, y: &Buffer) -> Buffer {
-    let (_, slopes, g) = windows(gpu, size, x, y);
-    gathered(gpu, size, x, y, &slopes, &g)
+pub fn backward(gpu: &Gpu, p: Pair) -> Buffer {
+    gathered(gpu, p, &windows(gpu, p).1)
 }
 
 /// The image's SSIM `[1]`, and what [`mean_backward`] takes besides the images.
-pub fn mean(gpu: &Gpu, size: (usize, usize, usize), x: &Buffer, y: &Buffer) -> (Buffer, [Buffer; 2]) {
-    let (values, slopes, g) = windows(gpu, size, x, y);
+pub fn mean(gpu: &Gpu, p: Pair) -> (Buffer, Kept) {
+    let (values, kept) = windows(gpu, p);
     let sum = gpu.empty(1);
     linear::sum_rows_part(gpu, &Rows::all(gpu, values.len()), 1, &values, (&sum).into());
-    (times(gpu, &sum, &gpu.upload(&[1.0 / values.len() as f32])), [slopes, g])
+    (times(gpu, &sum, &gpu.upload(&[1.0 / values.len() as f32])), kept)
 }
 
 /// Gradient with respect to x, `[h, w, c]`, given that of [`mean`].
-pub fn mean_backward(gpu: &Gpu, size: (usize, usize, usize), x: &Buffer, y: &Buffer, kept: [&Buffer; 2], d_mean: &Buffer) -> Buffer {
-    times(gpu, &gathered(gpu, size, x, y, kept[0], kept[1]), d_mean)
+pub fn mean_backward(gpu: &Gpu, p: Pair, kept: &Kept, d_mean: &Buffer) -> Buffer {
+    times(gpu, &gathered(gpu, p, kept), d_mean)
 }
 
 /// The gradient from the windows' factors.
-fn gathered(gpu: &Gpu, (w, h, c): (usize, usize, usize), x: &Buffer, y: &Buffer, slopes: &Buffer, g: &Buffer) -> Buffer {
-    if slopes.is_empty() {
-        return gpu.zeros(x.len());
+fn gathered(gpu: &Gpu, p: Pair, [slopes, g]: &Kept) -> Buffer {
+    let ((w, h, c), n, windows) = (p.size, p.len(), p.windows());
+    if windows == 0 {
+        return gpu.zeros(n);
     }
-    let out = gpu.empty(x.len());
-    // SAFETY: units past the pixels stop; windows are clamped to those that exist.
-    unsafe {
-        gather::launch_unchecked(
-            &gpu.client,
-            units(x.len()),
-            CubeDim::new_1d(CUBE),
-            x.arg(),
-            y.arg(),
-            g.arg(),
-            slopes.arg(),
-            out.arg(),
-            x.len() as u32,
-            w as u32,
-            h as u32,
-            c as u32,
-            3.0 / slopes.len() as f32,
-        );
-    }
+    let out = gpu.empty(n);
+    launch!(
+        gpu,
+        gather,
+        n,
+        [p.x => n, p.y => n, g => WINDOW, slopes => windows * 3, out => n],
+        n as u32,
+        w as u32,
+        h as u32,
+        c as u32,
+        1.0 / windows as f32,
+    );
     out
 }
 
 /// `x · factor[0]`.
 fn times(gpu: &Gpu, x: &Buffer, factor: &Buffer) -> Buffer {
-    let out = gpu.empty(x.len());
-    // SAFETY: units past the length stop.
-    unsafe {
-        scale::launch_unchecked(&gpu.client, units(x.len()), CubeDim::new_1d(CUBE), x.arg(), factor.arg(), out.arg(), x.len() as u32);
-    }
+    let n = x.len();
+    let out = gpu.empty(n);
+    launch!(gpu, scale, n, [x => n, factor => 1, out => n], n as u32);
     out
 }
 

@@ -1,6 +1,8 @@
 //! Structural similarity (Wang et al. 2004): Gaussian window 11×11 with σ = 1.5, `C₁ = 0.01²`,
 //! `C₂ = 0.03²`, windows inside the image only, mean over positions and channels.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -1,38 +1,21 @@
 //! One unit per number of the input.
 
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, launch};
 use cubecl::prelude::*;
 
 /// `[N, dims]` to `[N, dims · bands]`.
 pub fn forward(gpu: &Gpu, bands: usize, x: &Buffer) -> Buffer {
-    let out = gpu.empty(x.len() * bands);
-    if !x.is_empty() {
-        // SAFETY: units past the length stop.
-        unsafe {
-            wave::launch_unchecked(&gpu.client, units(x.len()), CubeDim::new_1d(CUBE), x.arg(), out.arg(), x.len() as u32, bands as u32)
-        };
-    }
+    let n = x.len();
+    let out = gpu.empty(n * bands);
+    launch!(gpu, wave, n, [x => n, out => n * bands], n as u32, bands as u32);
     out
 }
 
 /// Gradient of x.
 pub fn backward(gpu: &Gpu, bands: usize, x: &Buffer, d_out: &Buffer) -> Buffer {
-    let out = gpu.empty(x.len());
-    if !x.is_empty() {
-        // SAFETY: units past the length stop.
-        unsafe {
-            slope::launch_unchecked(
-                &gpu.client,
-                units(x.len()),
-                CubeDim::new_1d(CUBE),
-                x.arg(),
-                d_out.arg(),
-                out.arg(),
-                x.len() as u32,
-                bands as u32,
-            );
-        }
-    }
+    let n = x.len();
+    let out = gpu.empty(n);
+    launch!(gpu, slope, n, [x => n, d_out => n * bands, out => n], n as u32, bands as u32);
     out
 }
 

@@ -1,6 +1,8 @@
 //! Triangle-wave encoding (tiny-cuda-nn): a continuous, piecewise linear wave in place of sines,
 //! `y_k = 2 |((2ᵏ x + ½) mod 2) − 1| − 1` for band `k` with the mathematical (non-negative) modulus.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -3,8 +3,7 @@ use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
 #[test]
 fn matches_the_reference_both_ways() {
-    for (n, dims, bands) in [(0, 3, 4), (1, 1, 1), (40, 3, 12)] {
-        let (x, d) = (random(n * dims, 1), random(n * dims * bands, 2));
+    for cases::Case { dims, bands, x, d } in cases::cases() {
         let mut out = vec![9.0; d.len()];
         cpu::forward(dims, bands, &x, &mut out);
         assert_close("forward", &out, &reference::forward(bands, &wide(&x)), 1e-5);

@@ -1,43 +1,34 @@
 //! One unit per sample and channel; the table's gradient is added atomically.
 
 use super::Corners;
-use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, Native, Swap, units};
+use crate::gpu::{Accumulate, Buffer, Gpu, launch};
 use cubecl::prelude::*;
 
 /// Which rows the samples mix, on the device.
 pub struct GpuCorners {
     /// `[voxels, 8]`
-    pub rows: Buffer,
+    pub rows: Buffer<u32>,
     /// `[S]`
-    pub voxel: Buffer,
+    pub voxel: Buffer<u32>,
 }
 
 impl GpuCorners {
     pub fn upload(gpu: &Gpu, k: &Corners) -> Self {
-        GpuCorners { rows: gpu.upload_u32(k.rows), voxel: gpu.upload_u32(k.voxel) }
+        GpuCorners { rows: gpu.upload(k.rows), voxel: gpu.upload(k.voxel) }
     }
 
     /// Features `[S, C]` at places `[S, 3]` in their voxels.
     pub fn forward(&self, gpu: &Gpu, local: &Buffer, table: &Buffer, c: usize) -> Buffer {
-        let n = self.voxel.len() * c;
-        let out = gpu.empty(n);
-        if n > 0 {
-            // SAFETY: units past `n` stop; rows index the table.
-            unsafe {
-                mix::launch_unchecked(
-                    &gpu.client,
-                    units(n),
-                    CubeDim::new_1d(CUBE),
-                    self.rows.arg(),
-                    self.voxel.arg(),
-                    local.arg(),
-                    table.arg(),
-                    out.arg(),
-                    n as u32,
-                    c as u32,
-                );
-            }
-        }
+        let s = self.voxel.len();
+        let out = gpu.empty(s * c);
+        launch!(
+            gpu,
+            mix,
+            s * c,
+            [self.rows => self.rows.len(), self.voxel => s, local => s * 3, table => table.len(), out => s * c],
+            (s * c) as u32,
+            c as u32,
+        );
         out
     }
 
@@ -45,38 +36,29 @@ impl GpuCorners {
     pub fn backward(&self, gpu: &Gpu, local: &Buffer, table: &Buffer, c: usize, d_out: &Buffer, d_table: &Buffer) -> Buffer {
         let s = self.voxel.len();
         let d_local = gpu.empty(s * 3);
-        if s * c == 0 {
-            return d_local;
-        }
-        let scatter = if gpu.native_atomics { unmix::launch_unchecked::<Native> } else { unmix::launch_unchecked::<Swap> };
-        // SAFETY: as in `forward`.
-        unsafe {
-            scatter(
-                &gpu.client,
-                units(s * c),
-                CubeDim::new_1d(CUBE),
-                self.rows.arg(),
-                self.voxel.arg(),
-                local.arg(),
-                d_out.arg(),
-                d_table.arg(),
-                (s * c) as u32,
-                c as u32,
-            );
-            slope::launch_unchecked(
-                &gpu.client,
-                units(s),
-                CubeDim::new_1d(CUBE),
-                self.rows.arg(),
-                self.voxel.arg(),
-                local.arg(),
-                table.arg(),
-                d_out.arg(),
-                d_local.arg(),
-                s as u32,
-                c as u32,
-            );
-        }
+        launch!(
+            gpu,
+            unmix::<Adder>,
+            s * c,
+            [self.rows => self.rows.len(), self.voxel => s, local => s * 3, d_out => s * c, d_table => table.len()],
+            (s * c) as u32,
+            c as u32,
+        );
+        launch!(
+            gpu,
+            slope,
+            s,
+            [
+                self.rows => self.rows.len(),
+                self.voxel => s,
+                local => s * 3,
+                table => table.len(),
+                d_out => s * c,
+                d_local => s * 3,
+            ],
+            s as u32,
+            c as u32,
+        );
         d_local
     }
 }

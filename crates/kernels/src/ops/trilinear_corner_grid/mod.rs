@@ -1,6 +1,8 @@
 //! Features at the corners of the occupied voxels of a sparse world (GANcraft, section 3.1): each voxel
 //! names eight rows of a feature table, and a point takes their trilinear mix.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;

@@ -10,16 +10,15 @@ fn voxels(s: usize) -> Vec<u32> {
 
 #[test]
 fn matches_the_reference_both_ways() {
-    for (s, c) in [(0, 3), (1, 1), (300, 24)] {
-        let voxel = voxels(s);
-        let k = Corners { rows: &ROWS, voxel: &voxel };
-        let (u, t, d) = (random_unit(s * 3, 1), random(12 * c, 2), random(s * c, 3));
-        let mut out = vec![9.0; s * c];
-        cpu::forward(&k, &u, &t, c, &mut out);
-        assert_close("forward", &out, &reference::forward(&k, &wide(&u), &wide(&t), c), 1e-5);
-        let (mut du, mut dt) = (vec![9.0; s * 3], vec![0.0; 12 * c]);
-        cpu::backward(&k, &u, &t, c, &d, &mut du, &mut dt);
-        let (ru, rt) = reference::backward(&k, &wide(&u), &wide(&t), c, &wide(&d));
+    for case in cases::cases() {
+        let (k, c) = (case.corners(), case.c);
+        let mut out = vec![9.0; case.d.len()];
+        cpu::forward(&k, &case.local, &case.table, c, &mut out);
+        let (u, t) = (wide(&case.local), wide(&case.table));
+        assert_close("forward", &out, &reference::forward(&k, &u, &t, c), 1e-5);
+        let (mut du, mut dt) = (vec![9.0; case.local.len()], vec![0.0; case.table.len()]);
+        cpu::backward(&k, &case.local, &case.table, c, &case.d, &mut du, &mut dt);
+        let (ru, rt) = reference::backward(&k, &u, &t, c, &wide(&case.d));
         assert_close("positions", &du, &ru, 1e-4);
         assert_close("table", &dt, &rt, 1e-4);
     }

@@ -7,15 +7,17 @@
 //! blocks of 16 rows, each layer to whole blocks of 16 columns. Gradients of the weights stay in registers while a
 //! cube goes from tile to tile, and are added up at the end.
 
-mod ahead;
-mod back;
+mod backward;
+mod forward;
 mod plan;
 
 use super::super::{Head, Mlp};
-use crate::device::Api;
-use crate::gpu::{Buffer, CUBE, Gpu, Rows, has_cuda_headers, units};
+use crate::api::Api;
+use crate::gpu::{Buffer, CUBE, Gpu, Rows, has_cuda_headers, launch};
+use backward::backward_tiles;
 use cubecl::ir::{ElemType, FloatKind};
 use cubecl::prelude::*;
+use forward::forward_tiles;
 use half::{bf16, f16};
 use plan::Plan;
 
@@ -52,10 +54,21 @@ pub struct Fused {
     pub element: Element,
     plan: Plan,
     /// For every number of the packed weights its parameter, and the other way round.
-    to_packed: Buffer,
-    from_packed: Buffer,
+    to_packed: Buffer<u32>,
+    from_packed: Buffer<u32>,
     /// Cubes on the way back.
     cubes: usize,
+}
+
+/// Calls a method that is generic over the element with that of a network.
+macro_rules! with_element {
+    ($self:ident.$method:ident($($argument:expr),*)) => {
+        match $self.element {
+            Element::F32 => $self.$method::<f32>($($argument),*),
+            Element::F16 => $self.$method::<f16>($($argument),*),
+            Element::Bf16 => $self.$method::<bf16>($($argument),*),
+        }
+    };
 }
 
 /// What the way back needs of the way forward.
@@ -122,7 +135,7 @@ impl Fused {
             }
         }
         let processors = hardware.num_streaming_multiprocessors.unwrap_or(PROCESSORS) as usize;
-        let (to_packed, from_packed) = (gpu.upload_u32(&to_packed), gpu.upload_u32(&from_packed));
+        let (to_packed, from_packed) = (gpu.upload(&to_packed), gpu.upload(&from_packed));
         Some(Fused { element, plan, to_packed, from_packed, cubes: 2 * processors })
     }
 
@@ -132,69 +145,72 @@ impl Fused {
     }
 
     /// The weights as the kernels want them.
-    fn pack(&self, gpu: &Gpu, params: &Buffer) -> Buffer {
+    fn pack<E: Float>(&self, gpu: &Gpu, params: &Buffer) -> Buffer {
         let n = self.to_packed.len();
-        let packed = self.memory(gpu, n);
-        let launch = match self.element {
-            Element::F32 => arrange::launch_unchecked::<f32>,
-            Element::F16 => arrange::launch_unchecked::<f16>,
-            Element::Bf16 => arrange::launch_unchecked::<bf16>,
-        };
-        let largest = f32::from_bits(self.plan.largest);
-        // SAFETY: units past the packed weights stop; the map names parameters.
-        unsafe {
-            launch(&gpu.client, units(n), CubeDim::new_1d(CUBE), params.arg(), self.to_packed.arg(), packed.arg_of(n), n as u32, largest);
-        }
-        packed
+        let out = self.memory(gpu, n);
+        let packed: Buffer<E> = out.cast();
+        launch!(
+            gpu,
+            arrange::<E>,
+            n,
+            [params => self.from_packed.len(), self.to_packed => n, packed => n],
+            n as u32,
+            f32::from_bits(self.plan.largest),
+        );
+        out
     }
 
     /// Heads of rows of inputs, and with `keep` what [`Fused::backward`] needs.
     pub fn forward(&self, gpu: &Gpu, params: &Buffer, inputs: &[&Buffer], rows: &Rows, keep: bool) -> Kept {
-        let packed = self.pack(gpu, params);
+        with_element!(self.forward_as(gpu, params, inputs, rows, keep))
+    }
+
+    fn forward_as<E: Float>(&self, gpu: &Gpu, params: &Buffer, inputs: &[&Buffer], rows: &Rows, keep: bool) -> Kept {
+        let packed = self.pack::<E>(gpu, params);
         let plan = Plan { keep, ..self.plan.clone() };
-        let kept_len = if keep { rows.most * plan.kept } else { 1 };
+        let kept_len = if keep { rows.most * plan.kept } else { 0 };
         let values = self.memory(gpu, kept_len);
         let heads: Vec<Buffer> = plan.heads.iter().map(|h| gpu.empty(rows.most * h.channels)).collect();
         let tiles = rows.most.div_ceil(plan.tile);
-        if tiles > 0 {
-            let count = CubeCount::Static(tiles.min(MAX_CUBES) as u32, tiles.div_ceil(MAX_CUBES) as u32, 1);
-            let launch = match self.element {
-                Element::F32 => ahead::ahead::launch_unchecked::<f32>,
-                Element::F16 => ahead::ahead::launch_unchecked::<f16>,
-                Element::Bf16 => ahead::ahead::launch_unchecked::<bf16>,
-            };
-            // Stands in for inputs and heads that the network lacks.
-            let none = gpu.empty(1);
-            let input = |i: usize| inputs.get(i).copied().unwrap_or(&none).arg();
-            let head = |i: usize| heads.get(i).unwrap_or(&none).arg();
-            let (live, at) = rows.arg();
-            // SAFETY: the kernel checks rows against those in use, and columns against the plan.
-            unsafe {
-                launch(
-                    &gpu.client,
-                    count,
-                    CubeDim::new_1d(CUBE),
-                    live,
-                    input(0),
-                    input(1),
-                    input(2),
-                    packed.arg_of(self.to_packed.len()),
-                    params.arg(),
-                    values.arg_of(kept_len),
-                    head(0),
-                    head(1),
-                    at,
-                    rows.most as u32,
-                    plan,
-                );
-            }
-        }
+        // Stands in for inputs and heads that the network lacks.
+        let none = gpu.empty(0);
+        let input = |i: usize| inputs.get(i).copied().unwrap_or(&none);
+        let head = |i: usize| heads.get(i).unwrap_or(&none);
+        let (weights, kept): (Buffer<E>, Buffer<E>) = (packed.cast(), values.cast());
+        launch!(
+            gpu,
+            forward_tiles::<E>,
+            ([tiles.min(MAX_CUBES), tiles.div_ceil(MAX_CUBES), 1], CubeDim::new_1d(CUBE)),
+            [
+                rows.live => rows.at + 1,
+                input(0) => self.input_len(rows, 0),
+                input(1) => self.input_len(rows, 1),
+                input(2) => self.input_len(rows, 2),
+                weights => self.to_packed.len(),
+                params => self.from_packed.len(),
+                kept => kept_len,
+                head(0) => self.head_len(rows, 0),
+                head(1) => self.head_len(rows, 1),
+            ],
+            rows.place(),
+            rows.most as u32,
+            plan,
+        );
         Kept { values, packed, heads }
+    }
+
+    /// Numbers of input `i`; 0 where there is none.
+    fn input_len(&self, rows: &Rows, i: usize) -> usize {
+        self.plan.inputs.get(i).map_or(0, |input| rows.most * input.width)
+    }
+
+    /// Numbers of head `i`; 0 where there is none.
+    fn head_len(&self, rows: &Rows, i: usize) -> usize {
+        self.plan.heads.get(i).map_or(0, |h| rows.most * h.channels)
     }
 
     /// Gradients of the parameters, and of the inputs where they are wanted, given those of the heads; in half
     /// precision they are carried times `scale`.
-    #[allow(clippy::too_many_arguments)]
     pub fn backward(
         &self,
         gpu: &Gpu,
@@ -202,69 +218,77 @@ impl Fused {
         inputs: &[&Buffer],
         kept: &Kept,
         rows: &Rows,
-        d_heads: &[&Buffer],
-        scale: f32,
+        (d_heads, scale): (&[&Buffer], f32),
     ) -> (Buffer, Vec<Option<Buffer>>) {
-        let plan = &self.plan;
-        let d_inputs: Vec<Option<Buffer>> = inputs.iter().zip(&plan.inputs).map(|(x, i)| i.wanted.then(|| gpu.empty(x.len()))).collect();
-        let cubes = self.cubes.min(rows.most.div_ceil(plan.tile)).max(1);
-        let parts = gpu.empty(cubes * plan.packed);
-        let launch = match self.element {
-            Element::F32 => back::back::launch_unchecked::<f32>,
-            Element::F16 => back::back::launch_unchecked::<f16>,
-            Element::Bf16 => back::back::launch_unchecked::<bf16>,
-        };
-        let none = gpu.empty(1);
-        let input = |i: usize| inputs.get(i).copied().unwrap_or(&none).arg();
-        let d_input = |i: usize| d_inputs.get(i).and_then(Option::as_ref).unwrap_or(&none).arg();
-        let head = |i: usize| kept.heads.get(i).unwrap_or(&none).arg();
-        let d_head = |i: usize| d_heads.get(i).copied().unwrap_or(&none).arg();
         let scale = if self.element == Element::F16 { scale } else { 1.0 };
-        let (live, at) = rows.arg();
-        // SAFETY: as in `forward`.
-        unsafe {
-            launch(
-                &gpu.client,
-                CubeCount::Static(cubes as u32, 1, 1),
-                CubeDim::new_1d(CUBE),
-                live,
-                input(0),
-                input(1),
-                input(2),
-                kept.packed.arg_of(self.to_packed.len()),
-                kept.values.arg_of(rows.most * plan.kept),
-                head(0),
-                head(1),
-                d_head(0),
-                d_head(1),
-                d_input(0),
-                d_input(1),
-                d_input(2),
-                parts.arg(),
-                at,
-                rows.most as u32,
-                scale,
-                plan.clone(),
-            );
-        }
-        let d_params = gpu.empty(params.len());
-        // SAFETY: units past the parameters stop; the map names packed weights.
-        unsafe {
-            add_up::launch_unchecked(
-                &gpu.client,
-                units(params.len()),
-                CubeDim::new_1d(CUBE),
-                parts.arg(),
-                self.from_packed.arg(),
-                d_params.arg(),
-                params.len() as u32,
-                cubes as u32,
-                plan.packed as u32,
-                1.0 / scale,
-            );
-        }
+        let d_inputs: Vec<Option<Buffer>> =
+            inputs.iter().zip(&self.plan.inputs).map(|(x, i)| i.wanted.then(|| gpu.empty(x.len()))).collect();
+        let cubes = self.cubes.min(rows.most.div_ceil(self.plan.tile)).max(1);
+        let parts = gpu.empty(cubes * self.plan.packed);
+        let of = Backward { inputs, kept, d_heads, d_inputs: &d_inputs, parts: &parts, cubes, scale };
+        with_element!(self.backward_as(gpu, rows, &of));
+        let n = params.len();
+        let d_params = gpu.empty(n);
+        launch!(
+            gpu,
+            add_up,
+            n,
+            [parts => cubes * self.plan.packed, self.from_packed => n, d_params => n],
+            n as u32,
+            cubes as u32,
+            self.plan.packed as u32,
+            1.0 / scale,
+        );
         (d_params, d_inputs)
     }
+
+    fn backward_as<E: Float>(&self, gpu: &Gpu, rows: &Rows, of: &Backward) {
+        let plan = &self.plan;
+        let none = gpu.empty(0);
+        let input = |i: usize| of.inputs.get(i).copied().unwrap_or(&none);
+        let d_input = |i: usize| of.d_inputs.get(i).and_then(Option::as_ref).unwrap_or(&none);
+        let head = |i: usize| of.kept.heads.get(i).unwrap_or(&none);
+        let d_head = |i: usize| of.d_heads.get(i).copied().unwrap_or(&none);
+        let d_len = |i: usize| if plan.inputs.get(i).is_some_and(|i| i.wanted) { self.input_len(rows, i) } else { 0 };
+        let (weights, kept): (Buffer<E>, Buffer<E>) = (of.kept.packed.cast(), of.kept.values.cast());
+        launch!(
+            gpu,
+            backward_tiles::<E>,
+            ([of.cubes, 1, 1], CubeDim::new_1d(CUBE)),
+            [
+                rows.live => rows.at + 1,
+                input(0) => self.input_len(rows, 0),
+                input(1) => self.input_len(rows, 1),
+                input(2) => self.input_len(rows, 2),
+                weights => self.to_packed.len(),
+                kept => rows.most * plan.kept,
+                head(0) => self.head_len(rows, 0),
+                head(1) => self.head_len(rows, 1),
+                d_head(0) => self.head_len(rows, 0),
+                d_head(1) => self.head_len(rows, 1),
+                d_input(0) => d_len(0),
+                d_input(1) => d_len(1),
+                d_input(2) => d_len(2),
+                of.parts => of.cubes * plan.packed,
+            ],
+            rows.place(),
+            rows.most as u32,
+            of.scale,
+            plan.clone(),
+        );
+    }
+}
+
+/// What a way back reads and writes.
+struct Backward<'a> {
+    inputs: &'a [&'a Buffer],
+    kept: &'a Kept,
+    d_heads: &'a [&'a Buffer],
+    d_inputs: &'a [Option<Buffer>],
+    /// Gradients of the packed weights, cube by cube.
+    parts: &'a Buffer,
+    cubes: usize,
+    scale: f32,
 }
 
 #[cube(launch_unchecked)]

@@ -4,7 +4,7 @@
 use super::super::OccupancyBits;
 use super::{GpuOccupancy, Space, put};
 use crate::gpu::random::{Wide, below, halves, key, product, sum, uniform, widened};
-use crate::gpu::{Buffer, CUBE, Gpu, GpuError, Rows, units};
+use crate::gpu::{Buffer, Gpu, GpuError, Rows, launch};
 use cubecl::prelude::*;
 use diorama_geom::rng::Rng;
 
@@ -21,9 +21,9 @@ pub struct GpuOccupancyGrid {
     /// Decayed maximum density per cell; negative: never occupied; the greatest number: not sampled yet.
     density: Buffer,
     /// Bits of the highest density met since the last update; they order as the densities do.
-    fresh: Buffer,
+    fresh: Buffer<u32>,
     /// Cells that are sampled.
-    live: Buffer,
+    live: Buffer<u32>,
     decay: f32,
     /// Density above which a cell of each cascade is occupied, unless the cascade's mean is lower.
     thresholds: Buffer,
@@ -36,8 +36,8 @@ impl GpuOccupancyGrid {
         GpuOccupancyGrid {
             bits: GpuOccupancy::upload(gpu, bits),
             density: gpu.upload(density),
-            fresh: gpu.upload(fresh),
-            live: gpu.upload_u32(live),
+            fresh: gpu.upload(fresh).cast(),
+            live: gpu.upload(live),
             decay,
             thresholds: gpu.upload(thresholds),
         }
@@ -48,129 +48,95 @@ impl GpuOccupancyGrid {
     /// # Errors
     /// When the device was lost.
     pub fn read(&self, gpu: &Gpu) -> Result<(Vec<f32>, Vec<f32>), GpuError> {
-        Ok((gpu.read(&self.density)?, gpu.read(&self.fresh)?))
+        Ok((gpu.read(&self.density)?, gpu.read(&self.fresh.cast())?))
     }
 
     /// Notes densities met in cells, but for negative ones; they count at the next update.
-    pub fn record(&self, gpu: &Gpu, rows: &Rows, cells: &Buffer, sigma: &Buffer) {
+    pub fn record(&self, gpu: &Gpu, rows: &Rows, cells: &Buffer<u32>, sigma: &Buffer) {
         self.note(gpu, rows, cells, sigma, 1);
     }
 
     /// [`GpuOccupancyGrid::record`] for blocks of `block³` cells that begin at the given ones.
-    fn note(&self, gpu: &Gpu, rows: &Rows, cells: &Buffer, sigma: &Buffer, block: usize) {
-        let n = rows.most * block.pow(3);
-        if n == 0 {
-            return;
-        }
-        let (live, at) = rows.arg();
-        // SAFETY: units past the rows stop; cells and their blocks lie in the grid.
-        unsafe {
-            highest::launch_unchecked(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                live,
-                cells.arg(),
-                sigma.arg(),
-                self.fresh.arg(),
-                at,
-                block as u32,
-                self.bits.resolution as u32,
-            );
-        }
+    fn note(&self, gpu: &Gpu, rows: &Rows, cells: &Buffer<u32>, sigma: &Buffer, block: usize) {
+        launch!(
+            gpu,
+            highest,
+            rows.most * block.pow(3),
+            [rows.live => rows.at + 1, cells => rows.most, sigma => rows.most, self.fresh => self.density.len()],
+            rows.place(),
+            block as u32,
+            self.bits.resolution as u32,
+        );
     }
 
     /// Random points `[count, 3]` of live cells in a field's coordinates, and the cells `[count]`; where blocks of
     /// `block³` cells share a point, the block's first cell.
-    pub fn probe(&self, gpu: &Gpu, rng: &Rng, counter: u64, count: usize, block: usize, space: Space) -> (Buffer, Buffer) {
+    pub fn probe(&self, gpu: &Gpu, rng: &Rng, counter: u64, count: usize, block: usize, space: Space) -> (Buffer, Buffer<u32>) {
         let (points, cells) = (gpu.empty(count * 3), gpu.empty(count));
         let ((key_high, key_low), (high, low)) = (key(rng), halves(counter.wrapping_mul(count as u64).wrapping_mul(4)));
         let (kind, width) = space.arg();
         if count > 0 && !self.live.is_empty() {
-            // SAFETY: units past `count` stop; draws stay below the number of live cells.
-            unsafe {
-                probe::launch_unchecked(
-                    &gpu.client,
-                    units(count),
-                    CubeDim::new_1d(CUBE),
-                    self.live.arg(),
-                    points.arg(),
-                    cells.arg(),
-                    count as u32,
-                    self.live.len() as u32,
-                    self.bits.resolution as u32,
-                    block as u32,
-                    key_high,
-                    key_low,
-                    high,
-                    low,
-                    width,
-                    kind,
-                );
-            }
+            launch!(
+                gpu,
+                probe,
+                count,
+                [self.live => self.live.len(), points => count * 3, cells => count],
+                count as u32,
+                self.live.len() as u32,
+                self.bits.resolution as u32,
+                block as u32,
+                key_high,
+                key_low,
+                high,
+                low,
+                width,
+                kind,
+            );
         }
         (points, cells)
     }
 
     /// Folds in the densities `[count]` of probed cells and all that was met, and decides anew about every cell.
-    pub fn update(&self, gpu: &Gpu, cells: &Buffer, sigma: &Buffer, block: usize) {
+    pub fn update(&self, gpu: &Gpu, cells: &Buffer<u32>, sigma: &Buffer, block: usize) {
         if self.live.is_empty() {
             return;
         }
         self.note(gpu, &Rows::all(gpu, cells.len()), cells, sigma, block);
         let (n, cascades, cells) = (self.bits.resolution, self.bits.cascades, self.density.len());
-        let (sums, counts, limits) = (gpu.empty(PARTS * cascades), gpu.empty(PARTS * cascades), gpu.empty(cascades));
-        let cube = CubeDim::new_1d(CUBE);
-        // SAFETY: units past the parts, words and blocks stop.
-        unsafe {
-            fold::launch_unchecked(
-                &gpu.client,
-                units(PARTS * cascades),
-                cube,
-                self.density.arg(),
-                self.fresh.arg(),
-                sums.arg(),
-                counts.arg(),
-                PARTS as u32,
-                (PARTS * cascades) as u32,
-                (cells / cascades) as u32,
-                self.decay,
-            );
-            decide::launch_unchecked(
-                &gpu.client,
-                CubeCount::Static(1, 1, 1),
-                CubeDim::new_1d(1),
-                sums.arg(),
-                counts.arg(),
-                self.thresholds.arg(),
-                limits.arg(),
-                PARTS as u32,
-                cascades as u32,
-            );
-            occupy::launch_unchecked(
-                &gpu.client,
-                units(cells / 32),
-                cube,
-                self.density.arg(),
-                limits.arg(),
-                self.bits.bits.arg(),
-                (cells / 32) as u32,
-                (cells / cascades / 32) as u32,
-            );
-            for c in 1..cascades {
-                pool::launch_unchecked(&gpu.client, units(n.pow(3) / 32), cube, self.bits.bits.arg(), c as u32, n as u32);
-            }
-            let blocks = self.bits.blocks.len();
-            summarise::launch_unchecked(
-                &gpu.client,
-                units(blocks),
-                cube,
-                self.bits.bits.arg(),
-                self.bits.blocks.arg(),
-                blocks as u32,
-                n as u32,
-            );
+        let parts = PARTS * cascades;
+        let (sums, counts, limits) = (gpu.empty(parts), gpu.empty(parts), gpu.empty(cascades));
+        launch!(
+            gpu,
+            fold,
+            parts,
+            [self.density => cells, self.fresh => cells, sums => parts, counts => parts],
+            PARTS as u32,
+            parts as u32,
+            (cells / cascades) as u32,
+            self.decay,
+        );
+        launch!(
+            gpu,
+            decide,
+            ([1; 3], CubeDim::new_1d(1)),
+            [sums => parts, counts => parts, self.thresholds => cascades, limits => cascades],
+            PARTS as u32,
+            cascades as u32,
+        );
+        let words = cells / 32;
+        launch!(
+            gpu,
+            occupy,
+            words,
+            [self.density => cells, limits => cascades, self.bits.bits => words],
+            words as u32,
+            (words / cascades) as u32,
+        );
+        for c in 1..cascades {
+            launch!(gpu, pool, n.pow(3) / 32, [self.bits.bits => words], c as u32, n as u32);
         }
+        let blocks = self.bits.blocks.len();
+        launch!(gpu, summarise, blocks, [self.bits.bits => words, self.bits.blocks => blocks], blocks as u32, n as u32);
     }
 }
 

@@ -2,7 +2,7 @@
 //! are mixed in, since rays come in no order.
 
 use super::{CELLS, Drawn, GpuPhotographs, PHOTOGRAPH};
-use crate::gpu::{Accumulate, Buffer, CUBE, Gpu, GpuError, Native, Swap, units};
+use crate::gpu::{Accumulate, Buffer, Gpu, GpuError, launch};
 use cubecl::prelude::*;
 
 /// Share of its old error that a cell keeps per ray.
@@ -43,33 +43,23 @@ impl GpuErrorMap {
 
     /// Mixes in the squared errors `[R]` of drawn rays.
     pub fn record(&self, gpu: &Gpu, photographs: &GpuPhotographs, drawn: &Drawn, errors: &Buffer) {
-        let launch = if gpu.native_atomics { note::launch_unchecked::<Native> } else { note::launch_unchecked::<Swap> };
-        let cube = CubeDim::new_1d(CUBE);
-        // SAFETY: units past the rays, then past the cells, stop; images are those of the map.
-        unsafe {
-            launch(
-                &gpu.client,
-                units(errors.len()),
-                cube,
-                photographs.sizes.arg(),
-                drawn.images.arg(),
-                drawn.pixels.arg(),
-                drawn.left_out.arg(),
-                errors.arg(),
-                self.gains.arg(),
-                self.hits.arg(),
-                errors.len() as u32,
-            );
-            settle::launch_unchecked(
-                &gpu.client,
-                units(self.errors.len()),
-                cube,
-                self.gains.arg(),
-                self.hits.arg(),
-                self.errors.arg(),
-                self.errors.len() as u32,
-            );
-        }
+        let (rays, cells) = (errors.len(), self.errors.len());
+        launch!(
+            gpu,
+            note::<Adder>,
+            rays,
+            [
+                photographs.sizes => self.images * PHOTOGRAPH,
+                drawn.images => rays,
+                drawn.pixels => rays * 2,
+                drawn.left_out => rays,
+                errors => rays,
+                self.gains => cells,
+                self.hits => cells,
+            ],
+            rays as u32,
+        );
+        launch!(gpu, settle, cells, [self.gains => cells, self.hits => cells, self.errors => cells], cells as u32);
     }
 
     /// Lets draws go by the present errors.
@@ -79,16 +69,10 @@ impl GpuErrorMap {
     }
 
     fn rebuild(&self, gpu: &Gpu) {
-        if self.images == 0 {
-            return;
-        }
-        let sums = gpu.empty(self.images);
-        let (count, cube) = (units(self.images), CubeDim::new_1d(CUBE));
-        // SAFETY: units past the images stop.
-        unsafe {
-            total::launch_unchecked(&gpu.client, count.clone(), cube, self.drawn.arg(), sums.arg(), self.images as u32);
-            cumulate::launch_unchecked(&gpu.client, count, cube, self.drawn.arg(), sums.arg(), self.cdf.arg(), self.images as u32);
-        }
+        let (images, cells) = (self.images, self.images * CELLS * CELLS);
+        let sums = gpu.empty(images);
+        launch!(gpu, total, images, [self.drawn => cells, sums => images], images as u32);
+        launch!(gpu, cumulate, images, [self.drawn => cells, sums => images, self.cdf => cells], images as u32);
     }
 
     /// Errors, and those that draws go by.

@@ -3,7 +3,7 @@
 
 use super::sample;
 use crate::gpu::random::{Wide, halves, key, sum, uniform, widened};
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::GpuPacked;
 use cubecl::prelude::*;
 use diorama_geom::rng::Rng;
@@ -23,78 +23,48 @@ pub fn stratified(gpu: &Gpu, near_far: &Buffer, n: usize, jitter: Jitter) -> Gpu
     let rays = near_far.len() / 2;
     let p = GpuPacked { offsets: gpu.empty(rays + 1), t: gpu.empty(rays * n), dt: gpu.empty(rays * n) };
     let [key_high, key_low, high, low] = numbers(jitter, n);
-    // SAFETY: units past the samples and the one after them stop.
-    unsafe {
-        spread::launch_unchecked(
-            &gpu.client,
-            units(rays * n + 1),
-            CubeDim::new_1d(CUBE),
-            near_far.arg(),
-            p.offsets.arg(),
-            p.t.arg(),
-            p.dt.arg(),
-            rays as u32,
-            n as u32,
-            key_high,
-            key_low,
-            high,
-            low,
-            jitter.is_some(),
-        );
-    }
+    launch!(
+        gpu,
+        spread,
+        rays * n + 1,
+        [near_far => rays * 2, p.offsets => rays + 1, p.t => rays * n, p.dt => rays * n],
+        rays as u32,
+        n as u32,
+        key_high,
+        key_low,
+        high,
+        low,
+        jitter.is_some(),
+    );
     p
 }
 
 /// Intervals whose edges are those of `n` coarse ones per ray and `m` more where `weights` `[R, n]` are high.
 pub fn refine(gpu: &Gpu, coarse: &GpuPacked, weights: &Buffer, n: usize, m: usize, jitter: Jitter) -> GpuPacked {
     let rays = coarse.rays();
-    let (edges, u) = (gpu.empty(rays * (n + 1)), gpu.empty(rays * m));
-    let p = GpuPacked { offsets: gpu.empty(rays + 1), t: gpu.empty(rays * (n + m)), dt: gpu.empty(rays * (n + m)) };
+    let (n_edges, n_fine, n_all) = (rays * (n + 1), rays * m, rays * (n + m));
+    let (edges, u) = (gpu.empty(n_edges), gpu.empty(n_fine));
+    let p = GpuPacked { offsets: gpu.empty(rays + 1), t: gpu.empty(n_all), dt: gpu.empty(n_all) };
     let [key_high, key_low, high, low] = numbers(jitter, m);
-    let cube = CubeDim::new_1d(CUBE);
-    // SAFETY: units past what they write stop.
-    unsafe {
-        bounds::launch_unchecked(
-            &gpu.client,
-            units(edges.len()),
-            cube,
-            coarse.t.arg(),
-            coarse.dt.arg(),
-            edges.arg(),
-            edges.len() as u32,
-            n as u32,
-        );
-        ladder::launch_unchecked(
-            &gpu.client,
-            units(u.len()),
-            cube,
-            u.arg(),
-            u.len() as u32,
-            m as u32,
-            key_high,
-            key_low,
-            high,
-            low,
-            jitter.is_some(),
-        );
-    }
+    launch!(
+        gpu,
+        bounds,
+        n_edges,
+        [coarse.t => rays * n, coarse.dt => rays * n, edges => n_edges],
+        n_edges as u32,
+        n as u32,
+    );
+    launch!(gpu, ladder, n_fine, [u => n_fine], n_fine as u32, m as u32, key_high, key_low, high, low, jitter.is_some());
     let fine = sample(gpu, n, &edges, weights, m, &u);
-    // SAFETY: units past the rays and the one after them stop.
-    unsafe {
-        merge::launch_unchecked(
-            &gpu.client,
-            units(rays + 1),
-            cube,
-            edges.arg(),
-            fine.arg(),
-            p.offsets.arg(),
-            p.t.arg(),
-            p.dt.arg(),
-            rays as u32,
-            n as u32,
-            m as u32,
-        );
-    }
+    launch!(
+        gpu,
+        merge,
+        rays + 1,
+        [edges => n_edges, fine => n_fine, p.offsets => rays + 1, p.t => n_all, p.dt => n_all],
+        rays as u32,
+        n as u32,
+        m as u32,
+    );
     p
 }
 

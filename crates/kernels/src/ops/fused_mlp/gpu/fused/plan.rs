@@ -1,6 +1,6 @@
 //! How the layers of a network lie in memory: packed weights, a tile's activations and gradients, what is kept.
 
-use super::BLOCK;
+use super::{BLOCK, PLANES};
 use crate::ops::fused_mlp::{Head, Mlp, Source};
 use crate::ops::linear::Activation;
 use crate::ops::linear::gpu::code;
@@ -29,6 +29,13 @@ pub(super) struct Feed {
     pub fresh: bool,
 }
 
+impl Feed {
+    /// Whether its gradient is added to that of later layers.
+    pub fn adds(&self) -> bool {
+        !self.fresh && matches!(self.source, Source::Layer(_))
+    }
+}
+
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub(super) struct PlannedLayer {
     pub feeds: Vec<Feed>,
@@ -48,6 +55,13 @@ pub(super) struct PlannedLayer {
     pub kept: Option<usize>,
     /// First column among a tile's gradients; none: only heads give it any.
     pub gradient: Option<usize>,
+}
+
+impl PlannedLayer {
+    /// Blocks of its weight.
+    fn blocks(&self) -> usize {
+        (self.rows / BLOCK) * (self.padded / BLOCK)
+    }
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
@@ -122,88 +136,91 @@ impl Columns {
     }
 }
 
-impl Plan {
-    /// Plans layers up to the last that a head needs; none where the network is too large, reads too much, is modulated, frozen in part
-    /// or has activations other than ReLU.
-    pub fn new(mlp: &Mlp, heads: &[(Head, usize)], per_level: usize, wanted: &[bool]) -> Option<Plan> {
-        let count = heads.iter().map(|(h, _)| h.layer + 1).max()?;
-        let n_inputs = mlp.input_widths.len();
-        if n_inputs > INPUTS || heads.len() > HEADS {
+/// Where the layers up to the last that a head needs lie on the way forward.
+struct Layout {
+    layers: Vec<PlannedLayer>,
+    inputs: Vec<PlannedInput>,
+    forward: Columns,
+    /// Numbers of all weights, and of what is kept per row.
+    weight: usize,
+    kept: usize,
+}
+
+impl Layout {
+    /// Adds layer `j`, of `count`; none where it is too large, reads too much, is modulated, frozen or has an activation other than ReLU.
+    fn add(&mut self, mlp: &Mlp, j: usize, count: usize) -> Option<()> {
+        let l = &mlp.layers[j];
+        let readers = |s: Source| (0..count).filter(|j| mlp.layers[*j].inputs.contains(&s)).collect::<Vec<_>>();
+        let mut loaded = Vec::new();
+        for s in &l.inputs {
+            if let Source::Input(i) = *s
+                && readers(*s)[0] == j
+                && !loaded.contains(&i)
+            {
+                self.inputs[i].column = self.forward.take(self.inputs[i].padded);
+                loaded.push(i);
+            }
+        }
+        let (mut feeds, mut at) = (Vec::new(), 0);
+        for s in &l.inputs {
+            let width = mlp.source_width(*s);
+            let column = match *s {
+                Source::Input(i) => self.inputs[i].column,
+                Source::Layer(i) => self.layers[i].column.expect("a layer that is read has a place"),
+            };
+            feeds.push(Feed { source: *s, width, padded: padded(width), at, column, gradient: None, fresh: true });
+            at += padded(width);
+        }
+        for f in &feeds {
+            if readers(f.source).last() == Some(&j) {
+                self.forward.free(f.column);
+            }
+        }
+        let read = !readers(Source::Layer(j)).is_empty();
+        let p = padded(l.width);
+        let column = read.then(|| self.forward.take(p));
+        let relu = l.activation == Activation::Relu;
+        if l.modulation.is_some() || l.frozen || !(relu || l.activation == Activation::None) {
             return None;
         }
-        let readers = |s: Source| (0..count).filter(|j| mlp.layers[*j].inputs.contains(&s)).collect::<Vec<_>>();
-        let mut inputs: Vec<PlannedInput> = (0..n_inputs)
-            .map(|i| {
-                let width = mlp.input_widths[i];
-                let per_level = if i == 0 { per_level } else { 0 };
-                PlannedInput { width, padded: padded(width), per_level, column: 0, wanted: wanted[i] }
-            })
-            .collect();
-        let mut layers: Vec<PlannedLayer> = Vec::new();
-        let (mut forward, mut weight, mut kept) = (Columns::default(), 0, 0);
-        for (j, l) in mlp.layers[..count].iter().enumerate() {
-            let mut loaded = Vec::new();
-            for s in &l.inputs {
-                if let Source::Input(i) = *s
-                    && readers(*s)[0] == j
-                    && !loaded.contains(&i)
-                {
-                    inputs[i].column = forward.take(inputs[i].padded);
-                    loaded.push(i);
-                }
-            }
-            let (mut feeds, mut at) = (Vec::new(), 0);
-            for s in &l.inputs {
-                let width = mlp.source_width(*s);
-                let column = match *s {
-                    Source::Input(i) => inputs[i].column,
-                    Source::Layer(i) => layers[i].column.expect("a layer that is read has a place"),
-                };
-                feeds.push(Feed { source: *s, width, padded: padded(width), at, column, gradient: None, fresh: true });
-                at += padded(width);
-            }
-            for f in &feeds {
-                if readers(f.source).last() == Some(&j) {
-                    forward.free(f.column);
-                }
-            }
-            let read = !readers(Source::Layer(j)).is_empty();
-            let p = padded(l.width);
-            let column = read.then(|| forward.take(p));
-            let relu = l.activation == Activation::Relu;
-            if l.modulation.is_some() || l.frozen || !(relu || l.activation == Activation::None) {
-                return None;
-            }
-            let keeps = read || relu;
-            let place = keeps.then_some(kept);
-            kept += if keeps { p } else { 0 };
-            if at > MOST_WIDTH || p > MOST_WIDTH || l.inputs.iter().enumerate().any(|(i, s)| l.inputs[..i].contains(s)) {
-                return None;
-            }
-            layers.push(PlannedLayer {
-                feeds,
-                inputs: loaded,
-                width: l.width,
-                padded: p,
-                rows: at,
-                relu,
-                weight,
-                bias: l.bias.then_some((mlp.offsets[j] + mlp.fan_in(j) * l.width, 0)),
-                column,
-                kept: place,
-                gradient: None,
-            });
-            weight += at * p;
+        if at > MOST_WIDTH || p > MOST_WIDTH || l.inputs.iter().enumerate().any(|(i, s)| l.inputs[..i].contains(s)) {
+            return None;
         }
-        for l in &mut layers {
+        let keeps = read || relu;
+        self.layers.push(PlannedLayer {
+            feeds,
+            inputs: loaded,
+            width: l.width,
+            padded: p,
+            rows: at,
+            relu,
+            weight: self.weight,
+            bias: l.bias.then_some((mlp.offsets[j] + mlp.fan_in(j) * l.width, 0)),
+            column,
+            kept: keeps.then_some(self.kept),
+            gradient: None,
+        });
+        self.kept += if keeps { p } else { 0 };
+        self.weight += at * p;
+        Some(())
+    }
+
+    /// Gives biases their places behind the weights.
+    fn place_biases(&mut self) {
+        for l in &mut self.layers {
             if let Some((_, at)) = &mut l.bias {
-                *at = weight;
-                weight += l.padded;
+                *at = self.weight;
+                self.weight += l.padded;
             }
         }
+    }
+
+    /// Gives gradients their columns on the way back, and returns how many columns those take.
+    fn place_gradients(&mut self) -> usize {
         let mut back = Columns::default();
-        let mut seen = vec![false; n_inputs];
-        for j in (0..count).rev() {
+        let mut seen = vec![false; self.inputs.len()];
+        let layers = &mut self.layers;
+        for j in (0..layers.len()).rev() {
             // Its gradient is used up before those of what it read are formed.
             if let Some(at) = layers[j].gradient {
                 back.free(at);
@@ -212,7 +229,7 @@ impl Plan {
             for e in 0..layers[j].feeds.len() {
                 let (source, width) = (layers[j].feeds[e].source, layers[j].feeds[e].padded);
                 let (place, fresh) = match source {
-                    Source::Input(i) if !wanted[i] => (None, true),
+                    Source::Input(i) if !self.inputs[i].wanted => (None, true),
                     Source::Input(i) => {
                         let at = back.take(width);
                         passing.push(at);
@@ -228,6 +245,31 @@ impl Plan {
             }
             passing.into_iter().for_each(|at| back.free(at));
         }
+        back.most
+    }
+}
+
+impl Plan {
+    /// Plans layers up to the last that a head needs; none where the network is too large, reads too much, is modulated, frozen in part
+    /// or has activations other than ReLU.
+    pub fn new(mlp: &Mlp, heads: &[(Head, usize)], per_level: usize, wanted: &[bool]) -> Option<Plan> {
+        let count = heads.iter().map(|(h, _)| h.layer + 1).max()?;
+        let n_inputs = mlp.input_widths.len();
+        if n_inputs > INPUTS || heads.len() > HEADS {
+            return None;
+        }
+        let input = |i: usize| {
+            let width = mlp.input_widths[i];
+            let per_level = if i == 0 { per_level } else { 0 };
+            PlannedInput { width, padded: padded(width), per_level, column: 0, wanted: wanted[i] }
+        };
+        let inputs = (0..n_inputs).map(input).collect();
+        let mut layout = Layout { layers: Vec::new(), inputs, forward: Columns::default(), weight: 0, kept: 0 };
+        for j in 0..count {
+            layout.add(mlp, j, count)?;
+        }
+        layout.place_biases();
+        let gradients = layout.place_gradients();
         let heads = heads.iter().map(|(h, channels)| PlannedHead {
             layer: h.layer,
             channel: h.channel,
@@ -235,9 +277,9 @@ impl Plan {
             activation: code(h.activation),
             shift: h.shift.to_bits(),
         });
+        let Layout { layers, inputs, forward, weight, kept } = layout;
         let widest = |f: &dyn Fn(&PlannedLayer) -> usize| layers.iter().map(f).max().unwrap_or(0);
         let (stage, x, g) = (widest(&|l| l.padded) + PAD, widest(&|l| l.rows) + PAD, widest(&|l| l.padded) + PAD);
-        let heads = heads.collect();
         Some(Plan {
             tile: 0,
             tensor: false,
@@ -247,22 +289,37 @@ impl Plan {
             kept: kept.max(1),
             x,
             g,
-            gradients: back.most.max(BLOCK) + PAD,
+            gradients: gradients.max(BLOCK) + PAD,
             packed: weight,
             keep: true,
+            heads: heads.collect(),
             layers,
             inputs,
-            heads,
         })
     }
 
     /// Results of a unit that wait for the last tile.
     pub fn sums(&self) -> usize {
-        self.layers.iter().map(|l| (l.rows / BLOCK) * (l.padded / BLOCK)).sum()
+        self.sums_before(self.layers.len())
     }
 
     pub fn biases(&self) -> usize {
-        self.layers.iter().filter(|l| l.bias.is_some()).count()
+        self.biases_before(self.layers.len())
+    }
+
+    /// [`Plan::sums`] of the layers before `j`.
+    pub fn sums_before(&self, j: usize) -> usize {
+        self.layers[..j].iter().map(PlannedLayer::blocks).sum()
+    }
+
+    /// Blocks of each plane for the weights of the layers before `j`.
+    pub fn blocks_before(&self, j: usize) -> usize {
+        self.layers[..j].iter().map(|l| l.blocks().div_ceil(PLANES)).sum()
+    }
+
+    /// Biases of the layers before `j`.
+    pub fn biases_before(&self, j: usize) -> usize {
+        self.layers[..j].iter().filter(|l| l.bias.is_some()).count()
     }
 
     /// Shared memory of either kernel, the larger.

@@ -128,10 +128,102 @@ fn finish<E: Float>(
     }
 }
 
+/// Brings the inputs that layer `j` reads first to shared memory.
+#[cube]
+fn load_inputs<E: Float>(
+    x0: &[f32],
+    x1: &[f32],
+    x2: &[f32],
+    acts: &mut Shared<[E]>,
+    first: usize,
+    rows: usize,
+    most: u32,
+    #[comptime] plan: Plan,
+    #[comptime] j: usize,
+) {
+    let (tile, stride) = comptime!((plan.tile, plan.stride));
+    let largest = comptime!(f32::from_bits(plan.largest));
+    #[unroll]
+    for l in 0..comptime!(plan.layers[j].inputs.len()) {
+        let i = comptime!(plan.layers[j].inputs[l]);
+        let input = comptime!(plan.inputs[i].clone());
+        let column = comptime!(input.column);
+        if comptime!(i == 0) {
+            load::<E>(x0, acts, first, rows, most, largest, input, tile, stride, column);
+        } else if comptime!(i == 1) {
+            load::<E>(x1, acts, first, rows, most, largest, input, tile, stride, column);
+        } else {
+            load::<E>(x2, acts, first, rows, most, largest, input, tile, stride, column);
+        }
+    }
+}
+
+/// The sums of layer `j` on tensor cores, block by block, to `stage`.
+#[cube]
+fn multiply_blocks<E: Float>(packed: &[E], acts: &Shared<[E]>, stage: &mut Shared<[f32]>, #[comptime] plan: Plan, #[comptime] j: usize) {
+    let layer = comptime!(plan.layers[j].clone());
+    let (tile, stride, n) = comptime!((plan.tile, plan.stride, layer.padded));
+    let across = comptime!(n / BLOCK);
+    let mut block = UNIT_POS as usize / 32;
+    while block < comptime!(tile / BLOCK * (n / BLOCK)) {
+        let r = block / across * BLOCK;
+        let c = block % across * BLOCK;
+        let sum = no_sum();
+        #[unroll]
+        for s in 0..comptime!(layer.feeds.len()) {
+            let feed = comptime!(layer.feeds[s].clone());
+            #[unroll]
+            for k in 0..comptime!(feed.padded / BLOCK) {
+                let from = r * stride + comptime!(feed.column + k * BLOCK);
+                let a =
+                    factor::<E>(&acts[from..comptime!(tile * stride)], stride as u32, cmma::MatrixIdent::A, cmma::MatrixLayout::RowMajor);
+                let weight = comptime!(layer.weight + (feed.at + k * BLOCK) * n) + c;
+                let b = factor::<E>(&packed[weight..comptime!(plan.packed)], n as u32, cmma::MatrixIdent::B, cmma::MatrixLayout::RowMajor);
+                cmma::execute(&a, &b, &sum, &sum);
+            }
+        }
+        let to = r * comptime!(plan.stage) + c;
+        cmma::store(&mut stage[to..comptime!(tile * plan.stage)], &sum, comptime!(plan.stage as u32), cmma::MatrixLayout::RowMajor);
+        block += PLANES;
+    }
+}
+
+/// The sums of layer `j`, some of each unit's own.
+#[cube]
+fn multiply_units<E: Float>(packed: &[E], acts: &Shared<[E]>, sums: &mut Array<f32>, #[comptime] plan: Plan, #[comptime] j: usize) {
+    let layer = comptime!(plan.layers[j].clone());
+    let (stride, n) = comptime!((plan.stride, layer.padded));
+    let mr = comptime!(plan.tile / BLOCK);
+    let nr = comptime!(n / BLOCK);
+    let tx = UNIT_POS as usize % BLOCK;
+    let ty = UNIT_POS as usize / BLOCK;
+    let mut left = Array::<f32>::new(mr);
+    let mut right = Array::<f32>::new(nr);
+    #[unroll]
+    for e in 0..comptime!(mr * nr) {
+        sums[e] = 0.0;
+    }
+    #[unroll]
+    for s in 0..comptime!(layer.feeds.len()) {
+        let feed = comptime!(layer.feeds[s].clone());
+        for k in 0..comptime!(feed.padded) {
+            #[unroll]
+            for i in 0..mr {
+                left[i] = f32::cast_from(acts[(ty + i * BLOCK) * stride + comptime!(feed.column) + k]);
+            }
+            #[unroll]
+            for i in 0..nr {
+                right[i] = f32::cast_from(packed[comptime!(layer.weight) + (comptime!(feed.at) + k) * n + tx + i * BLOCK]);
+            }
+            add_outer(sums, &left, &right, mr, nr);
+        }
+    }
+}
+
 /// A tile of rows through all layers.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
-pub(super) fn ahead<E: Float>(
+pub(super) fn forward_tiles<E: Float>(
     live: &[u32],
     x0: &[f32],
     x1: &[f32],
@@ -147,66 +239,20 @@ pub(super) fn ahead<E: Float>(
 ) {
     let rows = live[at as usize] as usize;
     let tile = comptime!(plan.tile);
-    let stride = comptime!(plan.stride);
     let first = (CUBE_POS_X as usize + CUBE_POS_Y as usize * MAX_CUBES) * tile;
     if first >= rows {
         terminate!();
     }
-    let largest = comptime!(f32::from_bits(plan.largest));
     let unit = UNIT_POS as usize;
-    let mut acts = Shared::<[E]>::new_aligned_slice(comptime!(tile * stride), 32usize);
+    let mut acts = Shared::<[E]>::new_aligned_slice(comptime!(tile * plan.stride), 32usize);
     let mut stage = Shared::<[f32]>::new_aligned_slice(comptime!(if plan.tensor { tile * plan.stage } else { 1 }), 32usize);
     #[unroll]
     for j in 0..comptime!(plan.layers.len()) {
-        let layer = comptime!(plan.layers[j].clone());
-        #[unroll]
-        for l in 0..comptime!(layer.inputs.len()) {
-            let i = comptime!(layer.inputs[l]);
-            let input = comptime!(plan.inputs[i].clone());
-            let column = comptime!(input.column);
-            if comptime!(i == 0) {
-                load::<E>(x0, &mut acts, first, rows, most, largest, input, tile, stride, column);
-            } else if comptime!(i == 1) {
-                load::<E>(x1, &mut acts, first, rows, most, largest, input, tile, stride, column);
-            } else {
-                load::<E>(x2, &mut acts, first, rows, most, largest, input, tile, stride, column);
-            }
-        }
+        load_inputs::<E>(x0, x1, x2, &mut acts, first, rows, most, comptime!(plan.clone()), j);
         sync_cube();
-        let n = comptime!(layer.padded);
+        let n = comptime!(plan.layers[j].padded);
         if comptime!(plan.tensor) {
-            let across = comptime!(n / BLOCK);
-            let mut block = unit / 32;
-            while block < comptime!(tile / BLOCK * (n / BLOCK)) {
-                let r = block / across * BLOCK;
-                let c = block % across * BLOCK;
-                let sum = no_sum();
-                #[unroll]
-                for s in 0..comptime!(layer.feeds.len()) {
-                    let feed = comptime!(layer.feeds[s].clone());
-                    #[unroll]
-                    for k in 0..comptime!(feed.padded / BLOCK) {
-                        let from = r * stride + comptime!(feed.column + k * BLOCK);
-                        let a = factor::<E>(
-                            &acts[from..comptime!(tile * stride)],
-                            stride as u32,
-                            cmma::MatrixIdent::A,
-                            cmma::MatrixLayout::RowMajor,
-                        );
-                        let weight = comptime!(layer.weight + (feed.at + k * BLOCK) * n) + c;
-                        let b = factor::<E>(
-                            &packed[weight..comptime!(plan.packed)],
-                            n as u32,
-                            cmma::MatrixIdent::B,
-                            cmma::MatrixLayout::RowMajor,
-                        );
-                        cmma::execute(&a, &b, &sum, &sum);
-                    }
-                }
-                let to = r * comptime!(plan.stage) + c;
-                cmma::store(&mut stage[to..comptime!(tile * plan.stage)], &sum, comptime!(plan.stage as u32), cmma::MatrixLayout::RowMajor);
-                block += PLANES;
-            }
+            multiply_blocks::<E>(packed, &acts, &mut stage, comptime!(plan.clone()), j);
             sync_cube();
             let mut e = unit;
             while e < comptime!(tile * n) {
@@ -219,36 +265,14 @@ pub(super) fn ahead<E: Float>(
         } else {
             let mr = comptime!(tile / BLOCK);
             let nr = comptime!(n / BLOCK);
-            let tx = unit % BLOCK;
-            let ty = unit / BLOCK;
             let mut sums = Array::<f32>::new(comptime!(mr * nr));
-            let mut left = Array::<f32>::new(mr);
-            let mut right = Array::<f32>::new(nr);
-            #[unroll]
-            for e in 0..comptime!(mr * nr) {
-                sums[e] = 0.0;
-            }
-            #[unroll]
-            for s in 0..comptime!(layer.feeds.len()) {
-                let feed = comptime!(layer.feeds[s].clone());
-                for k in 0..comptime!(feed.padded) {
-                    #[unroll]
-                    for i in 0..mr {
-                        left[i] = f32::cast_from(acts[(ty + i * BLOCK) * stride + comptime!(feed.column) + k]);
-                    }
-                    #[unroll]
-                    for i in 0..nr {
-                        right[i] = f32::cast_from(packed[comptime!(layer.weight) + (comptime!(feed.at) + k) * n + tx + i * BLOCK]);
-                    }
-                    add_outer(&mut sums, &left, &right, mr, nr);
-                }
-            }
+            multiply_units::<E>(packed, &acts, &mut sums, comptime!(plan.clone()), j);
             sync_cube();
             #[unroll]
             for a in 0..mr {
                 #[unroll]
                 for b in 0..nr {
-                    let (r, c) = (ty + a * BLOCK, tx + b * BLOCK);
+                    let (r, c) = (unit / BLOCK + a * BLOCK, unit % BLOCK + b * BLOCK);
                     finish::<E>(sums[a * nr + b], r, c, first, rows, params, &mut acts, kept, h0, h1, comptime!(plan.clone()), j);
                 }
             }

@@ -1,23 +1,11 @@
-//! Leaving out samples that cannot matter, before the costly part of a step: those behind opaque matter and
-//! those that hold next to nothing.
+//! One unit per ray: first to decide which samples stay, then, with their places known, to bring them together.
 
-use super::bounded;
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use super::Pruning;
+use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::GpuPacked;
+use crate::ops::march::gpu::bounded;
 use crate::ops::scan;
 use cubecl::prelude::*;
-
-/// Which samples are left out.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Limits {
-    /// Share of light behind which nothing counts.
-    pub stop: f32,
-    /// Opacity below which a sample is left out, unless it is denser than `thin`.
-    pub min_alpha: f32,
-    pub thin: f32,
-    /// Weight in the pixel below which a sample is left out.
-    pub min_weight: f32,
-}
 
 /// The samples that stay.
 pub struct Pruned {
@@ -25,59 +13,47 @@ pub struct Pruned {
     /// Share of light that passes all samples, left out or not, `[R]`.
     pub light: Buffer,
     /// Where each lay before.
-    source: Buffer,
+    source: Buffer<u32>,
 }
 
-/// Keeps what [`Limits`] leave of samples with densities `[S]`, as many as `capacity` holds; rays that lose others
+/// Keeps what [`Pruning`] leaves of samples with densities `[S]`, as many as `capacity` holds; rays that lose others
 /// for want of room are marked in `cut`. Densities that no light reaches become −1.
-pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: Limits, cut: &Buffer, capacity: usize) -> Pruned {
-    let n = p.rays();
+pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: &Pruning, cut: &Buffer<u32>, capacity: usize) -> Pruned {
+    let (n, s) = (p.rays(), p.t.len());
     let counts = gpu.empty(n);
-    let (kept, light) = (gpu.empty(p.t.len()), gpu.empty(n));
-    if n > 0 {
-        // SAFETY: units past the rays stop; offsets bound the samples.
-        unsafe {
-            keep::launch_unchecked(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                p.offsets.arg(),
-                p.dt.arg(),
-                sigma.arg(),
-                kept.arg(),
-                counts.arg(),
-                light.arg(),
-                n as u32,
-                limits.stop,
-                limits.min_alpha,
-                // Times a length, this stays a number.
-                limits.thin.min(1e30),
-                limits.min_weight,
-            );
-        }
-    }
+    let (kept, light) = (gpu.empty(s), gpu.empty(n));
+    // Times a length, this stays a number.
+    let thin = limits.thin.min(1e30);
+    launch!(
+        gpu,
+        keep,
+        n,
+        [p.offsets => n + 1, p.dt => s, sigma => s, kept => s, counts => n, light => n],
+        n as u32,
+        limits.stop,
+        limits.min_alpha,
+        thin,
+        limits.min_weight,
+    );
     let whole = scan::gpu::exclusive(gpu, &counts);
     let offsets = bounded(gpu, &whole, cut, capacity);
     let (t, dt, source) = (gpu.empty(capacity), gpu.empty(capacity), gpu.empty(capacity));
-    if n > 0 {
-        // SAFETY: units past the rays stop; samples beyond the capacity are not written.
-        unsafe {
-            compact::launch_unchecked(
-                &gpu.client,
-                units(n),
-                CubeDim::new_1d(CUBE),
-                p.offsets.arg(),
-                p.t.arg(),
-                p.dt.arg(),
-                kept.arg(),
-                offsets.arg(),
-                t.arg(),
-                dt.arg(),
-                source.arg(),
-                n as u32,
-            );
-        }
-    }
+    launch!(
+        gpu,
+        compact,
+        n,
+        [
+            p.offsets => n + 1,
+            p.t => s,
+            p.dt => s,
+            kept => s,
+            offsets => n + 1,
+            t => capacity,
+            dt => capacity,
+            source => capacity,
+        ],
+        n as u32,
+    );
     Pruned { packed: GpuPacked { offsets, t, dt }, light, source }
 }
 
@@ -93,28 +69,20 @@ impl Pruned {
     }
 
     fn taken(&self, gpu: &Gpu, all: &Buffer, width: usize, per_level: usize) -> Buffer {
-        let rows = self.packed.rows();
-        let out = gpu.empty(rows.most * width);
-        if !out.is_empty() {
-            let (live, at) = rows.arg();
-            // SAFETY: units past the rows stop; sources name samples.
-            unsafe {
-                fetch::launch_unchecked(
-                    &gpu.client,
-                    units(out.len()),
-                    CubeDim::new_1d(CUBE),
-                    live,
-                    self.source.arg(),
-                    all.arg(),
-                    out.arg(),
-                    at,
-                    (all.len() / width) as u32,
-                    rows.most as u32,
-                    width as u32,
-                    per_level as u32,
-                );
-            }
-        }
+        let (rows, samples) = (self.packed.rows(), all.len() / width);
+        let n = rows.most * width;
+        let out = gpu.empty(n);
+        launch!(
+            gpu,
+            fetch,
+            n,
+            [rows.live => rows.at + 1, self.source => rows.most, all => samples * width, out => n],
+            rows.place(),
+            samples as u32,
+            rows.most as u32,
+            width as u32,
+            per_level as u32,
+        );
         out
     }
 }

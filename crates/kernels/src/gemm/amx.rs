@@ -4,7 +4,7 @@
 //! rows, B's lines hold pairs of rows interleaved. Operands are rounded to bf16 (nearest even) while they
 //! are packed into tiles; sums run over `k` in a fixed order.
 
-use crate::gemm::{Gemm, Init, View};
+use super::{Gemm, Init, View};
 use std::arch::asm;
 use std::arch::x86_64::*;
 use std::cell::RefCell;

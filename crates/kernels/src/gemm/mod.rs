@@ -1,5 +1,8 @@
 //! Small matrix products on blocks that stay in cache: `C = act(init + A·B)`.
 
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod amx;
+
 use crate::simd::{self, Lane, Level, Plain};
 use std::cell::RefCell;
 
@@ -15,7 +18,7 @@ pub enum Precision {
 /// Whether [`Precision::Bf16`] differs from f32 on this machine.
 pub fn has_bf16() -> bool {
     #[cfg(target_arch = "x86_64")]
-    return simd::level() == Level::Avx512 && crate::amx::is_available();
+    return simd::level() == Level::Avx512 && amx::is_available();
     #[cfg(not(target_arch = "x86_64"))]
     return false;
 }
@@ -59,28 +62,31 @@ impl<'a> View<'a> {
     }
 }
 
-/// `c[i, j] = act(init + Σ_p a[i, p] b[p, j])`, with `act` ReLU or nothing.
+/// A product `act(init + A B)`, with `act` ReLU or nothing.
 ///
 /// # Shapes
-/// a: `[m, k]` any strides; b: `[k, n]` row-major, rows `ldb` apart; c: `[m, n]`, rows `ldc` apart.
+/// a: `[m, k]` any strides; b: `[k, n]` row-major, rows `ldb` apart; the result: `[m, n]`, rows `ldc` apart.
+#[derive(Clone, Copy)]
+pub struct Gemm<'a> {
+    pub m: usize,
+    pub n: usize,
+    pub k: usize,
+    pub a: View<'a>,
+    pub b: &'a [f32],
+    pub ldb: usize,
+    pub ldc: usize,
+    pub init: Init<'a>,
+    pub relu: bool,
+}
+
+/// `c[i, j] = act(init + Σ_p a[i, p] b[p, j])`.
+///
 /// Sums run over `p` in a fixed order, so results do not depend on the thread count.
 ///
 /// # Panics
 /// When a slice is too short for its shape.
-#[allow(clippy::too_many_arguments)]
-pub fn gemm(
-    precision: Precision,
-    m: usize,
-    n: usize,
-    k: usize,
-    a: View,
-    b: &[f32],
-    ldb: usize,
-    c: &mut [f32],
-    ldc: usize,
-    init: Init,
-    relu: bool,
-) {
+pub fn gemm(precision: Precision, g: Gemm, c: &mut [f32]) {
+    let Gemm { m, n, k, a, b, ldb, ldc, init, .. } = g;
     if m == 0 || n == 0 {
         return;
     }
@@ -90,11 +96,10 @@ pub fn gemm(
     if let Init::Bias(bias) = init {
         assert!(bias.len() >= n, "gemm: bias is too short");
     }
-    let g = Gemm { m, n, k, a, b, ldb, ldc, init, relu };
     #[cfg(target_arch = "x86_64")]
     if precision == Precision::Bf16 && has_bf16() {
         // SAFETY: bounds were asserted above; the CPU and the system allow tiles.
-        return unsafe { crate::amx::run(&g, c) };
+        return unsafe { amx::run(&g, c) };
     }
     let _ = precision;
     // SAFETY: bounds were asserted above; `level()` only names sets that this CPU has.
@@ -109,20 +114,6 @@ pub fn gemm(
             _ => g.run::<Plain, 4, 2>(c),
         }
     }
-}
-
-/// A product whose shapes were checked.
-#[derive(Clone, Copy)]
-pub(crate) struct Gemm<'a> {
-    pub m: usize,
-    pub n: usize,
-    pub k: usize,
-    pub a: View<'a>,
-    pub b: &'a [f32],
-    pub ldb: usize,
-    pub ldc: usize,
-    pub init: Init<'a>,
-    pub relu: bool,
 }
 
 impl Gemm<'_> {
@@ -338,10 +329,14 @@ mod tests {
                     })
                     .collect();
                 let mut c = vec![9.0; m * n];
-                gemm(Precision::F32, m, n, k, View::rows(&a, k), &b, n, &mut c, n, Init::Bias(&bias), relu);
+                gemm(Precision::F32, Gemm { m, n, k, a: View::rows(&a, k), b: &b, ldb: n, ldc: n, init: Init::Bias(&bias), relu }, &mut c);
                 assert_close("rows", &c, &want, 1e-5);
                 let mut c: Vec<f32> = (0..m * n).map(|e| bias[e % n]).collect();
-                gemm(Precision::F32, m, n, k, View::transposed(&at, m), &b, n, &mut c, n, Init::Accumulate, relu);
+                gemm(
+                    Precision::F32,
+                    Gemm { m, n, k, a: View::transposed(&at, m), b: &b, ldb: n, ldc: n, init: Init::Accumulate, relu },
+                    &mut c,
+                );
                 assert_close("transposed", &c, &want, 1e-5);
             }
         }
@@ -374,10 +369,14 @@ mod tests {
                     })
                     .collect();
                 let mut c = vec![9.0; m * n];
-                gemm(Precision::Bf16, m, n, k, View::rows(&a, k), &b, n, &mut c, n, Init::Bias(&bias), relu);
+                gemm(Precision::Bf16, Gemm { m, n, k, a: View::rows(&a, k), b: &b, ldb: n, ldc: n, init: Init::Bias(&bias), relu }, &mut c);
                 assert_close("rows", &c, &want, 1e-5);
                 let mut c: Vec<f32> = (0..m * n).map(|e| bias[e % n]).collect();
-                gemm(Precision::Bf16, m, n, k, View::transposed(&at, m), &b, n, &mut c, n, Init::Accumulate, relu);
+                gemm(
+                    Precision::Bf16,
+                    Gemm { m, n, k, a: View::transposed(&at, m), b: &b, ldb: n, ldc: n, init: Init::Accumulate, relu },
+                    &mut c,
+                );
                 assert_close("transposed", &c, &want, 1e-5);
             }
         }

@@ -1,6 +1,7 @@
-//! The loss of a batch of rays: colour, opacity, distortion and depth, each a mean over the rays.
+//! The loss of a batch of rays: color, opacity, distortion and depth, each a mean over the rays.
 
-use crate::gpu::{Buffer, CUBE, Gpu, units};
+use super::ColorLoss;
+use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::{GpuComposited, GpuGradients, GpuPacked};
 use crate::ops::{depth_loss, distortion};
 use cubecl::prelude::*;
@@ -14,8 +15,7 @@ const PARTS: usize = 256;
 /// What counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Terms {
-    /// Width of the Huber loss's quadratic part; 0: squared error.
-    pub huber: f32,
+    pub color: ColorLoss,
     /// For linear light: what is added to a prediction that its difference is divided by; 0: differences count as they are.
     pub relative: f32,
     /// Weight of the distortion loss.
@@ -28,13 +28,23 @@ pub struct Terms {
     pub depth: f32,
 }
 
+impl ColorLoss {
+    /// Width of the quadratic part as kernels take it; 0: all of it.
+    fn width(self) -> f32 {
+        match self {
+            ColorLoss::Mse => 0.0,
+            ColorLoss::Huber(width) => width,
+        }
+    }
+}
+
 /// Where a step's figures are added.
 #[derive(Clone, Copy)]
 pub struct Figures<'a> {
     /// `[SUMS]`
     pub sums: &'a Buffer,
     /// Offsets of all samples that were marched, `[R + 1]`.
-    pub marched: &'a Buffer,
+    pub marched: &'a Buffer<u32>,
     /// Whether this is what the step is judged by; else only loss and samples are added.
     pub is_main: bool,
 }
@@ -47,65 +57,63 @@ pub struct Target<'a> {
     /// What transparent pixels are composited on, `[R, 3]`.
     pub background: &'a Buffer,
     /// Rays that do not count: not 0, `[R]`.
-    pub left_out: &'a Buffer,
+    pub left_out: &'a Buffer<u32>,
     /// Distance of the surface along the ray, 0 where it is not known, `[R]`; not read without [`Terms::depth`].
     pub distance: &'a Buffer,
 }
 
 /// Composites packed samples with densities `[S]` and colours `[S, 3]`, compares them, and takes the gradients back to
 /// both, all rays in one launch; adds the step's figures. Also gives the squared error of each ray `[R]`. Gradients
-/// closer than `near_scaling` are scaled as by [`super::soften`].
-#[allow(clippy::too_many_arguments)]
+/// closer than `near_scaling` are scaled as by [`crate::ops::field_step::gpu::scale_near_gradients`].
 pub fn composite_and_loss(
     gpu: &Gpu,
     terms: Terms,
     p: &GpuPacked,
-    sigma: &Buffer,
-    rgb: &Buffer,
+    (sigma, rgb): (&Buffer, &Buffer),
     target: Target,
     near_scaling: f32,
     figures: Figures,
 ) -> (GpuGradients, Buffer) {
-    let r = p.rays();
+    let (r, s) = (p.rays(), p.t.len());
     let (values, errors) = (gpu.empty(r), gpu.empty(r));
-    let g = GpuGradients { sigma: gpu.empty(sigma.len()), features: gpu.empty(rgb.len()), background: gpu.empty(r * 3) };
+    let g = GpuGradients { sigma: gpu.empty(s), features: gpu.empty(s * 3), background: gpu.empty(r * 3) };
     if r == 0 {
         return (g, errors);
     }
-    // SAFETY: units past the rays stop; offsets bound the samples.
-    unsafe {
-        blend_and_compare::launch_unchecked(
-            &gpu.client,
-            units(r),
-            CubeDim::new_1d(CUBE),
-            p.offsets.arg(),
-            p.t.arg(),
-            p.dt.arg(),
-            sigma.arg(),
-            rgb.arg(),
-            target.rgba.arg(),
-            target.background.arg(),
-            target.left_out.arg(),
-            target.distance.arg(),
-            g.sigma.arg(),
-            g.features.arg(),
-            g.background.arg(),
-            values.arg(),
-            errors.arg(),
-            r as u32,
-            1.0 / r as f32,
-            terms.huber,
-            terms.relative,
-            terms.alpha,
-            terms.distortion,
-            near_scaling,
-            terms.depth,
-            terms.normalized,
-            terms.depth > 0.0,
-        );
-    }
+    let by_depth = terms.depth > 0.0;
+    launch!(
+        gpu,
+        blend_and_compare,
+        r,
+        [
+            p.offsets => r + 1,
+            p.t => s,
+            p.dt => s,
+            sigma => s,
+            rgb => s * 3,
+            target.rgba => r * 4,
+            target.background => r * 3,
+            target.left_out => r,
+            target.distance => if by_depth { r } else { 0 },
+            g.sigma => s,
+            g.features => s * 3,
+            g.background => r * 3,
+            values => r,
+            errors => r,
+        ],
+        r as u32,
+        1.0 / r as f32,
+        terms.color.width(),
+        terms.relative,
+        terms.alpha,
+        terms.distortion,
+        near_scaling,
+        terms.depth,
+        terms.normalized,
+        by_depth,
+    );
     // The values hold the distortion already.
-    add_up(gpu, p, target.left_out, &values, &errors, &values, 0.0, figures);
+    add_up(gpu, p, target.left_out, [&values, &errors, &values], 0.0, figures);
     (g, errors)
 }
 
@@ -114,31 +122,29 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
     let r = p.rays();
     let d = GpuComposited { color: gpu.empty(r * 3), depth: gpu.zeros(r), opacity: gpu.empty(r), weights: gpu.empty(0) };
     let (values, errors, d_spread) = (gpu.empty(r), gpu.empty(r), gpu.empty(r));
-    let cube = CubeDim::new_1d(CUBE);
-    // SAFETY: units past the rays stop.
-    unsafe {
-        compare::launch_unchecked(
-            &gpu.client,
-            units(r),
-            cube,
-            out.color.arg(),
-            out.opacity.arg(),
-            target.rgba.arg(),
-            target.background.arg(),
-            target.left_out.arg(),
-            d.color.arg(),
-            d.opacity.arg(),
-            d_spread.arg(),
-            values.arg(),
-            errors.arg(),
-            r as u32,
-            1.0 / r as f32,
-            terms.huber,
-            terms.relative,
-            terms.alpha,
-            terms.distortion,
-        );
-    }
+    launch!(
+        gpu,
+        compare,
+        r,
+        [
+            out.color => r * 3,
+            out.opacity => r,
+            target.rgba => r * 4,
+            target.background => r * 3,
+            target.left_out => r,
+            d.color => r * 3,
+            d.opacity => r,
+            d_spread => r,
+            values => r,
+            errors => r,
+        ],
+        r as u32,
+        1.0 / r as f32,
+        terms.color.width(),
+        terms.relative,
+        terms.alpha,
+        terms.distortion,
+    );
     let (spread, weights) = if terms.normalized {
         distortion::gpu::both(gpu, &distortion::gpu::normalized(gpu, p), &out.weights, &d_spread)
     } else {
@@ -146,53 +152,33 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
     };
     if terms.depth > 0.0 {
         let scale = 1.0 / r.max(1) as f32;
-        depth_loss::gpu::add(gpu, p, &out.weights, target.distance, target.left_out, terms.depth, scale, &values, &weights);
+        depth_loss::gpu::add(gpu, p, &out.weights, target.distance, target.left_out, (terms.depth, scale), (&values, &weights));
     }
-    add_up(gpu, p, target.left_out, &values, &errors, &spread, terms.distortion, figures);
+    add_up(gpu, p, target.left_out, [&values, &errors, &spread], terms.distortion, figures);
     (GpuComposited { weights, ..d }, errors)
 }
 
 /// Adds a step's figures to `sums`.
-#[allow(clippy::too_many_arguments)]
-fn add_up(
-    gpu: &Gpu,
-    p: &GpuPacked,
-    left_out: &Buffer,
-    values: &Buffer,
-    errors: &Buffer,
-    spread: &Buffer,
-    distortion: f32,
-    figures: Figures,
-) {
-    let (r, parts) = (p.rays() as u32, gpu.empty(PARTS * 3));
-    // SAFETY: units past the parts stop; offsets hold one number more than there are rays.
-    unsafe {
-        gather::launch_unchecked(
-            &gpu.client,
-            units(PARTS),
-            CubeDim::new_1d(CUBE),
-            left_out.arg(),
-            values.arg(),
-            errors.arg(),
-            spread.arg(),
-            parts.arg(),
-            r,
-            PARTS as u32,
-            distortion,
-        );
-        finish::launch_unchecked(
-            &gpu.client,
-            CubeCount::Static(1, 1, 1),
-            CubeDim::new_1d(1),
-            parts.arg(),
-            p.offsets.arg(),
-            figures.marched.arg(),
-            figures.sums.arg(),
-            r,
-            PARTS as u32,
-            figures.is_main,
-        );
-    }
+fn add_up(gpu: &Gpu, p: &GpuPacked, left_out: &Buffer<u32>, [values, errors, spread]: [&Buffer; 3], distortion: f32, figures: Figures) {
+    let (r, parts) = (p.rays(), gpu.empty(PARTS * 3));
+    launch!(
+        gpu,
+        gather,
+        PARTS,
+        [left_out => r, values => r, errors => r, spread => r, parts => PARTS * 3],
+        r as u32,
+        PARTS as u32,
+        distortion,
+    );
+    launch!(
+        gpu,
+        finish,
+        ([1; 3], CubeDim::new_1d(1)),
+        [parts => PARTS * 3, p.offsets => r + 1, figures.marched => r + 1, figures.sums => SUMS],
+        r as u32,
+        PARTS as u32,
+        figures.is_main,
+    );
 }
 
 /// A channel's error.

@@ -1,0 +1,46 @@
+//! Every op on a device against its f64 reference, forward and backward: the cases of `ops/<op>/cases.rs`.
+
+use crate::gpu::{Gpu, GpuError};
+use crate::ops::{
+    adam, composite, depth_loss, distortion, field_step, frequency, fused_mlp, hash_grid, linear, march, marching_cubes,
+    marching_tetrahedra, pixel_gather, prune, ray_aabb, ray_generation, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
+    trilinear_corner_grid,
+};
+
+pub use crate::gpu::table::{Row, TOLERANCE, Table};
+
+/// Runs all cases.
+///
+/// # Errors
+/// When the device is lost; wrong results are rows with a fault.
+pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
+    let mut table = Table::new(gpu);
+    let ops = [
+        hash_grid::cases::check,
+        frequency::cases::check,
+        triangle_wave::cases::check,
+        spherical_harmonics::cases::check,
+        linear::cases::check,
+        fused_mlp::cases::check,
+        composite::cases::check,
+        distortion::cases::check,
+        depth_loss::cases::check,
+        scan::cases::check,
+        ray_aabb::cases::check,
+        march::cases::check,
+        sample_pdf::cases::check,
+        trilinear_corner_grid::cases::check,
+        pixel_gather::cases::check,
+        prune::cases::check,
+        adam::cases::check,
+        ray_generation::cases::check,
+        ssim::cases::check,
+        field_step::cases::check,
+        marching_cubes::cases::check,
+        marching_tetrahedra::check,
+    ];
+    for check in ops {
+        check(gpu, &mut table)?;
+    }
+    Ok(table.rows)
+}

@@ -1,0 +1,96 @@
+//! Typed memory of a device, and rows of which only the device knows how many are in use.
+
+use super::Gpu;
+use cubecl::prelude::*;
+use cubecl::server::Handle;
+use std::marker::PhantomData;
+
+/// Numbers in the memory of a device. Clones share the memory.
+#[derive(Debug)]
+pub struct Buffer<T = f32> {
+    handle: Handle,
+    len: usize,
+    element: PhantomData<T>,
+}
+
+impl<T> Clone for Buffer<T> {
+    fn clone(&self) -> Self {
+        Buffer { handle: self.handle.clone(), len: self.len, element: PhantomData }
+    }
+}
+
+impl<T> Buffer<T> {
+    /// `len` numbers in memory that is there already.
+    ///
+    /// # Panics
+    /// When the memory holds fewer.
+    pub fn of(handle: Handle, len: usize) -> Buffer<T> {
+        assert!(handle.size_in_used() >= (size_of::<T>() * len) as u64, "{len} numbers in {} bytes", handle.size_in_used());
+        Buffer { handle, len, element: PhantomData }
+    }
+
+    /// The memory, for another library on the same device.
+    pub fn handle(self) -> Handle {
+        self.handle
+    }
+
+    /// The memory of this buffer and of its clones.
+    pub(super) fn memory(&self) -> Handle {
+        self.handle.clone()
+    }
+
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The same bits as numbers of another type, as many as the memory of these holds.
+    pub fn cast<U>(&self) -> Buffer<U> {
+        Buffer { handle: self.handle.clone(), len: self.len * size_of::<T>() / size_of::<U>(), element: PhantomData }
+    }
+
+    /// For a launch whose kernel indexes up to `len` numbers.
+    ///
+    /// # Panics
+    /// When there are fewer.
+    #[track_caller]
+    pub(crate) fn arg(&self, len: usize, kernel: &str, name: &str) -> BufferArg {
+        assert!(self.len >= len, "{kernel}: {name} holds {} numbers, not {len}", self.len);
+        // SAFETY: the handle was made with room for `self.len` numbers, and for one number at least.
+        unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len.max(1)) }
+    }
+}
+
+/// Rows of a matrix of which only the device knows how many are in use.
+#[derive(Clone)]
+pub struct Rows {
+    /// As many as there is memory for.
+    pub most: usize,
+    /// Counts, of which number `at` is that of these rows; at most `most`.
+    pub(crate) live: Buffer<u32>,
+    pub(crate) at: usize,
+}
+
+impl Rows {
+    /// All of `n` rows.
+    pub fn all(gpu: &Gpu, n: usize) -> Rows {
+        Rows { most: n, live: gpu.upload(&[n as u32]), at: 0 }
+    }
+
+    /// As many as number `at` of `live` says, which is at most `most`.
+    ///
+    /// # Panics
+    /// When there is no such number.
+    pub fn counted(most: usize, live: &Buffer<u32>, at: usize) -> Rows {
+        assert!(at < live.len(), "rows: no number {at}");
+        Rows { most, live: live.clone(), at }
+    }
+
+    /// Place of the count, for a launch.
+    pub(crate) fn place(&self) -> u32 {
+        self.at as u32
+    }
+}
