@@ -1,7 +1,8 @@
-//! Chores: `cargo xtask ci`, `cargo xtask gpu-check`, `cargo xtask viewer-check` and `cargo xtask tidy`.
+//! Chores: `cargo xtask ci`, `examples`, `gpu-check`, `viewer-check` and `tidy`.
 
 #[cfg(test)]
 mod ci_script;
+mod examples;
 #[cfg(test)]
 mod named_tests;
 mod tidy;
@@ -12,11 +13,12 @@ fn main() -> ExitCode {
     let verb = std::env::args().nth(1).unwrap_or_default();
     let ok = match &verb[..] {
         "ci" => ci(),
+        "examples" => step("examples", examples::run()),
         "gpu-check" => gpu_check(&std::env::args().nth(2).unwrap_or("vulkan".into())),
         "viewer-check" => viewer_check(),
         "tidy" => step("tidy", tidy::run()),
         _ => {
-            eprintln!("usage: cargo xtask ci | gpu-check [vulkan|metal|webgpu|cuda|webgpu,cuda] | viewer-check | tidy");
+            eprintln!("usage: cargo xtask ci | examples | gpu-check [vulkan|metal|webgpu|cuda|webgpu,cuda] | viewer-check | tidy");
             false
         }
     };
@@ -122,6 +124,7 @@ fn ci() -> bool {
         // A level that this machine lacks falls back to the best it has.
         ok &= step(level, libraries_at(level));
     }
+    ok &= step("examples", examples::run());
     ok &= step("fuzz", fuzz("20000"));
     ok &= step("docs", cargo(&["doc", "--release", "--workspace", "--no-deps"]));
     for (tool, args) in [("deny", &["deny", "check", "licenses", "bans", "sources"][..]), ("typos", &["typos"][..])] {

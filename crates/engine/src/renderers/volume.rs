@@ -88,6 +88,27 @@ const CHUNK_OF_BLOCKS: usize = 1 << 14;
 /// Pixels between those that are traced first where pixels may be interpolated.
 const COARSEST: usize = 4;
 
+impl<'a> Tracer<'a> {
+    /// Full quality before black, without bounds besides the outer `cube` (lowest corner and edge, model space).
+    pub fn new(field: &'a Field, sampling: Sampling<'a>, cube: (f32, f32)) -> Tracer<'a> {
+        Tracer {
+            field,
+            sampling,
+            backdrop: Backdrop::Color([0.0; 3]),
+            near: 0.0,
+            cube,
+            clip: None,
+            crop: None,
+            pruning: Quality::Full.pruning(),
+            appearance: None,
+            is_linear: false,
+            shared_weight: Quality::Full.shared_weight(),
+            tolerance: Quality::Full.tolerance(),
+            accelerator: None,
+        }
+    }
+}
+
 impl Tracer<'_> {
     /// Renders the view of a camera that stands in model space; `progress` is told the rows done.
     pub fn view(&self, camera: &PosedCamera, progress: &mut dyn FnMut(usize)) -> View {

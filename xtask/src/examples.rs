@@ -1,0 +1,144 @@
+//! The workspace's examples: all are built, and those of a list are run, each into a folder of its own.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// Examples that are run with a folder as their argument, and files that each must write there.
+const RUN: [(&str, &[&str]); 9] = [
+    ("cube", &["cube.glb", "cube.obj", "cube.ply", "cube.stl", "cube.usdz", "cube.dae"]),
+    ("custom_loss", &["squares.png", "cauchy.png"]),
+    ("custom_ray_code", &["sun_0.png", "sun_1.png", "sun_2.png"]),
+    ("mesh_formula", &["gyroid.glb"]),
+    ("points_and_depth", &["points.ply", "depth.png"]),
+    ("read_capture", &["sparse/0/images.txt"]),
+    ("read_checkpoint", &["checkpoints/latest.safetensors"]),
+    ("render_path", &["orbit.gif"]),
+    ("train_from_code", &["view.png", "run/summary.json"]),
+];
+
+/// Examples that are only built, and why.
+const BUILT: [(&str, &str); 4] = [
+    ("graph-check", "needs a device; `cargo xtask gpu-check` runs it"),
+    ("ops-speed", "measures for minutes"),
+    ("own_picture", "serves until it is stopped; `cargo xtask viewer-check` opens its page"),
+    ("photographs", "renders a large capture"),
+];
+
+/// Most lines of an example that is run, and the longest that it may take.
+const LINES: usize = 150;
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// Builds all examples and runs those of the list; whether all did what they say.
+pub fn run() -> bool {
+    let mut breaches = check(&sources(Path::new("crates")));
+    let built = crate::cargo(&["build", "--release", "--quiet", "--workspace", "--examples"]);
+    if !built {
+        breaches.push("the examples do not build".into());
+    }
+    let folder = std::env::temp_dir().join(format!("diorama-examples-{}", std::process::id()));
+    let begin = Instant::now();
+    for (name, files) in RUN.iter().filter(|_| built) {
+        let start = Instant::now();
+        let result = run_one(name, &folder.join(name), files);
+        println!("{name}: {:.1} s", start.elapsed().as_secs_f64());
+        breaches.extend(result.err().map(|why| format!("{name}: {why}")));
+    }
+    println!("{} examples ran in {:.0} s, {} were only built", RUN.len(), begin.elapsed().as_secs_f64(), BUILT.len());
+    let _ = std::fs::remove_dir_all(&folder);
+    breaches.iter().for_each(|b| println!("{b}"));
+    breaches.is_empty()
+}
+
+/// Runs an example to its end and looks for what it writes.
+fn run_one(name: &str, folder: &Path, files: &[&str]) -> Result<(), String> {
+    std::fs::create_dir_all(folder).map_err(|e| format!("{}: {e}", folder.display()))?;
+    let mut command = Command::new(Path::new("target/release/examples").join(name));
+    let mut child = command.arg(folder).stdout(Stdio::null()).spawn().map_err(|e| format!("cannot be started: {e}"))?;
+    let start = Instant::now();
+    let status = loop {
+        match child.try_wait() {
+            Ok(Some(status)) => break status,
+            Ok(None) if start.elapsed() < PATIENCE => std::thread::sleep(Duration::from_millis(20)),
+            Ok(None) => {
+                let _ = child.kill();
+                let _ = child.wait();
+                return Err(format!("takes more than {} s", PATIENCE.as_secs()));
+            }
+            Err(e) => return Err(e.to_string()),
+        }
+    };
+    if !status.success() {
+        return Err(format!("ended with {status}"));
+    }
+    let lacks = files.iter().find(|f| !std::fs::metadata(folder.join(f)).is_ok_and(|m| m.len() > 0));
+    lacks.map_or(Ok(()), |f| Err(format!("did not write {f}")))
+}
+
+/// Name and text of every example below `crates`.
+fn sources(crates: &Path) -> Vec<(String, String)> {
+    let entries = |folder: &Path| -> Vec<PathBuf> { std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()).collect() };
+    let files = entries(crates).into_iter().flat_map(|krate| entries(&krate.join("examples")));
+    let mut found: Vec<(String, String)> = files
+        .filter(|f| f.extension().is_some_and(|e| e == "rs"))
+        .map(|f| (f.file_stem().unwrap_or_default().to_string_lossy().into_owned(), std::fs::read_to_string(&f).unwrap_or_default()))
+        .collect();
+    found.sort();
+    found
+}
+
+/// Examples that no list names, names without an example, and examples that are run and too long or do not say what they show.
+fn check(sources: &[(String, String)]) -> Vec<String> {
+    let listed = || RUN.iter().map(|r| r.0).chain(BUILT.iter().map(|b| b.0));
+    let mut breaches = Vec::new();
+    for (name, text) in sources {
+        if !listed().any(|l| l == name) {
+            breaches.push(format!("{name}: add it to a list of xtask/src/examples.rs"));
+        }
+        let is_run = RUN.iter().any(|r| r.0 == name);
+        if is_run && text.lines().count() > LINES {
+            breaches.push(format!("{name}: {} lines, more than {LINES}", text.lines().count()));
+        }
+        if !text.starts_with("//! ") {
+            breaches.push(format!("{name}: its first line must say what it shows"));
+        }
+    }
+    let gone = listed().filter(|l| !sources.iter().any(|s| s.0 == *l));
+    breaches.extend(gone.map(|l| format!("{l}: is listed in xtask/src/examples.rs and is gone")));
+    breaches
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn workspace() -> Vec<(String, String)> {
+        sources(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../crates"))
+    }
+
+    #[test]
+    fn every_example_is_listed_short_and_says_what_it_shows() {
+        assert_eq!(check(&workspace()), Vec::<String>::new());
+    }
+
+    #[test]
+    fn breaches_are_found() {
+        let mut s = workspace();
+        s.retain(|(name, _)| name != "cube");
+        s.push(("stranger".into(), "//! Shows nothing.\n".into()));
+        let mesh = s.iter_mut().find(|(name, _)| name == "mesh_formula").unwrap();
+        mesh.1 = "fn main() {}\n".repeat(LINES + 1);
+        let b = check(&s).join("\n");
+        for what in ["stranger: add it", "mesh_formula: 151 lines", "mesh_formula: its first line", "cube: is listed"] {
+            assert!(b.contains(what), "{what}: {b}");
+        }
+    }
+
+    #[test]
+    fn an_example_that_fails_is_noticed() {
+        let folder = std::env::temp_dir().join(format!("diorama-no-example-{}", std::process::id()));
+        let why = run_one("no_such_example", &folder, &[]).unwrap_err();
+        assert!(why.contains("cannot be started"), "{why}");
+        let _ = std::fs::remove_dir_all(folder);
+    }
+}
