@@ -65,10 +65,7 @@ pub fn train(
         events(&Event::Note(note.clone()));
     }
     let config = &resolved(config, &capture)?;
-    if config.data.white > 0.0 {
-        let white = config.data.white;
-        events(&Event::Note(format!("the photographs hold linear light: {white} is shown as white (--set data.white={white})")));
-    }
+    white_note(config.data.white).into_iter().for_each(|n| events(&Event::Note(n)));
     memory::check_training(config, &capture)?.into_iter().for_each(|n| events(&Event::Note(n)));
     let (store, budget) = load_pixels(config, &capture, &opened)?;
     if let n @ 2.. = store.stride() {
@@ -132,6 +129,11 @@ pub fn train(
         peak_memory_bytes: diorama_data::memory::peak_of_process(),
     })?;
     Ok(Trained { device: trainer.device.name(), model: trainer.model, summary })
+}
+
+/// What the user is told where photographs hold linear light.
+fn white_note(white: f32) -> Option<String> {
+    (white > 0.0).then(|| format!("the photographs hold linear light: {white} is shown as white (--set data.white={white})"))
 }
 
 /// Takes the model to the run's last checkpoint, or leaves it at its start; what the user is told.
