@@ -332,7 +332,8 @@ impl GpuTrainer {
             group.step(gpu, at, &d);
             self.cameras.correct(gpu, &group.values, *focal);
         }
-        if let (Some(map), Some(errors), Some(photographs)) = (&self.error_map, &learned.errors, &self.photographs) {
+        let drawn_from = self.photographs.as_ref().filter(|_| s.rays.is_of_cameras());
+        if let (Some(map), Some(errors), Some(photographs)) = (&self.error_map, &learned.errors, drawn_from) {
             map.record(gpu, photographs, &rays.drawn, errors);
             if s.refresh_errors {
                 map.refresh(gpu);
@@ -379,7 +380,7 @@ impl GpuTrainer {
     /// Places samples and trains on them; the samples, the offsets of all that were marched, and what was learned.
     fn place(&self, s: &Step, r: &Rays) -> Result<(GpuPacked, Buffer<u32>, Learned), GpuError> {
         let (gpu, rays, left_out) = (&self.gpu, &r.rays, &r.drawn.left_out);
-        let moves = self.corrections.is_some();
+        let moves = self.corrections.is_some() && s.rays.is_of_cameras();
         let all = |of: &GpuField, packed: &GpuPacked, is_main: bool| {
             let (points, features) = of.encode(gpu, rays, packed);
             let marched = &packed.offsets;

@@ -80,9 +80,12 @@ impl CpuTrainer {
             Placement::Hierarchical { .. } => self.hierarchical(of, s),
         };
         self.field.stages.done("network");
-        let mse = match (s.loss, photographs) {
-            (Loss::Photometric(_), p) => self.score(&*of.field, of.error_map.as_deref_mut(), p.map(|p| p.pixels)),
-            (Loss::Batch(_), _) => f64::NAN,
+        let mse = match s.loss {
+            Loss::Photometric(_) => {
+                let drawn_from = photographs.filter(|_| s.rays.is_of_cameras()).map(|p| p.pixels);
+                self.score(&*of.field, of.error_map.as_deref_mut(), drawn_from)
+            }
+            Loss::Batch(_) => f64::NAN,
         };
         let figures = Figures { steps: 1, rays: self.batch.len() as u64, loss, mse, trained: trained as f64, marched: marched as f64 };
         if !loss.is_finite() {
@@ -91,13 +94,14 @@ impl CpuTrainer {
         if let Some(l) = &mut of.learned {
             l.backward(&self.batch.dirs, &self.background, &self.field.out.d_background);
         }
-        if let Some((group, _)) = &mut of.corrections {
+        let moves = s.rays.is_of_cameras();
+        if let Some((group, _)) = of.corrections.as_mut().filter(|_| moves) {
             self.correct_cameras(group);
         }
         self.field.stages.done("score");
         optimise(of, s);
         self.field.stages.done("optimise");
-        if of.corrections.is_some() {
+        if of.corrections.is_some() && moves {
             self.correct(of);
         }
         if s.refresh_errors
@@ -214,7 +218,7 @@ impl CpuTrainer {
         };
         let (dirs, images, background) = (&self.batch.dirs[..], Some(&self.batch.images[..]), &self.background[..]);
         let b = Batch { samples, positions: &on.positions, dirs, images, given, background, near_scaling: s.near_scaling };
-        let moves = of.corrections.is_some() && matches!(which, Which::Main);
+        let moves = of.corrections.is_some() && s.rays.is_of_cameras() && matches!(which, Which::Main);
         let d_positions = moves.then_some(&mut self.d_positions);
         match s.loss {
             Loss::Batch(loss) => field.train(&b, &mut on.encoded, fields::Loss::Batch(loss), &mut self.field, d_positions),
@@ -300,7 +304,7 @@ fn optimise(of: &mut Trainees, s: &Step) {
     fields.extend(of.coarse.as_deref_mut());
     let groups = fields.into_iter().flat_map(Field::groups_mut).chain(of.learned.as_mut().map(|l| &mut l.group));
     groups.for_each(|g| g.step(t, s.rate_scale));
-    if let Some((group, focal)) = &mut of.corrections {
+    if let Some((group, focal)) = of.corrections.as_mut().filter(|_| s.rays.is_of_cameras()) {
         group.step(t, s.rate_scale);
         if !*focal {
             group.values.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);

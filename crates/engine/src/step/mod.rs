@@ -45,7 +45,8 @@ pub struct Step<'a> {
 pub enum RaySource<'a> {
     /// Random pixels of the training photographs, half of them where errors are high if there is an [`ErrorMap`].
     Photographs { count: usize, rng: Rng },
-    /// Rays of the caller's, for example of whole patches that generated cameras see.
+    /// Rays of the caller's, for example of whole patches that generated cameras see. They teach cameras' corrections and the error map
+    /// nothing.
     Given(GivenRays<'a>),
 }
 
@@ -56,6 +57,11 @@ impl RaySource<'_> {
             RaySource::Photographs { count, .. } => *count,
             RaySource::Given(g) => g.images.len(),
         }
+    }
+
+    /// Whether the rays are those of the training cameras, which corrections and the error map belong to.
+    pub(crate) fn is_of_cameras(&self) -> bool {
+        matches!(self, RaySource::Photographs { .. })
     }
 }
 

@@ -208,3 +208,30 @@ fn rays_through_pixels_of_known_distance_and_masked_ones_are_told_apart() {
         assert_eq!(p[0] < 6.0, *counts);
     }
 }
+
+#[test]
+fn rays_of_the_callers_teach_cameras_and_the_error_map_nothing() {
+    let pixels = Plain([[0.9, 0.1, 0.1, 1.0]; 2]);
+    let photographs = Photographs { pixels: &pixels, observations: &[] };
+    let (mut field, mut map) = (hash_field(), ErrorMap::new(2));
+    let mut group = ParamGroup::dense("corrections", vec![0.01; 2 * CORRECTION], Adam::default());
+    // No camera has this image.
+    let (images, jitter, background) = (vec![7; 8], vec![0.5; 8], vec![0.0; 24]);
+    let (origins, dirs) = ([2.0, 0.5, 0.4].repeat(8), [-1.0, 0.0, 0.0].repeat(8));
+    let target = [0.2, 0.3, 0.4, 1.0].repeat(8);
+    let given = GivenRays {
+        images: &images,
+        origins: &origins,
+        dirs: &dirs,
+        jitter: &jitter,
+        target: &target,
+        background: &background,
+        codes: &[],
+    };
+    let mut of = Trainees { corrections: Some((&mut group, true)), error_map: Some(&mut map), ..of(&mut field) };
+    let mut trainer = CpuTrainer::new(scene(), &of);
+    let described = step(0, stratified(), photometric(ColorLoss::Mse));
+    let figures = trainer.step(&mut of, Some(&photographs), &Step { rays: RaySource::Given(given), ..described });
+    assert!(figures.mse > 0.0 && figures.trained > 0.0, "{figures:?}");
+    assert!(group.values.iter().all(|v| *v == 0.01) && map.errors == ErrorMap::new(2).errors);
+}
