@@ -3,7 +3,7 @@
 use crate::gpu::{Gpu, GpuError};
 use crate::ops::{
     adam, composite, depth_loss, distortion, field_step, frequency, fused_mlp, hash_grid, linear, march, marching_cubes,
-    marching_tetrahedra, pixel_gather, prune, ray_aabb, ray_generation, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
+    marching_tetrahedra, occupancy_update, photometric_loss, pixel_gather, prune, ray_aabb, ray_generation, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
     trilinear_corner_grid,
 };
 
@@ -25,9 +25,11 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         composite::cases::check,
         distortion::cases::check,
         depth_loss::cases::check,
+        photometric_loss::cases::check,
         scan::cases::check,
         ray_aabb::cases::check,
         march::cases::check,
+        occupancy_update::cases::check,
         sample_pdf::cases::check,
         trilinear_corner_grid::cases::check,
         pixel_gather::cases::check,

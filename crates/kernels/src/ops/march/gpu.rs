@@ -1,7 +1,6 @@
 //! One unit per ray, in two passes of the same march as the CPU's: the first counts a ray's samples, the second writes them where a
 //! scan of the counts puts them.
 
-pub mod occupancy;
 mod positions;
 
 use super::{MarchConfig, OccupancyBits};
@@ -9,18 +8,18 @@ use crate::gpu::{Buffer, Gpu, GpuError, launch};
 use crate::ops::composite::gpu::GpuPacked;
 use crate::ops::scan;
 use cubecl::prelude::*;
-use positions::put;
 
+pub(crate) use positions::put;
 pub use positions::{Space, positions, positions_backward, to_space};
 
 const _: () = assert!(super::BLOCK == 8, "the kernel's blocks are 8 cells wide");
 
 /// Occupancy on the device: one bit per cell, one word per block of 8³ cells.
 pub struct GpuOccupancy {
-    resolution: usize,
-    cascades: usize,
-    bits: Buffer<u32>,
-    blocks: Buffer<u32>,
+    pub(crate) resolution: usize,
+    pub(crate) cascades: usize,
+    pub(crate) bits: Buffer<u32>,
+    pub(crate) blocks: Buffer<u32>,
 }
 
 impl GpuOccupancy {
@@ -40,8 +39,7 @@ impl GpuOccupancy {
     ///
     /// # Errors
     /// When the device was lost.
-    pub fn differences(&self, gpu: &Gpu, other: &OccupancyBits) -> Result<usize, GpuError> {
-        let other = GpuOccupancy::upload(gpu, other);
+    pub fn differences(&self, gpu: &Gpu, other: &GpuOccupancy) -> Result<usize, GpuError> {
         let mut wrong = 0;
         for (a, b) in [(&self.bits, &other.bits), (&self.blocks, &other.blocks)] {
             wrong += gpu.read(a)?.iter().zip(gpu.read(b)?).filter(|(a, b)| **a != *b).count();
