@@ -1,10 +1,10 @@
 //! Sums over channels and taps for every pixel of the output, vectors along pixels: forward passes and gradients of inputs.
 
-use super::Activation;
 use super::bands::{Bands, Scratch, aligned, with_scratch};
 use super::depthwise;
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Phase, Tensors, offset};
+use crate::ops::activation::{Activation, cpu::forward_in_place};
 use crate::simd;
 use crate::tile::{Kernel, Pack, Segment, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
@@ -343,7 +343,9 @@ impl Job<'_> {
         if let Some(before) = self.before {
             self.store(segments, channel, rows, sums, before);
         }
-        self.activation.apply(sums);
+        if self.activation != Activation::None {
+            forward_in_place(self.activation, sums);
+        }
         self.store(segments, channel, rows, sums, self.out);
     }
 

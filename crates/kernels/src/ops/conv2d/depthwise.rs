@@ -3,6 +3,7 @@
 use super::bands::{aligned, with_scratch};
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Tensors, WeightSums, offset};
+use crate::ops::activation::{Activation, cpu::forward_in_place};
 use crate::simd;
 use crate::tile::{Dots, MOST_DOTS, Row, Shared, kernel};
 use rayon::prelude::*;
@@ -58,10 +59,11 @@ pub fn run(c: &Correlation, t: Tensors) {
                         if let Some(before) = &mut before {
                             spread(&row[..columns], c.spread[1], &mut before[at..]);
                         }
-                        if in_place {
-                            t.activation.apply(&mut out[at..at + columns]);
-                        } else {
-                            t.activation.apply(&mut row[..columns]);
+                        let target = if in_place { &mut out[at..at + columns] } else { &mut row[..columns] };
+                        if t.activation != Activation::None {
+                            forward_in_place(t.activation, target);
+                        }
+                        if !in_place {
                             spread(&row[..columns], c.spread[1], &mut out[at..]);
                         }
                     }

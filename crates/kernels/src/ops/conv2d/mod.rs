@@ -1,6 +1,5 @@
 //! Convolution of images, `y = act(w ∗ x + b)`, with stride, padding, dilation and groups.
 
-mod activation;
 pub(crate) mod bands;
 pub(crate) mod correlate;
 pub mod cpu;
@@ -12,7 +11,7 @@ pub(crate) mod shapes;
 mod tests;
 pub(crate) mod weights;
 
-pub use activation::Activation;
+use super::activation::Activation;
 
 /// What a convolution is besides its weights; pairs are (vertical, horizontal).
 ///
