@@ -1,4 +1,4 @@
-//! Compositing, comparison and both ways back in one kernel: one unit per ray.
+//! Compositing, comparison with photographs and the gradients of both in one kernel: one unit per ray.
 
 use super::{color_error, depth_loss};
 use cubecl::prelude::*;
@@ -112,8 +112,8 @@ fn compare_color(
     Compared { value, squared, d_light }
 }
 
-/// Takes the gradients of a ray's color `[3]` and of the light that passes it back to densities and colors, and adds those of
-/// distortion and depth, whose part of the loss is the result. Weights are read from `d_sigma` `[S]` and replaced.
+/// Gradients of a ray's densities and colors, given those of its color `[3]` and of the light that passes it; adds those of distortion
+/// and depth, and returns their part of the loss. Weights are read from `d_sigma` `[S]` and replaced.
 #[cube]
 fn blend_backward(
     t: &[f32],
@@ -133,7 +133,7 @@ fn blend_backward(
     depth: f32,
     #[comptime] normalized: bool,
 ) -> f32 {
-    // From the back, where what is still behind is small.
+    // From the last sample on, where sums are small.
     let mut after = blended.light;
     let mut behind = blended.light * d_light;
     let mut sum_w = blended.weight;
@@ -221,8 +221,9 @@ pub(super) fn blend_and_compare(
     let c = compare_color(r, scale, b.light, &color, rgba, background, huber, relative, &mut d_color, d_background);
     let off = 1.0 - b.light - rgba[r * 4 + 3];
     let d_light = c.d_light - scale * alpha * 2.0 * off;
-    let more =
-        blend_backward(t, dt, rgb, d_sigma, d_rgb, &d_color, d_light, &b, surface, first, count, scale, distortion, near, depth, normalized);
+    let more = blend_backward(
+        t, dt, rgb, d_sigma, d_rgb, &d_color, d_light, &b, surface, first, count, scale, distortion, near, depth, normalized,
+    );
     let mut value = c.value + alpha * off * off + more;
     let mut error = c.squared;
     if scale == 0.0 {
