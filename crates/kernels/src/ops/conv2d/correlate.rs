@@ -5,6 +5,7 @@ use super::bands::{Bands, Scratch, aligned, with_scratch};
 use super::depthwise;
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Phase, Tensors, offset};
+use super::winograd;
 use crate::simd;
 use crate::tile::{Kernel, Pack, Segment, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
@@ -72,6 +73,7 @@ impl Correlation {
         if self.channels == 1 && self.features <= 2 {
             return depthwise::run(self, t);
         }
+        let Err(t) = winograd::run(self, t) else { return };
         let level = simd::level();
         let job = self.job(t, kernel(level));
         let parts = self.features.div_ceil(job.features);

@@ -11,6 +11,7 @@ pub(crate) mod shapes;
 #[cfg(test)]
 mod tests;
 pub(crate) mod weights;
+mod winograd;
 
 pub use activation::Activation;
 
