@@ -149,7 +149,7 @@ fn square_kernels_on_many_channels_take_fewer_products() {
     };
     for level in Level::available() {
         with_level(level, || {
-            let c = Conv2d { padding: [1; 2], ..Conv2d::new(32, 32, 3) };
+            let c = Conv2d { padding: [1; 2], ..Conv2d::new(64, 64, 3) };
             assert!(fewer(c) && fewer(Conv2d { groups: 2, ..c }));
             assert!(!fewer(Conv2d { stride: [2; 2], ..c }) && !fewer(Conv2d { dilation: [2; 2], ..c }));
             assert!(!fewer(Conv2d { channels_in: 3, ..c }) && !fewer(Conv2d { kernel: [3, 1], ..c }));
