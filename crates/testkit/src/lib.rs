@@ -32,10 +32,34 @@ pub fn compare(a: &[f32], b: &[f64], tolerance: f64) -> Result<f64, String> {
     Ok(worst)
 }
 
-/// Panics with `what` unless [`compare`] passes.
+/// [`compare`], which must also refuse the same numbers with one of them wrong: off by twice what is allowed, or NaN. So every comparison
+/// of every op shows that it could have failed.
+pub fn compare_proven(a: &[f32], b: &[f64], tolerance: f64) -> Result<f64, String> {
+    let worst = compare(a, b, tolerance)?;
+    let rms = (b.iter().map(|v| v * v).sum::<f64>() / b.len().max(1) as f64).sqrt();
+    let Some(largest) = (0..b.len()).max_by(|i, j| b[*i].abs().total_cmp(&b[*j].abs())) else { return Ok(worst) };
+    let mut spoiled = a.to_vec();
+    for i in [0, b.len() / 2, b.len() - 1, largest] {
+        let allowed = tolerance * (b[i].abs() + rms);
+        let mut off = (b[i] + 2.0 * allowed) as f32;
+        if (off as f64 - b[i]).abs() <= allowed {
+            off = off.next_up();
+        }
+        for wrong in [off, f32::NAN] {
+            let right = std::mem::replace(&mut spoiled[i], wrong);
+            if compare(&spoiled, b, tolerance).is_ok() {
+                return Err(format!("the comparison does not notice {wrong} in place of {right} (element {i})"));
+            }
+            spoiled[i] = right;
+        }
+    }
+    Ok(worst)
+}
+
+/// Panics with `what` unless [`compare_proven`] passes.
 #[track_caller]
 pub fn assert_close(what: &str, a: &[f32], b: &[f64], tolerance: f64) {
-    if let Err(e) = compare(a, b, tolerance) {
+    if let Err(e) = compare_proven(a, b, tolerance) {
         panic!("{what}: {e}");
     }
 }
@@ -89,6 +113,16 @@ mod tests {
         assert!(compare(&[f32::NAN], &[1.0], 1.0).is_err());
         assert!(compare(&[1.0], &[f64::NAN], 1.0).is_err());
         assert!(compare(&[f32::INFINITY], &[1.0], 1.0).is_err());
+    }
+
+    #[test]
+    fn a_comparison_that_notices_nothing_fails() {
+        assert_eq!(compare_proven(&[1.0, 0.0, -3.0], &[1.0, 0.0, -3.0], 1e-6), Ok(0.0));
+        assert_eq!(compare_proven(&[0.0], &[0.0], 0.0), Ok(0.0));
+        assert_eq!(compare_proven(&[], &[], 1e-6), Ok(0.0));
+        assert!(compare_proven(&[1.0, 2.0], &[1.0, 2.1], 1e-3).is_err());
+        let blind = compare_proven(&[1.0, 2.0], &[1.0, 2.0], f64::INFINITY);
+        assert!(blind.unwrap_err().contains("does not notice"));
     }
 
     #[test]

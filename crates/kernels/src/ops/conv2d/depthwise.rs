@@ -1,5 +1,6 @@
 //! Layers whose outputs have one input channel each: whole rows at a time, vectors along pixels.
 
+use super::activate;
 use super::bands::{aligned, with_scratch};
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Tensors, WeightSums, offset};
@@ -63,7 +64,7 @@ pub fn run(c: &Correlation, t: Tensors) {
                         let out = &mut out[place(rows.start)..];
                         // SAFETY: the copy goes on for a row more; the rows are whole tiles of the output.
                         unsafe { kernel.depthwise(&of(rows.start, rows.len(), out.as_mut_ptr())) };
-                        t.activation.apply(&mut out[..rows.len() * columns]);
+                        activate(t.activation, &mut out[..rows.len() * columns]);
                         continue;
                     }
                     for y in rows {
@@ -72,7 +73,7 @@ pub fn run(c: &Correlation, t: Tensors) {
                         if let Some(before) = &mut before {
                             spread(&row[..columns], c.spread[1], &mut before[place(y)..]);
                         }
-                        t.activation.apply(&mut row[..columns]);
+                        activate(t.activation, &mut row[..columns]);
                         spread(&row[..columns], c.spread[1], &mut out[place(y)..]);
                     }
                 }

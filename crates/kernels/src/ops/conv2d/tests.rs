@@ -1,4 +1,5 @@
 use super::*;
+use crate::ops::activation::tests::ALL as ACTIVATIONS;
 use crate::simd::{Level, with_level};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
@@ -41,9 +42,6 @@ fn cases() -> Vec<(Conv2d, Images)> {
         (Conv2d { groups: 4, dilation: [3, 2], padding: [3, 1], ..conv(4, 4, [3, 3]) }, images(1, 15, 40)),
     ]
 }
-
-const ACTIVATIONS: [Activation; 6] =
-    [Activation::None, Activation::Relu, Activation::LeakyRelu(0.2), Activation::Sigmoid, Activation::Tanh, Activation::Silu];
 
 /// Random tensors of a layer: x, weights of variance 1 / fan-in, bias, gradient of the outputs.
 fn tensors(c: &Conv2d, images: &Images) -> [Vec<f32>; 4] {
@@ -118,6 +116,7 @@ fn reference_gradients_match_central_differences() {
 fn results_do_not_depend_on_the_number_of_threads() {
     let c = Conv2d { padding: [1; 2], ..Conv2d::new(20, 24, 3) };
     let images = Images { batch: 3, height: 21, width: 50 };
+    assert!(c.weight_sums(&images).shares() > 1, "pixels of the weights' gradient are summed in parts");
     let [x, w, b, d] = tensors(&c, &images);
     let run = |threads: usize| {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(|| {

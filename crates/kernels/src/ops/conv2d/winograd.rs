@@ -3,10 +3,11 @@
 //! `Y = Aᵀ [(G g Gᵀ) ⊙ (Bᵀ d B)] A` per 4×4 tile d of the input and kernel g (Lavin and Gray, "Fast Algorithms for Convolutional
 //! Neural Networks", CVPR 2016, section 4.1); over channels, the products are 16 matrix products, one per element of a tile.
 
-use super::Activation;
+use super::activate;
 use super::bands::{Scratch, aligned, with_scratch};
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Tensors};
+use crate::ops::activation::Activation;
 use crate::simd;
 use crate::tile::{Kernel, Shared, Start, Tile, kernel};
 use crate::vector::{by_lanes, vectorized};
@@ -246,7 +247,7 @@ impl Job<'_> {
             self.store(part, channel, [top, bottom], before);
         }
         for row in [&mut *top, &mut *bottom] {
-            self.activation.apply(row);
+            activate(self.activation, row);
         }
         self.store(part, channel, [top, bottom], self.out);
     }
