@@ -10,6 +10,7 @@ pub mod loader;
 mod on_device;
 mod optimizer;
 mod schedule;
+mod stack;
 #[cfg(test)]
 mod tests;
 
@@ -17,4 +18,5 @@ pub use ema::Ema;
 pub use gradients::Gradients;
 pub use loader::{Loader, LoaderSettings, SampleKey};
 pub use optimizer::{Group, Optimizer, Rule, StateError};
-pub use schedule::Schedule;
+pub use schedule::{Schedule, Shape};
+pub use stack::stack;
