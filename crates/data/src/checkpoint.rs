@@ -3,6 +3,7 @@
 
 use crate::atomic;
 use crate::error::{self, DataError, Result};
+use diorama_geom::NamedArray;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
 use std::io::Write;
@@ -80,6 +81,12 @@ pub fn save(folder: &Path, entries: &[Entry], mut metadata: HashMap<String, Stri
     atomic::write_with(&latest, |w| w.write_all(&bytes))
 }
 
+/// Saves arrays into `folder`, as [`save`] does.
+pub fn save_arrays(folder: &Path, arrays: &[NamedArray], metadata: HashMap<String, String>) -> Result<()> {
+    let entries: Vec<Entry> = arrays.iter().map(|a| Entry { name: a.name.clone(), shape: a.shape.clone(), data: &a.values }).collect();
+    save(folder, &entries, metadata)
+}
+
 /// Reads one file and checks its hash.
 pub fn read(path: &Path) -> Result<Checkpoint> {
     let bytes = error::read(path, LIMIT)?;
@@ -137,6 +144,11 @@ pub fn latest(folder: &Path) -> PathBuf {
 }
 
 impl Checkpoint {
+    /// All tensors, sorted by name.
+    pub fn into_arrays(self) -> Vec<NamedArray> {
+        self.tensors.into_iter().map(|(name, shape, values)| NamedArray { name, shape, values }).collect()
+    }
+
     /// Takes a tensor out.
     pub fn take(&mut self, name: &str) -> Option<Vec<f32>> {
         let i = self.tensors.iter().position(|t| t.0 == name)?;
