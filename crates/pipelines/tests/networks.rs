@@ -1,11 +1,10 @@
 //! Networks and files together: weights that PyTorch wrote, and a run that goes on from a checkpoint.
 
 use diorama_data::{checkpoint, weights as files};
-use diorama_geom::NamedArray;
 use diorama_nets::layers::{BatchNorm, Conv2d, Init, Linear};
 use diorama_nets::ops::{self, Activation, Conv, Error};
 use diorama_nets::param::{self, Mode, Module, Visitor};
-use diorama_nets::train::{Gradients, Optimizer, Rule};
+use diorama_nets::train::{self, Gradients, Optimizer, Rule};
 use diorama_nets::weights::{KeyMap, Strictness, load};
 use diorama_nets::{Device, Tensor, TensorData};
 use diorama_testkit::random;
@@ -93,20 +92,15 @@ fn a_run_goes_on_from_a_checkpoint_bit_for_bit() {
     let whole = Net::new(1);
     let mut steps = optimizer(&whole);
     whole.steps(&mut steps, 5);
-    let arrays: Vec<NamedArray> = param::arrays(&whole).into_iter().chain(steps.state()).collect();
-    let entry = |a: &NamedArray| (a.name.clone(), a.shape.clone());
-    let entries: Vec<checkpoint::Entry> =
-        arrays.iter().map(|a| checkpoint::Entry { name: entry(a).0, shape: entry(a).1, data: &a.values }).collect();
-    checkpoint::save(dir.path(), &entries, HashMap::from([("method".into(), "network".into())])).unwrap();
+    let metadata = HashMap::from([("method".into(), "network".into())]);
+    checkpoint::save_arrays(dir.path(), &train::saved(&whole, &steps, None), metadata).unwrap();
     whole.steps(&mut steps, 5);
 
     let (saved, note) = checkpoint::load(dir.path()).unwrap();
     assert_eq!(note, None);
-    let saved: Vec<NamedArray> = saved.tensors.into_iter().map(|(name, shape, values)| NamedArray { name, shape, values }).collect();
     let resumed = Net::new(2);
     let mut resumed_steps = optimizer(&resumed);
-    load(&resumed, &saved, &KeyMap::PLAIN, Strictness::AllowUnexpected).unwrap();
-    resumed_steps.restore(&resumed, &saved).unwrap();
+    train::resume(&resumed, &mut resumed_steps, None, &saved.into_arrays()).unwrap();
     resumed.steps(&mut resumed_steps, 5);
     assert_eq!(param::arrays(&whole), param::arrays(&resumed));
     assert_eq!(steps.state(), resumed_steps.state());

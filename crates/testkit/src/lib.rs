@@ -1,4 +1,12 @@
-//! Comparators, gradient checks and generators for tests.
+//! Comparators, gradient checks and random inputs for tests.
+//!
+//! ```
+//! use diorama_testkit::{assert_close, assert_gradient};
+//!
+//! assert_close("a third", &[0.333_333_3], &[1.0 / 3.0], 1e-6);
+//! // f(x, y) = x² + 3 y has the gradient (2 x, 3).
+//! assert_gradient("f", &[4.0, 3.0], &[2.0, 1.0], 1e-6, |x| x[0] * x[0] + 3.0 * x[1]);
+//! ```
 
 use diorama_geom::rng::Rng;
 
@@ -13,7 +21,10 @@ pub fn random_unit(n: usize, seed: u64) -> Vec<f32> {
     random(n, seed).into_iter().map(|v| (v * 0.5 + 0.5).min(0.999_999)).collect()
 }
 
-/// The first place where `|a − b| > tolerance · (|b| + rms b)`, with its error, or the largest error.
+/// Compares with the criterion `|a − b| ≤ tolerance · (|b| + rms b)`. Returns the largest error relative to `|b| + rms b`.
+///
+/// # Errors
+/// A message with the first element that violates the criterion, or with the lengths if they differ.
 pub fn compare(a: &[f32], b: &[f64], tolerance: f64) -> Result<f64, String> {
     if a.len() != b.len() {
         return Err(format!("lengths differ: {} and {}", a.len(), b.len()));
@@ -56,7 +67,7 @@ pub fn compare_proven(a: &[f32], b: &[f64], tolerance: f64) -> Result<f64, Strin
     Ok(worst)
 }
 
-/// Panics with `what` unless [`compare_proven`] passes.
+/// Panics with `what` unless [`compare_proven`] succeeds.
 #[track_caller]
 pub fn assert_close(what: &str, a: &[f32], b: &[f64], tolerance: f64) {
     if let Err(e) = compare_proven(a, b, tolerance) {
@@ -64,7 +75,7 @@ pub fn assert_close(what: &str, a: &[f32], b: &[f64], tolerance: f64) {
     }
 }
 
-/// Central differences of `f` at `x`, one parameter at a time, step `h`.
+/// Gradient of `f` at `x` by central differences: one parameter at a time, with step `h`.
 pub fn central_differences(x: &[f64], h: f64, mut f: impl FnMut(&[f64]) -> f64) -> Vec<f64> {
     let mut x = x.to_vec();
     (0..x.len())
@@ -80,7 +91,7 @@ pub fn central_differences(x: &[f64], h: f64, mut f: impl FnMut(&[f64]) -> f64) 
         .collect()
 }
 
-/// Panics unless an f64 gradient equals the central differences of `f` within `tolerance`.
+/// Panics unless `gradient` equals the central differences of `f` within `tolerance`.
 #[track_caller]
 pub fn assert_gradient(what: &str, gradient: &[f64], x: &[f64], tolerance: f64, f: impl FnMut(&[f64]) -> f64) {
     let numeric = central_differences(x, 1e-5, f);
@@ -88,7 +99,7 @@ pub fn assert_gradient(what: &str, gradient: &[f64], x: &[f64], tolerance: f64, 
     assert_close(what, &gradient, &numeric, tolerance);
 }
 
-/// Widens to f64, for references.
+/// Converts to f64, for reference implementations.
 pub fn wide(x: &[f32]) -> Vec<f64> {
     x.iter().map(|&v| v as f64).collect()
 }

@@ -10,6 +10,7 @@ pub(crate) mod shapes;
 #[cfg(test)]
 mod tests;
 pub(crate) mod weights;
+mod winograd;
 
 use super::activation::Activation;
 
@@ -103,5 +104,12 @@ impl Conv2d {
         );
         let positive = [self.kernel, self.stride, self.dilation].iter().flatten().all(|&v| v > 0);
         assert!(positive, "conv2d: kernel, stride and dilation are at least 1");
+    }
+}
+
+/// `values ← act(values)` on this thread.
+fn activate(activation: Activation, values: &mut [f32]) {
+    if activation != Activation::None {
+        crate::ops::activation::cpu::forward_in_place(activation, values);
     }
 }
