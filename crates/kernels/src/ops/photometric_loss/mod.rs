@@ -1,6 +1,6 @@
 //! The loss of rays against photographs: `1/R Σ_r (⅓ Σ_k ℓ(c_rk − ĉ_rk) + λ_α (o_r − a_r)² + λ_s spread_r + λ_d astray_r)` with squared
-//! differences or Huber's (1964) as `ℓ`, opacities `o`, photographs' alphas `a`, the distortion loss ([`distortion`](super::distortion)) and
-//! the depth loss ([`depth_loss`](super::depth_loss)).
+//! differences or Huber's (1964) as `ℓ`, opacities `o`, photographs' alphas `a`, the [distortion loss](super::distortion) and the
+//! [depth loss](super::depth_loss).
 
 #[cfg(any(test, feature = "gpu"))]
 pub(crate) mod cases;

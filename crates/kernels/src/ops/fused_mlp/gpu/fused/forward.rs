@@ -74,7 +74,8 @@ pub(super) fn load<E: Float>(
     }
 }
 
-/// Adds bias and activation to a layer's sum `v` in row `r` of the tile and column `c`, and stores it for later layers, heads and the backward pass.
+/// Applies bias and activation to a layer's sum `v` in row `r` of the tile and column `c`, and stores it for later layers, heads and the
+/// backward pass.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube]
 fn finish<E: Float>(
