@@ -3,8 +3,8 @@
 use crate::gpu::{Gpu, GpuError};
 use crate::ops::{
     adam, composite, depth_loss, distortion, field_step, frequency, fused_mlp, grid_sample, hash_grid, linear, march, marching_cubes,
-    marching_tetrahedra, occupancy_update, photometric_loss, pixel_gather, prune, ray_aabb, ray_generation, resample, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
-    trilinear_corner_grid,
+    marching_tetrahedra, occupancy_update, photometric_loss, pixel_gather, prune, ray_aabb, ray_generation, resample, sample_pdf, scan,
+    spherical_harmonics, ssim, triangle_wave, trilinear_corner_grid,
 };
 
 pub use crate::gpu::table::{Row, TOLERANCE, Table};

@@ -21,7 +21,9 @@ pub fn run(gpu: &Gpu) -> Vec<Row> {
         let layer = |device: &Device| results(device, [image], |[x]| average_pool(x, pool, count_padding));
         table_rows(&mut table, &format!("average pool, counts padding {count_padding}"), layer(&here), layer(&there));
     }
-    for (mode, outside) in [(GridMode::Bilinear, Outside::Zeros), (GridMode::Bilinear, Outside::Border), (GridMode::Nearest, Outside::Zeros)] {
+    for (mode, outside) in
+        [(GridMode::Bilinear, Outside::Zeros), (GridMode::Bilinear, Outside::Border), (GridMode::Nearest, Outside::Zeros)]
+    {
         let settings = GridSettings { mode, outside, align_corners: false };
         let layer = |device: &Device| results(device, [image, [2, 4, 6, 2]], |[x, grid]| grid_sample(x, grid * 1.3, settings));
         table_rows(&mut table, &format!("grid sample {settings:?}"), layer(&here), layer(&there));
@@ -35,9 +37,7 @@ fn results<const N: usize>(
     shapes: [[usize; 4]; N],
     layer: impl Fn([Tensor<4>; N]) -> Result<Tensor<4>, OpError>,
 ) -> Result<Vec<Vec<f32>>, String> {
-    let given = |shape: [usize; 4], seed: u64| {
-        Tensor::<4>::from_data(TensorData::new(random(shape.iter().product(), seed), shape), device)
-    };
+    let given = |shape: [usize; 4], seed: u64| Tensor::<4>::from_data(TensorData::new(random(shape.iter().product(), seed), shape), device);
     let inputs: [Tensor<4>; N] = std::array::from_fn(|i| given(shapes[i], 1 + i as u64).require_grad());
     let out = layer(inputs.clone()).map_err(|e| e.to_string())?;
     // Every element has a gradient of its own.

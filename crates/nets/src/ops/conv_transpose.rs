@@ -1,8 +1,8 @@
 //! Transposed convolution of images, with bias and activation.
 
-use super::{Activation, Conv};
 use super::by_burn;
 use super::conv::{Wanted, bias, check_conv};
+use super::{Activation, Conv};
 use crate::bridge::work;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one};
 use burn::backend::DispatchTensor;

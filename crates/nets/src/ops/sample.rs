@@ -10,9 +10,9 @@ use burn::tensor::Tensor;
 use diorama_kernels::gpu::{Buffer, Gpu};
 use diorama_kernels::ops::grid_sample::{self, GridSample, Mode, Outside};
 use diorama_kernels::ops::pool::{Pool, cpu as pools};
-use diorama_kernels::ops::resample::{Filter, Resample, cpu as resampling, shuffle};
 #[cfg(feature = "gpu")]
 use diorama_kernels::ops::resample;
+use diorama_kernels::ops::resample::{Filter, Resample, cpu as resampling, shuffle};
 use std::collections::HashMap;
 use std::sync::{Arc, LazyLock, Mutex};
 

@@ -5,17 +5,17 @@ use super::bands::{Bands, Scratch, aligned, with_scratch};
 use super::depthwise;
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Phase, Tensors, offset};
-use crate::ops::activation::Activation;
 use super::winograd;
+use crate::ops::activation::Activation;
 use crate::simd;
 use crate::tile::{Kernel, Pack, Segment, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
 use std::ops::Range;
 
 /// Floats of the input that a tile reads per pass where it reads the copy itself, so that they stay in the first-level cache.
-const DIRECT: usize = 9 << 10;
+const DIRECT: usize = 6 << 10;
 /// Terms of a sum per pass where it reads a panel.
-const TERMS: usize = 288;
+const TERMS: usize = 192;
 /// Floats of sums that a band keeps between passes.
 const SUMS: usize = 96 << 10;
 /// Portions in which the input of a later pass is asked of memory.

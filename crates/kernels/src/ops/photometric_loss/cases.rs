@@ -132,7 +132,8 @@ impl OnGpu {
         let (g, errors) = on_gpu::composite_and_loss(gpu, loss, &self.packed, (&sigma, &rgb), self.target(), near, figures);
         let (sigma, rgb, background) = (wide(&case.scene.sigma), wide(&case.rgb), wide(&case.background));
         let (ds, dc, db) = composite::reference::backward(&p, &sigma, &rgb, 3, &background, &want.d);
-        let scaled = |d: &[f64], width: usize| -> Vec<f64> { d.iter().zip(0..).map(|(d, i)| d * near_share(&p, i / width, near)).collect() };
+        let scaled =
+            |d: &[f64], width: usize| -> Vec<f64> { d.iter().zip(0..).map(|(d, i)| d * near_share(&p, i / width, near)).collect() };
         let shape = format!("{} near scaling {near}", self.shape);
         table.close("composite + loss", "errors", &shape, &errors, &want.errors)?;
         table.close("composite + loss", "d sigma", &shape, &g.sigma, &scaled(&ds, 1))?;

@@ -27,8 +27,7 @@ fn rays_match_the_reference_both_ways() {
             let (span, values_of_ray) = (p.range(r), &color[r * 3..r * 3 + 3]);
             let out =
                 RayOutput { values: values_of_ray, opacity: opacity[r], depth: 0.0, weights: &weights[span.clone()], first: span.start };
-            let mut g =
-                RayGradient { values: &mut d_color[r * 3..r * 3 + 3], opacity: 0.0, depth: 0.0, weights: &mut d_weights[span] };
+            let mut g = RayGradient { values: &mut d_color[r * 3..r * 3 + 3], opacity: 0.0, depth: 0.0, weights: &mut d_weights[span] };
             values.push(loss.ray(r, &out, &mut g) as f32 * case.counts.len() as f32);
             d_opacity.push(g.opacity);
             let rgb = std::array::from_fn(|k| color[r * 3 + k]);
@@ -96,8 +95,7 @@ fn relative_differences_count_alike_in_shadow_and_in_light() {
 fn each_term_changes_the_loss_and_masked_rays_do_not_count() {
     let samples = Packed { offsets: &[0, 2], t: &[0.0, 1.0], dt: &[0.5, 0.5] };
     let run = |counts: bool, distance: f32, terms: Terms| {
-        let targets =
-            Targets { rgba: &[0.2, 0.4, 0.6, 0.5], background: &[1.0; 3], counts: &[counts], distance: &[distance] };
+        let targets = Targets { rgba: &[0.2, 0.4, 0.6, 0.5], background: &[1.0; 3], counts: &[counts], distance: &[distance] };
         of_ray(&Photometric::new(terms, Measure::default(), targets, samples), 0, [0.5; 3], 0.9, &[0.4, 0.5]).0
     };
     let none = Terms { color: ColorLoss::Mse, distortion: 0.0, depth: 0.0, alpha: 0.0 };

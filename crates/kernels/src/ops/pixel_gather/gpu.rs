@@ -283,12 +283,7 @@ fn pixel_at(spot: &Spot, sizes: &[u32]) -> Pixel {
 #[cube]
 fn draw_observed(key: &Wide, draw: &Wide, observations: &[u32], observed: u32) -> Pixel {
     let at = below(key, draw, observed) as usize * OBSERVATION;
-    Pixel {
-        image: observations[at],
-        x: observations[at + 1],
-        y: observations[at + 2],
-        distance: f32::reinterpret(observations[at + 3]),
-    }
+    Pixel { image: observations[at], x: observations[at + 1], y: observations[at + 2], distance: f32::reinterpret(observations[at + 3]) }
 }
 
 /// The pixel that was kept of another one's `stride × stride` square.

@@ -1,16 +1,16 @@
 //! Cases of the op, for its tests and for `bench check`.
 
+use super::{Filter, Resample};
 #[cfg(feature = "gpu")]
 use super::{gpu as on_gpu, reference};
-use super::{Filter, Resample};
 #[cfg(feature = "gpu")]
 use crate::{
     gpu::{Gpu, GpuError, table::Table},
     ops::pool::Pool,
 };
+use diorama_testkit::random;
 #[cfg(feature = "gpu")]
 use diorama_testkit::wide;
-use diorama_testkit::random;
 
 pub const FILTERS: [Filter; 6] = [
     Filter::Nearest,
@@ -22,15 +22,8 @@ pub const FILTERS: [Filter; 6] = [
 ];
 
 /// Sizes of images before and after.
-pub const SIZES: [([usize; 2], [usize; 2]); 7] = [
-    ([1, 1], [1, 1]),
-    ([5, 7], [10, 14]),
-    ([13, 40], [5, 17]),
-    ([3, 1], [1, 6]),
-    ([40, 33], [3, 2]),
-    ([4, 5], [4, 5]),
-    ([3, 3], [0, 4]),
-];
+pub const SIZES: [([usize; 2], [usize; 2]); 7] =
+    [([1, 1], [1, 1]), ([5, 7], [10, 14]), ([13, 40], [5, 17]), ([3, 1], [1, 6]), ([40, 33], [3, 2]), ([4, 5], [4, 5]), ([3, 3], [0, 4])];
 
 /// Planes, and gradients of the resampled ones.
 pub struct Case {

@@ -221,8 +221,9 @@ pub(super) fn blend_and_compare(
     let c = compare_color(r, scale, b.light, &color, rgba, background, huber, relative, &mut d_color, d_background);
     let off = 1.0 - b.light - rgba[r * 4 + 3];
     let d_light = c.d_light - scale * alpha * 2.0 * off;
-    let more =
-        blend_backward(t, dt, rgb, d_sigma, d_rgb, &d_color, d_light, &b, surface, first, count, scale, distortion, near, depth, normalized);
+    let more = blend_backward(
+        t, dt, rgb, d_sigma, d_rgb, &d_color, d_light, &b, surface, first, count, scale, distortion, near, depth, normalized,
+    );
     let mut value = c.value + alpha * off * off + more;
     let mut error = c.squared;
     if scale == 0.0 {
