@@ -131,7 +131,7 @@ impl Grid {
         self.tiles(rows).div_ceil(kernel.lanes)
     }
 
-    /// Whether the products saved outweigh the transforms, whose costs in cycles per vector were measured.
+    /// Whether the products saved outweigh the transforms, in estimated cycles per vector of tiles.
     fn pays(&self, c: &Correlation, kernel: &Kernel) -> bool {
         let transforms = 60.0 / c.features as f64 + 40.0 / c.channels as f64;
         let image = self.vectors_of_image(kernel) as f64 * (8.0 + transforms) + 8.0 * self.height.div_ceil(self.rows) as f64;
