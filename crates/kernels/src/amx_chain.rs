@@ -54,7 +54,7 @@ impl Chain {
         self.layers[0].k_tiles
     }
 
-    /// Lines that `n` rows of input take.
+    /// Number of tile lines that hold `n` rows of input.
     pub fn input_lines(&self, n: usize) -> usize {
         n.next_multiple_of(BLOCK) * self.input_tiles()
     }
@@ -64,7 +64,7 @@ impl Chain {
         self.layers.last().map_or(0, |l| l.columns)
     }
 
-    /// Fills input lines with `n` rows of `width` numbers, zeros beyond.
+    /// Writes `n` rows of `width` numbers to input lines and fills the rest with zeros.
     ///
     /// # Panics
     /// When a slice is too short.
@@ -92,7 +92,7 @@ impl Chain {
         }
     }
 
-    /// 32 rows through all layers, of which `rows` are written.
+    /// Takes 32 rows through all layers and writes the first `rows` of the results.
     #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
     unsafe fn block(&self, input: *const Line, rows: usize, out: *mut f32) {
         // What is read of either was written before.
@@ -112,7 +112,7 @@ impl Chain {
                     if l == last {
                         write(sum, rows, layer.columns - j, layer.columns, out.add(j));
                     } else {
-                        hand_over(sum, next.add(j / BLOCK * 16), next_tiles);
+                        store_as_input(sum, next.add(j / BLOCK * 16), next_tiles);
                     }
                 }
             }
@@ -124,7 +124,7 @@ impl Chain {
 /// Rounds `relu(sum)` to the tiles of the next layer's input.
 #[inline]
 #[target_feature(enable = "avx512f,avx512bw,avx512bf16")]
-unsafe fn hand_over(sum: *const f32, next: *mut Line, tiles: usize) {
+unsafe fn store_as_input(sum: *const f32, next: *mut Line, tiles: usize) {
     let zero = _mm512_setzero_ps();
     for r in 0..BLOCK {
         // SAFETY: 32 rows of 32 sums; row r of either tile, see the caller.

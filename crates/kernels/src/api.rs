@@ -33,7 +33,7 @@ impl Api {
         }
     }
 
-    /// What to say where a build cannot reach it.
+    /// Message for a build that cannot reach it.
     pub fn not_built(self) -> String {
         let name = self.name();
         match self {

@@ -1,10 +1,10 @@
-//! Every op on a device against its f64 reference, forward and backward: the cases of `ops/<op>/cases.rs`.
+//! Compares every op on a device with its f64 reference, forward and backward, on the cases of `ops/<op>/cases.rs`.
 
 use crate::gpu::{Gpu, GpuError};
 use crate::ops::{
-    adam, composite, depth_loss, distortion, field_step, frequency, fused_mlp, grid_sample, hash_grid, linear, march, marching_cubes,
-    marching_tetrahedra, occupancy_update, photometric_loss, pixel_gather, prune, ray_aabb, ray_generation, resample, sample_pdf, scan,
-    spherical_harmonics, ssim, triangle_wave, trilinear_corner_grid,
+    adam, composite, depth_loss, distortion, error_map, field_step, frequency, fused_mlp, grid_sample, hash_grid, linear, march,
+    marching_cubes, marching_tetrahedra, occupancy_update, photometric_loss, pixel_draw, pixel_gather, pool, prune, ray_aabb,
+    ray_generation, resample, sample_pdf, scan, spherical_harmonics, ssim, strata, triangle_wave, trilinear_corner_grid,
 };
 
 pub use crate::gpu::table::{Row, TOLERANCE, Table};
@@ -12,7 +12,7 @@ pub use crate::gpu::table::{Row, TOLERANCE, Table};
 /// Runs all cases.
 ///
 /// # Errors
-/// When the device is lost; wrong results are rows with a fault.
+/// When the device is lost. A wrong result is no error but a row with a fault.
 pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
     let mut table = Table::new(gpu);
     let ops = [
@@ -31,8 +31,11 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         march::cases::check,
         occupancy_update::cases::check,
         sample_pdf::cases::check,
+        strata::cases::check,
         trilinear_corner_grid::cases::check,
         pixel_gather::cases::check,
+        error_map::cases::check,
+        pixel_draw::cases::check,
         prune::cases::check,
         adam::cases::check,
         ray_generation::cases::check,
@@ -41,6 +44,7 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         marching_cubes::cases::check,
         marching_tetrahedra::check,
         resample::cases::check,
+        pool::cases::check,
         grid_sample::cases::check,
     ];
     for check in ops {

@@ -1,4 +1,4 @@
-//! What this machine can compute on.
+//! Processors of this machine: its CPU and its GPUs.
 
 pub use crate::api::Api;
 use crate::simd::{self, Level};
@@ -36,9 +36,9 @@ pub fn cpu() -> Cpu {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct GpuInfo {
     pub api: Api,
-    /// What it calls itself.
+    /// Name that the driver reports.
     pub name: String,
-    /// Whether the CPU plays it.
+    /// Whether a driver on the CPU emulates it.
     pub software: bool,
 }
 

@@ -60,7 +60,7 @@ pub fn exp(x: f32) -> f32 {
 /// `1 − e⁻ˣ` for `x ≥ 0`, exact to rounding where x is small.
 #[inline(always)]
 pub fn one_minus_exp_neg(x: f32) -> f32 {
-    // Taylor where cancellation would bite.
+    // Taylor's series where the difference would cancel.
     let series = x * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0 - x * (1.0 / 120.0 - x * (1.0 / 720.0 - x * (1.0 / 5040.0)))))));
     if x < 0.4 { series } else { 1.0 - exp(-x) }
 }

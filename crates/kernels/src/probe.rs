@@ -1,4 +1,4 @@
-//! What the machine itself can do, measured, so that kernels can be judged against it.
+//! Measured limits of the machine, with which the speed of kernels is compared.
 
 use crate::simd::{self, Lane, Level, Plain};
 use std::hint::black_box;
@@ -78,7 +78,7 @@ mod tests {
 
     #[test]
     fn figures_are_plausible() {
-        // Slower than any CPU in use, faster than any that exists.
+        // Between what the slowest CPU in use and the fastest one can do.
         let peak = fma_peak(1 << 16);
         assert!((1e8..1e13).contains(&peak), "{peak}");
         let bandwidth = read_bandwidth(&vec![1; 1 << 18]);

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 /// An instruction set that the kernels are compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Level {
-    /// Plain Rust on arrays of eight floats; the compiler vectorises it for the base target.
+    /// Plain Rust on arrays of eight floats; the compiler vectorizes it for the base target.
     Portable = 1,
     /// AVX2 with FMA, 8 floats.
     Avx2 = 2,
@@ -317,7 +317,7 @@ mod x86 {
     }
 }
 
-/// Asks memory for values that are read before long; a hint, which changes no result.
+/// Prefetches values that are about to be read; a hint that changes no result.
 #[inline]
 pub fn fetch(values: &[f32]) {
     #[cfg(target_arch = "x86_64")]
@@ -330,7 +330,7 @@ pub fn fetch(values: &[f32]) {
     let _ = values;
 }
 
-/// The same for floats that are read and written at once.
+/// Prefetches floats that are about to be read and written.
 #[inline(always)]
 pub fn fetch_now(first: *const f32, floats: usize) {
     #[cfg(target_arch = "x86_64")]
@@ -343,7 +343,7 @@ pub fn fetch_now(first: *const f32, floats: usize) {
     let _ = (first, floats);
 }
 
-/// The same for floats that are written before long.
+/// Prefetches floats that are about to be written.
 #[inline]
 pub fn fetch_to_write(first: *mut f32, floats: usize) {
     #[cfg(target_arch = "x86_64")]

@@ -47,7 +47,7 @@ pub(crate) fn dot<const F: bool>(x: &[f32], y: &[f32]) -> f32 {
     fold(lanes) + tail
 }
 
-/// Mean of a slice and `Σ (x − mean)²`, from sums about the mean of some first elements: it is so near that little cancels.
+/// Mean of a slice and `Σ (x − mean)²`, from sums about the mean of the first elements, which is close enough to avoid cancellation.
 #[inline(always)]
 pub(crate) fn moments<const F: bool>(x: &[f32]) -> (f32, f32) {
     let (n, near) = (x.len() as f32, x.len().min(LANES));

@@ -1,5 +1,4 @@
-//! Tasks that a problem is cut into by its size alone, run in parallel at the caller's SIMD level, and the
-//! parts of slices that they write.
+//! Parallel tasks whose number depends on a problem's size alone, run at the caller's SIMD level, and the parts of slices that they write.
 
 use crate::simd;
 use rayon::prelude::*;
@@ -19,7 +18,7 @@ pub fn run(n: usize, elements: usize, work: impl Fn(usize) + Sync) {
     (0..n).into_par_iter().for_each(|i| simd::with_level(level, || work(i)));
 }
 
-/// A mutable slice of which tasks write disjoint parts.
+/// A mutable slice whose disjoint parts are written by tasks.
 #[derive(Clone, Copy)]
 pub struct Parts<'a, T> {
     ptr: *mut T,
@@ -66,7 +65,7 @@ thread_local! {
     static BUFFER: Cell<Vec<f32>> = const { Cell::new(Vec::new()) };
 }
 
-/// Lends `work` a buffer of `n` floats that this thread keeps; they hold anything.
+/// Lends `work` a buffer of `n` floats of any value, which this thread keeps between calls.
 pub fn with_buffer<R>(n: usize, work: impl FnOnce(&mut [f32]) -> R) -> R {
     let mut buffer = BUFFER.take();
     if buffer.len() < n {

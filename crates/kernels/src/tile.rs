@@ -1,15 +1,15 @@
 //! Register tiles: `C += Σ_k A[·, k] B[k, ·]`, both operands read where they lie through a table of offsets.
 //!
-//! Convolutions and large matrix products walk their outputs in such tiles. The walk itself is ordinary code: only
+//! Convolutions and large matrix products compute their outputs in such tiles. The loops over tiles are ordinary code: only
 //! the tile, and the copies that feed it, are compiled per instruction set and reached through [`Kernel`].
 
 use crate::simd::{self, Lane, Level, Plain};
 
-/// What a tile's sum is added to.
+/// Initial values of a tile's sums.
 #[derive(Clone, Copy)]
 pub enum Start {
     Zero,
-    /// What `c` holds.
+    /// The present content of `c`.
     Accumulate,
     /// One value per row.
     Bias(*const f32),
@@ -235,7 +235,7 @@ unsafe fn pack<L: Lane>(p: &Pack) {
                         i += 1;
                     }
                 } else if i < s.len {
-                    // What is too much is overwritten by the next segment or row.
+                    // The next segment or row overwrites the surplus.
                     L::store(to.add(i), L::load(from.add(i)));
                 }
             }

@@ -1,5 +1,5 @@
 //! Functions of one number for loops that are compiled once per instruction set, with fused multiply-add (`F`) where the set has it.
-//! The functions of [`math`](crate::math) stay apart, because the losses of fields repeat bit for bit.
+//! Fields use those of [`math`](crate::math) instead, so that their losses stay the same bit for bit.
 
 /// Compiles a function once per instruction set and chooses at run time; `F` tells the body whether multiply-add is one instruction.
 macro_rules! vectorized {
@@ -99,7 +99,7 @@ fn within(x: f32, bound: f32) -> f32 {
     if x < -bound { -bound } else { x }
 }
 
-/// `quotient` where `|x|` is below `bound`, else 1 with the sign of x, exactly, since slopes multiply what is missing to 1.
+/// `quotient` where `|x|` is below `bound`, else exactly ±1 by the sign of x, since slopes are products with `1 − y`.
 #[inline(always)]
 fn saturated(x: f32, bound: f32, quotient: f32) -> f32 {
     let y = if x >= bound { 1.0 } else { within(quotient, 1.0) };
@@ -164,7 +164,7 @@ pub(crate) fn ln_1p<const F: bool>(e: f32) -> f32 {
     2.0 * z * polynomial::<F, 8>(z * z, series)
 }
 
-/// Floats from which on a result is written past the caches, which could not hold it anyway.
+/// Floats from which on a result bypasses the caches, which could not hold it.
 pub(crate) const LARGE: usize = 1 << 23;
 
 /// Copies to memory that is not read into the caches first. [`fence`] must follow before other threads read it.

@@ -5,7 +5,7 @@
 use diorama_data::photo;
 use diorama_engine::fields::{Batch, DirectionCode, Encoded, Encoder, Field, FieldBuffers, Loss, RayCodes};
 use diorama_engine::params::ParamGroup;
-use diorama_engine::samplers::{RayBatch, pixels, stratified};
+use diorama_engine::samplers::{RayBatch, pixels};
 use diorama_geom::contraction::Space;
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
@@ -18,6 +18,7 @@ use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
 use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::march::{self, MarchRays, Marched};
 use diorama_kernels::ops::ray_generation::PosedCamera;
+use diorama_kernels::ops::strata::cpu as strata;
 use diorama_scenes::still_life;
 use std::path::PathBuf;
 
@@ -83,7 +84,7 @@ impl RayLoss for Squares<'_> {
 /// Colors of rays under their suns `[R, 3]`; trains on them where there are targets.
 fn evaluate(field: &mut Field, batch: &RayBatch, noise: Option<(Rng, u64)>, suns: &[f32], targets: Option<&[f32]>) -> Vec<f32> {
     let (mut samples, mut positions, mut encoded) = (Marched::default(), Vec::new(), Encoded::default());
-    stratified::stratified(batch, SAMPLES, noise, &mut samples);
+    strata::stratified(&batch.near_far, SAMPLES, noise, &mut samples);
     let RayBatch { origins, dirs, near_far, jitter, .. } = batch;
     march::cpu::positions(&MarchRays { origins, dirs, near_far, jitter, resumed: false }, &samples, &mut positions);
     field.encode(&positions, &mut encoded);

@@ -8,7 +8,7 @@ use diorama_kernels::gpu::{Buffer, Gpu, Rows};
 use diorama_kernels::ops::field_step::gpu::{Arithmetic, GpuNet};
 use diorama_kernels::ops::frequency::Frequency;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
-use diorama_kernels::ops::march::gpu::Space;
+use diorama_kernels::ops::march::Space;
 use diorama_kernels::ops::photometric_loss::Measure;
 use diorama_kernels::ops::trilinear_corner_grid::gpu::{GpuVoxels, keep_empty};
 use diorama_kernels::ops::{frequency, spherical_harmonics, triangle_wave};
@@ -51,8 +51,8 @@ impl Shape {
         let space = match (field.encoder.is_centered(), field.space) {
             (false, geom::Space::Contracted(edge)) => Space::Contracted(edge),
             (false, geom::Space::Cube(edge)) => Space::Cube(edge),
-            (true, geom::Space::Contracted(edge)) => Space::ContractedCentred(edge),
-            (true, geom::Space::Cube(edge)) => Space::Centred(edge),
+            (true, geom::Space::Contracted(edge)) => Space::ContractedCentered(edge),
+            (true, geom::Space::Cube(edge)) => Space::Centered(edge),
         };
         let net = GpuNet::new(gpu, &field.net, &field.density_net(Precision::F32), per_level, &wanted, arithmetic);
         Shape { encoder, directions: field.codes.direction, net, space, measure: measure(field) }

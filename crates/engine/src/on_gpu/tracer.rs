@@ -12,7 +12,7 @@ use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays};
 use diorama_kernels::ops::prune::gpu as prune;
-use diorama_kernels::ops::sample_pdf::gpu::strata;
+use diorama_kernels::ops::strata::gpu as strata;
 
 /// Samples that there is room for, and where the CPU plays the device.
 const ROOM: usize = 1 << 20;

@@ -3,21 +3,21 @@
 use super::shape::Shape;
 use crate::fields::Field;
 use crate::params::ParamGroup;
-use crate::step::{self, Figures, GivenRays, Loss, Placement, Probes, RaySource, Scene, Step, Trainees};
+use crate::step::{Figures, GivenRays, Loss, Placement, Probes, RaySource, Scene, Step, Trainees};
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
+use diorama_kernels::ops::error_map::gpu::{self as error_map, GpuErrorMap};
 use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
 use diorama_kernels::ops::linear::{self, Activation, Dense};
 use diorama_kernels::ops::march::gpu::{self as march, GpuRays};
 use diorama_kernels::ops::occupancy_update::gpu::GpuOccupancyGrid;
 use diorama_kernels::ops::photometric_loss::gpu::{self as loss, SUMS, Target};
-use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
-use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, Drawn, GpuPhotographs};
+use diorama_kernels::ops::pixel_draw::gpu::{Drawn, GpuPhotographs};
 use diorama_kernels::ops::prune::gpu as prune;
 use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
-use diorama_kernels::ops::sample_pdf::gpu::strata;
+use diorama_kernels::ops::strata::gpu as strata;
 use diorama_kernels::ops::{ray_aabb, spherical_harmonics};
 use std::ops::Range;
 
@@ -255,6 +255,7 @@ impl GpuTrainer {
     /// Uploads all that training needs.
     pub fn new(gpu: Gpu, scene: Scene, of: &Trainees, photographs: Option<GpuPhotographs>) -> Self {
         let cameras = GpuCameras::upload(&gpu, &scene.cameras);
+        let error_map = of.error_map.as_ref().zip(photographs.as_ref()).map(|(m, p)| GpuErrorMap::upload(&gpu, m, p.sizes()));
         let corrections = of.corrections.as_ref().map(|(g, focal)| (GpuGroup::upload(&gpu, g), *focal));
         corrections.iter().for_each(|(g, focal)| cameras.correct(&gpu, &g.values, *focal));
         GpuTrainer {
@@ -266,7 +267,7 @@ impl GpuTrainer {
             photographs,
             cameras,
             corrections,
-            error_map: of.error_map.as_ref().map(|m| GpuErrorMap::upload(&gpu, &m.errors, &m.drawn)),
+            error_map,
             sums: gpu.zeros(SUMS),
             on_host: Figures::default(),
             d_given: Vec::new(),
@@ -322,8 +323,9 @@ impl GpuTrainer {
             self.cameras.correct(gpu, &group.values, *focal);
         }
         let drawn_from = self.photographs.as_ref().filter(|_| s.rays.is_of_cameras());
-        if let (Some(map), Some(errors), Some(photographs)) = (&self.error_map, &learned.errors, drawn_from) {
-            map.record(gpu, photographs, &rays.drawn, errors);
+        if let (Some(map), Some(errors), Some(_)) = (&self.error_map, &learned.errors, drawn_from) {
+            let Drawn { images, pixels, left_out, .. } = &rays.drawn;
+            map.record(gpu, error_map::Rays { images, pixels, left_out }, errors);
             if s.refresh_errors {
                 map.refresh(gpu);
             }
@@ -346,11 +348,7 @@ impl GpuTrainer {
         let (drawn, origins, dirs, background, codes) = match &s.rays {
             RaySource::Photographs { count, rng } => {
                 let from = self.photographs.as_ref().expect("photographs to draw from");
-                let backdrop = match s.backdrop {
-                    step::Backdrop::Color(color) => Backdrop::Color(color),
-                    step::Backdrop::Random(rng) => Backdrop::Random(rng),
-                };
-                let drawn = from.draw(gpu, *count, s.first, rng, self.error_map.as_ref(), backdrop);
+                let drawn = from.draw(gpu, *count, s.first, rng, self.error_map.as_ref(), s.backdrop);
                 let (origins, dirs) = self.cameras.forward(gpu, &drawn.images, &drawn.pixels);
                 let background = drawn.background.clone();
                 (drawn, origins, dirs, background, Vec::new())

@@ -11,13 +11,14 @@ use super::view::{interpolate_between, sort_by_tiles};
 use crate::background::LearnedBackground;
 use crate::fields::{Batch, Encoded, Field, FieldBuffers, Pruning, VisibleSamples};
 use crate::samplers::occupancy::Occupancy;
-use crate::samplers::{RayBatch, pixels, stratified};
+use crate::samplers::{RayBatch, pixels};
 use diorama_geom::OrientedBox;
 use diorama_geom::color::srgb_from_linear;
 use diorama_geom::glam::DVec3;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::march::{self, MarchRays, Marched};
 use diorama_kernels::ops::ray_generation::PosedCamera;
+use diorama_kernels::ops::strata::cpu as strata;
 
 /// What stands behind the scene.
 #[derive(Clone, Copy)]
@@ -227,15 +228,15 @@ impl Tracer<'_> {
             }
             Sampling::Stratified { samples } => {
                 let mut marched = Marched::default();
-                stratified::stratified(batch, samples, None, &mut marched);
+                strata::stratified(&batch.near_far, samples, None, &mut marched);
                 self.evaluate(self.field, batch, &marched, buf);
                 take_traced(buf)
             }
             Sampling::Hierarchical { coarse, samples, more } => {
                 let (mut first, mut second) = (Marched::default(), Marched::default());
-                stratified::stratified(batch, samples, None, &mut first);
+                strata::stratified(&batch.near_far, samples, None, &mut first);
                 self.evaluate(coarse, batch, &first, buf);
-                stratified::refine(&first, &buf.out.weights, samples, more, None, &mut second);
+                strata::refine(&first, &buf.out.weights, samples, more, None, &mut second);
                 self.evaluate(self.field, batch, &second, buf);
                 take_traced(buf)
             }

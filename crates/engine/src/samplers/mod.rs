@@ -3,7 +3,6 @@
 pub mod occupancy;
 pub mod pixels;
 pub mod stereo;
-pub mod stratified;
 
 use diorama_kernels::ops::photometric_loss::Targets;
 

@@ -3,8 +3,8 @@
 use super::{Backdrop, Figures, GivenRays, Loss, Photographs, Placement, RaySource, Scene, Step, Trainees, corrected};
 use crate::fields::{self, Batch, Field, FieldBuffers, VisibleSamples};
 use crate::params::ParamGroup;
+use crate::samplers::RayBatch;
 use crate::samplers::pixels::{self, DrawOptions, ErrorMap, PixelSource};
-use crate::samplers::{RayBatch, stratified};
 use crate::stages::Stages;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::linear::Activation;
@@ -12,6 +12,7 @@ use diorama_kernels::ops::march::{self, MarchRays};
 use diorama_kernels::ops::photometric_loss::{Measure, Photometric, RELATIVE, squared_error};
 use diorama_kernels::ops::ray_aabb;
 use diorama_kernels::ops::ray_generation::{self, CORRECTION, PosedCamera};
+use diorama_kernels::ops::strata::cpu as strata;
 
 /// Carries out [`Step`]s on the CPU; keeps its buffers.
 pub struct CpuTrainer {
@@ -183,7 +184,7 @@ impl CpuTrainer {
     /// Samples in equal intervals through the one field.
     fn stratified(&mut self, of: &mut Trainees, s: &Step) -> (f64, usize, usize) {
         let Placement::Stratified { samples, rng } = s.placement else { unreachable!("placed otherwise") };
-        stratified::stratified(&self.batch, samples, Some((rng, s.first)), &mut self.visible.samples);
+        strata::stratified(&self.batch.near_far, samples, Some((rng, s.first)), &mut self.visible.samples);
         encode(of.field, &self.batch, &mut self.visible);
         let loss = self.train(of, s, Which::Main);
         (loss, self.visible.samples.t.len(), self.visible.samples.t.len())
@@ -192,11 +193,11 @@ impl CpuTrainer {
     /// Samples in equal intervals through the coarse field, then more where it found matter through the main one.
     fn hierarchical(&mut self, of: &mut Trainees, s: &Step) -> (f64, usize, usize) {
         let Placement::Hierarchical { samples, more, coarse, fine } = s.placement else { unreachable!("placed otherwise") };
-        stratified::stratified(&self.batch, samples, Some((coarse, s.first)), &mut self.guide.samples);
+        strata::stratified(&self.batch.near_far, samples, Some((coarse, s.first)), &mut self.guide.samples);
         encode(of.coarse.as_ref().expect("a coarse field"), &self.batch, &mut self.guide);
         let coarse_loss = self.train(of, s, Which::Coarse);
         let (from, to) = (&self.guide.samples, &mut self.visible.samples);
-        stratified::refine(from, &self.field.out.weights, samples, more, Some((fine, s.first)), to);
+        strata::refine(from, &self.field.out.weights, samples, more, Some((fine, s.first)), to);
         encode(of.field, &self.batch, &mut self.visible);
         let loss = self.train(of, s, Which::Main);
         let trained = self.guide.samples.t.len() + self.visible.samples.t.len();

@@ -6,6 +6,7 @@ mod cpu;
 pub use cpu::CpuTrainer;
 #[cfg(feature = "gpu")]
 pub(crate) use cpu::measure;
+pub use diorama_kernels::ops::pixel_draw::Backdrop;
 
 use crate::background::LearnedBackground;
 use crate::fields::{Field, Pruning};
@@ -82,14 +83,6 @@ pub struct GivenRays<'a> {
     pub background: &'a [f32],
     /// Vectors of [`crate::fields::RayCodes::given`], `[R, width]` each.
     pub codes: &'a [&'a [f32]],
-}
-
-/// What photographs' transparent pixels, and the field, are composited on.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Backdrop {
-    Color([f32; 3]),
-    /// Another color for every ray.
-    Random(Rng),
 }
 
 /// How samples are placed on rays.

@@ -72,13 +72,13 @@ thread_local! {
     static PACKED: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
 }
 
-/// What an output element starts from.
+/// Initial value of an output element's sum.
 #[derive(Clone, Copy)]
 pub enum Init<'a> {
     Zero,
     /// One value per column, `[n]`.
     Bias(&'a [f32]),
-    /// What `c` holds.
+    /// The present content of `c`.
     Accumulate,
 }
 
@@ -175,7 +175,7 @@ impl Gemm<'_> {
     #[inline(always)]
     unsafe fn run_packed<L: Lane, const MR: usize, const NR: usize>(&self, c: &mut [f32]) {
         let width = NR * L::N;
-        // Taken out and put back: a closure would not be compiled for the instruction set.
+        // Moved out and returned: a closure would not be compiled for the instruction set.
         let mut panel = PACKED.take();
         panel.resize(PANEL * width, 0.0);
         for p in (0..self.k.max(1)).step_by(PANEL) {
@@ -208,7 +208,7 @@ impl Gemm<'_> {
         PACKED.set(panel);
     }
 
-    /// Walks the output in tiles of `MR` rows by `NR` vectors.
+    /// Computes the output in tiles of `MR` rows by `NR` vectors.
     #[inline(always)]
     unsafe fn run<L: Lane, const MR: usize, const NR: usize>(&self, c: &mut [f32]) {
         let cp = c.as_mut_ptr();

@@ -1,4 +1,4 @@
-//! Adding f32 from many units at once.
+//! Concurrent addition of f32 by many units.
 
 use cubecl::prelude::*;
 
@@ -13,7 +13,7 @@ pub trait Accumulate: 'static + Send + Sync {
 /// The device's own addition.
 pub struct Native;
 
-/// Exchange of the bits, which every device has.
+/// Addition by exchange of bits, an atomic operation that every device has.
 pub struct Swap;
 
 #[cube]
@@ -30,8 +30,8 @@ impl Accumulate for Swap {
     type Cell = u32;
 
     fn add(cell: &Atomic<u32>, value: f32) {
-        // What was there is taken out, summed and put back; what others put there meanwhile comes out of that
-        // and is carried on.
+        // Takes the cell's number out, adds to it and writes the sum. If another unit wrote a number meanwhile, the exchange returns it,
+        // and it is added in the next round.
         let mut carry = value;
         while carry != 0.0 {
             let sum = f32::reinterpret(cell.exchange(0u32)) + carry;

@@ -1,4 +1,4 @@
-//! Typed memory of a device, and rows of which only the device knows how many are in use.
+//! Typed memory of a device, and matrices whose number of rows in use is known to the device alone.
 
 use super::Gpu;
 use cubecl::prelude::*;
@@ -20,7 +20,7 @@ impl<T> Clone for Buffer<T> {
 }
 
 impl<T> Buffer<T> {
-    /// `len` numbers in memory that is there already.
+    /// A buffer of `len` numbers in existing memory.
     ///
     /// # Panics
     /// When the memory holds fewer.
@@ -29,7 +29,7 @@ impl<T> Buffer<T> {
         Buffer { handle, len, element: PhantomData }
     }
 
-    /// The memory, for another library on the same device.
+    /// Memory of the buffer, to be shared with another library on the same device.
     pub fn handle(self) -> Handle {
         self.handle
     }
@@ -52,7 +52,7 @@ impl<T> Buffer<T> {
         Buffer { handle: self.handle.clone(), len: self.len * size_of::<T>() / size_of::<U>(), element: PhantomData }
     }
 
-    /// For a launch whose kernel indexes up to `len` numbers.
+    /// Argument of a launch whose kernel indexes up to `len` numbers.
     ///
     /// # Panics
     /// When there are fewer.
@@ -64,12 +64,12 @@ impl<T> Buffer<T> {
     }
 }
 
-/// Rows of a matrix of which only the device knows how many are in use.
+/// Rows of a matrix whose number in use is known to the device alone.
 #[derive(Clone)]
 pub struct Rows {
-    /// As many as there is memory for.
+    /// Rows that there is memory for.
     pub most: usize,
-    /// Counts, of which number `at` is that of these rows; at most `most`.
+    /// Counts of rows in use; that of these rows is `live[at]`, at most `most`.
     pub(crate) live: Buffer<u32>,
     pub(crate) at: usize,
 }
@@ -80,7 +80,7 @@ impl Rows {
         Rows { most: n, live: gpu.upload(&[n as u32]), at: 0 }
     }
 
-    /// As many as number `at` of `live` says, which is at most `most`.
+    /// `live[at]` rows, at most `most`.
     ///
     /// # Panics
     /// When there is no such number.
@@ -89,7 +89,7 @@ impl Rows {
         Rows { most, live: live.clone(), at }
     }
 
-    /// Place of the count, for a launch.
+    /// Index of the count, as kernels take it.
     pub(crate) fn place(&self) -> u32 {
         self.at as u32
     }

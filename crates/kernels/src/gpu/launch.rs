@@ -6,12 +6,12 @@ use cubecl::prelude::*;
 /// Most cubes along one axis that every API allows.
 const MAX_CUBES: u32 = 65_535;
 
-/// Units of a launch; none: nothing is launched.
+/// Number and shape of a launch's cubes; `None` launches nothing.
 pub(crate) trait Grid {
     fn cubes(self) -> Option<(CubeCount, CubeDim)>;
 }
 
-/// One unit for each of so many elements. Kernels stop the units past them.
+/// One unit per element. Kernels stop the units past the last element.
 impl Grid for usize {
     fn cubes(self) -> Option<(CubeCount, CubeDim)> {
         let cubes = u32::try_from(self.div_ceil(CUBE as usize)).expect("fewer than 2^32 cubes");
@@ -20,7 +20,7 @@ impl Grid for usize {
     }
 }
 
-/// Cubes along each axis, and their shape.
+/// Number of cubes along each axis, and the shape of a cube.
 impl Grid for ([usize; 3], CubeDim) {
     fn cubes(self) -> Option<(CubeCount, CubeDim)> {
         let [x, y, z] = self.0.map(|n| u32::try_from(n).expect("fewer than 2^32 cubes"));
@@ -39,7 +39,7 @@ impl Binds<&'static [Atomic<f32>]> for Buffer<f32> {}
 impl Binds<&'static [Atomic<u32>]> for Buffer<f32> {}
 impl Binds<&'static [Atomic<u32>]> for Buffer<u32> {}
 
-/// Stands in for a bound buffer where types are checked; never called.
+/// Stand-in for a bound buffer in code that the compiler checks and nobody runs.
 pub(crate) fn stand_in<T, P>(_: &Buffer<T>) -> P
 where
     Buffer<T>: Binds<P>,
@@ -47,15 +47,15 @@ where
     unreachable!("only types are checked")
 }
 
-/// The same for a number.
+/// Stand-in for a number in the same code.
 pub(crate) fn number<P>() -> P {
     unreachable!("only types are checked")
 }
 
 /// Launches a kernel: `launch!(gpu, kernel, units, [buffer => length, …], number, …)`.
 ///
-/// `units` is a number of elements with one unit each, or `([x, y, z], cube)`; of none, nothing is launched. Buffers come with the
-/// length up to which the kernel indexes them. `kernel::<Adder>` stands for a kernel generic over [`Accumulate`](crate::gpu::Accumulate)
+/// `units` is a number of elements with one unit each, or `([x, y, z], cube)`; 0 units launch nothing. Each buffer is followed by the
+/// length up to which the kernel indexes it. `kernel::<Adder>` stands for a kernel generic over [`Accumulate`](crate::gpu::Accumulate)
 /// with the device's way of adding.
 ///
 /// # Panics
@@ -71,7 +71,7 @@ macro_rules! launch {
     ($gpu:expr, $kernel:ident $(::<$generic:ty>)?, $units:expr, [$($buffer:expr => $len:expr),* $(,)?] $(, $number:expr)* $(,)?) => {
         if let Some((cubes, cube)) = $crate::gpu::launch::Grid::cubes($units) {
             if false {
-                // The kernel's own signature, which launches forget.
+                // Checks arguments against the kernel's signature, which `launch_unchecked` does not.
                 $kernel $(::<$generic>)? (
                     $($crate::gpu::launch::stand_in(&$buffer),)*
                     $({

@@ -18,7 +18,7 @@ pub(crate) use launch::launch;
 
 /// Units per cube of the kernels that treat one element per unit.
 pub const CUBE: u32 = 256;
-/// What `stubs/cuda-on-cpu` calls itself.
+/// Device name of `stubs/cuda-on-cpu`.
 const CUDA_ON_CPU: &str = "CPU playing CUDA";
 
 /// Why a device cannot be used.
@@ -41,13 +41,13 @@ pub enum GpuError {
 #[derive(Clone)]
 pub struct Gpu {
     pub api: Api,
-    /// What the device calls itself.
+    /// Name that the driver reports.
     pub name: String,
-    /// Whether the CPU plays the device.
+    /// Whether a driver on the CPU emulates the device.
     pub software: bool,
     device: cubecl::Device,
     pub(crate) client: Client,
-    /// Whether f32 can be added atomically; else exchanges serve.
+    /// Whether the device adds f32 atomically; without it kernels use exchanges ([`Swap`]).
     pub(crate) native_atomics: bool,
     /// Whether kernels use memory shared by a cube. Mesa's software Vulkan before 23 crashes on it as SPIR-V
     /// declares it, and gains nothing from it.
@@ -63,7 +63,7 @@ impl Gpu {
         Gpu::open_kind(api, true)
     }
 
-    /// The best device of an API, unless the CPU plays it.
+    /// Opens the best device of an API that is hardware.
     ///
     /// # Errors
     /// As [`Gpu::open`].
@@ -78,7 +78,7 @@ impl Gpu {
         #[cfg(feature = "cuda")]
         keep_compiled();
         let (device, software) = find(api).filter(|(_, software)| or_software || !software).ok_or(GpuError::NoDevice(api.name()))?;
-        let client = quietly(|| device.client()).map_err(|e| GpuError::Open(api.name(), e))?;
+        let client = catch_quietly(|| device.client()).map_err(|e| GpuError::Open(api.name(), e))?;
         Ok(Gpu::with(api, device, software, client))
     }
 
@@ -138,11 +138,11 @@ impl Gpu {
 
     /// Gives back memory that is no longer used.
     pub fn release(&self) {
-        // A device that fails here fails at the next read as well, which tells.
+        // A device that fails here also fails at the next read, which reports it.
         let _ = self.client.memory_cleanup();
     }
 
-    /// Memory for `len` numbers of unknown value.
+    /// Uninitialized memory for `len` numbers.
     pub fn empty<T>(&self, len: usize) -> Buffer<T> {
         Buffer::of(self.client.empty((len * size_of::<T>()).next_multiple_of(4).max(4)), len)
     }
@@ -165,7 +165,7 @@ impl Gpu {
     pub fn either(&self, a: &Buffer<u32>, b: &Buffer<u32>) -> Buffer<u32> {
         let n = a.len().min(b.len());
         let out = self.empty(n);
-        launch!(self, unite, n, [a => n, b => n, out => n], n as u32);
+        launch!(self, mark_either, n, [a => n, b => n, out => n], n as u32);
         out
     }
 
@@ -174,12 +174,12 @@ impl Gpu {
         Buffer::of(self.client.create_from_slice(bytes), data.len())
     }
 
-    /// [`Gpu::upload`], without bringing zeros there where there is nothing else.
+    /// [`Gpu::upload`], which fills the buffer on the device if all numbers are 0.
     pub fn upload_or_zeros(&self, data: &[f32]) -> Buffer {
         if data.iter().all(|v| v.to_bits() == 0) { self.zeros(data.len()) } else { self.upload(data) }
     }
 
-    /// Waits for the device and brings numbers back.
+    /// Waits for the device and downloads a buffer.
     ///
     /// # Errors
     /// When the device was lost or ran out of memory.
@@ -198,12 +198,12 @@ impl Gpu {
 
     fn lost(&self, e: &dyn std::fmt::Debug) -> GpuError {
         let text = format!("{e:?}");
-        let told = (self.name.clone(), brief(&text));
-        if is_out_of_memory(&text) { GpuError::Memory(told.0, told.1) } else { GpuError::Lost(told.0, told.1) }
+        let (name, cause) = (self.name.clone(), last_cause(&text));
+        if is_out_of_memory(&text) { GpuError::Memory(name, cause) } else { GpuError::Lost(name, cause) }
     }
 }
 
-/// Has compiled kernels kept in the user's cache folder, for the next start. What the program decided before stays.
+/// Lets CubeCL keep compiled kernels in the user's cache folder for the next start, unless the program has configured it already.
 #[cfg(feature = "cuda")]
 fn keep_compiled() {
     use cubecl::config::cache::CacheConfig;
@@ -214,8 +214,8 @@ fn keep_compiled() {
     CubeClRuntimeConfig::try_set(c);
 }
 
-/// Whether a failure says that memory was short: CubeCL's own words, or a driver's. CubeCL puts allocations off; of one
-/// that failed it says no more than that its memory was never initialized.
+/// Whether the text of a failure, CubeCL's or a driver's, means that memory was short. CubeCL allocates late; about an allocation that
+/// failed it only says that its memory was never initialized.
 fn is_out_of_memory(text: &str) -> bool {
     let text = text.to_lowercase().replace([' ', '_'], "");
     ["outofmemory", "neverinitialized", "can'tallocate", "buffertoobig", "outofdevicememory", "outofhostmemory"]
@@ -223,8 +223,8 @@ fn is_out_of_memory(text: &str) -> bool {
         .any(|t| text.contains(t))
 }
 
-/// A failure in one line: its last cause, without a kernel's source and backtraces.
-fn brief(text: &str) -> String {
+/// Last cause of a failure in one line, without kernel sources and backtraces.
+fn last_cause(text: &str) -> String {
     const MOST: usize = 240;
     let end = [text.find("[Source]"), text.find("Backtrace"), text.find("No backtrace")].into_iter().flatten().min().unwrap_or(text.len());
     let cause = text[..end].rsplit("Caused by:").find(|c| !c.trim().is_empty()).unwrap_or("the device failed");
@@ -235,7 +235,7 @@ fn brief(text: &str) -> String {
     }
 }
 
-/// Whether the headers are there that CUDA kernels with half precision include.
+/// Whether the headers that CUDA kernels with half precision include are installed.
 pub(crate) fn has_cuda_headers() -> bool {
     let own = std::env::var_os("CUDA_PATH").map(std::path::PathBuf::from);
     let usual = ["/usr/local/cuda", "/opt/cuda", "C:/Program Files/NVIDIA GPU Computing Toolkit/CUDA"].map(std::path::PathBuf::from);
@@ -245,7 +245,7 @@ pub(crate) fn has_cuda_headers() -> bool {
 fn find(api: Api) -> Option<(cubecl::Device, bool)> {
     let on = |kind, backend| WgpuDevice::new(kind).on(backend);
     let backend = match api {
-        Api::Cuda => return quietly(|| cubecl::Device::cuda(0)).ok()?.ok().map(|d| (d, false)),
+        Api::Cuda => return catch_quietly(|| cubecl::Device::cuda(0)).ok()?.ok().map(|d| (d, false)),
         Api::Vulkan => WgpuBackend::Vulkan,
         Api::Metal => WgpuBackend::Metal,
         Api::WebGpu => WgpuBackend::Auto,
@@ -260,13 +260,13 @@ fn find(api: Api) -> Option<(cubecl::Device, bool)> {
     kinds.into_iter().find_map(|kind| {
         let software = matches!(kind, WgpuDeviceKind::Cpu);
         let device = cubecl::Device::Wgpu(on(kind, backend));
-        let found = quietly(|| !cubecl::Device::enumerate(device.to_id()).is_empty()).unwrap_or(false);
+        let found = catch_quietly(|| !cubecl::Device::enumerate(device.to_id()).is_empty()).unwrap_or(false);
         found.then_some((device, software))
     })
 }
 
-/// Runs what may panic in a driver's absence, without its message on the terminal.
-fn quietly<T>(f: impl FnOnce() -> T) -> Result<T, String> {
+/// Runs `work`, which may panic without a driver, and keeps the panic's message off the terminal.
+fn catch_quietly<T>(f: impl FnOnce() -> T) -> Result<T, String> {
     static ONE: std::sync::Mutex<()> = std::sync::Mutex::new(());
     let _one = ONE.lock();
     let hook = std::panic::take_hook();
@@ -294,7 +294,7 @@ fn duplicate(from: &[u32], to: &mut [u32], n: u32) {
 }
 
 #[cube(launch_unchecked)]
-fn unite(a: &[u32], b: &[u32], out: &mut [u32], n: u32) {
+fn mark_either(a: &[u32], b: &[u32], out: &mut [u32], n: u32) {
     if ABSOLUTE_POS < n as usize {
         out[ABSOLUTE_POS] = a[ABSOLUTE_POS] | b[ABSOLUTE_POS];
     }
@@ -302,7 +302,7 @@ fn unite(a: &[u32], b: &[u32], out: &mut [u32], n: u32) {
 
 #[cfg(test)]
 mod tests {
-    use super::{brief, is_out_of_memory};
+    use super::{is_out_of_memory, last_cause};
 
     #[test]
     fn a_full_device_is_told_apart_from_a_lost_one() {
@@ -321,9 +321,9 @@ mod tests {
     #[test]
     fn failures_are_told_in_one_line() {
         let long = "Several failures\nCaused by:\n  A launch error\nCaused by:\n  out of\n    memory\n[Source]\nfloat x;\nBacktrace: none";
-        assert_eq!(brief(long), "out of memory");
-        assert_eq!(brief("can't allocate buffer of size: 9\nNo backtrace available"), "can't allocate buffer of size: 9");
-        assert_eq!(brief(""), "the device failed");
-        assert_eq!(brief(&"é".repeat(500)).chars().count(), 241);
+        assert_eq!(last_cause(long), "out of memory");
+        assert_eq!(last_cause("can't allocate buffer of size: 9\nNo backtrace available"), "can't allocate buffer of size: 9");
+        assert_eq!(last_cause(""), "the device failed");
+        assert_eq!(last_cause(&"é".repeat(500)).chars().count(), 241);
     }
 }

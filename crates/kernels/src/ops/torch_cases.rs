@@ -1,4 +1,5 @@
-//! Our CPU ops against outputs and gradients that PyTorch wrote (`benches/peers/ops_reference.py`), for what conventions decide.
+//! Compares CPU ops whose conventions differ between libraries with outputs and gradients that PyTorch wrote
+//! (`benches/peers/ops_reference.py`).
 
 use super::activation::{self, Activation};
 use super::attention::{self, Attention};

@@ -65,6 +65,43 @@ fn joined_layouts_are_permutations() {
 }
 
 #[test]
+fn convolutions_and_attention_have_the_right_gradients() {
+    let settings = Conv { groups: 2, ..Conv::same(3).stride(2) }.activation(Activation::Gelu);
+    let b = || Tensor::<1>::from_data(TensorData::new(random(6, 6), [6]), &Device::flex());
+    let (x, w) = (|| leaf([2, 4, 5, 4], 7), || leaf([6, 2, 3, 3], 8));
+    assert_differences([2, 4, 5, 4], |x| weighed(conv2d(x, w(), Some(b()), settings).unwrap(), 2));
+    assert_differences([6, 2, 3, 3], |w| weighed(conv2d(x(), w, Some(b()), settings).unwrap(), 2));
+    assert_differences([6], |b| weighed(conv2d(x(), w(), Some(b), settings).unwrap(), 2));
+    let (settings, w) = (Conv { output_padding: [1; 2], ..settings }, || leaf([4, 3, 3, 3], 8));
+    assert_differences([2, 4, 5, 4], |x| weighed(conv_transpose2d(x, w(), Some(b()), settings).unwrap(), 2));
+    assert_differences([4, 3, 3, 3], |w| weighed(conv_transpose2d(x(), w, Some(b()), settings).unwrap(), 2));
+    assert_differences([6], |b| weighed(conv_transpose2d(x(), w(), Some(b), settings).unwrap(), 2));
+    let (q, kv) = (|| leaf([2, 3, 4], 9), || leaf([2, 5, 4], 10));
+    assert_differences([2, 3, 4], |q| weighed(attention(q, kv(), kv() * 2.0, false).unwrap(), 2));
+    assert_differences([2, 5, 4], |k| weighed(attention(q(), k, kv(), false).unwrap(), 2));
+    assert_differences([2, 5, 4], |v| weighed(attention(q(), kv(), v, false).unwrap(), 2));
+}
+
+#[test]
+fn changes_of_size_have_the_right_gradients() {
+    let image = [1, 4, 5, 6];
+    for filter in [Filter::Nearest, Filter::Bilinear { align_corners: true }, Filter::BicubicAntialiased, Filter::Area] {
+        assert_differences(image, |x| weighed(resize(x, filter, [7, 4]).unwrap(), 2));
+    }
+    let pool = Pool { kernel: [3, 2], stride: [2, 2], padding: [1, 0], ceil_mode: false };
+    assert_differences(image, |x| weighed(average_pool(x, pool, true).unwrap(), 2));
+    assert_differences(image, |x| weighed(max_pool(x, pool).unwrap(), 2));
+    assert_differences(image, |x| weighed(global_average_pool(x).unwrap(), 2));
+    assert_differences(image, |x| weighed(pixel_shuffle(x, 2).unwrap(), 2));
+    let settings = GridSettings { mode: GridMode::Bilinear, outside: Outside::Border, align_corners: false };
+    // Between the centers of pixels, whose values meet in a kink.
+    let between = [-0.62f32, -0.53, 0.41, 0.23, 0.77, -0.71, -0.05, 0.57];
+    let grid = || Tensor::<4>::from_data(TensorData::new(between.to_vec(), [1, 2, 2, 2]), &Device::flex());
+    assert_differences(image, |x| weighed(grid_sample(x, grid(), settings).unwrap(), 2));
+    assert_differences([1, 2, 2, 2], |d| weighed(grid_sample(leaf(image, 3), grid() + d * 0.01, settings).unwrap(), 2));
+}
+
+#[test]
 fn losses_have_the_right_gradients() {
     let y = Tensor::<2>::from_data(TensorData::new(random(12, 5), [3, 4]), &Device::flex());
     for kind in [Error::Squared, Error::Absolute, Error::Huber(0.2)] {

@@ -49,7 +49,7 @@ pub(super) fn resident(
     gpu: &diorama_kernels::gpu::Gpu,
     store: &PixelStore,
     observations: &[diorama_engine::samplers::pixels::Observation],
-) -> pixel_gather::gpu::GpuPhotographs {
+) -> diorama_kernels::ops::pixel_draw::gpu::GpuPhotographs {
     let n = store.len();
     let sizes: Vec<(u32, u32)> = (0..n).map(|i| store.size(i)).collect();
     let keys: Vec<_> = (0..n).map(|i| store.kept_by(i)).collect();
@@ -64,7 +64,14 @@ pub(super) fn resident(
         first += store.kept(i);
     }
     let pixels = (store.format(), &pixels[..]);
-    let mut images = pixel_gather::gpu::GpuPhotographs::upload(gpu, &sizes, store.stride(), &keys, pixels, (!all).then_some(&mask[..]));
-    images.observe(gpu, &observations.iter().map(|o| (o.image, o.x, o.y, o.distance)).collect::<Vec<_>>());
+    let mut images = diorama_kernels::ops::pixel_draw::gpu::GpuPhotographs::upload(
+        gpu,
+        &sizes,
+        store.stride(),
+        &keys,
+        pixels,
+        (!all).then_some(&mask[..]),
+    );
+    images.observe(gpu, observations);
     images
 }

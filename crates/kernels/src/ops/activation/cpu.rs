@@ -53,7 +53,7 @@ pub(crate) fn backward_of_kept(a: Activation, kept: &[f32], d: &[f32], dx: &mut 
     match a {
         Activation::Sigmoid => sigmoid_backward(kept, d, dx),
         Activation::Tanh => tanh_backward(kept, d, dx),
-        // Output and input have one sign where the output is kept.
+        // The slopes of those that keep their output depend on its sign alone, which is the input's.
         _ => backward_block(a, kept, d, dx),
     }
 }

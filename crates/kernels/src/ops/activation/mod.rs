@@ -29,7 +29,7 @@ pub enum Activation {
 }
 
 impl Activation {
-    /// Whether the slope needs the function's input; else the output tells it, too.
+    /// Whether the slope must be computed from the function's input; else the output suffices.
     pub fn needs_input(self) -> bool {
         match self {
             Activation::None | Activation::Relu | Activation::Sigmoid | Activation::Tanh => false,

@@ -10,7 +10,7 @@ use diorama_testkit::random;
 use diorama_testkit::wide;
 use std::ops::Range;
 
-/// Three steps of parameters; of each gradient every third number is 0.
+/// Gradients of three steps, every third number of which is 0.
 pub struct Case {
     pub adam: Adam,
     /// Whether parameters without gradient are left alone.

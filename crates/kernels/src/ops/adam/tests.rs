@@ -47,7 +47,7 @@ fn sparse_matches_the_reference_and_clears_what_it_used() {
 }
 
 #[test]
-fn it_walks_to_the_minimum() {
+fn it_converges_to_the_minimum() {
     let (mut p, mut m, mut v) = (vec![5.0f32], vec![0.0], vec![0.0]);
     let a = Adam { rate: 0.1, ..Adam::default() };
     for t in 1..400 {

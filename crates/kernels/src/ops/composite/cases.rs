@@ -19,7 +19,7 @@ pub struct Scene {
     pub sigma: Vec<f32>,
 }
 
-/// Ragged rays, empty ones among them, some opaque.
+/// Rays with different numbers of samples; some are empty, some opaque.
 pub fn scene(rays: usize, seed: u64) -> Scene {
     let n = random_unit(rays, seed);
     let mut offsets = vec![0u32];

@@ -1,4 +1,4 @@
-//! One pass forward, one pass back with a running suffix sum; parallel over rays.
+//! One forward pass and one backward pass with a running suffix sum; parallel over rays.
 
 use super::{Composited, Packed};
 use crate::math;
@@ -7,7 +7,7 @@ use rayon::prelude::*;
 /// Rays per task.
 const RAYS: usize = 64;
 
-/// Gradients that come in; what is absent is zero.
+/// Gradients of the results; `None` stands for zeros.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Upstream<'a> {
     pub color: Option<&'a [f32]>,
@@ -16,7 +16,7 @@ pub struct Upstream<'a> {
     pub weights: Option<&'a [f32]>,
 }
 
-/// Gradients that go out.
+/// Gradients of the inputs.
 #[derive(Clone, Debug, Default)]
 pub struct Gradients {
     pub sigma: Vec<f32>,
@@ -40,7 +40,7 @@ pub fn ray_weights(sigma: &[f32], dt: &[f32], weights: &mut [f32]) -> f32 {
 /// Gradient of one ray's densities: `g` holds `∂L/∂w_i`, `g_out` is `∂L/∂T_out`.
 #[inline]
 pub fn ray_sigma_gradient(sigma: &[f32], dt: &[f32], weights: &[f32], t_out: f32, g: &[f32], g_out: f32, d_sigma: &mut [f32]) {
-    // Behind sample i: Σ_{j>i} w_j g_j + T_out g_out, gathered from the back, where it is small.
+    // Behind sample i: Σ_{j>i} w_j g_j + T_out g_out, summed from the last sample on, where terms are small.
     let mut behind = t_out * g_out;
     let mut after = t_out;
     for i in (0..sigma.len()).rev() {
@@ -148,7 +148,7 @@ pub fn transmittance_at(p: &Packed, sigma: &[f32], t_query: &[f32]) -> Vec<f32> 
         .collect()
 }
 
-/// Front colour `[R, c]`, transmittance at the split `[R]`, colour behind it `[R, c]`.
+/// Front color `[R, c]`, transmittance at the split `[R]`, color behind it `[R, c]`.
 pub fn split(p: &Packed, sigma: &[f32], features: &[f32], c: usize, t_split: &[f32]) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     let (mut front, mut back, mut between) = (vec![0.0; p.rays() * c], vec![0.0; p.rays() * c], vec![1.0; p.rays()]);
     let colors = front.par_chunks_mut(c.max(1)).zip(back.par_chunks_mut(c.max(1)));

@@ -1,4 +1,4 @@
-//! One unit per ray for weights and densities, one per ray and channel for colours.
+//! One unit per ray for weights and densities, one per ray and channel for colors.
 
 use crate::gpu::{Buffer, Gpu, Rows, launch};
 use cubecl::prelude::*;
@@ -20,7 +20,7 @@ impl GpuPacked {
         self.offsets.len().saturating_sub(1)
     }
 
-    /// The samples: as many as the last offset says.
+    /// Rows of the samples, whose number is the last offset.
     pub fn rows(&self) -> Rows {
         Rows::counted(self.t.len(), &self.offsets, self.rays())
     }
@@ -47,7 +47,7 @@ pub fn forward(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, features: &Buffer, c: u
     let out = GpuComposited { color: gpu.empty(r * c), depth: gpu.empty(r), opacity: gpu.empty(r), weights: gpu.empty(s) };
     launch!(
         gpu,
-        weigh,
+        weigh_samples,
         r,
         [p.offsets => r + 1, p.t => s, p.dt => s, sigma => s, out.weights => s, out.depth => r, out.opacity => r],
         r as u32,
@@ -77,7 +77,7 @@ pub fn backward(
     let g = GpuGradients { sigma: gpu.empty(s), features: gpu.empty(s * c), background: gpu.empty(r * c) };
     launch!(
         gpu,
-        unblend,
+        features_backward,
         r * c,
         [p.offsets => r + 1, out.weights => s, out.opacity => r, d.color => r * c, g.features => s * c, g.background => r * c],
         (r * c) as u32,
@@ -85,7 +85,7 @@ pub fn backward(
     );
     launch!(
         gpu,
-        unweigh,
+        densities_backward,
         r,
         [
             p.offsets => r + 1,
@@ -108,7 +108,16 @@ pub fn backward(
 }
 
 #[cube(launch_unchecked)]
-fn weigh(offsets: &[u32], t: &[f32], dt: &[f32], sigma: &[f32], weights: &mut [f32], depth: &mut [f32], opacity: &mut [f32], rays: u32) {
+fn weigh_samples(
+    offsets: &[u32],
+    t: &[f32],
+    dt: &[f32],
+    sigma: &[f32],
+    weights: &mut [f32],
+    depth: &mut [f32],
+    opacity: &mut [f32],
+    rays: u32,
+) {
     let r = ABSOLUTE_POS;
     if r >= rays as usize {
         terminate!();
@@ -152,7 +161,7 @@ fn blend(
 }
 
 #[cube(launch_unchecked)]
-fn unblend(
+fn features_backward(
     offsets: &[u32],
     weights: &[f32],
     opacity: &[f32],
@@ -177,7 +186,7 @@ fn unblend(
 }
 
 #[cube(launch_unchecked)]
-fn unweigh(
+fn densities_backward(
     offsets: &[u32],
     t: &[f32],
     dt: &[f32],
@@ -204,7 +213,7 @@ fn unweigh(
     for k in 0..c {
         out += d_color[r * c + k] * background[r * c + k];
     }
-    // From the back, where what is still behind is small.
+    // From the last sample on, where sums are small.
     let mut after = 1.0 - opacity[r];
     let mut behind = after * out;
     for j in 0..count {

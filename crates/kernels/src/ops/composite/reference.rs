@@ -86,7 +86,7 @@ pub fn transmittance_at(p: &Packed, sigma: &[f64], t_query: &[f64]) -> Vec<f64> 
         .collect()
 }
 
-/// Splits each ray at `t_split`: front colour, transmittance there, and the colour behind it as if
+/// Splits each ray at `t_split`: front color, transmittance there, and the color behind it as if
 /// nothing stood in front (without background). Samples belong to the side of their midpoint.
 pub fn split(p: &Packed, sigma: &[f64], features: &[f64], c: usize, t_split: &[f64]) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
     let (mut front, mut back, mut between) = (vec![0.0; p.rays() * c], vec![0.0; p.rays() * c], vec![1.0; p.rays()]);

@@ -5,7 +5,7 @@ use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::GpuPacked;
 use cubecl::prelude::*;
 
-/// What light counts that ends at distance `middle`.
+/// Penalty on light that ends at distance `middle`.
 #[cube]
 pub fn away(middle: f32, surface: f32) -> f32 {
     clamp((middle / surface - 1.0).abs() - EXACT, 0.0, MOST)
@@ -26,7 +26,7 @@ pub fn add(
     let (values, d_weights) = to;
     launch!(
         gpu,
-        judge,
+        add_depth_loss,
         r,
         [p.offsets => r + 1, p.t => s, p.dt => s, weights => s, surface => r, left_out => r, values => r, d_weights => s],
         r as u32,
@@ -36,7 +36,7 @@ pub fn add(
 }
 
 #[cube(launch_unchecked)]
-fn judge(
+fn add_depth_loss(
     offsets: &[u32],
     t: &[f32],
     dt: &[f32],

@@ -1,8 +1,8 @@
-//! Light that ends away from a surface of known distance, such as a sparse point that the ray's photograph shows (after
-//! Deng et al. 2022, DS-NeRF): of a ray `Σ_i w_i · min(max(|m_i / d − 1| − 0.02, 0), 0.5)`, with the weights `w`, the middles
-//! `m` of the samples and the surface's distance `d`.
+//! Depth supervision (after Deng et al. 2022, DS-NeRF): penalty on a ray's weights away from a surface of known distance, such as a
+//! sparse point that the photograph shows. Per ray `Σ_i w_i · min(max(|m_i / d − 1| − 0.02, 0), 0.5)`, with weights `w`, the middles `m`
+//! of the samples and the surface's distance `d`.
 //!
-//! The weights are judged, not their mean distance, so that fog before a surface counts as much as matter behind it.
+//! It sums over weights instead of comparing their mean distance, so that fog before a surface costs as much as matter behind it.
 
 #[cfg(any(test, feature = "gpu"))]
 pub(crate) mod cases;
@@ -10,19 +10,19 @@ pub(crate) mod cases;
 pub mod gpu;
 pub mod reference;
 
-/// Share of the distance within which light may end: sparse points are not exact.
+/// Tolerated distance from the surface, as a share of its distance: sparse points are not exact.
 pub const EXACT: f32 = 0.02;
 
-/// What counts at most: a wrong point must not outweigh the photographs.
+/// Largest penalty: a wrong point must not outweigh the photographs.
 pub const MOST: f32 = 0.5;
 
-/// What light counts that ends at distance `middle` from the camera on a ray whose surface is at `surface`.
+/// Penalty on light that ends at distance `middle` from the camera, where the surface is at `surface`.
 #[inline(always)]
 pub fn away(middle: f32, surface: f32) -> f32 {
     ((middle / surface - 1.0).abs() - EXACT).clamp(0.0, MOST)
 }
 
-/// Loss of a ray with samples from `t` on of lengths `dt` and weights `w`; adds `scale · ∂loss/∂w` to `g`.
+/// Loss of a ray whose samples begin at `t`, are `dt` long and have weights `w`; adds `scale · ∂loss/∂w` to `g`.
 pub fn ray(t: &[f32], dt: &[f32], w: &[f32], surface: f32, scale: f32, g: &mut [f32]) -> f32 {
     let mut loss = 0.0;
     for i in 0..w.len() {

@@ -3,7 +3,7 @@
 use super::{EXACT, MOST};
 use crate::ops::composite::Packed;
 
-/// What the light of sample `i` counts on a ray whose surface is at `surface`.
+/// Penalty on the light of sample `i`, where the surface is at `surface`.
 fn away(p: &Packed, i: usize, surface: f32) -> f64 {
     let middle = p.t[i] as f64 + 0.5 * p.dt[i] as f64;
     ((middle / surface as f64 - 1.0).abs() - EXACT as f64).clamp(0.0, MOST as f64)

@@ -10,8 +10,8 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
-/// Distance `t` as a coordinate in which all of space is finite, `s = 4 t / (1 + t)`: distance around 1, where its slope
-/// is 1, and disparity beyond. Unbounded rays are judged in it, as mip-NeRF 360 does with its normalized distance.
+/// Distance `t` as a coordinate in which all of space is finite, `s = 4 t / (1 + t)`: like distance around 1, where its slope
+/// is 1, and like disparity beyond. The loss of unbounded rays is taken in it, as in mip-NeRF 360's normalized distance.
 #[inline(always)]
 pub fn normalized_distance(t: f32) -> f32 {
     4.0 * t / (1.0 + t)

@@ -1,7 +1,7 @@
 //! Cases of the op, for its tests and for `bench check`.
 
 #[cfg(feature = "gpu")]
-use super::gpu::{Arithmetic, FieldInput, GpuNet, scale_near_gradients};
+use super::gpu::{Arithmetic, FieldInput, GpuNet, look_up, look_up_backward, scale_near_gradients};
 use super::reference::{self, Step};
 use super::{FieldNet, Output};
 use crate::ops::composite::Composited;
@@ -13,6 +13,7 @@ use crate::ops::linear::Activation;
 #[cfg(feature = "gpu")]
 use crate::{
     gpu::{Buffer, Gpu, GpuError, table::Table},
+    ops::embedding,
     ops::composite::gpu::{GpuComposited, GpuPacked},
 };
 use diorama_geom::rng::Rng;
@@ -41,7 +42,7 @@ pub fn ngp_net(features: usize) -> FieldNet {
     )
 }
 
-/// The same with eleven channels more, of a layer of their own and of the color's, and the density in another channel.
+/// The same network with eleven more channels (ten of another layer, one of the color's), and the density in another channel.
 fn with_labels(features: usize) -> FieldNet {
     let mut net = ngp_net(features);
     let mut layers = net.mlp.layers.clone();
@@ -125,6 +126,24 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         }
         check_near_scaling(gpu, table, &case)?;
     }
+    check_look_up(gpu, table)
+}
+
+/// Rows of codes per ray, and the gradient of their table.
+#[cfg(feature = "gpu")]
+fn check_look_up(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    let (rows, width) = (7, 5);
+    for n in [0, 1, 200] {
+        let (codes, d, shape) = (random(rows * width, 1), random(n * width, 2), format!("R={n}"));
+        let index: Vec<u32> = (0..n as u32).map(|i| i * 3 % rows as u32).collect();
+        let names: Vec<i64> = index.iter().map(|i| *i as i64).collect();
+        let on_gpu = gpu.upload(&index);
+        let want = embedding::reference::forward(width, &wide(&codes), &names);
+        table.close("look up", "forward", &shape, &look_up(gpu, &gpu.upload(&codes), &on_gpu, width), &want)?;
+        let got = gpu.zeros(rows * width);
+        look_up_backward(gpu, &gpu.upload(&d), &on_gpu, width, &got);
+        table.close("look up", "d table", &shape, &got, &embedding::reference::backward(rows, width, &names, &wide(&d)))?;
+    }
     Ok(())
 }
 
@@ -150,7 +169,7 @@ fn check_case(gpu: &Gpu, table: &mut Table, case: &Case, (arithmetic, name): (Ar
     let on_gpu = GpuNet::new(gpu, net, &density, LEVELS.1, &[true; 3], arithmetic);
     let element = on_gpu.element();
     if matches!((arithmetic, element), (Arithmetic::Exact, None) | (Arithmetic::Best, None | Some(Element::F32))) {
-        // The device has no way but those before.
+        // The device has no arithmetic besides those checked before.
         return Ok(());
     }
     let want = case.want();

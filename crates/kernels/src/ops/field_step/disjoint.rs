@@ -3,7 +3,7 @@
 use std::marker::PhantomData;
 use std::ops::Range;
 
-/// Hands out parts of a slice; the holder guarantees that no two live parts overlap.
+/// A slice whose parts are lent to tasks; the caller guarantees that no two live parts overlap.
 #[derive(Clone, Copy)]
 pub struct Disjoint<'a> {
     ptr: *mut f32,

@@ -1,4 +1,4 @@
-//! The standard field on the device: encoded positions, network, compositing, and back.
+//! The standard field on a device: encoded positions, network, compositing, and their gradients.
 
 use super::FieldNet;
 use crate::gpu::{Accumulate, Buffer, Gpu, Rows, launch};
@@ -12,7 +12,7 @@ use crate::ops::prune::gpu::Pruned;
 use cubecl::prelude::*;
 use diorama_geom::rng::Rng;
 
-/// How a network is computed.
+/// Arithmetic and launches of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Arithmetic {
     /// In one launch, on tensor cores if the device has them.
@@ -68,7 +68,7 @@ impl GpuNet {
         GpuNet { net: net.clone(), density: density.clone(), per_level, fused }
     }
 
-    /// What the network multiplies in one launch; none: it goes layer by layer.
+    /// Element type of a network that runs in one launch; `None` if it runs layer by layer.
     pub fn element(&self) -> Option<Element> {
         self.fused.as_ref().map(|[whole, _]| whole.element)
     }
@@ -100,7 +100,7 @@ impl GpuNet {
         }
     }
 
-    /// Densities and colours of packed samples; with `keep` ready for [`GpuNet::gradients`].
+    /// Densities and colors of packed samples; with `keep`, also what [`GpuNet::gradients`] needs.
     pub fn evaluate(&self, gpu: &Gpu, params: &Buffer, input: &FieldInput, keep: bool) -> Evaluated {
         let (p, rows) = (input.packed, input.packed.rows());
         let mut inputs = vec![input.features.clone()];
@@ -148,7 +148,7 @@ impl GpuNet {
         GpuStep { out, at, background: background.clone() }
     }
 
-    /// Gradients of parameters, features and codes, given those of densities and colours.
+    /// Gradients of parameters, features and codes, given those of densities and colors.
     pub fn gradients(&self, gpu: &Gpu, params: &Buffer, at: &Evaluated, g: &GpuGradients) -> GpuStepGradients {
         let (p, rows, net) = (&at.packed, at.packed.rows(), &self.net);
         let inputs: Vec<&Buffer> = at.inputs.iter().collect();
@@ -209,8 +209,8 @@ impl GpuNet {
     }
 }
 
-/// Whether tensor cores give about what the reference gives, forward and backward, on a few rows: a driver that
-/// multiplies wrongly must not spoil a run unseen.
+/// Whether tensor cores agree with the reference on a few rows, forward and backward: a driver that multiplies wrongly must not spoil a
+/// run unnoticed.
 fn agrees(gpu: &Gpu, net: &FieldNet, whole: &Fused, per_level: usize) -> bool {
     const ROWS: usize = 80;
     let noise = |n: usize, stream: u64| -> Vec<f32> {
@@ -262,16 +262,16 @@ fn agrees(gpu: &Gpu, net: &FieldNet, whole: &Fused, per_level: usize) -> bool {
     kept.heads.iter().zip(&heads).all(|(got, want)| close(got, want)) && close(&got, &want)
 }
 
-/// Times the rays: what gradients of a mean over rays are multiplied by in half precision.
+/// Factor of gradients in half precision, per ray of the batch, because they belong to a mean over rays.
 const HALF_SCALE: f32 = 64.0;
 
-/// Activations on the way forward.
+/// Activations of a forward pass.
 enum Values {
     Kept(Kept),
     Layers(mlp::Values),
 }
 
-/// Densities `[S]` and outputs `[S, C]`, and what a backward pass needs beside them.
+/// Densities `[S]` and outputs `[S, C]`, with the values that a backward pass needs.
 pub struct Evaluated {
     packed: GpuPacked,
     inputs: Vec<Buffer>,
@@ -280,7 +280,7 @@ pub struct Evaluated {
     pub outputs: Buffer,
 }
 
-/// What a backward pass needs of the forward one.
+/// Values that a forward pass keeps for the backward pass.
 pub struct GpuStep {
     pub out: GpuComposited,
     at: Evaluated,
@@ -332,7 +332,7 @@ pub fn scale_near_gradients(gpu: &Gpu, p: &GpuPacked, d_sigma: &Buffer, d_output
     );
 }
 
-/// Level-major to row-major features, or back.
+/// Transposes features from level-major to row-major order, or from row-major to level-major.
 fn transpose_levels(gpu: &Gpu, rows: &Rows, from: &Buffer, per_level: usize, dims: usize, to_rows: bool) -> Buffer {
     let n = rows.most * dims;
     let to = gpu.empty(n);
@@ -350,7 +350,7 @@ fn transpose_levels(gpu: &Gpu, rows: &Rows, from: &Buffer, per_level: usize, dim
     to
 }
 
-/// Copies each ray's code `[R, K]` to its samples `[S, K]`, or sums them back.
+/// Copies each ray's code `[R, K]` to its samples `[S, K]`, or sums samples' gradients per ray.
 fn expand_ray_code(gpu: &Gpu, p: &GpuPacked, code: &Buffer, samples: &Buffer, width: usize, spread: bool) {
     let (rays, s) = (p.rays(), p.t.len());
     let n = rays * width;

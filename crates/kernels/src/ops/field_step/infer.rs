@@ -34,7 +34,7 @@ struct Part<'a> {
     params: &'a [f32],
 }
 
-/// Memory kept between calls.
+/// Buffers that are reused between calls.
 #[derive(Default)]
 pub struct InferBuffers {
     points: Vec<f32>,
@@ -115,7 +115,7 @@ impl<'a> Inference<'a> {
         let n = points[0].len();
         #[cfg(target_arch = "x86_64")]
         if let Some((chain, _)) = &self.tiles {
-            // The last sixteen are filled up with zeros.
+            // The last group of sixteen is filled up with zeros.
             let whole = n / 16 * 16;
             fit(&mut buf.lines, chain.input_lines(n));
             let [x, y, z] = points;

@@ -1,4 +1,4 @@
-//! The standard field in one pass: encoded positions → networks → compositing → loss, and back, block
+//! Training step of the standard field in one pass: encoded positions → networks → compositing → loss → gradients, block
 //! by block, so that activations never leave the cache. It serves every field made of an
 //! encoding and a [`Mlp`]: instant-ngp's hash grid (features computed beforehand, level by level), and
 //! NeRF's frequency encoding (computed inside the block).
@@ -50,7 +50,7 @@ impl FieldNet {
         FieldNet { mlp, density, outputs: vec![Output { head: color, channels: 3 }] }
     }
 
-    /// Where the color stands.
+    /// Head of the color.
     ///
     /// # Panics
     /// When the field has none.
@@ -58,7 +58,7 @@ impl FieldNet {
         &self.outputs.first().filter(|o| o.channels == 3).expect("a field with a color").head
     }
 
-    /// The color's head, to be changed.
+    /// Head of the color, mutable.
     ///
     /// # Panics
     /// When the field has none.
@@ -195,7 +195,7 @@ pub trait BatchLoss: Sync {
     fn batch(&self, out: &RayOutputs, gradients: &mut RayGradients) -> f64;
 }
 
-/// Gradients that were computed elsewhere, as a loss; its value is 0.
+/// A loss of value 0 whose gradients were computed elsewhere.
 #[derive(Clone, Copy, Debug)]
 pub struct InjectedGradients<'a>(pub &'a RayGradients);
 

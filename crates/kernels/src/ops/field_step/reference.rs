@@ -5,8 +5,8 @@ use crate::ops::composite::{self, Composited, Packed};
 use crate::ops::fused_mlp::{Head, reference as mlp};
 use crate::ops::linear::reference::{activate, slope};
 
-/// Share of sample `i`'s gradient that remains where gradients closer to the camera than `reach` are scaled (0: none are): `min(m / reach, 1)²`
-/// with the sample's middle `m`.
+/// Factor `min(m / reach, 1)²` of the gradient of sample `i` with middle `m`, where gradients closer to the camera than `reach` are scaled;
+/// a `reach` of 0 scales none.
 pub fn near_share(p: &Packed, i: usize, reach: f32) -> f64 {
     let middle = p.t[i] as f64 + 0.5 * p.dt[i] as f64;
     if reach > 0.0 { (middle / reach as f64).min(1.0).powi(2) } else { 1.0 }

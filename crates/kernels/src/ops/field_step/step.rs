@@ -1,5 +1,5 @@
-//! The driver: rays are cut into a fixed number of groups, groups into blocks; each group sums its
-//! parameter gradients apart and groups are added in order, so results do not depend on threads.
+//! The loop over blocks: rays are divided into groups by the number of samples, groups into blocks. Each group sums its own parameter
+//! gradients, and groups are added in order, so that results do not depend on the number of threads.
 
 use super::disjoint::Disjoint;
 use super::{BlockEncoding, FieldNet, Positions, RayCode, RayGradient, RayLoss, RayOutput};
@@ -15,21 +15,21 @@ const BLOCK: usize = 252;
 const GROUPS: usize = 16;
 const GROUP_SAMPLES: usize = 2048;
 
-/// What a step reads.
+/// Inputs of a step.
 #[derive(Clone, Copy)]
 pub struct StepInput<'a> {
     pub net: &'a FieldNet,
     /// `[params_len]`
     pub params: &'a [f32],
     pub samples: Packed<'a>,
-    /// What stands behind every output, `[R, C]`.
+    /// Background of every output, `[R, C]`.
     pub background: &'a [f32],
     /// Distance `D` within which gradients of samples are scaled by `(t / D)²`, so that space close to a
     /// camera, which few rays share, learns no faster than the rest (Philip and Deschaintre 2023); 0: none.
     pub near_scaling: f32,
 }
 
-/// What a step gives per ray and per sample.
+/// Results of a step per ray and per sample.
 #[derive(Clone, Debug, Default)]
 pub struct StepOutput {
     /// `[R, C]`, background included.
@@ -45,7 +45,7 @@ pub struct StepOutput {
     pub loss: f64,
 }
 
-/// Memory kept between steps.
+/// Buffers that are reused between steps.
 #[derive(Default)]
 pub struct StepBuffers {
     prepared: Prepared,
@@ -91,7 +91,7 @@ struct Shared<'a> {
     d_background: Disjoint<'a>,
 }
 
-/// Evaluates and composites all samples; with a loss, also runs back and adds to `d_params`.
+/// Evaluates and composites all samples; with a loss, also runs the backward pass and adds to `d_params`.
 ///
 /// # Panics
 /// When shapes do not fit.

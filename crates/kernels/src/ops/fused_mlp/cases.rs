@@ -71,7 +71,7 @@ fn modulated_twice() -> Mlp {
     )
 }
 
-/// Small ones of every kind; of the last, layer 1 is frozen.
+/// Small networks of every kind; layer 1 of the last one is frozen.
 pub fn networks() -> [Mlp; 4] {
     [Mlp::chain(vec![32], &[64, 64, 16], false), branched(), modulated(), modulated_twice()]
 }
@@ -89,15 +89,15 @@ pub fn cases() -> Vec<Case> {
     networks().into_iter().chain([wide_chain]).flat_map(|mlp| [0, 1, 259].map(|n| (mlp.clone(), n))).map(of).collect()
 }
 
-/// Largest error allowed of numbers in half precision (11 bits), and of their gradients: root mean square, relative
-/// to that of all. Gradients stray further, because sums close to 0 fall on the other side of a ReLU's kink.
+/// Largest root mean square error of values and of gradients in half precision (11 bits), relative to the root mean square of the
+/// reference. Gradients differ more, because sums close to 0 fall on the other side of a ReLU's kink.
 #[cfg(feature = "gpu")]
 const HALF_TOLERANCE: [f64; 2] = [5e-3, 5e-2];
 /// The same for bfloat16 (8 bits).
 #[cfg(feature = "gpu")]
 const BRAIN_TOLERANCE: [f64; 2] = [3e-2, 2e-1];
 
-/// Compares a result that was computed with an element.
+/// Compares a result with its reference, with the tolerance of the element type that computed it.
 #[cfg(feature = "gpu")]
 pub fn compare_as(element: Option<Element>, result: &str, got: &[f32], want: &[f64]) -> Result<f64, String> {
     let allowed = match element {

@@ -1,4 +1,4 @@
-//! One block of rows at a time; [`forward_block`] and [`backward_block`] are what fused ops call.
+//! One block of rows at a time; fused ops call [`forward_block`] and [`backward_block`].
 
 use super::{Layer, Mlp, Source};
 use crate::gemm::{self, Gemm, Init, View, gemm};
@@ -18,7 +18,7 @@ pub struct Prepared {
 }
 
 impl Prepared {
-    /// Brings the transposes up to date with `params`.
+    /// Updates the transposes from `params`.
     pub fn update(&mut self, mlp: &Mlp, params: &[f32]) {
         self.transposed.resize_with(mlp.layers.len(), Vec::new);
         for j in 0..mlp.layers.len() {
@@ -34,10 +34,10 @@ pub struct Activations {
     pub grads: Vec<Vec<f32>>,
     /// Products before the activation, of layers whose slope needs them.
     pre: Vec<Vec<f32>>,
-    /// What modulated layers read, side by side and scaled.
+    /// Scaled inputs of modulated layers, concatenated.
     scaled: Vec<Vec<f32>>,
     seeded: Vec<bool>,
-    /// Whether a gradient is wanted of a layer's output: something below it is trained, or an input that is asked for.
+    /// Whether a layer's output needs a gradient, because a layer below it is trained or an input's gradient is wanted.
     wanted: Vec<bool>,
     input_seeded: Vec<bool>,
     d_scaled: Vec<f32>,
@@ -74,7 +74,7 @@ impl Activations {
         &mut self.grads[layer]
     }
 
-    /// Marks the layers whose gradient leads to a trained layer or to an input that is asked for.
+    /// Marks the layers whose gradients reach a trained layer or an input whose gradient is wanted.
     fn mark_wanted(&mut self, mlp: &Mlp, is_asked: impl Fn(usize) -> bool) {
         self.wanted.clear();
         for layer in &mlp.layers {
@@ -143,7 +143,7 @@ fn read<'a>(s: Source, inputs: &[&'a [f32]], values: &'a [Vec<f32>]) -> &'a [f32
     }
 }
 
-/// What a layer reads, side by side, `[n, K]`.
+/// Concatenated inputs of a layer, `[n, K]`.
 fn join(mlp: &Mlp, layer: &Layer, inputs: &[&[f32]], values: &[Vec<f32>], out: &mut [f32]) {
     let total: usize = layer.inputs.iter().map(|s| mlp.source_width(*s)).sum();
     let mut first = 0;
@@ -163,8 +163,8 @@ fn scale_rows(x: &mut [f32], k: usize, code: &[f32], stride: usize) {
     }
 }
 
-/// Adds parameter gradients to `d_params` and overwrites those inputs' gradients that are asked for.
-/// Gradients of layer outputs enter through [`Activations::seed`]. Frozen layers and what lies below them alone are skipped.
+/// Adds parameter gradients to `d_params` and overwrites the wanted gradients of inputs.
+/// Gradients of layer outputs enter through [`Activations::seed`]. Frozen layers, and layers below them that nothing else needs, are skipped.
 ///
 /// # Shapes
 /// inputs and d_inputs: `[n, K_i]`; d_params: `[params_len]`.
@@ -202,7 +202,7 @@ pub fn backward_block(
     }
 }
 
-/// What the backward pass of a block of rows reads.
+/// Inputs of the backward pass of a block of rows.
 #[derive(Clone, Copy)]
 struct Block<'a> {
     mlp: &'a Mlp,
@@ -212,7 +212,7 @@ struct Block<'a> {
 }
 
 impl Block<'_> {
-    /// One layer whose gradient before the activation is in `acts.grads`.
+    /// Backward pass of one layer, whose gradient before the activation is in `acts.grads`.
     fn backward_layer(&self, j: usize, acts: &mut Activations, d_params: &mut [f32], d_inputs: &mut [Option<&mut [f32]>]) {
         let (mlp, n, layer) = (self.mlp, self.n, &self.mlp.layers[j]);
         let (precision, width, total) = (mlp.precision, layer.width, mlp.fan_in(j));
@@ -248,7 +248,7 @@ impl Block<'_> {
         }
     }
 
-    /// The same for a layer that input `m` modulates.
+    /// [`Self::backward_layer`] for a layer that input `m` modulates.
     fn backward_modulated(&self, j: usize, m: usize, acts: &mut Activations, d_params: &mut [f32], d_inputs: &mut [Option<&mut [f32]>]) {
         let (mlp, n, layer) = (self.mlp, self.n, &self.mlp.layers[j]);
         let (precision, width, total, at) = (mlp.precision, layer.width, mlp.fan_in(j), mlp.offsets[j]);
@@ -263,7 +263,7 @@ impl Block<'_> {
                 d_weight,
             );
         }
-        // Of the scaled rows; that of the rows themselves after another scaling.
+        // The gradient of the scaled rows; another scaling makes it that of the rows.
         acts.d_scaled.resize(n * total, 0.0);
         let d = &mut acts.d_scaled[..];
         gemm(

@@ -8,7 +8,7 @@ use crate::ops::linear::gpu::{self as linear, Part};
 use crate::ops::linear::{Activation, BiasKind, Dense};
 use cubecl::prelude::*;
 
-/// Activations of a network for the way back.
+/// Activations of a network that its backward pass needs.
 pub struct Values {
     /// Outputs `[N, width]` of every layer.
     pub layers: Vec<Buffer>,
@@ -113,7 +113,7 @@ fn parts<'a>(mlp: &Mlp, j: usize, params: &'a Buffer) -> (Part<'a>, Option<Part<
     (Part { buffer: params, at }, mlp.layers[j].bias.then_some(bias))
 }
 
-/// What layer `j` reads, side by side, `[N, K]`.
+/// Concatenated inputs of layer `j`, `[N, K]`.
 fn joined(gpu: &Gpu, mlp: &Mlp, j: usize, inputs: &[&Buffer], values: &[Buffer], rows: &Rows) -> Buffer {
     let of = |s: Source| match s {
         Source::Input(i) => inputs[i],

@@ -1,5 +1,5 @@
 //! A small network of fully connected layers evaluated block by block, so that activations stay in
-//! cache on the way forward and back. Layers read any of the inputs and earlier layers, joined side
+//! cache in both passes. Layers read any of the inputs and earlier layers, joined side
 //! by side, which covers skip connections and split heads.
 
 #[cfg(any(test, feature = "gpu"))]
@@ -15,7 +15,7 @@ use super::linear::Activation;
 use crate::gemm::Precision;
 use diorama_geom::rng::Rng;
 
-/// What a layer reads.
+/// Source of a layer's inputs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Source {
     Input(usize),
@@ -86,7 +86,7 @@ impl Mlp {
         mlp
     }
 
-    /// A chain of ReLU layers with a linear last layer (instant-ngp's small networks are such, without biases).
+    /// A chain of ReLU layers with a linear last layer, such as instant-ngp's small networks (which have no biases).
     pub fn chain(input_widths: Vec<usize>, widths: &[usize], bias: bool) -> Mlp {
         let layers = widths
             .iter()

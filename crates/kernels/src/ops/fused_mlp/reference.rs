@@ -3,7 +3,7 @@
 use super::{Layer, Mlp, Source};
 use crate::ops::linear::{BiasKind, Dense, reference as linear};
 
-/// What a layer reads, side by side, `[N, K]`, scaled where it is modulated.
+/// Concatenated inputs of a layer, `[N, K]`, scaled where it is modulated.
 fn joined(mlp: &Mlp, layer: &Layer, inputs: &[&[f64]], values: &[Vec<f64>], n: usize) -> Vec<f64> {
     let mut out = Vec::new();
     for i in 0..n {

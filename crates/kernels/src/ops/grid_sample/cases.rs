@@ -9,7 +9,7 @@ use diorama_testkit::random;
 #[cfg(feature = "gpu")]
 use diorama_testkit::wide;
 
-/// Every way of sampling, of nothing.
+/// Every combination of mode, border and alignment, for no images.
 pub fn modes() -> Vec<GridSample> {
     let mut out = Vec::new();
     for mode in [Mode::Bilinear, Mode::Nearest] {

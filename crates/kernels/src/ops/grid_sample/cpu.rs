@@ -30,7 +30,7 @@ fn place(s: &GridSample, n: f32, g: f32) -> (f32, f32) {
     let is_inside = at > 0.0 && at < n - 1.0;
     match s.outside {
         Outside::Zeros => (at, slope),
-        // Written so that NaN becomes the first pixel.
+        // This order of comparisons maps NaN to the first pixel.
         Outside::Border => (if at > 0.0 { if at < n - 1.0 { at } else { n - 1.0 } } else { 0.0 }, if is_inside { slope } else { 0.0 }),
     }
 }
@@ -48,7 +48,7 @@ multiversion! {
                 let (px, py) = (x0 + (k & 1) as f32, y0 + (k >> 1) as f32);
                 let (wx, wy) = (if k & 1 == 0 { 1.0 - tx } else { tx }, if k >> 1 == 0 { 1.0 - ty } else { ty });
                 let is_inside = px >= 0.0 && px < w && py >= 0.0 && py < h;
-                // Written so that what is no number, or far away, becomes the first pixel.
+                // NaN and points far away read the first pixel, with weight 0.
                 let (px, py) = if is_inside { (px as u32, py as u32) } else { (0, 0) };
                 corners.pixel[k][i] = py * s.from[1] as u32 + px;
                 corners.weight[k][i] = if is_inside { wx * wy } else { 0.0 };

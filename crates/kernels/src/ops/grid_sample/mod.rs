@@ -9,7 +9,7 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
-/// How a value between pixels is made.
+/// Interpolation between pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
     Bilinear,
@@ -17,7 +17,7 @@ pub enum Mode {
     Nearest,
 }
 
-/// What lies outside of the image.
+/// Values outside of the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outside {
     Zeros,

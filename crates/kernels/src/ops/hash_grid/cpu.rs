@@ -1,4 +1,4 @@
-//! Vectorised over points, parallel over (level, chunk of points) forward and over levels backward,
+//! Vectorized over points, parallel over (level, chunk of points) forward and over levels backward,
 //! so that every gradient row has one writer and sums are in a fixed order.
 
 mod jacobian;
@@ -92,7 +92,7 @@ pub fn forward_serial(grid: &HashGrid, points: &[f32], table: &[f32], out: &mut 
     }
 }
 
-/// Whether [`forward_lines`] serves this grid here: rows of two features that fit one line.
+/// Whether this CPU has [`forward_lines`] for the grid: it needs rows of two features, all levels within one line.
 #[cfg(target_arch = "x86_64")]
 pub(crate) fn has_lines(grid: &HashGrid) -> bool {
     crate::gemm::has_bf16() && grid.config.features == 2 && grid.levels.len() <= 16
@@ -225,7 +225,7 @@ pub fn backward_positions(grid: &HashGrid, points: &[f32], table: &[f32], d_out:
             for (l, level) in grid.levels.iter().enumerate() {
                 let d = &d_out[(l * s + i) * width..][..width];
                 let (idx, f, clamped) = cell(level, &points[i * 3..i * 3 + 3]);
-                // What each corner's row contributes to the loss per unit of weight.
+                // Contribution of each corner's row to the loss, per unit of weight.
                 let v: [f32; 8] = std::array::from_fn(|c| {
                     let row = &table[(level.offset + idx[c]) * width..][..width];
                     row.iter().zip(d).map(|(r, d)| r * d).sum()
@@ -409,7 +409,7 @@ mod x86 {
         }
     }
 
-    /// Adds the gradients of sixteen points at a time; the rows of the next sixteen are already on their way.
+    /// Adds the gradients of sixteen points at a time; the rows of the next sixteen are prefetched.
     ///
     /// # Safety
     /// As for [`forward16`]; `marks` covers `rows`.

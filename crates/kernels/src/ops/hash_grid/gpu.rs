@@ -4,13 +4,13 @@ use super::HashGrid;
 use crate::gpu::{Accumulate, Buffer, Gpu, Rows, launch};
 use cubecl::prelude::*;
 
-/// Numbers that describe a level to the kernels: cells, dense, first row, rows.
+/// Numbers per level in the kernels' description: cells, whether dense, first row, rows.
 const LEVEL: usize = 4;
 
 /// A grid whose description lies on the device.
 pub struct GpuHashGrid {
     pub grid: HashGrid,
-    /// What the kernels know of each level.
+    /// Description of each level for the kernels.
     pub levels: Buffer<u32>,
 }
 
@@ -147,7 +147,7 @@ struct Axis {
     slope: f32,
 }
 
-/// Where a point lies in a level.
+/// Place of a point in a level.
 #[derive(CubeType)]
 struct Place {
     level: usize,
@@ -156,7 +156,7 @@ struct Place {
     z: Axis,
 }
 
-/// A corner of a point's cell: first number of its row, weight, and the weight's slopes along the point.
+/// A corner of a point's cell: first number of its row, weight, and the weight's derivatives with respect to the point.
 #[derive(CubeType)]
 struct Corner {
     row: usize,

@@ -1,10 +1,16 @@
 //! Cases of the op, for its tests and for `bench check`.
 
-use super::{MarchConfig, MarchRays, Marched, OccupancyBits};
+use super::{MarchConfig, MarchRays, Marched, OccupancyBits, Space};
 #[cfg(feature = "gpu")]
 use super::{gpu as on_gpu, reference};
+use crate::ops::composite::cases::{Scene, scene};
 #[cfg(feature = "gpu")]
-use crate::gpu::{Gpu, GpuError, table::Table};
+use crate::{
+    gpu::{Gpu, GpuError, table::Table},
+    ops::composite::gpu::GpuPacked,
+};
+#[cfg(feature = "gpu")]
+use diorama_testkit::wide;
 use diorama_testkit::{random, random_unit};
 
 /// Rays in and around the model cube with unit directions.
@@ -85,8 +91,46 @@ pub fn compare_rays(got: &Marched, want: &Marched) -> Result<f64, String> {
     if ties * 50 <= n { Ok(0.0) } else { Err(format!("{ties} of {n} rays differ")) }
 }
 
+/// Coordinates in which positions are compared.
+pub const SPACES: [Space; 5] =
+    [Space::Model, Space::Cube(4.0), Space::Centered(4.0), Space::Contracted(1.5), Space::ContractedCentered(1.5)];
+
+/// Samples of rays that begin in and around the model cube, and gradients of their positions.
+pub struct Places {
+    pub rays: Rays,
+    pub scene: Scene,
+    pub d: Vec<f32>,
+}
+
+pub fn places() -> [Places; 3] {
+    [0, 1, 80].map(|n| {
+        let scene = scene(n, 3);
+        Places { rays: rays(n, 1.0), d: random(scene.t.len() * 3, 6), scene }
+    })
+}
+
+#[cfg(feature = "gpu")]
+fn check_positions(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for Places { rays, scene, d } in places() {
+        let (r, p) = (rays.view(), scene.packed());
+        let (on, packed, d_gpu) = (on_gpu::GpuRays::upload(gpu, &r), GpuPacked::upload(gpu, &p), gpu.upload(&d));
+        let model = on_gpu::positions(gpu, &on, &packed, Space::Model);
+        for space in SPACES {
+            let (shape, want) = (format!("R={} {space:?}", p.rays()), reference::positions(&r, &p, space));
+            table.close("positions", "forward", &shape, &on_gpu::positions(gpu, &on, &packed, space), &want)?;
+            table.close("positions", "points", &shape, &on_gpu::to_space(gpu, &model, space), &want)?;
+            let (d_origins, d_dirs) = on_gpu::positions_backward(gpu, &on, &packed, &d_gpu, space);
+            let (want_origins, want_dirs) = reference::positions_backward(&r, &p, space, &wide(&d));
+            table.close("positions", "d origins", &shape, &d_origins, &want_origins)?;
+            table.close("positions", "d directions", &shape, &d_dirs, &want_dirs)?;
+        }
+    }
+    Ok(())
+}
+
 #[cfg(feature = "gpu")]
 pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    check_positions(gpu, table)?;
     for Case { grid, config, rays } in cases() {
         let (r, n) = (rays.view(), rays.jitter.len());
         let shape = format!("R={n} cascades={} unbounded={}", grid.cascades, config.unbounded);
@@ -102,7 +146,7 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             cells: gpu.read(&marched.cells)?,
         };
         table.row("march", "samples", shape.clone(), compare_rays(&got, &want));
-        let places = gpu.read(&on_gpu::positions(gpu, &on, packed, on_gpu::Space::Model))?;
+        let places = gpu.read(&on_gpu::positions(gpu, &on, packed, Space::Model))?;
         table.row("march", "positions", shape.clone(), compare_places(&got, &rays, &places));
         // With room for half of them, offsets must stop there and what fits must be the same.
         let half = capacity / 2;

@@ -165,7 +165,7 @@ struct RayMarch<'a> {
 }
 
 impl RayMarch<'_> {
-    /// Takes samples in the cell ahead if it is occupied, else skips the empty space.
+    /// Takes samples in the next cell if it is occupied, else skips the empty space.
     #[inline(always)]
     fn advance(&mut self) {
         let dt = self.config.step(self.t);

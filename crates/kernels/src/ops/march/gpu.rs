@@ -10,7 +10,7 @@ use crate::ops::scan;
 use cubecl::prelude::*;
 
 pub(crate) use positions::put;
-pub use positions::{Space, positions, positions_backward, to_space};
+pub use positions::{positions, positions_backward, to_space};
 
 const _: () = assert!(super::BLOCK == 8, "the kernel's blocks are 8 cells wide");
 
@@ -74,11 +74,11 @@ pub struct GpuMarched {
     pub packed: GpuPacked,
     /// Cells `[capacity]` that the samples lie in.
     pub cells: Buffer<u32>,
-    /// 1 for each ray that lost samples because they found no room, `[R]`.
+    /// 1 for each ray that lost samples for want of room, `[R]`.
     pub cut: Buffer<u32>,
 }
 
-/// Packed samples. Those that find no room are left out, the last rays' first.
+/// Packed samples, as many as `capacity` holds; the last rays lose theirs first.
 pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfig, capacity: usize) -> GpuMarched {
     let n = rays.jitter.len();
     let counts = gpu.empty(n);
@@ -123,7 +123,7 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
     GpuMarched { packed: GpuPacked { offsets, t, dt }, cells, cut }
 }
 
-/// Offsets that end where the memory does, so that no reader passes it; rays that lose samples are marked.
+/// Offsets limited to the capacity, so that no reader exceeds it; rays that lose samples are marked in `cut`.
 pub(crate) fn bounded(gpu: &Gpu, offsets: &Buffer<u32>, cut: &Buffer<u32>, capacity: usize) -> Buffer<u32> {
     let n = offsets.len();
     let out = gpu.empty(n);

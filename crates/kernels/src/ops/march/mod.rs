@@ -16,7 +16,7 @@ mod tests;
 
 use rayon::prelude::*;
 
-/// Edge of the blocks of cells whose emptiness is known at a glance.
+/// Edge of the blocks of cells, for each of which one flag says whether it is empty.
 pub(crate) const BLOCK: usize = 8;
 
 /// Which cells may hold matter, one bit each, `[cascades, z, y, x]`.
@@ -56,8 +56,8 @@ impl OccupancyBits {
         !self.blocks[((cascade * n + at[2] / BLOCK) * n + at[1] / BLOCK) * n + at[0] / BLOCK]
     }
 
-    /// Decides anew about every cell, but for those of a coarser cascade that a finer one covers: they are
-    /// occupied where the finer cells are.
+    /// Sets every cell by `occupied`, except the cells of a coarser cascade that a finer one covers: those are occupied where one of
+    /// their finer cells is.
     pub fn fill_with(&mut self, occupied: impl Fn(usize) -> bool + Sync) {
         const WORDS: usize = 64;
         self.bits.par_chunks_mut(WORDS).enumerate().for_each(|(chunk, words)| {
@@ -81,7 +81,7 @@ impl OccupancyBits {
         });
     }
 
-    /// Takes over the cascade before `cascade` into the cells that it covers.
+    /// Sets the cells of `cascade` that the finer cascade before it covers.
     fn pool(&mut self, cascade: usize) {
         let n = self.resolution;
         let words = n.pow(3) / 64;
@@ -115,7 +115,7 @@ impl OccupancyBits {
     }
 }
 
-/// How far apart samples lie.
+/// Spacing of samples.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MarchConfig {
     pub cone: f32,
@@ -129,7 +129,7 @@ pub struct MarchConfig {
 }
 
 impl Default for MarchConfig {
-    /// Steps that grow with distance at no point, inside of the cascades alone.
+    /// Steps of constant length, within the cascades alone.
     fn default() -> Self {
         MarchConfig { cone: 0.0, dt_min: 1.0 / 1024.0, dt_max: 1.0, disparity_from: f32::MAX, unbounded: false, max_samples: 1024 }
     }
@@ -161,8 +161,23 @@ pub struct MarchRays<'a> {
     pub near_far: &'a [f32],
     /// Offset of the samples within a step, in [0, 1), `[R]`.
     pub jitter: &'a [f32],
-    /// Whether the rays go on from an earlier march: the first sample then begins at near itself.
+    /// Whether the rays continue an earlier march: the first sample then begins exactly at near.
     pub resumed: bool,
+}
+
+/// Coordinates in which positions are given.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Space {
+    /// Coordinates of the rays.
+    Model,
+    /// The cube of this width around the model cube's center as `[0, 1]³`.
+    Cube(f32),
+    /// All of space, contracted beyond the cube of this width, as `[0, 1]³`.
+    Contracted(f32),
+    /// As [`Space::Cube`], but as `[−1, 1]³`.
+    Centered(f32),
+    /// As [`Space::Contracted`], but as `[−1, 1]³`.
+    ContractedCentered(f32),
 }
 
 /// Packed samples that marching writes.
@@ -179,7 +194,7 @@ pub struct Marched {
 }
 
 impl Marched {
-    /// Forgets all samples and keeps the memory.
+    /// Removes all samples and keeps the memory.
     pub fn clear(&mut self) {
         self.offsets.clear();
         self.t.clear();

@@ -174,6 +174,42 @@ fn points_are_normalized_as_space_says() {
 }
 
 #[test]
+fn positions_match_the_reference_both_ways() {
+    use diorama_testkit::{assert_close, wide};
+    for cases::Places { rays, scene, d } in cases::places() {
+        let (r, p) = (rays.view(), scene.packed());
+        let samples = Marched { offsets: scene.offsets.clone(), t: scene.t.clone(), dt: scene.dt.clone(), cells: Vec::new() };
+        let mut model = Vec::new();
+        cpu::positions(&r, &samples, &mut model);
+        assert_close("model", &model, &reference::positions(&r, &p, super::Space::Model), 1e-5);
+        for (space, own) in [(Space::Cube(4.0), super::Space::Cube(4.0)), (Space::Contracted(1.5), super::Space::Contracted(1.5))] {
+            let mut points = [0, 1, 2].map(|k| model.iter().skip(k).step_by(3).copied().collect::<Vec<f32>>());
+            cpu::normalize(space, &mut points);
+            let rows: Vec<f32> = (0..p.samples()).flat_map(|i| [points[0][i], points[1][i], points[2][i]]).collect();
+            assert_close("normalized", &rows, &reference::positions(&r, &p, own), 1e-5);
+        }
+        let (mut d_origins, mut d_dirs) = (vec![9.0; r.origins.len()], vec![9.0; r.dirs.len()]);
+        cpu::positions_backward(&samples, &d, &mut d_origins, &mut d_dirs);
+        let (want_origins, want_dirs) = reference::positions_backward(&r, &p, super::Space::Model, &wide(&d));
+        assert_close("d origins", &d_origins, &want_origins, 1e-4);
+        assert_close("d directions", &d_dirs, &want_dirs, 1e-4);
+    }
+}
+
+#[test]
+fn reference_gradients_of_points_match_central_differences() {
+    // Within the inner cube and far outside, along each axis.
+    let points = [[0.4, 0.6, 0.5], [2.9, 0.2, -0.4], [0.1, -7.0, 3.0], [-1.0, 2.0, 40.0]];
+    for space in cases::SPACES {
+        for (point, d) in points.into_iter().zip([[0.3, -0.8, 0.5], [1.0, 0.2, -0.4], [-0.6, 0.7, 0.1], [0.9, -0.2, 0.8]]) {
+            let g = reference::to_space_backward(space, point, d);
+            let loss = |x: &[f64]| (0..3).map(|k| d[k] * reference::to_space(space, [x[0], x[1], x[2]])[k]).sum();
+            diorama_testkit::assert_gradient(&format!("{space:?} {point:?}"), &g, &point, 1e-5, loss);
+        }
+    }
+}
+
+#[test]
 fn positions_pass_their_gradients_to_origins_and_directions() {
     let (g, r) = (sparse_grid(1), rays(9, 0.9));
     let c = MarchConfig { cone: 0.0, dt_min: 0.01, dt_max: 0.01, max_samples: 30, ..MarchConfig::default() };

@@ -200,7 +200,7 @@ pub fn surface(table: &CaseTable, grid: &[f32], [nx, ny, nz]: [usize; 3], level:
     let starts: Vec<usize> = (0..nz.saturating_sub(1)).step_by(SLAB).collect();
     let (mut positions, mut faces): (Vec<[f32; 3]>, Vec<[u32; 3]>) = (Vec::new(), Vec::new());
     let mut below: Vec<u32> = Vec::new();
-    // A few slabs at a time: what waits to be joined stays small.
+    // A few slabs at a time, so that few unjoined vertices are in memory.
     for starts in starts.chunks(rayon::current_num_threads() * 2) {
         let slabs: Vec<_> = starts.par_iter().map(|z| slab(*z)).collect();
         for (own, own_faces, shared, top) in slabs {

@@ -1,5 +1,5 @@
 //! One unit per grid point: it owns the crossings on the edges that begin there and the triangles of the cell above it.
-//! Counted first, then, with their places known, written.
+//! A first pass counts them, a scan gives their places, and a second pass writes them.
 #![allow(clippy::collapsible_if)] // the outer one is decided when a kernel is made, the inner one when it runs
 
 use super::CaseTable;

@@ -96,7 +96,7 @@ fn share_a_face(e: u8, f: u8) -> bool {
 }
 
 /// Triangulates a ring of crossings. A diagonal within a face of the cell could coincide with one of the
-/// neighbouring cell and leave an edge with four triangles, so ears are cut along other diagonals while there are any.
+/// neighboring cell and leave an edge with four triangles, so ears are cut along other diagonals while there are any.
 fn cut_ears(mut ring: Vec<u8>, out: &mut Vec<[u8; 3]>) {
     while ring.len() > 3 {
         let n = ring.len();

@@ -66,7 +66,7 @@ vectorized! {
     }
 }
 
-/// What happens to a plane: `max((x − mean) scale + shift, floor)`.
+/// Map of a plane: `max((x − mean) scale + shift, floor)`.
 #[derive(Clone, Copy)]
 struct Line {
     mean: f32,
@@ -102,7 +102,7 @@ impl Norm<'_> {
     }
 
     /// Whether an activation remains after the floor.
-    fn bends(&self) -> bool {
+    fn has_curve(&self) -> bool {
         !matches!(self.activation, Activation::None | Activation::Relu)
     }
 
@@ -128,7 +128,7 @@ fn statistics(norm: &Norm, set: usize, x: &[f32]) -> (f32, f32) {
     (mean as f32, (squares / count) as f32)
 }
 
-/// Output of all of x. Mean and biased variance are written, but for [`Over::Given`], where they are read.
+/// Normalizes all of x. Mean and biased variance are written, or read with [`Over::Given`].
 ///
 /// # Shapes
 /// x, out `[N, C, L]`; mean, variance: see [`Over`].
@@ -152,7 +152,7 @@ pub fn forward(norm: &Norm, x: &[f32], mean: &mut [f32], variance: &mut [f32], o
             let out = unsafe { out.range(norm.span(plane)) };
             for (out, x) in out.chunks_mut(BLOCK).zip(x[norm.span(plane)].chunks(BLOCK)) {
                 apply(x, line, out);
-                if norm.bends() {
+                if norm.has_curve() {
                     activation::forward_in_place(norm.activation, out);
                 }
             }
@@ -212,11 +212,11 @@ pub fn backward(norm: &Norm, x: &[f32], mean: &[f32], variance: &[f32], d: &[f32
     }
 }
 
-/// `Σ g` and `Σ g (x − mean)` of a plane, where g is the gradient before the activation; `dx` holds g where the activation bends.
+/// `Σ g` and `Σ g (x − mean)` of a plane, where g is the gradient before the activation; for activations other than ReLU, `dx` receives g.
 fn plane_sums(norm: &Norm, line: Line, x: &[f32], d: &[f32], dx: &mut [f32], out: &mut [f32]) {
     let (mut sum, mut along) = (0.0f64, 0.0f64);
     for ((x, d), dx) in x.chunks(BLOCK).zip(d.chunks(BLOCK)).zip(dx.chunks_mut(BLOCK)) {
-        let (s, a) = if norm.bends() {
+        let (s, a) = if norm.has_curve() {
             apply(x, line, dx);
             activation::backward_in_place(norm.activation, d, dx);
             gradient_sums(x, dx, line)
@@ -229,11 +229,11 @@ fn plane_sums(norm: &Norm, line: Line, x: &[f32], d: &[f32], dx: &mut [f32], out
     (out[0], out[1]) = (sum as f32, along as f32);
 }
 
-/// Gradient of a plane of x; reads what [`plane_sums`] left in `dx`.
+/// Gradient of a plane of x, from the values that [`plane_sums`] wrote to `dx`.
 fn plane_gradient(norm: &Norm, line: Line, slope: f32, constant: f32, x: &[f32], d: &[f32], dx: &mut [f32]) {
     let mut kept = [0.0f32; BLOCK];
     for ((x, d), dx) in x.chunks(BLOCK).zip(d.chunks(BLOCK)).zip(dx.chunks_mut(BLOCK)) {
-        let d = if norm.bends() {
+        let d = if norm.has_curve() {
             kept[..dx.len()].copy_from_slice(dx);
             &kept[..dx.len()]
         } else {

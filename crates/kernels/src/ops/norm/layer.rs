@@ -24,7 +24,7 @@ vectorized! {
 }
 
 vectorized! {
-    /// What [`normalize_row`] writes, from statistics that are known.
+    /// [`normalize_row`] with known statistics.
     fn normalize_again<const F>(x: &[f32], mean: f32, inverse: f32, scale: &[f32], shift: &[f32], out: &mut [f32]) {
         apply_row::<F>(x, mean, inverse, scale, shift, out);
     }

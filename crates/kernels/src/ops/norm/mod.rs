@@ -9,15 +9,15 @@ mod tests;
 
 use super::activation::Activation;
 
-/// What a mean and a variance are taken over.
+/// Set of elements that share a mean and a variance.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Over {
     /// All images and places of a channel; statistics `[C]`.
     Batch,
     /// As [`Over::Batch`], but the statistics are given (inference, frozen layers).
     Given,
-    /// Places of the channels of one of so many groups, image by image; statistics `[N, G]`. As many groups as channels are
-    /// instance normalization.
+    /// Places of the channels of one of so many groups, image by image; statistics `[N, G]`. With as many groups as channels this
+    /// is instance normalization.
     Groups(usize),
 }
 

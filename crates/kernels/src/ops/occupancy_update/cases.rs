@@ -4,8 +4,7 @@ use super::{OccupancyGrid, UNKNOWN, UNSEEN, reference};
 #[cfg(feature = "gpu")]
 use crate::{
     gpu::{Gpu, GpuError, Rows, table::Table},
-    ops::march::gpu::Space,
-    ops::march::{OccupancyBits, gpu::GpuOccupancy},
+    ops::march::{OccupancyBits, Space, gpu::GpuOccupancy},
     ops::occupancy_update::gpu::GpuOccupancyGrid,
 };
 use diorama_geom::rng::Rng;

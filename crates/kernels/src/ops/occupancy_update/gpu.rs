@@ -3,7 +3,8 @@
 use super::{OccupancyGrid, UNKNOWN};
 use crate::gpu::random::{Wide, below, halves, key, product, sum, uniform, widened};
 use crate::gpu::{Buffer, Gpu, GpuError, Rows, launch};
-use crate::ops::march::gpu::{GpuOccupancy, Space, put};
+use crate::ops::march::Space;
+use crate::ops::march::gpu::{GpuOccupancy, put};
 use cubecl::prelude::*;
 use diorama_geom::rng::Rng;
 
@@ -54,7 +55,7 @@ impl GpuOccupancyGrid {
     fn note(&self, gpu: &Gpu, rows: &Rows, cells: &Buffer<u32>, sigma: &Buffer, block: usize) {
         launch!(
             gpu,
-            highest,
+            raise_met,
             rows.most * block.pow(3),
             [rows.live => rows.at + 1, cells => rows.most, sigma => rows.most, self.fresh => self.density.len()],
             rows.place(),
@@ -111,7 +112,7 @@ impl GpuOccupancyGrid {
         );
         launch!(
             gpu,
-            decide,
+            find_limits,
             ([1; 3], CubeDim::new_1d(1)),
             [sums => parts, counts => parts, self.thresholds => cascades, limits => cascades],
             PARTS as u32,
@@ -120,7 +121,7 @@ impl GpuOccupancyGrid {
         let words = cells / 32;
         launch!(
             gpu,
-            occupy,
+            set_bits,
             words,
             [self.density => cells, limits => cascades, self.bits.bits => words],
             words as u32,
@@ -135,7 +136,7 @@ impl GpuOccupancyGrid {
 }
 
 #[cube(launch_unchecked)]
-fn highest(live: &[u32], cells: &[u32], sigma: &[f32], fresh: &[Atomic<u32>], at: u32, block: u32, resolution: u32) {
+fn raise_met(live: &[u32], cells: &[u32], sigma: &[f32], fresh: &[Atomic<u32>], at: u32, block: u32, resolution: u32) {
     let unit = ABSOLUTE_POS;
     let b = block as usize;
     let n = resolution as usize;
@@ -201,7 +202,7 @@ fn fold(density: &mut [f32], fresh: &mut [u32], sums: &mut [f32], counts: &mut [
     }
     let mut total = 0.0f32;
     let mut known = 0u32;
-    // Neighbouring units read neighbouring cells.
+    // Neighboring units read neighboring cells.
     let first = unit / parts as usize * cells as usize;
     let mut i = first + unit % parts as usize;
     while i < first + cells as usize {
@@ -228,7 +229,7 @@ fn fold(density: &mut [f32], fresh: &mut [u32], sums: &mut [f32], counts: &mut [
 
 /// The threshold of each cascade: the mean of its known densities, but no more than `most`.
 #[cube(launch_unchecked)]
-fn decide(sums: &[f32], counts: &[u32], most: &[f32], limits: &mut [f32], parts: u32, cascades: u32) {
+fn find_limits(sums: &[f32], counts: &[u32], most: &[f32], limits: &mut [f32], parts: u32, cascades: u32) {
     for c in 0..cascades as usize {
         let mut total = 0.0f32;
         let mut known = 0u32;
@@ -241,7 +242,7 @@ fn decide(sums: &[f32], counts: &[u32], most: &[f32], limits: &mut [f32], parts:
 }
 
 #[cube(launch_unchecked)]
-fn occupy(density: &[f32], limits: &[f32], bits: &mut [u32], words: u32, words_per_cascade: u32) {
+fn set_bits(density: &[f32], limits: &[f32], bits: &mut [u32], words: u32, words_per_cascade: u32) {
     let w = ABSOLUTE_POS;
     if w >= words as usize {
         terminate!();

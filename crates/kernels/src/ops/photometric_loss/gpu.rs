@@ -49,7 +49,7 @@ pub struct Target<'a> {
     pub distance: &'a Buffer,
 }
 
-/// Composites packed samples with densities `[S]` and colors `[S, 3]`, compares them, and takes the gradients back to
+/// Composites packed samples with densities `[S]` and colors `[S, 3]`, compares them, and computes the gradients of
 /// both, all rays in one launch; adds the step's figures. Also gives the squared error of each ray `[R]`. Gradients
 /// closer than `near_scaling` are scaled as by [`crate::ops::field_step::gpu::scale_near_gradients`].
 pub fn composite_and_loss(

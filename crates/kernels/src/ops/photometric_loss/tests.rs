@@ -53,7 +53,9 @@ fn reference_gradients_match_central_differences() {
         let rays = case.counts.len().min(6);
         // Few rays: every number of theirs is moved.
         case.scene = crate::ops::composite::cases::scene(rays, 3);
-        (case.rgb.truncate(case.scene.t.len() * 3), case.counts.truncate(rays), case.distance.truncate(rays));
+        case.rgb.truncate(case.scene.t.len() * 3);
+        case.counts.truncate(rays);
+        case.distance.truncate(rays);
         let (want, l) = (case.want(), case.loss());
         let mean = |out: &Composited<f64>| reference::forward(&l, out, &want.out.color).0.iter().sum::<f64>() / rays.max(1) as f64;
         let moved = |set: &dyn Fn(&mut Composited<f64>)| {

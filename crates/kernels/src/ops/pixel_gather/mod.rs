@@ -13,9 +13,6 @@ mod tests;
 
 use diorama_geom::PixelFormat;
 
-/// One training ray of so many goes through a pixel of known distance, where there are any.
-pub const OBSERVED_EVERY: u32 = 8;
-
 /// Words of 32 bits that a pixel takes.
 pub fn words_per_pixel(format: PixelFormat) -> usize {
     format.bytes() / 4

@@ -1,6 +1,8 @@
 //! Largest values and means of windows, with PyTorch's rules for borders, and means of whole planes. Means over windows are
 //! [`resample`](super::resample) with the table that [`Pool::average`] makes, and adaptive means its area filter.
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 pub mod reference;
 #[cfg(test)]

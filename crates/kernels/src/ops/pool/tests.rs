@@ -1,20 +1,8 @@
 use super::super::resample;
+use super::cases::pools;
 use super::*;
 use crate::simd::{Level, with_level};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
-
-fn pools() -> Vec<(Pool, [usize; 2])> {
-    let mut out = Vec::new();
-    for (kernel, stride, padding) in [(1, 1, 0), (2, 2, 0), (3, 2, 1), (3, 1, 1), (2, 3, 1), (5, 4, 2)] {
-        for ceil_mode in [false, true] {
-            for from in [[5, 5], [6, 37], [7, 8]] {
-                out.push((Pool { kernel: [kernel; 2], stride: [stride; 2], padding: [padding; 2], ceil_mode }, from));
-            }
-        }
-    }
-    out.push((Pool { kernel: [2, 3], stride: [1, 2], padding: [0, 1], ceil_mode: true }, [4, 9]));
-    out
-}
 
 #[test]
 fn max_matches_the_reference_both_ways_at_every_level() {

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 /// Rays per task.
 const RAYS: usize = 64;
 
-/// Samples as they pass light, packed ray by ray.
+/// Samples in the order in which light passes them, packed ray by ray.
 ///
 /// # Shapes
 /// offsets: `[R + 1]`; dt, sigma and alpha: `[S]`; light and counts: `[R]`.
@@ -24,7 +24,7 @@ pub struct Samples<'a> {
     pub counts: &'a mut [u32],
 }
 
-/// Lets light through: opacities, what is left out, and the light that is left.
+/// Computes opacities, drops samples, and updates each ray's light.
 pub fn prune(pruning: &Pruning, samples: Samples) {
     let Samples { offsets, dt, mut sigma, mut alpha, light, counts } = samples;
     let mut tasks = Vec::with_capacity(counts.len().div_ceil(RAYS));

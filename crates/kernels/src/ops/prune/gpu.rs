@@ -1,4 +1,4 @@
-//! One unit per ray: first to decide which samples stay, then, with their places known, to bring them together.
+//! One unit per ray, in two passes: the first decides which samples stay, the second packs them where a scan of their counts puts them.
 
 use super::Pruning;
 use crate::gpu::{Buffer, Gpu, launch};
@@ -12,7 +12,7 @@ pub struct Pruned {
     pub packed: GpuPacked,
     /// Share of light that passes all samples, left out or not, `[R]`.
     pub light: Buffer,
-    /// Where each lay before.
+    /// Index of each among the samples before.
     source: Buffer<u32>,
 }
 
@@ -22,11 +22,11 @@ pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: &Pruning, cut: &B
     let (n, s) = (p.rays(), p.t.len());
     let counts = gpu.empty(n);
     let (kept, light) = (gpu.empty(s), gpu.empty(n));
-    // Times a length, this stays a number.
+    // Finite also after multiplication by a length.
     let thin = limits.thin.min(1e30);
     launch!(
         gpu,
-        keep,
+        mark_kept,
         n,
         [p.offsets => n + 1, p.dt => s, sigma => s, kept => s, counts => n, light => n],
         n as u32,
@@ -74,7 +74,7 @@ impl Pruned {
         let out = gpu.empty(n);
         launch!(
             gpu,
-            fetch,
+            gather_kept,
             n,
             [rows.live => rows.at + 1, self.source => rows.most, all => samples * width, out => n],
             rows.place(),
@@ -88,7 +88,7 @@ impl Pruned {
 }
 
 #[cube(launch_unchecked)]
-fn keep(
+fn mark_kept(
     offsets: &[u32],
     dt: &[f32],
     sigma: &mut [f32],
@@ -155,7 +155,7 @@ fn compact(
 }
 
 #[cube(launch_unchecked)]
-fn fetch(live: &[u32], source: &[u32], all: &[f32], out: &mut [f32], at: u32, samples: u32, most: u32, width: u32, per_level: u32) {
+fn gather_kept(live: &[u32], source: &[u32], all: &[f32], out: &mut [f32], at: u32, samples: u32, most: u32, width: u32, per_level: u32) {
     let i = ABSOLUTE_POS;
     let f = per_level as usize;
     let per = live[at as usize] as usize * f;

@@ -1,4 +1,4 @@
-//! Leaving out samples that cannot matter before the costly part of a step: those behind opaque matter (instant-ngp ends rays where
+//! Removal of samples that cannot matter before the costly part of a step: those behind opaque matter (instant-ngp ends rays where
 //! the transmittance falls below 1e-4) and those that hold next to nothing (nerfacc, Li et al. 2023, the alpha threshold).
 //!
 //! With transmittance `T`, opacity `α = 1 − e^(−σ δ)` and length `δ`, a sample stays where `T ≥ stop`, `α ≥ min(min_alpha, thin · δ)`
@@ -13,7 +13,7 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
-/// Which samples are left out.
+/// Limits below which samples are left out.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pruning {
     /// Samples behind which less than this share of light arrives.
@@ -26,5 +26,5 @@ pub struct Pruning {
     pub min_weight: f32,
 }
 
-/// Stands for a sample that is left out, and for the density of one that no light reaches.
+/// Mark of a sample that is left out, and density of one that no light reaches.
 pub const DROPPED: f32 = -1.0;

@@ -3,7 +3,7 @@
 use super::{DROPPED, Pruning};
 use crate::ops::composite::Packed;
 
-/// What stays of packed samples.
+/// Samples that remain after pruning.
 pub struct Pruned {
     /// Samples that stay, in order, and where each ray's begin among them, `[R + 1]`.
     pub kept: Vec<usize>,

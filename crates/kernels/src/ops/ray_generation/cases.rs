@@ -2,7 +2,7 @@
 
 use super::PosedCamera;
 #[cfg(feature = "gpu")]
-use super::{gpu::GpuCameras, reference};
+use super::{CORRECTION, gpu::GpuCameras, reference};
 #[cfg(feature = "gpu")]
 use crate::gpu::{Gpu, GpuError, table::Table};
 use diorama_geom::glam::DVec3;
@@ -11,7 +11,7 @@ use diorama_geom::{Camera, Lens, Pose};
 use diorama_testkit::wide;
 use diorama_testkit::{random, random_unit};
 
-/// Every lens, turned and moved.
+/// Cameras with every lens, rotated and translated.
 pub fn cameras() -> Vec<PosedCamera> {
     let lenses = [
         Lens::Pinhole,
@@ -62,6 +62,33 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let want = reference::backward(&all, &c.index, &pw, &wide(&c.d_origins), &wide(&c.d_dirs));
         let got = on_gpu.backward(gpu, &ig, &pg, &dirs, &gpu.upload(&c.d_origins), &gpu.upload(&c.d_dirs));
         table.close("ray generation", "d corrections", &shape, &got, &want)?;
+    }
+    check_corrections(gpu, table)
+}
+
+/// Cameras with corrections, which replace those before.
+#[cfg(feature = "gpu")]
+fn check_corrections(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    const OP: &str = "camera corrections";
+    let (base, case) = (cameras(), case(60));
+    let mut numbers = random(base.len() * CORRECTION, 3);
+    // One is none, and one rotates by next to nothing.
+    numbers[..CORRECTION].fill(0.0);
+    numbers[CORRECTION..2 * CORRECTION].iter_mut().for_each(|v| *v *= 1e-6);
+    let correct = |(c, d): (&PosedCamera, &[f32])| c.corrected(&std::array::from_fn(|k| d[k] as f64));
+    let on_gpu = GpuCameras::upload(gpu, &base);
+    for refined in [false, true] {
+        let kept = gpu.upload(&numbers);
+        on_gpu.correct(gpu, &kept, refined);
+        let of_focal = |i: usize| i % CORRECTION == 6 && !refined;
+        let own: Vec<f32> = numbers.iter().zip(0..).map(|(v, i)| if of_focal(i) { 0.0 } else { *v }).collect();
+        let corrected: Vec<PosedCamera> = base.iter().zip(own.chunks_exact(CORRECTION)).map(correct).collect();
+        let (origins, dirs) = on_gpu.forward(gpu, &gpu.upload(&case.index), &gpu.upload(&case.pixels));
+        let (want_origins, want_dirs) = reference::forward(&corrected, &case.index, &wide(&case.pixels));
+        let shape = format!("{} cameras, focal lengths refined: {refined}", base.len());
+        table.close(OP, "corrections", &shape, &kept, &wide(&own))?;
+        table.close(OP, "origins", &shape, &origins, &want_origins)?;
+        table.close(OP, "directions", &shape, &dirs, &want_dirs)?;
     }
     Ok(())
 }

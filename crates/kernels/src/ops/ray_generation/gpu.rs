@@ -20,9 +20,9 @@ const EQUIRECTANGULAR: u32 = 4;
 /// Cameras on the device.
 pub struct GpuCameras {
     count: usize,
-    /// As given.
+    /// Cameras without corrections.
     base: Buffer,
-    /// With their corrections.
+    /// Cameras with their corrections.
     numbers: Buffer,
 }
 
@@ -50,7 +50,7 @@ impl GpuCameras {
     }
 
     /// Applies corrections `[cameras, 7]` to the cameras as they were given; see [`PosedCamera::corrected`]. Unless
-    /// focal lengths are `refined`, their corrections are taken back to 0.
+    /// focal lengths are `refined`, their corrections are reset to 0.
     pub fn correct(&self, gpu: &Gpu, corrections: &Buffer, refined: bool) {
         assert_eq!(corrections.len(), self.count * CORRECTION, "cameras: corrections");
         let n = self.count;
@@ -100,7 +100,7 @@ impl GpuCameras {
     }
 }
 
-/// A camera turned by a rotation vector (Rodrigues' formula), moved, and with its focal lengths scaled.
+/// A camera rotated by a rotation vector (Rodrigues' formula), translated, and with its focal lengths scaled.
 #[cube(launch_unchecked)]
 fn adjust(base: &[f32], corrections: &mut [f32], out: &mut [f32], n: u32, #[comptime] refined: bool) {
     let camera = ABSOLUTE_POS;
@@ -144,7 +144,7 @@ fn adjust(base: &[f32], corrections: &mut [f32], out: &mut [f32], n: u32, #[comp
     let scale = corrections[d + 6].exp();
     out[at + 12] = base[at + 12] * scale;
     out[at + 13] = base[at + 13] * scale;
-    // What is neither turned, moved nor scaled.
+    // The numbers that corrections do not change.
     #[unroll]
     for k in 14..CAMERA {
         let same = base[at + k];
@@ -257,9 +257,9 @@ fn direction(c: &[f32], camera: usize, px: f32, py: f32, zoom: f32) -> Direction
     Direction { x: x * scale, y: y * scale, z: z * scale }
 }
 
-/// Turned into the world.
+/// Rotates a direction from the camera into the world.
 #[cube]
-fn turn(c: &[f32], camera: usize, d: &Direction) -> Direction {
+fn rotate_to_world(c: &[f32], camera: usize, d: &Direction) -> Direction {
     let r = camera * CAMERA;
     Direction {
         x: c[r] * d.x + c[r + 1] * d.y + c[r + 2] * d.z,
@@ -276,7 +276,7 @@ fn cast(c: &[f32], index: &[u32], pixels: &[f32], origins: &mut [f32], dirs: &mu
     }
     let camera = index[r] as usize;
     let local = direction(c, camera, pixels[r * 2], pixels[r * 2 + 1], 1.0);
-    let d = turn(c, camera, &local);
+    let d = rotate_to_world(c, camera, &local);
     #[unroll]
     for k in 0..3usize {
         origins[r * 3 + k] = c[camera * CAMERA + k * 4 + 3];
@@ -320,6 +320,6 @@ fn correct<A: Accumulate>(
     let wide = direction(c, camera, pixels[r * 2], pixels[r * 2 + 1], 1.0 + h);
     let narrow = direction(c, camera, pixels[r * 2], pixels[r * 2 + 1], 1.0 - h);
     let slope = Direction { x: (wide.x - narrow.x) / (2.0 * h), y: (wide.y - narrow.y) / (2.0 * h), z: (wide.z - narrow.z) / (2.0 * h) };
-    let d = turn(c, camera, &slope);
+    let d = rotate_to_world(c, camera, &slope);
     A::add(&out[to + 6], d.x * gx + d.y * gy + d.z * gz);
 }

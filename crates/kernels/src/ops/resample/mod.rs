@@ -14,7 +14,7 @@ mod weights;
 
 pub use weights::Weights;
 
-/// How values between pixels are made. All but [`Filter::Bilinear`] and [`Filter::Nearest`] average over the pixels that a smaller image's pixel covers.
+/// Interpolation between pixels. All but [`Filter::Bilinear`] and [`Filter::Nearest`] average over the pixels that a smaller image's pixel covers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Filter {
     /// The pixel whose corner is nearest, as PyTorch's `nearest`.

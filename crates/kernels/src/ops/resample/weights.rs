@@ -93,7 +93,7 @@ impl Weights {
         let mut rows = Vec::new();
         for o in 0..(length - fir.taps.len()) / fir.down + 1 {
             let mut row: (usize, Vec<f64>) = (0, Vec::new());
-            // A convolution: the filter is turned round.
+            // A convolution: the filter is reversed.
             for (k, w) in fir.taps.iter().rev().enumerate() {
                 let Some(at) = (o * fir.down + k).checked_sub(fir.padding[0]) else { continue };
                 if at % fir.up == 0 && at / fir.up < inputs {

@@ -1,4 +1,4 @@
-//! One walk along the bins per ray when `u` increases, a fresh start when it does not.
+//! Inverts the cumulative distribution per ray by a linear search that continues from the bin before as long as `u` increases.
 
 use super::FLOOR;
 use rayon::prelude::*;

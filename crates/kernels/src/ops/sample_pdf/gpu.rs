@@ -1,7 +1,5 @@
 //! One unit per new distance.
 
-pub mod strata;
-
 use super::FLOOR;
 use crate::gpu::{Buffer, Gpu, launch};
 use cubecl::prelude::*;

@@ -36,7 +36,7 @@ fn windows(gpu: &Gpu, p: Pair) -> (Buffer, Kept) {
     let g = gpu.upload(&gaussian().map(|v| v as f32));
     launch!(
         gpu,
-        judge,
+        compare_windows,
         n,
         [p.x => len, p.y => len, g => WINDOW, values => n, slopes => n * 3],
         n as u32,
@@ -108,7 +108,18 @@ fn scale(x: &[f32], factor: &[f32], out: &mut [f32], len: u32) {
 }
 
 #[cube(launch_unchecked)]
-fn judge(x: &[f32], y: &[f32], g: &[f32], values: &mut [f32], slopes: &mut [f32], n: u32, width: u32, channels: u32, c1: f32, c2: f32) {
+fn compare_windows(
+    x: &[f32],
+    y: &[f32],
+    g: &[f32],
+    values: &mut [f32],
+    slopes: &mut [f32],
+    n: u32,
+    width: u32,
+    channels: u32,
+    c1: f32,
+    c2: f32,
+) {
     let unit = ABSOLUTE_POS;
     if unit >= n as usize {
         terminate!();

@@ -1,4 +1,4 @@
-//! `y = act(a + b)` elementwise, where act is nothing or a ReLU: how residual branches meet; and sums of gradients.
+//! `y = act(a + b)` elementwise, where act is nothing or a ReLU: the sum of residual branches, and of gradients.
 
 pub mod cpu;
 pub mod reference;

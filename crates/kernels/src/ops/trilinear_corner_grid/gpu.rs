@@ -37,7 +37,7 @@ impl GpuCorners {
         let s = self.voxel.len();
         launch!(
             gpu,
-            unmix::<Adder>,
+            scatter_gradients::<Adder>,
             s * c,
             [self.rows => self.rows.len(), self.voxel => s, local => s * 3, d_out => s * c, d_table => d_table.len()],
             (s * c) as u32,
@@ -108,7 +108,7 @@ impl GpuVoxels {
     }
 }
 
-/// Sets the gradient of the row that belongs to all that is empty to 0: what is empty stays so.
+/// Clears the gradient of the row that all empty voxels share, so that they stay empty.
 pub fn keep_empty(gpu: &Gpu, c: usize, d_table: &Buffer) {
     launch!(gpu, clear, c, [d_table => c], c as u32);
 }
@@ -182,7 +182,15 @@ fn mix(rows: &[u32], voxel: &[u32], local: &[f32], table: &[f32], out: &mut [f32
 }
 
 #[cube(launch_unchecked)]
-fn unmix<A: Accumulate>(rows: &[u32], voxel: &[u32], local: &[f32], d_out: &[f32], d_table: &[Atomic<A::Cell>], n: u32, channels: u32) {
+fn scatter_gradients<A: Accumulate>(
+    rows: &[u32],
+    voxel: &[u32],
+    local: &[f32],
+    d_out: &[f32],
+    d_table: &[Atomic<A::Cell>],
+    n: u32,
+    channels: u32,
+) {
     let unit = ABSOLUTE_POS;
     if unit >= n as usize {
         terminate!();

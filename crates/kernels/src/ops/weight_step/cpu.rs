@@ -4,7 +4,7 @@ use super::{Rule, Step};
 use crate::math::multiversion;
 use rayon::prelude::*;
 
-/// Weights per task: elements are independent, so the cut changes no result.
+/// Weights per task; elements are independent, so that it changes no result.
 const CHUNK: usize = 1 << 14;
 
 /// Steps weights and their moments (empty where the rule has none).
@@ -45,7 +45,7 @@ pub fn step(s: &Step, p: &mut [f32], m: &mut [f32], v: &mut [f32], g: &[f32]) {
     }
 }
 
-/// What Adam's elements share.
+/// Factors that all elements of an Adam step share.
 struct Factors {
     beta1: f32,
     beta2: f32,

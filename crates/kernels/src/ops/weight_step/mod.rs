@@ -10,7 +10,7 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
-/// How a weight follows its gradient.
+/// Rule by which a weight follows its gradient.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Rule {
     Sgd {
@@ -57,6 +57,6 @@ pub struct Step {
     pub t: u64,
     /// Factor of the gradient.
     pub scale: f32,
-    /// Most of a gradient's magnitude, after the factor.
+    /// Largest magnitude of a gradient, after the factor.
     pub limit: f32,
 }

@@ -1,5 +1,5 @@
 //! A whole network in one launch (Müller et al. 2021, "Real-time neural radiance caching", section 4): a cube takes a
-//! tile of rows through all layers in memory that it shares, and back. Tensor cores multiply where the device has
+//! tile of rows through all layers in shared memory, forward and backward. Tensor cores multiply where the device has
 //! them, with weights and activations in half precision, sums in f32, and gradients scaled so that they stay in
 //! its range; elsewhere units multiply in f32.
 //!
@@ -23,19 +23,19 @@ use plan::Plan;
 
 /// Edge of a block.
 const BLOCK: usize = 16;
-/// Planes of a cube, where planes have 32 units.
+/// Planes (warps) of a cube, with 32 units each.
 const PLANES: usize = CUBE as usize / 32;
 /// Most cubes along one axis.
 const MAX_CUBES: usize = 65_535;
-/// Row of a packed weight that no parameter fills.
+/// Marker of a number of the packed weights that is padding.
 const EMPTY: u32 = u32::MAX;
-/// Most results of one unit that wait for the last tile.
+/// Most results that a unit keeps until the last tile.
 const MOST_SUMS: usize = 96;
 
-/// Processors of a device that does not tell: many, since a cube too much costs little and an idle processor a lot.
+/// Assumed number of processors of a device that does not report it: many, since an extra cube costs little and an idle processor a lot.
 const PROCESSORS: u32 = 128;
 
-/// What activations and packed weights are.
+/// Element type of activations and packed weights.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Element {
     F32,
@@ -53,10 +53,10 @@ impl Element {
 pub struct Fused {
     pub element: Element,
     plan: Plan,
-    /// For every number of the packed weights its parameter, and the other way round.
+    /// Parameter of every number of the packed weights, and the packed number of every parameter.
     to_packed: Buffer<u32>,
     from_packed: Buffer<u32>,
-    /// Cubes on the way back.
+    /// Cubes of the backward pass.
     cubes: usize,
 }
 
@@ -71,11 +71,11 @@ macro_rules! with_element {
     };
 }
 
-/// What the way back needs of the way forward.
+/// Values that the forward pass keeps for the backward pass.
 pub struct Kept {
     values: Buffer,
     packed: Buffer,
-    /// Of each head, activated, `[S, channels]`.
+    /// Activated values of each head, `[S, channels]`.
     pub heads: Vec<Buffer>,
 }
 
@@ -100,8 +100,8 @@ pub fn tensor_element(gpu: &Gpu) -> Option<Element> {
 
 impl Fused {
     /// Kernels for the layers up to the heads (each with its number of channels), with input 0 in levels of
-    /// `per_level` numbers (0: in rows), and gradients of the inputs that are `wanted`. None where the network or
-    /// the device is not made for it.
+    /// `per_level` numbers (0: in rows), and gradients of the inputs that are `wanted`. None where the network
+    /// or the device does not fit.
     pub fn new(gpu: &Gpu, mlp: &Mlp, heads: &[(Head, usize)], per_level: usize, wanted: &[bool], element: Element) -> Option<Fused> {
         let hardware = &gpu.client.properties().hardware;
         if !gpu.shared || hardware.max_units_per_cube < CUBE || hardware.max_bindings < 16 {
@@ -144,14 +144,14 @@ impl Fused {
         gpu.empty((n * self.element.bytes()).div_ceil(4))
     }
 
-    /// The weights as the kernels want them.
+    /// Weights in the packed layout of the kernels.
     fn pack<E: Float>(&self, gpu: &Gpu, params: &Buffer) -> Buffer {
         let n = self.to_packed.len();
         let out = self.memory(gpu, n);
         let packed: Buffer<E> = out.cast();
         launch!(
             gpu,
-            arrange::<E>,
+            pack_params::<E>,
             n,
             [params => self.from_packed.len(), self.to_packed => n, packed => n],
             n as u32,
@@ -172,7 +172,7 @@ impl Fused {
         let values = self.memory(gpu, kept_len);
         let heads: Vec<Buffer> = plan.heads.iter().map(|h| gpu.empty(rows.most * h.channels)).collect();
         let tiles = rows.most.div_ceil(plan.tile);
-        // Stands in for inputs and heads that the network lacks.
+        // Bound in place of inputs and heads that the network lacks.
         let none = gpu.empty(0);
         let input = |i: usize| inputs.get(i).copied().unwrap_or(&none);
         let head = |i: usize| heads.get(i).unwrap_or(&none);
@@ -199,18 +199,18 @@ impl Fused {
         Kept { values, packed, heads }
     }
 
-    /// Numbers of input `i`; 0 where there is none.
+    /// Width of input `i`; 0 where there is none.
     fn input_len(&self, rows: &Rows, i: usize) -> usize {
         self.plan.inputs.get(i).map_or(0, |input| rows.most * input.width)
     }
 
-    /// Numbers of head `i`; 0 where there is none.
+    /// Channels of head `i`; 0 where there is none.
     fn head_len(&self, rows: &Rows, i: usize) -> usize {
         self.plan.heads.get(i).map_or(0, |h| rows.most * h.channels)
     }
 
     /// Gradients of the parameters, and of the inputs where they are wanted, given those of the heads; in half
-    /// precision they are carried times `scale`.
+    /// precision they are computed times `scale`.
     pub fn backward(
         &self,
         gpu: &Gpu,
@@ -279,7 +279,7 @@ impl Fused {
     }
 }
 
-/// What a way back reads and writes.
+/// Buffers of a backward pass.
 struct Backward<'a> {
     inputs: &'a [&'a Buffer],
     kept: &'a Kept,
@@ -292,7 +292,7 @@ struct Backward<'a> {
 }
 
 #[cube(launch_unchecked)]
-fn arrange<E: Float>(params: &[f32], map: &[u32], packed: &mut [E], n: u32, largest: f32) {
+fn pack_params<E: Float>(params: &[f32], map: &[u32], packed: &mut [E], n: u32, largest: f32) {
     let i = ABSOLUTE_POS;
     if i >= n as usize {
         terminate!();

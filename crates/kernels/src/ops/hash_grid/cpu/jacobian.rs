@@ -1,4 +1,4 @@
-//! Slopes of the features along the points, and what their gradients give the table.
+//! Derivatives of the features with respect to the points, and the table's gradient from theirs.
 
 use super::super::HashGrid;
 use super::{cell, trilinear_slopes};
@@ -25,7 +25,7 @@ pub fn jacobian(grid: &HashGrid, points: &[f32], table: &[f32], out: &mut [f32])
     });
 }
 
-/// Adds to the table's gradient what the Jacobian's gradient `[L, S, F, 3]` gives it.
+/// Adds to the table's gradient, given the Jacobian's gradient `[L, S, F, 3]`.
 pub fn jacobian_backward(grid: &HashGrid, points: &[f32], d_jacobian: &[f32], d_table: &mut [f32]) {
     let (s, width) = (points.len() / 3, grid.config.features);
     assert_eq!(d_jacobian.len(), s * grid.output_dims() * 3, "hash grid: d_jacobian");

@@ -1,34 +1,20 @@
-//! Places of samples in the coordinates that a field reads, and their gradients.
+//! Positions of samples in the coordinates that a field reads, and their gradients.
 
 use super::GpuRays;
 use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::GpuPacked;
+use crate::ops::march::Space;
 use cubecl::prelude::*;
 
-/// Coordinates in which positions are given.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Space {
-    /// As the rays'.
-    Model,
-    /// The cube of this width around the model cube's centre as `[0, 1]³`.
-    Cube(f32),
-    /// All of space, contracted beyond the cube of this width, as `[0, 1]³`.
-    Contracted(f32),
-    /// As [`Space::Cube`], but as `[−1, 1]³`.
-    Centred(f32),
-    /// As [`Space::Contracted`], but as `[−1, 1]³`.
-    ContractedCentred(f32),
-}
-
 impl Space {
-    /// Kind and width, for a launch.
+    /// Kind and width, as kernels take them.
     pub(crate) fn arg(self) -> (u32, f32) {
         match self {
             Space::Model => (0, 1.0),
             Space::Cube(width) => (1, width),
             Space::Contracted(width) => (2, width),
-            Space::Centred(width) => (3, width),
-            Space::ContractedCentred(width) => (4, width),
+            Space::Centered(width) => (3, width),
+            Space::ContractedCentered(width) => (4, width),
         }
     }
 }
@@ -40,7 +26,7 @@ pub fn positions(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked, space: Space) -
     let (kind, width) = space.arg();
     launch!(
         gpu,
-        place,
+        place_samples,
         n,
         [samples.offsets => n + 1, samples.t => s, samples.dt => s, rays.origins => n * 3, rays.dirs => n * 3, out => s * 3],
         n as u32,
@@ -66,7 +52,7 @@ pub fn positions_backward(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked, d: &Bu
     let (kind, width) = space.arg();
     launch!(
         gpu,
-        pull,
+        sum_ray_gradients,
         n,
         [
             samples.offsets => n + 1,
@@ -135,7 +121,7 @@ fn convert(points: &[f32], out: &mut [f32], n: u32, width: f32, #[comptime] kind
 /// The sum of `d · ∂put/∂point` over a ray's samples, and the same times their distances.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
-fn pull(
+fn sum_ray_gradients(
     offsets: &[u32],
     t: &[f32],
     dt: &[f32],
@@ -217,7 +203,7 @@ fn pull(
 }
 
 #[cube(launch_unchecked)]
-fn place(
+fn place_samples(
     offsets: &[u32],
     t: &[f32],
     dt: &[f32],

@@ -1,4 +1,4 @@
-//! Compositing, comparison and both ways back in one kernel: one unit per ray.
+//! Compositing, comparison with photographs and the gradients of both in one kernel: one unit per ray.
 
 use super::{color_error, depth_loss};
 use cubecl::prelude::*;
@@ -112,8 +112,8 @@ fn compare_color(
     Compared { value, squared, d_light }
 }
 
-/// Takes the gradients of a ray's color `[3]` and of the light that passes it back to densities and colors, and adds those of
-/// distortion and depth, whose part of the loss is the result. Weights are read from `d_sigma` `[S]` and replaced.
+/// Gradients of a ray's densities and colors, given those of its color `[3]` and of the light that passes it; adds those of distortion
+/// and depth, and returns their part of the loss. Weights are read from `d_sigma` `[S]` and replaced.
 #[cube]
 fn blend_backward(
     t: &[f32],
@@ -133,7 +133,7 @@ fn blend_backward(
     depth: f32,
     #[comptime] normalized: bool,
 ) -> f32 {
-    // From the back, where what is still behind is small.
+    // From the last sample on, where sums are small.
     let mut after = blended.light;
     let mut behind = blended.light * d_light;
     let mut sum_w = blended.weight;

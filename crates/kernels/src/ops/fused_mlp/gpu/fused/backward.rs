@@ -1,6 +1,6 @@
-//! The way back.
+//! Backward pass of the network, tile by tile.
 
-use super::forward::{factor, load, no_sum, spot};
+use super::forward::{factor, load, no_sum, place_in_tile};
 use super::plan::{Plan, PlannedHead, PlannedInput};
 use super::{BLOCK, PLANES};
 use crate::gpu::CUBE;
@@ -8,7 +8,7 @@ use crate::ops::fused_mlp::Source;
 use crate::ops::linear::gpu::{add_outer, slope};
 use cubecl::prelude::*;
 
-/// Brings what layer `j` kept to shared memory, zeros past the rows.
+/// Loads the kept values of layer `j` into shared memory, with zeros past the rows.
 #[cube]
 fn load_kept<E: Float>(
     kept: &[E],
@@ -35,7 +35,7 @@ fn load_kept<E: Float>(
     }
 }
 
-/// Takes an input's gradient from shared memory to where it belongs.
+/// Stores an input's gradient from shared memory.
 #[cube]
 fn store_input_gradient(
     gradients: &Shared<[f32]>,
@@ -54,7 +54,7 @@ fn store_input_gradient(
     let numbers = comptime!(tile * input.padded);
     let mut e = UNIT_POS as usize;
     while e < numbers {
-        let s = spot(e, first, most, comptime!(input.clone()), tile);
+        let s = place_in_tile(e, first, most, comptime!(input.clone()), tile);
         if first + s.row < rows && s.column < width {
             let v = gradients[s.row * stride + column + s.column] / scale;
             if comptime!(fresh) {
@@ -78,7 +78,7 @@ fn head_gradient(out: &[f32], d: &[f32], row: usize, c: usize, #[comptime] head:
     g
 }
 
-/// The gradient of the sum of layer `j`, to `g`.
+/// Writes the gradient of layer `j`'s sums to `g`.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube]
 fn layer_gradient<E: Float>(
@@ -130,9 +130,9 @@ fn layer_gradient<E: Float>(
     }
 }
 
-/// What layer `j` read, to `x`.
+/// Loads the inputs of layer `j` into `x`.
 #[cube]
-fn load_feeds<E: Float>(
+fn load_sources<E: Float>(
     x0: &[f32],
     x1: &[f32],
     x2: &[f32],
@@ -239,9 +239,9 @@ fn add_weight_sums<E: Float>(x: &Shared<[E]>, g: &Shared<[E]>, sums: &mut Array<
     }
 }
 
-/// The gradient of what feed `s` of layer `j` read, on tensor cores.
+/// Gradient of source `s` of layer `j`, on tensor cores.
 #[cube]
-fn feed_gradient_blocks<E: Float>(
+fn source_gradient_blocks<E: Float>(
     packed: &[E],
     g: &Shared<[E]>,
     gradients: &mut Shared<[f32]>,
@@ -275,9 +275,9 @@ fn feed_gradient_blocks<E: Float>(
     }
 }
 
-/// The gradient of what feed `s` of layer `j` read, some numbers of each unit's own.
+/// Gradient of source `s` of layer `j`, some numbers per unit.
 #[cube]
-fn feed_gradient_units<E: Float>(
+fn source_gradient_units<E: Float>(
     packed: &[E],
     g: &Shared<[E]>,
     gradients: &mut Shared<[f32]>,
@@ -324,7 +324,7 @@ fn feed_gradient_units<E: Float>(
     }
 }
 
-/// Takes the gradients of the inputs that layer `j` read to where they belong.
+/// Stores the gradients of the inputs that layer `j` reads.
 #[cube]
 fn store_input_gradients(
     gradients: &Shared<[f32]>,
@@ -407,7 +407,7 @@ fn store_sums(
     }
 }
 
-/// Tiles of rows back through all layers.
+/// Takes tiles of rows backward through all layers.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
 pub(super) fn backward_tiles<E: Float>(
@@ -460,7 +460,7 @@ pub(super) fn backward_tiles<E: Float>(
         for back_to_front in 0..comptime!(plan.layers.len()) {
             let j = comptime!(plan.layers.len() - 1 - back_to_front);
             layer_gradient::<E>(kept, h0, h1, d0, d1, &gradients, &mut g, first, rows, scale, comptime!(plan.clone()), j);
-            load_feeds::<E>(x0, x1, x2, kept, &mut x, first, rows, most, comptime!(plan.clone()), j);
+            load_sources::<E>(x0, x1, x2, kept, &mut x, first, rows, most, comptime!(plan.clone()), j);
             sync_cube();
             add_bias_sums::<E>(&g, &mut bias, comptime!(plan.clone()), j);
             if comptime!(plan.tensor) {
@@ -472,9 +472,9 @@ pub(super) fn backward_tiles<E: Float>(
             for s in 0..comptime!(plan.layers[j].feeds.len()) {
                 if comptime!(plan.layers[j].feeds[s].gradient.is_some()) {
                     if comptime!(plan.tensor) {
-                        feed_gradient_blocks::<E>(packed, &g, &mut gradients, comptime!(plan.clone()), j, s);
+                        source_gradient_blocks::<E>(packed, &g, &mut gradients, comptime!(plan.clone()), j, s);
                     } else {
-                        feed_gradient_units::<E>(packed, &g, &mut gradients, comptime!(plan.clone()), j, s);
+                        source_gradient_units::<E>(packed, &g, &mut gradients, comptime!(plan.clone()), j, s);
                     }
                 }
             }

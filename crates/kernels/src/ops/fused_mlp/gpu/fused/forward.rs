@@ -1,4 +1,4 @@
-//! The way forward.
+//! Forward pass of the network, tile by tile.
 
 use super::plan::{Plan, PlannedInput};
 use super::{BLOCK, MAX_CUBES, PLANES};
@@ -6,7 +6,7 @@ use crate::gpu::CUBE;
 use crate::ops::linear::gpu::{add_outer, apply};
 use cubecl::prelude::*;
 
-/// A block of a factor, whose rows or columns are `stride` apart.
+/// Loads a block of a factor whose rows or columns are `stride` apart.
 #[cube]
 pub(super) fn factor<E: Float>(
     from: &[E],
@@ -23,7 +23,7 @@ pub(super) fn no_sum() -> cmma::Matrix<f32> {
     cmma::Matrix::<f32>::from_value(cmma::MatrixIdent::Accumulator, BLOCK, BLOCK, BLOCK, cmma::MatrixLayout::Undefined, 0.0)
 }
 
-/// Where a number of an input's tile is: in the tile, and in memory.
+/// Place of a number of an input's tile, in the tile and in memory.
 #[derive(CubeType)]
 pub(super) struct Spot {
     pub row: usize,
@@ -31,9 +31,9 @@ pub(super) struct Spot {
     pub at: usize,
 }
 
-/// The `e`-th number of an input's tile; neighbouring units get neighbouring numbers, of a row or of a level.
+/// The `e`-th number of an input's tile; neighboring units get neighboring numbers of a row or of a level.
 #[cube]
-pub(super) fn spot(e: usize, first: usize, most: u32, #[comptime] input: PlannedInput, #[comptime] tile: usize) -> Spot {
+pub(super) fn place_in_tile(e: usize, first: usize, most: u32, #[comptime] input: PlannedInput, #[comptime] tile: usize) -> Spot {
     let f = comptime!(input.per_level);
     if comptime!(f > 0) {
         let row = e / f % tile;
@@ -46,7 +46,7 @@ pub(super) fn spot(e: usize, first: usize, most: u32, #[comptime] input: Planned
     }
 }
 
-/// Brings an input's tile to shared memory, zeros where there is nothing.
+/// Loads an input's tile into shared memory, with zeros past the rows.
 #[cube]
 pub(super) fn load<E: Float>(
     x: &[f32],
@@ -64,7 +64,7 @@ pub(super) fn load<E: Float>(
     let numbers = comptime!(tile * input.padded);
     let mut e = UNIT_POS as usize;
     while e < numbers {
-        let s = spot(e, first, most, comptime!(input.clone()), tile);
+        let s = place_in_tile(e, first, most, comptime!(input.clone()), tile);
         let mut v = 0.0f32;
         if first + s.row < rows && s.column < width {
             v = clamp(x[s.at], -largest, largest);
@@ -74,7 +74,7 @@ pub(super) fn load<E: Float>(
     }
 }
 
-/// What becomes of a layer's sum `v` in row `r` of the tile and column `c`.
+/// Adds bias and activation to a layer's sum `v` in row `r` of the tile and column `c`, and stores it for later layers, heads and the backward pass.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube]
 fn finish<E: Float>(
@@ -128,7 +128,7 @@ fn finish<E: Float>(
     }
 }
 
-/// Brings the inputs that layer `j` reads first to shared memory.
+/// Loads the inputs that layer `j` is the first to read into shared memory.
 #[cube]
 fn load_inputs<E: Float>(
     x0: &[f32],
@@ -158,7 +158,7 @@ fn load_inputs<E: Float>(
     }
 }
 
-/// The sums of layer `j` on tensor cores, block by block, to `stage`.
+/// Computes the sums of layer `j` on tensor cores, block by block, into `stage`.
 #[cube]
 fn multiply_blocks<E: Float>(packed: &[E], acts: &Shared<[E]>, stage: &mut Shared<[f32]>, #[comptime] plan: Plan, #[comptime] j: usize) {
     let layer = comptime!(plan.layers[j].clone());
@@ -188,7 +188,7 @@ fn multiply_blocks<E: Float>(packed: &[E], acts: &Shared<[E]>, stage: &mut Share
     }
 }
 
-/// The sums of layer `j`, some of each unit's own.
+/// Computes the sums of layer `j` in f32, some per unit.
 #[cube]
 fn multiply_units<E: Float>(packed: &[E], acts: &Shared<[E]>, sums: &mut Array<f32>, #[comptime] plan: Plan, #[comptime] j: usize) {
     let layer = comptime!(plan.layers[j].clone());
@@ -220,7 +220,7 @@ fn multiply_units<E: Float>(packed: &[E], acts: &Shared<[E]>, sums: &mut Array<f
     }
 }
 
-/// A tile of rows through all layers.
+/// Takes tiles of rows through all layers.
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
 pub(super) fn forward_tiles<E: Float>(

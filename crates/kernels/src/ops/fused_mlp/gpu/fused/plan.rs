@@ -13,7 +13,7 @@ const MOST_WIDTH: usize = 128;
 /// Numbers between rows in shared memory, so that rows begin in different banks.
 const PAD: usize = 8;
 
-/// What a layer reads.
+/// Source of a layer.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub(super) struct Feed {
     pub source: Source,
@@ -21,11 +21,11 @@ pub(super) struct Feed {
     pub padded: usize,
     /// First row in the layer's packed weight.
     pub at: usize,
-    /// First column among a tile's activations on the way forward.
+    /// First column among a tile's activations in the forward pass.
     pub column: usize,
-    /// First column among a tile's gradients on the way back; none: its gradient is not wanted.
+    /// First column among a tile's gradients in the backward pass; `None` if its gradient is not wanted.
     pub gradient: Option<usize>,
-    /// Whether no later layer has left a gradient there.
+    /// Whether no later layer has written a gradient there.
     pub fresh: bool,
 }
 
@@ -49,11 +49,11 @@ pub(super) struct PlannedLayer {
     pub weight: usize,
     /// First number among the parameters, and in the packed gradients.
     pub bias: Option<(usize, usize)>,
-    /// First column among a tile's activations; none: no layer reads it.
+    /// First column among a tile's activations; `None` if no layer reads it.
     pub column: Option<usize>,
-    /// First column of what is kept for the way back.
+    /// First column among the values that are kept for the backward pass.
     pub kept: Option<usize>,
-    /// First column among a tile's gradients; none: only heads give it any.
+    /// First column among a tile's gradients; `None` if only heads give it a gradient.
     pub gradient: Option<usize>,
 }
 
@@ -93,7 +93,7 @@ pub(super) struct Plan {
     pub layers: Vec<PlannedLayer>,
     pub inputs: Vec<PlannedInput>,
     pub heads: Vec<PlannedHead>,
-    /// Numbers per row: activations, sums of a layer, what is kept, and on the way back input, gradient, gradients to come.
+    /// Numbers per row: activations, sums of a layer, kept values, and in the backward pass inputs, gradient, gradients of earlier layers.
     pub stride: usize,
     pub stage: usize,
     pub kept: usize,
@@ -109,7 +109,7 @@ fn padded(n: usize) -> usize {
     n.next_multiple_of(BLOCK)
 }
 
-/// Columns in use, handed out first fit.
+/// Columns in use, allocated first fit.
 #[derive(Default)]
 struct Columns {
     taken: Vec<(usize, usize)>,
@@ -205,7 +205,7 @@ impl Layout {
         Some(())
     }
 
-    /// Gives biases their places behind the weights.
+    /// Places the biases behind the weights.
     fn place_biases(&mut self) {
         for l in &mut self.layers {
             if let Some((_, at)) = &mut l.bias {
@@ -215,15 +215,15 @@ impl Layout {
         }
     }
 
-    /// Gives gradients their columns on the way back, and returns how many columns those take.
+    /// Allocates the gradients' columns in the backward pass, and returns how many they take.
     fn place_gradients(&mut self) -> usize {
-        let mut back = Columns::default();
+        let mut gradients = Columns::default();
         let mut seen = vec![false; self.inputs.len()];
         let layers = &mut self.layers;
         for j in (0..layers.len()).rev() {
-            // Its gradient is used up before those of what it read are formed.
+            // A layer's gradient is read for the last time before those of its sources are formed.
             if let Some(at) = layers[j].gradient {
-                back.free(at);
+                gradients.free(at);
             }
             let mut passing = Vec::new();
             for e in 0..layers[j].feeds.len() {
@@ -231,21 +231,21 @@ impl Layout {
                 let (place, fresh) = match source {
                     Source::Input(i) if !self.inputs[i].wanted => (None, true),
                     Source::Input(i) => {
-                        let at = back.take(width);
+                        let at = gradients.take(width);
                         passing.push(at);
                         (Some(at), !std::mem::replace(&mut seen[i], true))
                     }
                     Source::Layer(i) => {
                         let fresh = layers[i].gradient.is_none();
-                        let at = *layers[i].gradient.get_or_insert_with(|| back.take(width));
+                        let at = *layers[i].gradient.get_or_insert_with(|| gradients.take(width));
                         (Some(at), fresh)
                     }
                 };
                 (layers[j].feeds[e].gradient, layers[j].feeds[e].fresh) = (place, fresh);
             }
-            passing.into_iter().for_each(|at| back.free(at));
+            passing.into_iter().for_each(|at| gradients.free(at));
         }
-        back.most
+        gradients.most
     }
 }
 
@@ -298,7 +298,7 @@ impl Plan {
         })
     }
 
-    /// Results of a unit that wait for the last tile.
+    /// Results that a unit keeps until the last tile.
     pub fn sums(&self) -> usize {
         self.sums_before(self.layers.len())
     }
@@ -326,7 +326,7 @@ impl Plan {
     pub fn bytes(&self, tile: usize, element: usize) -> usize {
         let stage = if self.tensor { self.stage } else { 0 };
         let forward = self.stride * element + stage * 4;
-        let back = (self.x + self.g) * element + self.gradients * 4;
-        tile * forward.max(back)
+        let backward = (self.x + self.g) * element + self.gradients * 4;
+        tile * forward.max(backward)
     }
 }

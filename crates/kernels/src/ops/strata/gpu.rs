@@ -1,15 +1,12 @@
-//! Samples without an occupancy grid: one per equal interval (NeRF, eq. 2), and the union with new ones where a
-//! coarse pass found matter. The random numbers are the CPU's.
+//! One unit per sample, or per ray where coarse and new edges are merged. The random numbers are the CPU's.
 
-use super::sample;
+use super::Jitter;
 use crate::gpu::random::{Wide, halves, key, sum, uniform, widened};
 use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::GpuPacked;
+use crate::ops::sample_pdf::gpu::sample;
 use cubecl::prelude::*;
 use diorama_geom::rng::Rng;
-
-/// Random numbers and the rays drawn before.
-type Jitter = Option<(Rng, u64)>;
 
 /// Key and first counter, for a launch.
 fn numbers(jitter: Jitter, per_ray: usize) -> [u32; 4] {
@@ -54,7 +51,7 @@ pub fn refine(gpu: &Gpu, coarse: &GpuPacked, weights: &Buffer, n: usize, m: usiz
         n_edges as u32,
         n as u32,
     );
-    launch!(gpu, ladder, n_fine, [u => n_fine], n_fine as u32, m as u32, key_high, key_low, high, low, jitter.is_some());
+    launch!(gpu, spread_quantiles, n_fine, [u => n_fine], n_fine as u32, m as u32, key_high, key_low, high, low, jitter.is_some());
     let fine = sample(gpu, n, &edges, weights, m, &u);
     launch!(
         gpu,
@@ -140,7 +137,7 @@ fn bounds(t: &[f32], dt: &[f32], edges: &mut [f32], len: u32, n: u32) {
 }
 
 #[cube(launch_unchecked)]
-fn ladder(u: &mut [f32], len: u32, m: u32, key_high: u32, key_low: u32, high: u32, low: u32, #[comptime] jittered: bool) {
+fn spread_quantiles(u: &mut [f32], len: u32, m: u32, key_high: u32, key_low: u32, high: u32, low: u32, #[comptime] jittered: bool) {
     let unit = ABSOLUTE_POS;
     if unit >= len as usize {
         terminate!();

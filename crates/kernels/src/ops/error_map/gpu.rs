@@ -1,33 +1,47 @@
-//! Mean error of the parts of the training images, for drawing. A step's errors in one cell are averaged before they
-//! are mixed in, since rays come in no order.
+//! One unit per ray, cell or image. The errors of a call's rays are averaged per cell before they are mixed in, since rays have no order.
 
-use super::{CELLS, Drawn, GpuPhotographs, PHOTOGRAPH};
+use super::{CELLS, ErrorMap, KEPT};
 use crate::gpu::{Accumulate, Buffer, Gpu, GpuError, launch};
 use cubecl::prelude::*;
 
-/// Share of its old error that a cell keeps per ray.
-const KEPT: f32 = 0.9;
-
-/// Errors `[images, 16, 16]` on the device.
+/// [`ErrorMap`] on the device.
 pub struct GpuErrorMap {
-    images: usize,
+    /// Widths and heights, `[images, 2]`.
+    sizes: Buffer<u32>,
     errors: Buffer,
     /// As of the last refresh.
     drawn: Buffer,
     /// Sums of the roots of `drawn`.
     cdf: Buffer,
-    /// Of this step: sums and counts.
+    /// Sums and numbers of the errors that are to be mixed in.
     gains: Buffer,
     hits: Buffer,
 }
 
+/// Rays through pixels.
+#[derive(Clone, Copy)]
+pub struct Rays<'a> {
+    /// `[R]`
+    pub images: &'a Buffer<u32>,
+    /// Centers of pixels, `[R, 2]`.
+    pub pixels: &'a Buffer,
+    /// Rays that do not count: not 0, `[R]`.
+    pub left_out: &'a Buffer<u32>,
+}
+
 impl GpuErrorMap {
-    pub fn upload(gpu: &Gpu, errors: &[f32], drawn: &[f32]) -> Self {
-        let n = errors.len();
+    /// A map of images with widths and heights `sizes`.
+    ///
+    /// # Panics
+    /// When the map is of another number of images.
+    pub fn upload(gpu: &Gpu, map: &ErrorMap, sizes: &[(u32, u32)]) -> Self {
+        let n = map.errors.len();
+        assert_eq!(n, sizes.len() * CELLS * CELLS, "error map: images");
+        let sizes: Vec<u32> = sizes.iter().flat_map(|(w, h)| [*w, *h]).collect();
         let map = GpuErrorMap {
-            images: n / (CELLS * CELLS),
-            errors: gpu.upload(errors),
-            drawn: gpu.upload(drawn),
+            sizes: gpu.upload(&sizes),
+            errors: gpu.upload(&map.errors),
+            drawn: gpu.upload(&map.drawn),
             cdf: gpu.empty(n),
             gains: gpu.zeros(n),
             hits: gpu.zeros(n),
@@ -36,40 +50,40 @@ impl GpuErrorMap {
         map
     }
 
-    /// What draws go by.
+    /// Sums of the errors' roots up to each cell, by which cells are drawn.
     pub fn cdf(&self) -> &Buffer {
         &self.cdf
     }
 
-    /// Mixes in the squared errors `[R]` of drawn rays.
-    pub fn record(&self, gpu: &Gpu, photographs: &GpuPhotographs, drawn: &Drawn, errors: &Buffer) {
+    /// Mixes in the squared errors `[R]` of rays.
+    pub fn record(&self, gpu: &Gpu, of: Rays, errors: &Buffer) {
         let (rays, cells) = (errors.len(), self.errors.len());
         launch!(
             gpu,
-            note::<Adder>,
+            add_errors::<Adder>,
             rays,
             [
-                photographs.sizes => self.images * PHOTOGRAPH,
-                drawn.images => rays,
-                drawn.pixels => rays * 2,
-                drawn.left_out => rays,
+                self.sizes => cells / (CELLS * CELLS) * 2,
+                of.images => rays,
+                of.pixels => rays * 2,
+                of.left_out => rays,
                 errors => rays,
                 self.gains => cells,
                 self.hits => cells,
             ],
             rays as u32,
         );
-        launch!(gpu, settle, cells, [self.gains => cells, self.hits => cells, self.errors => cells], cells as u32);
+        launch!(gpu, mix_errors, cells, [self.gains => cells, self.hits => cells, self.errors => cells], cells as u32);
     }
 
-    /// Lets draws go by the present errors.
+    /// Makes draws go by the present errors.
     pub fn refresh(&self, gpu: &Gpu) {
         gpu.copy(&self.errors, &self.drawn);
         self.rebuild(gpu);
     }
 
     fn rebuild(&self, gpu: &Gpu) {
-        let (images, cells) = (self.images, self.images * CELLS * CELLS);
+        let (images, cells) = (self.errors.len() / (CELLS * CELLS), self.errors.len());
         let sums = gpu.empty(images);
         launch!(gpu, total, images, [self.drawn => cells, sums => images], images as u32);
         launch!(gpu, cumulate, images, [self.drawn => cells, sums => images, self.cdf => cells], images as u32);
@@ -85,7 +99,7 @@ impl GpuErrorMap {
 }
 
 #[cube(launch_unchecked)]
-fn note<A: Accumulate>(
+fn add_errors<A: Accumulate>(
     sizes: &[u32],
     images: &[u32],
     pixels: &[f32],
@@ -100,8 +114,8 @@ fn note<A: Accumulate>(
         terminate!();
     }
     let image = images[r] as usize;
-    let u = pixels[r * 2] / f32::cast_from(sizes[image * PHOTOGRAPH]);
-    let v = pixels[r * 2 + 1] / f32::cast_from(sizes[image * PHOTOGRAPH + 1]);
+    let u = pixels[r * 2] / f32::cast_from(sizes[image * 2]);
+    let v = pixels[r * 2 + 1] / f32::cast_from(sizes[image * 2 + 1]);
     let x = min(u32::cast_from(u * comptime!(CELLS as f32)), comptime!(CELLS as u32 - 1)) as usize;
     let y = min(u32::cast_from(v * comptime!(CELLS as f32)), comptime!(CELLS as u32 - 1)) as usize;
     let cell = (image * CELLS + y) * CELLS + x;
@@ -111,7 +125,7 @@ fn note<A: Accumulate>(
 
 /// `e ← 0.9ᵏ e + (1 − 0.9ᵏ) mean` for the k rays of a cell.
 #[cube(launch_unchecked)]
-fn settle(gains: &mut [f32], hits: &mut [f32], errors: &mut [f32], n: u32) {
+fn mix_errors(gains: &mut [f32], hits: &mut [f32], errors: &mut [f32], n: u32) {
     let cell = ABSOLUTE_POS;
     if cell >= n as usize {
         terminate!();
