@@ -1,8 +1,8 @@
 //! What `.ci/run` must do before the tests: install what they look for, and make its absence a failure.
 
 /// Packages whose absence would leave tests out.
-const INSTALLED: [&str; 8] =
-    ["mesa-vulkan-drivers", "g++", "chromium", "npm", "ffmpeg", "python3-venv", "python3-torch", "build-essential"];
+const INSTALLED: [&str; 9] =
+    ["mesa-vulkan-drivers", "g++", "chromium", "npm", "ffmpeg", "python3-venv", "python3-torch", "build-essential", "fonts-lato"];
 /// Variables that make a test fail, or run at all, where it would be skipped.
 const REQUIRED: [&str; 6] = [
     "DIORAMA_REQUIRE_READERS=1",
