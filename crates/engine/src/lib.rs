@@ -1,8 +1,7 @@
-//! Fields, samplers, renderers, losses, metrics, optimisers and the training run. Opens no file.
+//! Fields, samplers, renderers, metrics, optimisers and the training run. Opens no file.
 
 pub mod background;
 pub mod fields;
-pub mod losses;
 pub mod metrics;
 #[cfg(feature = "gpu")]
 pub mod on_gpu;

@@ -1,15 +1,15 @@
-//! What a source can show, turned into messages, and values of controls turned back.
+//! Converts a source's scene, controls and history to and from messages.
 
-use crate::messages::{Choice, Class, Control, Input, Layer, Legend, Photograph, Tell, Value};
+use crate::messages::{Choice, Class, Control, Input, Layer, Legend, Photograph, ServerMessage, Value};
 use diorama_geom::view_controls::{self as geom, ControlInput, ControlValue, ControlValues, ViewControl, ViewLayer};
 use diorama_geom::view_source::{ViewPoint, ViewScene};
 use std::collections::BTreeMap;
 
-/// Training values of a curve that the page is told, about.
+/// Approximate number of training values in a curve sent to the page.
 const MOST_POINTS: usize = 400;
 
-/// The scene as the page is told of it.
-pub fn tell(s: &ViewScene) -> Tell {
+/// The message that describes a scene.
+pub fn message(s: &ViewScene) -> ServerMessage {
     let photographs = s.frames.iter().map(|f| {
         let (r, t, c) = (f.world_from_camera.rotation, f.world_from_camera.translation, f.camera);
         let row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]];
@@ -23,7 +23,7 @@ pub fn tell(s: &ViewScene) -> Tell {
     let rows: [f64; 12] = [row(0), row(1), row(2)].concat().try_into().expect("twelve");
     let world_from_capture = Box::new(rows);
     let (lo, hi) = s.bounds;
-    Tell::Scene {
+    ServerMessage::Scene {
         name: s.name.clone(),
         photographs: photographs.collect(),
         layers: s.layers.iter().map(layer).collect(),
@@ -68,18 +68,18 @@ fn control(c: &ViewControl) -> Control {
     Control { id: c.id.clone(), label: c.label.clone(), help: c.help.clone(), layers: c.layers.clone(), input }
 }
 
-/// The curve as the page is told of it: of many training values every n-th, of held-out values all.
-pub fn history(points: &[ViewPoint]) -> Tell {
+/// The message with the training curve: every n-th training value if there are many, and all held-out values.
+pub fn history(points: &[ViewPoint]) -> ServerMessage {
     let nth = points.len().div_ceil(MOST_POINTS).max(1);
     let finite = |v: Option<f64>| v.filter(|v| v.is_finite());
     let shown = points.iter().enumerate().filter(|(i, p)| i % nth == 0 || p.held_out.is_some() || i + 1 == points.len());
-    Tell::History { points: shown.map(|(_, p)| (p.step as f64, finite(p.psnr), finite(p.held_out))).collect() }
+    ServerMessage::History { points: shown.map(|(_, p)| (p.step as f64, finite(p.psnr), finite(p.held_out))).collect() }
 }
 
-/// Values that a page gives, checked against the source's controls.
+/// Checks control values from a page against the source's controls.
 ///
 /// # Errors
-/// One line, when there is no such control or it does not take its value.
+/// One line, if there is no such control or it does not accept its value.
 pub fn values(controls: &[ViewControl], given: BTreeMap<String, Value>) -> Result<ControlValues, String> {
     let value = |v| match v {
         Value::Number(v) => ControlValue::Number(v),
@@ -89,7 +89,7 @@ pub fn values(controls: &[ViewControl], given: BTreeMap<String, Value>) -> Resul
     ControlValues::checked(controls, given.into_iter().map(|(id, v)| (id, value(v))))
 }
 
-/// A scene of one layer, for tests and fuzzing.
+/// A scene with one layer, for tests and fuzzing.
 pub fn with_layer(id: &str) -> ViewScene {
     ViewScene {
         name: String::new(),
@@ -115,10 +115,10 @@ mod tests {
     #[test]
     fn long_curves_are_thinned_and_keep_what_was_held_out() {
         let point = |i: u64| ViewPoint { step: i, psnr: Some(i as f64), held_out: (i == 777).then_some(20.0) };
-        let Tell::History { points } = history(&(0..4000).map(point).collect::<Vec<_>>()) else { panic!("no curve") };
+        let ServerMessage::History { points } = history(&(0..4000).map(point).collect::<Vec<_>>()) else { panic!("no curve") };
         assert!((400..500).contains(&points.len()), "{}", points.len());
         assert!(points.contains(&(777.0, Some(777.0), Some(20.0))) && points.last() == Some(&(3999.0, Some(3999.0), None)));
         let infinite = [ViewPoint { step: 1, psnr: Some(f64::INFINITY), held_out: None }];
-        assert_eq!(history(&infinite), Tell::History { points: vec![(1.0, None, None)] });
+        assert_eq!(history(&infinite), ServerMessage::History { points: vec![(1.0, None, None)] });
     }
 }

@@ -3,7 +3,6 @@
 use super::shape::Shape;
 use crate::fields::Field;
 use crate::params::ParamGroup;
-use crate::samplers::occupancy::Occupancy;
 use crate::step::{self, Figures, GivenRays, Loss, Placement, Probes, RaySource, Scene, Step, Trainees};
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
@@ -11,9 +10,9 @@ use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
 use diorama_kernels::ops::linear::{self, Activation, Dense};
-use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::{self as march, GpuRays};
-use diorama_kernels::ops::photometric_loss::gpu::{self as loss, SUMS, Target, Terms};
+use diorama_kernels::ops::occupancy_update::gpu::GpuOccupancyGrid;
+use diorama_kernels::ops::photometric_loss::gpu::{self as loss, SUMS, Target};
 use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, Drawn, GpuPhotographs};
 use diorama_kernels::ops::prune::gpu as prune;
@@ -171,7 +170,7 @@ impl GpuField {
             }
             Loss::Photometric(terms) => {
                 assert_eq!(net.net.channels(), 3, "a photometric loss compares colors alone");
-                let terms = self.terms(&terms);
+                let terms = (terms, self.shape.measure);
                 let (rgba, distance) = (&r.drawn.target, &r.drawn.distance);
                 let target = Target { rgba, background, left_out: on.left_out, distance };
                 let figures = loss::Figures { sums, marched: on.marched, is_main: on.is_main };
@@ -209,12 +208,6 @@ impl GpuField {
             group.step(gpu, at, &d);
         }
         Ok(Learned { errors, background: g.background, weights: composited, points, codes: d_given, loss })
-    }
-
-    /// What counts, as kernels take it.
-    fn terms(&self, t: &crate::losses::Terms) -> Terms {
-        let normalized = self.shape.is_unbounded;
-        Terms { color: t.color, relative: self.shape.relative, distortion: t.distortion, normalized, alpha: t.alpha, depth: t.depth }
     }
 }
 
@@ -261,10 +254,6 @@ pub struct GpuTrainer {
 impl GpuTrainer {
     /// Uploads all that training needs.
     pub fn new(gpu: Gpu, scene: Scene, of: &Trainees, photographs: Option<GpuPhotographs>) -> Self {
-        let occupancy = |o: &Occupancy| {
-            let thresholds: Vec<f32> = (0..o.bits.cascades).map(|c| o.most(c)).collect();
-            GpuOccupancyGrid::upload(&gpu, &o.bits, &o.density, &o.fresh, &o.live, o.decay, &thresholds)
-        };
         let cameras = GpuCameras::upload(&gpu, &scene.cameras);
         let corrections = of.corrections.as_ref().map(|(g, focal)| (GpuGroup::upload(&gpu, g), *focal));
         corrections.iter().for_each(|(g, focal)| cameras.correct(&gpu, &g.values, *focal));
@@ -273,7 +262,7 @@ impl GpuTrainer {
             coarse: of.coarse.as_ref().map(|f| GpuField::upload(&gpu, f, false)),
             scene,
             learned: of.learned.as_ref().map(|l| (GpuGroup::upload(&gpu, &l.group), l.activation)),
-            occupancy: of.occupancy.as_deref().map(occupancy),
+            occupancy: of.occupancy.as_deref().map(|o| GpuOccupancyGrid::upload(&gpu, &o.grid)),
             photographs,
             cameras,
             corrections,
@@ -474,8 +463,8 @@ impl GpuTrainer {
             m.rebuild();
         }
         if let (Some(own), Some(o)) = (&self.occupancy, &mut to.occupancy) {
-            (o.density, o.fresh) = own.read(gpu)?;
-            o.refresh();
+            (o.grid.density, o.grid.fresh) = own.read(gpu)?;
+            o.grid.refresh();
         }
         Ok(())
     }

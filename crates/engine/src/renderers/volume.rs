@@ -210,13 +210,13 @@ impl Tracer<'_> {
                 if self.shared_weight > 0.0 {
                     let images = self.appearance.map(|i| vec![i; batch.len()]);
                     let (field, pruning, shared_weight) = (self.field, self.pruning, self.shared_weight);
-                    let blocks = Blocks { field, grid: &grid.bits, march, pruning, shared_weight };
+                    let blocks = Blocks { field, grid: grid.bits(), march, pruning, shared_weight };
                     if let Some(out) = blocks.trace(&rays, images.as_deref()) {
                         return self.before_backdrop(batch, out);
                     }
                 }
                 let mut visible = VisibleSamples::default();
-                self.field.visible(&grid.bits, &rays, &march, self.pruning, &mut visible, buf);
+                self.field.visible(grid.bits(), &rays, &march, self.pruning, &mut visible, buf);
                 let VisibleSamples { samples, positions, mut encoded } = visible;
                 self.composite(self.field, batch, &samples, &positions, &mut encoded, buf);
                 let mut out = take_traced(buf);
@@ -335,7 +335,7 @@ mod tests {
         let rays =
             MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
         let mut marched = Marched::default();
-        march::cpu::march(&occupancy.bits, &rays, &occupancy.march_config(4096), &mut Default::default(), &mut marched);
+        march::cpu::march(occupancy.bits(), &rays, &occupancy.march_config(4096), &mut Default::default(), &mut marched);
         let mut buf = FieldBuffers::default();
         tracer.evaluate(&field, &batch, &marched, &mut buf);
         for r in 0..120 {

@@ -2,15 +2,14 @@
 
 use super::{Backdrop, Figures, GivenRays, Loss, Photographs, Placement, RaySource, Scene, Step, Trainees, corrected};
 use crate::fields::{self, Batch, Field, FieldBuffers, VisibleSamples};
-use crate::losses::{self, Photometric, RELATIVE, Terms};
 use crate::params::ParamGroup;
 use crate::samplers::pixels::{self, DrawOptions, ErrorMap, PixelSource};
 use crate::samplers::{RayBatch, stratified};
 use crate::stages::Stages;
 use diorama_kernels::ops::composite::Packed;
-use diorama_kernels::ops::distortion;
 use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::march::{self, MarchRays};
+use diorama_kernels::ops::photometric_loss::{Measure, Photometric, RELATIVE, squared_error};
 use diorama_kernels::ops::ray_aabb;
 use diorama_kernels::ops::ray_generation::{self, CORRECTION, PosedCamera};
 
@@ -173,7 +172,7 @@ impl CpuTrainer {
     /// Samples in occupied cells through the one field: loss, samples trained, samples marched.
     fn occupied(&mut self, of: &mut Trainees, s: &Step) -> (f64, usize, usize) {
         let Placement::Occupancy { march, pruning, .. } = s.placement else { unreachable!("placed otherwise") };
-        let grid = of.occupancy.as_mut().expect("an occupancy grid");
+        let grid = &mut of.occupancy.as_mut().expect("an occupancy grid").grid;
         of.field.visible(&grid.bits, &rays(&self.batch), &march, pruning, &mut self.visible, &mut self.field);
         self.field.visible.seen().for_each(|(cells, sigma)| grid.record(cells, sigma));
         let marched = self.field.visible.marched();
@@ -224,17 +223,7 @@ impl CpuTrainer {
             Loss::Batch(loss) => field.train(&b, &mut on.encoded, fields::Loss::Batch(loss), &mut self.field, d_positions),
             Loss::Photometric(terms) => {
                 assert_eq!(field.net.channels(), 3, "a photometric loss compares colors alone");
-                let (mut starts, mut lengths) = (Vec::new(), Vec::new());
-                let spread = if terms.distortion > 0.0 && field.is_unbounded() {
-                    distortion::cpu::normalize(&samples, &mut starts, &mut lengths);
-                    Packed { offsets: &marched.offsets, t: &starts, dt: &lengths }
-                } else {
-                    samples
-                };
-                let Terms { color, distortion, depth, alpha } = terms;
-                let relative = relative(field);
-                let batch = &self.batch;
-                let loss = Photometric { batch, samples: spread, background, color, relative, distortion, alpha, depth, along: samples };
+                let loss = Photometric::new(terms, measure(field), self.batch.targets(background), samples);
                 field.train(&b, &mut on.encoded, fields::Loss::Rays(&loss), &mut self.field, d_positions);
             }
         }
@@ -243,13 +232,13 @@ impl CpuTrainer {
 
     /// Squared error of the step's colors, and what the error map learns from it.
     fn score(&self, field: &Field, mut error_map: Option<&mut ErrorMap>, photographs: Option<&dyn PixelSource>) -> f64 {
-        let (b, is_linear) = (&self.batch, relative(field) > 0.0);
+        let (b, is_linear) = (&self.batch, measure(field).relative > 0.0);
         let (mut sum, mut n) = (0.0f64, 0usize);
         for r in (0..b.len()).filter(|r| b.counts[*r]) {
             let t = &b.target[r * 4..r * 4 + 4];
             let want = [0, 1, 2].map(|k| t[k] * t[3] + self.background[r * 3 + k] * (1.0 - t[3]));
             let got = [0, 1, 2].map(|k| self.field.out.values[r * 3 + k]);
-            let e = losses::squared_error(got, want, is_linear);
+            let e = squared_error(got, want, is_linear);
             sum += e as f64;
             n += 1;
             if let (Some(map), Some(photographs)) = (&mut error_map, photographs) {
@@ -279,11 +268,10 @@ enum Which {
     Coarse,
 }
 
-/// What differences of linear light are divided by besides the prediction; 0 where colors are as photographs show them. Linear light has a
-/// color head of its own.
-pub(crate) fn relative(field: &Field) -> f32 {
+/// How a loss measures a field's colors and distances. Linear light has a color head of its own.
+pub(crate) fn measure(field: &Field) -> Measure {
     let is_linear = field.net.outputs.first().is_some_and(|o| o.head.activation == Activation::TruncatedExp);
-    if is_linear { RELATIVE } else { 0.0 }
+    Measure { relative: if is_linear { RELATIVE } else { 0.0 }, normalized: field.is_unbounded() }
 }
 
 /// The batch's rays as marching takes them.

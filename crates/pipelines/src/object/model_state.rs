@@ -17,8 +17,8 @@ impl ObjectModel {
             add(format!("{name}.moment2"), &g.moment2);
         }
         if let Some(o) = &self.occupancy {
-            add("occupancy".into(), &o.density);
-            add("occupancy.fresh".into(), &o.fresh);
+            add("occupancy".into(), &o.grid.density);
+            add("occupancy.fresh".into(), &o.grid.fresh);
         }
         if let Some(m) = &self.error_map {
             add("error_map".into(), &m.errors);
@@ -78,9 +78,9 @@ impl ObjectModel {
             g.touched.fill(0);
         }
         if let Some(o) = &mut self.occupancy {
-            load("occupancy", &mut o.density)?;
-            load("occupancy.fresh", &mut o.fresh)?;
-            o.refresh();
+            load("occupancy", &mut o.grid.density)?;
+            load("occupancy.fresh", &mut o.grid.fresh)?;
+            o.grid.refresh();
         }
         if let Some(m) = &mut self.error_map {
             load("error_map", &mut m.errors)?;

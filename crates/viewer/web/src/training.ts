@@ -1,6 +1,6 @@
-// How far training is: figures, a bar, and a small curve of PSNR.
+// Progress of training: figures, a bar, and a small curve of PSNR.
 
-import type { Connection, Told } from "./connection";
+import type { Connection, Received } from "./connection";
 import { element, svg } from "./dom";
 
 interface Point {
@@ -9,14 +9,14 @@ interface Point {
   heldOut: number | null;
 }
 
-/** Points of the curve; of more, every second is dropped. */
+/** Most points of the curve; when there are more, every second one is dropped. */
 const MOST = 400;
 const [WIDTH, HEIGHT] = [272, 64];
 
 export class Training {
   private points: Point[] = [];
 
-  /** `running` tells whether the field changes. */
+  /** `running` is called with whether training is running. */
   constructor(connection: Connection, private readonly running: (on: boolean) => void) {
     connection.on("status", (t) => this.show(t));
     connection.on("history", (t) => {
@@ -25,7 +25,7 @@ export class Training {
     });
   }
 
-  private show(t: Told<"status">): void {
+  private show(t: Received<"status">): void {
     document.body.dataset.step = String(t.step);
     document.body.dataset.running = String(t.running);
     this.running(t.running);
@@ -51,10 +51,10 @@ export class Training {
     this.add(t);
   }
 
-  private add(t: Told<"status">): void {
+  private add(t: Received<"status">): void {
     const last = this.points.at(-1);
     if (!t.running || t.psnr <= 0 || t.step === last?.step) return;
-    // Another run begins anew.
+    // Another run starts with an empty curve.
     if (last && t.step < last.step) this.points = [];
     const before = this.points.filter((p) => p.heldOut !== null).at(-1)?.heldOut ?? null;
     this.points.push({ step: t.step, psnr: t.psnr, heldOut: t.held_out === before ? null : t.held_out });
