@@ -1,4 +1,4 @@
-//! Characters of the fonts that are installed, drawn by family.
+//! Images of characters in the installed fonts, by font family.
 
 use ab_glyph::{Font, FontRef, OutlinedGlyph, PxScaleFactor, point};
 use diorama_geom::{Image, ImageU8};
@@ -11,26 +11,26 @@ pub const SIDE: usize = 48;
 const CAPITAL: f32 = 30.0;
 const BASELINE: f32 = 38.0;
 const WIDEST: f32 = 46.0;
-/// Two faces are one drawing under two names where less than this share of their ink differs.
+/// Two faces count as the same drawing if less than this share of their ink differs.
 const ALIKE: f32 = 0.1;
-/// Fonts of pictures say so by these bytes of their table OS/2: IBM's class of symbols, or PANOSE's kind of pictures.
+/// Bytes of the OS/2 table by which fonts of pictures declare themselves: IBM's symbol class, PANOSE's pictorial kind.
 const PICTURES: [(usize, u8); 2] = [(30, 12), (32, 5)];
 
-/// An image of each character in one channel: 255 is ink, 0 is paper.
+/// One image per character, in one channel: 255 is ink, 0 is paper.
 pub type Face = Vec<ImageU8>;
 
-/// Faces that belong together.
+/// Faces that must be on one side of the split.
 pub struct Family {
     pub name: String,
     pub faces: Vec<Face>,
 }
 
-/// The same in three channels, as networks for photographs take it.
+/// A character in three equal channels, as networks for photographs expect.
 pub fn in_color(character: &ImageU8) -> Image {
     Image { width: SIDE, height: SIDE, channels: 3, data: character.data.iter().flat_map(|v| [*v as f32 / 255.0; 3]).collect() }
 }
 
-/// Families below the usual folders whose faces have all `characters` by their Unicode numbers and are no fonts of pictures.
+/// Families in the usual font folders, of faces that have all `characters` and are not fonts of pictures.
 pub fn installed(characters: &str) -> Vec<Family> {
     let home = std::env::var("HOME").or(std::env::var("USERPROFILE")).unwrap_or_default();
     let shared = ["/usr/share/fonts", "/usr/local/share/fonts", "/Library/Fonts", "/System/Library/Fonts", "C:/Windows/Fonts"];
@@ -49,7 +49,7 @@ pub fn installed(characters: &str) -> Vec<Family> {
     families(bytes.flat_map(|b| faces(&b, characters)).collect())
 }
 
-/// The faces of a file with the names of their families.
+/// The usable faces of a font file, with their family names.
 fn faces(bytes: &[u8], characters: &str) -> Vec<(String, Face)> {
     let read = |i| {
         let tables = ttf_parser::Face::parse(bytes, i).ok()?;
@@ -61,7 +61,7 @@ fn faces(bytes: &[u8], characters: &str) -> Vec<(String, Face)> {
     (0..ttf_parser::fonts_in_collection(bytes).unwrap_or(1)).filter_map(read).collect()
 }
 
-/// The characters on one baseline at one size, each in the middle; none where one is missing.
+/// The characters at one scale on one baseline, each centered; `None` if one is missing.
 fn draw(font: &FontRef, characters: &str) -> Option<Face> {
     let capital = font.outline(font.glyph_id('H'))?.bounds.height().abs();
     let character = |c: char| {
@@ -84,7 +84,7 @@ fn draw(font: &FontRef, characters: &str) -> Option<Face> {
     characters.chars().map(character).collect()
 }
 
-/// Families by the first word of their names, so that "Lato" and "Lato Black" are one; those that share a drawing are one, too.
+/// Groups faces by the first word of their family names ("Lato" and "Lato Black" are one), and merges groups that share a drawing.
 fn families(faces: Vec<(String, Face)>) -> Vec<Family> {
     let mut by_word: BTreeMap<String, Vec<Face>> = BTreeMap::new();
     for (name, face) in faces {
@@ -108,12 +108,12 @@ fn families(faces: Vec<(String, Face)>) -> Vec<Family> {
     out.into_iter().map(|(family, _)| family).collect()
 }
 
-/// Every fifth character of a face at a quarter of its size.
+/// Every fifth character of a face, at a quarter of its size.
 fn shape(face: &[ImageU8]) -> Vec<f32> {
     face.iter().step_by(5).flat_map(|c| c.downsampled(SIDE / 4, SIDE / 4).to_f32().data).collect()
 }
 
-/// The share of their ink in which two shapes differ.
+/// Share of the ink in which two shapes differ.
 fn difference(a: &[f32], b: &[f32]) -> f32 {
     let (differs, all) = a.iter().zip(b).fold((0.0, 0.0), |(d, all), (a, b)| (d + (a - b).abs(), all + a.max(*b)));
     differs / all

@@ -1,6 +1,6 @@
-//! Learns to read digits and capitals from the fonts of this machine, and is judged by families that training never saw.
+//! Trains a network to read digits and capitals in the fonts of this machine, and tests it on font families that training never saw.
 //!
-//! `cargo run --release -p diorama-pipelines --example characters -- [FOLDER] [--short]`; Ctrl-C saves, and the same command goes on.
+//! `cargo run --release -p diorama-pipelines --example characters -- [FOLDER] [--short]`; Ctrl-C saves, and the same command continues.
 
 mod fonts;
 
@@ -36,12 +36,12 @@ fn run() -> Result<ExitCode> {
     std::fs::create_dir_all(&out)?;
     let start = Instant::now();
 
-    // A fifth of the families, by a hash of their names, is never shown to the network.
+    // A hash of the name assigns about a fifth of the families to the test.
     let hash = |name: &str| name.bytes().fold(0, |h, b| Rng::new(h, b as u64).key());
     let (held_out, seen): (Vec<Family>, Vec<Family>) = fonts::installed(CLASSES).into_iter().partition(|f| hash(&f.name) % 5 == 0);
     if seen.len() < 20 || held_out.len() < 4 {
         let found = seen.len() + held_out.len();
-        return Err(format!("found {found} families of fonts with digits and capitals and needs about 30: install some").into());
+        return Err(format!("found {found} font families with digits and capitals, about 30 are needed; install more fonts").into());
     }
     let faces = |families: &[Family]| families.iter().map(|f| f.faces.len()).sum::<usize>();
     println!("{} families ({} faces) to learn from, {} ({}) held out", seen.len(), faces(&seen), held_out.len(), faces(&held_out));
@@ -57,10 +57,10 @@ fn run() -> Result<ExitCode> {
     if checkpoint::exists(&out) {
         let saved = checkpoint::load(&out)?.0;
         if saved.metadata.get("held out") != metadata.get("held out") {
-            return Err(format!("{} holds a run that learned from other fonts: name another folder", out.display()).into());
+            return Err(format!("{} contains a run with other fonts; choose another folder", out.display()).into());
         }
         train::resume(&net, &mut optimizer, Some(&mut average), &saved.into_arrays())?;
-        println!("going on from step {}", optimizer.steps());
+        println!("continuing from step {}", optimizer.steps());
     }
     ctrlc::set_handler(|| STOP.store(true, Relaxed))?;
 
@@ -97,7 +97,7 @@ fn run() -> Result<ExitCode> {
     Ok(if right > 0.5 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// A character of a family in a face chosen by chance, changed.
+/// A training image: a character of a family in a random face, augmented.
 fn sample(families: &[Family], key: &SampleKey) -> (Image, i64) {
     let (faces, class) = (&families[key.item / CLASSES.len()].faces, key.item % CLASSES.len());
     let face = &faces[Draws::new(key.rng).below(faces.len())];
@@ -106,7 +106,7 @@ fn sample(families: &[Family], key: &SampleKey) -> (Image, i64) {
     (changes.apply(&in_color(&face[class]), Rng::new(key.rng.bits(0), 1)), class as i64)
 }
 
-/// Reads every character of the families and prints the share that is right by family, and what is taken for what most often.
+/// Share of the families' characters that is read correctly; prints it by family, and the five most frequent mistakes.
 fn judge(net: &ResNet, families: &[Family], out: &Path) -> Result<f64> {
     let (mut shares, mut confused, mut mistakes) = (Vec::new(), BTreeMap::<_, usize>::new(), Vec::new());
     for family in families {
@@ -118,7 +118,7 @@ fn judge(net: &ResNet, families: &[Family], out: &Path) -> Result<f64> {
                 let read = (0..row.len()).max_by(|a, b| row[*a].total_cmp(&row[*b])).unwrap_or(0);
                 if read != class {
                     *confused.entry((class, read)).or_default() += 1;
-                    // Beside it what it was taken for, in the same face.
+                    // Beside it, in the same face, the character that was read.
                     mistakes.extend([face[class].clone(), face[read].clone()]);
                 }
             }
