@@ -4,7 +4,6 @@ use super::median_seconds;
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, Pose};
-use diorama_kernels::gemm::Precision;
 use diorama_kernels::gemm::{Precision, has_bf16};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::{self, Packed};

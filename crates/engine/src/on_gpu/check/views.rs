@@ -111,10 +111,10 @@ fn unit(v: &[f32]) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::samplers::RayBatch;
     use crate::fields::Pruning;
     use crate::renderers::supervised::Unserved;
     use crate::renderers::volume::{Placement, Traced};
+    use crate::samplers::RayBatch;
 
     /// Evaluates densities where it works.
     struct Device {

@@ -13,8 +13,8 @@ use crate::ops::linear::Activation;
 #[cfg(feature = "gpu")]
 use crate::{
     gpu::{Buffer, Gpu, GpuError, table::Table},
-    ops::embedding,
     ops::composite::gpu::{GpuComposited, GpuPacked},
+    ops::embedding,
 };
 use diorama_geom::rng::Rng;
 use diorama_testkit::{random, wide};
