@@ -1,8 +1,8 @@
 //! Checks `.ci/run`: it must install what tests need before they run, and turn its absence into a failure.
 
 /// Packages without which tests would be skipped.
-const INSTALLED: [&str; 8] =
-    ["mesa-vulkan-drivers", "g++", "chromium", "npm", "ffmpeg", "python3-venv", "python3-torch", "build-essential"];
+const INSTALLED: [&str; 9] =
+    ["mesa-vulkan-drivers", "g++", "chromium", "npm", "ffmpeg", "python3-venv", "python3-torch", "build-essential", "fonts-lato"];
 /// Variables that make a test fail, or run, instead of being skipped.
 const REQUIRED: [&str; 6] = [
     "DIORAMA_REQUIRE_READERS=1",

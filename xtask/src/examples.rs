@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Examples that are run with a folder as argument, and the files that each must write there.
-const RUN: [(&str, &[&str]); 9] = [
+/// Examples that are run with a folder as argument, and the files that each must write there. Further arguments follow the name.
+const RUN: [(&str, &[&str]); 10] = [
+    ("characters --short", &["latest.safetensors", "samples.png", "mistakes.png"]),
     ("cube", &["cube.glb", "cube.obj", "cube.ply", "cube.stl", "cube.usdz", "cube.dae"]),
     ("custom_loss", &["squares.png", "cauchy.png"]),
     ("custom_ray_code", &["sun_0.png", "sun_1.png", "sun_2.png"]),
@@ -40,7 +41,7 @@ pub fn run() -> bool {
     let begin = Instant::now();
     for (name, files) in RUN.iter().filter(|_| built) {
         let start = Instant::now();
-        let result = run_one(name, &folder.join(name), files);
+        let result = run_one(name, &folder.join(program(name)), files);
         println!("{name}: {:.1} s", start.elapsed().as_secs_f64());
         breaches.extend(result.err().map(|why| format!("{name}: {why}")));
     }
@@ -50,11 +51,17 @@ pub fn run() -> bool {
     breaches.is_empty()
 }
 
+/// The name of an example, without its arguments.
+fn program(name: &str) -> &str {
+    name.split(' ').next().unwrap_or_default()
+}
+
 /// Runs an example and checks the files that it writes.
 fn run_one(name: &str, folder: &Path, files: &[&str]) -> Result<(), String> {
     std::fs::create_dir_all(folder).map_err(|e| format!("{}: {e}", folder.display()))?;
-    let mut command = Command::new(Path::new("target/release/examples").join(name));
-    let mut child = command.arg(folder).stdout(Stdio::null()).spawn().map_err(|e| format!("cannot be started: {e}"))?;
+    let mut command = Command::new(Path::new("target/release/examples").join(program(name)));
+    let mut child =
+        command.arg(folder).args(name.split(' ').skip(1)).stdout(Stdio::null()).spawn().map_err(|e| format!("cannot be started: {e}"))?;
     let start = Instant::now();
     let status = loop {
         match child.try_wait() {
@@ -75,13 +82,20 @@ fn run_one(name: &str, folder: &Path, files: &[&str]) -> Result<(), String> {
     lacks.map_or(Ok(()), |f| Err(format!("did not write {f}")))
 }
 
-/// Name and text of every example below `crates`.
+/// Name and text of every example below `crates`, and of the other files of those that are folders.
 fn sources(crates: &Path) -> Vec<(String, String)> {
     let entries = |folder: &Path| -> Vec<PathBuf> { std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path()).collect() };
-    let files = entries(crates).into_iter().flat_map(|krate| entries(&krate.join("examples")));
+    let examples: Vec<PathBuf> = entries(crates).into_iter().flat_map(|krate| entries(&krate.join("examples"))).collect();
+    let files = examples.iter().flat_map(|e| if e.is_dir() { entries(e) } else { vec![e.clone()] });
+    let stem = |f: &Path| f.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let name = |f: &Path| match f.parent().filter(|folder| !folder.ends_with("examples")) {
+        Some(folder) if f.ends_with("main.rs") => stem(folder),
+        Some(folder) => format!("{}/{}", stem(folder), stem(f)),
+        None => stem(f),
+    };
     let mut found: Vec<(String, String)> = files
         .filter(|f| f.extension().is_some_and(|e| e == "rs"))
-        .map(|f| (f.file_stem().unwrap_or_default().to_string_lossy().into_owned(), std::fs::read_to_string(&f).unwrap_or_default()))
+        .map(|f| (name(&f), std::fs::read_to_string(&f).unwrap_or_default()))
         .collect();
     found.sort();
     found
@@ -89,13 +103,15 @@ fn sources(crates: &Path) -> Vec<(String, String)> {
 
 /// Examples in no list, listed names without an example, and examples that are too long or lack a first line of description.
 fn check(sources: &[(String, String)]) -> Vec<String> {
-    let listed = || RUN.iter().map(|r| r.0).chain(BUILT.iter().map(|b| b.0));
+    let run = || RUN.iter().map(|r| program(r.0));
+    let listed = || run().chain(BUILT.iter().map(|b| b.0));
     let mut breaches = Vec::new();
     for (name, text) in sources {
-        if !listed().any(|l| l == name) {
+        let example = name.split('/').next().unwrap_or_default();
+        if !listed().any(|l| l == example) {
             breaches.push(format!("{name}: add it to a list of xtask/src/examples.rs"));
         }
-        let is_run = RUN.iter().any(|r| r.0 == name);
+        let is_run = run().any(|r| r == example);
         if is_run && text.lines().count() > LINES {
             breaches.push(format!("{name}: {} lines, more than {LINES}", text.lines().count()));
         }
@@ -126,10 +142,13 @@ mod tests {
         let mut s = workspace();
         s.retain(|(name, _)| name != "cube");
         s.push(("stranger".into(), "//! Shows nothing.\n".into()));
+        s.push(("characters/more".into(), "//! More.\n".repeat(LINES + 2)));
         let mesh = s.iter_mut().find(|(name, _)| name == "mesh_formula").unwrap();
         mesh.1 = "fn main() {}\n".repeat(LINES + 1);
         let b = check(&s).join("\n");
-        for what in ["stranger: add it", "mesh_formula: 151 lines", "mesh_formula: its first line", "cube: is listed"] {
+        for what in
+            ["stranger: add it", "mesh_formula: 151 lines", "mesh_formula: its first line", "cube: is listed", "characters/more: 152 lines"]
+        {
             assert!(b.contains(what), "{what}: {b}");
         }
     }

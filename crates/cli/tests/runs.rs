@@ -43,7 +43,7 @@ fn runs_and_photographs_may_move() {
     // These commands do not read photographs.
     works(&elsewhere, &["render", s(&run), "--frames", "1", "--size", "16x16", "--device", "cpu"]);
     works(&elsewhere, &["export", s(&run), "-o", "a.ply", "--resolution", "16", "--level", "0.01", "--device", "cpu"]);
-    fails(&elsewhere, &["view", s(&data), "--data", s(&data), "--port", "0"], 2, &["--data", "is no run"]);
+    fails(&elsewhere, &["view", s(&data), "--data", s(&data), "--port", "0"], 2, &["--data", "is not a run"]);
     // Resuming stores the new place.
     works(&elsewhere, &["train", "-o", s(&run), "--resume", "--data", "../photographs", "--steps", "8"]);
     eval(dir.path(), s(&run), &[]);

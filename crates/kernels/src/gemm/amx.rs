@@ -84,23 +84,43 @@ static CONFIG: TileConfig = {
 /// [`is_available`] holds; slices fit the shapes as `gemm` asserts.
 pub unsafe fn run(g: &Gemm, c: &mut [f32]) {
     SCRATCH.with_borrow_mut(|s| {
-        let (mt, nt, kt) = (g.m.div_ceil(BLOCK) * 2, g.n.div_ceil(BLOCK) * 2, g.k.div_ceil(K));
-        for (v, tiles) in [(&mut s.a, mt * kt), (&mut s.b, nt * kt)] {
-            if v.len() < tiles * 16 {
-                v.resize(tiles * 16, Line::ZERO);
-            }
-        }
-        // SAFETY: the scratch holds mt·kt and nt·kt tiles; the CPU has the instructions.
+        // SAFETY: as the caller vouches.
         unsafe {
-            if g.a.col == 1 {
-                pack_rows(g, &mut s.a, kt);
-            } else {
-                pack_columns(g, &mut s.a, kt);
-            }
-            pack_pairs(g, &mut s.b, kt);
-            with_tiles(|| multiply(g, &s.a, &s.b, kt, c.as_mut_ptr()));
+            pack_a(g, &mut s.a);
+            run_packed(g, &s.a, &mut s.b, c.as_mut_ptr());
         }
     });
+}
+
+/// A as tiles, of whole blocks of rows.
+///
+/// # Safety
+/// [`is_available`] holds; A fits the shapes.
+pub unsafe fn pack_a(g: &Gemm, out: &mut Vec<Line>) {
+    let kt = g.k.div_ceil(K);
+    grow(out, g.m.div_ceil(BLOCK) * 2 * kt);
+    // SAFETY: there is room for these tiles; the CPU has the instructions.
+    unsafe { if g.a.col == 1 { pack_rows(g, out, kt) } else { pack_columns(g, out, kt) } }
+}
+
+/// Runs a product whose A is packed already; `b` is memory to pack B into.
+///
+/// # Safety
+/// [`is_available`] holds; `a` is what [`pack_a`] made of as many rows and terms; B and C fit the shapes.
+pub unsafe fn run_packed(g: &Gemm, a: &[Line], b: &mut Vec<Line>, c: *mut f32) {
+    let kt = g.k.div_ceil(K);
+    grow(b, g.n.div_ceil(BLOCK) * 2 * kt);
+    // SAFETY: there is room for these tiles; the CPU has the instructions.
+    unsafe {
+        pack_pairs(g, b, kt);
+        with_tiles(|| multiply(g, a, b, kt, c));
+    }
+}
+
+fn grow(lines: &mut Vec<Line>, tiles: usize) {
+    if lines.len() < tiles * 16 {
+        lines.resize(tiles * 16, Line::ZERO);
+    }
 }
 
 /// Runs `work` with the tile registers configured.

@@ -23,6 +23,46 @@ pub fn has_bf16() -> bool {
     return false;
 }
 
+/// A left factor that is rounded to bf16 and packed once for several products; for CPUs with [`has_bf16`].
+#[derive(Default)]
+pub(crate) struct Rounded {
+    #[cfg(target_arch = "x86_64")]
+    a: Vec<amx::Line>,
+    #[cfg(target_arch = "x86_64")]
+    b: Vec<amx::Line>,
+}
+
+impl Rounded {
+    /// Packs A of a product, whose B is not read.
+    ///
+    /// # Panics
+    /// Without [`has_bf16`], or when A is too short for its shape.
+    pub fn pack(&mut self, g: &Gemm) {
+        assert!(has_bf16(), "no bf16 tiles here");
+        assert!(g.m == 0 || g.k == 0 || g.a.data.len() > (g.m - 1) * g.a.row + (g.k - 1) * g.a.col, "gemm: a is too short");
+        // SAFETY: asserted above.
+        #[cfg(target_arch = "x86_64")]
+        unsafe {
+            amx::pack_a(g, &mut self.a);
+        }
+    }
+
+    /// `c = init + A B` with the A that was packed last; `c` is addressed as the description says.
+    ///
+    /// # Safety
+    /// The rows and terms are those that were packed; C exists.
+    pub unsafe fn multiply(&mut self, g: &Gemm, c: *mut f32) {
+        assert!(g.k == 0 || g.b.len() >= (g.k - 1) * g.ldb + g.n, "gemm: b is too short");
+        // SAFETY: as the caller vouches; packing asserted what the CPU has.
+        #[cfg(target_arch = "x86_64")]
+        unsafe {
+            amx::run_packed(g, &self.a, &mut self.b, c);
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        let _ = c;
+    }
+}
+
 /// Columns beyond which B is packed into panels that stay in the first-level cache.
 const WIDE: usize = 64;
 /// Rows of B per panel.

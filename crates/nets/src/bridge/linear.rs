@@ -1,5 +1,6 @@
 //! A fully connected layer in burn's graph.
 
+use super::precision::{Precision, precision};
 #[cfg(feature = "gpu")]
 use super::{DeviceKernels, DeviceOutputs, OnDevice};
 use super::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
@@ -14,6 +15,7 @@ use diorama_kernels::ops::linear::{Activation, BiasKind, Dense, Gradients, Linea
 struct LinearOp {
     activation: Activation,
     bias: BiasKind,
+    precision: Precision,
 }
 
 impl LinearOp {
@@ -24,7 +26,7 @@ impl LinearOp {
 
     fn layer(&self, x: &[usize], weight: &[usize]) -> Linear {
         let (rows, k, n) = Self::size(x, weight);
-        self.dense(k, n).of_rows(rows)
+        Linear { precision: self.precision, ..self.dense(k, n).of_rows(rows) }
     }
 
     fn dense(&self, k: usize, n: usize) -> Dense {
@@ -106,7 +108,7 @@ pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<2>>, activati
     };
     let mut inputs = vec![x.into_dispatch(), weight.into_dispatch()];
     inputs.extend(bias.map(|b| b.into_dispatch()));
-    apply_one(LinearOp { activation, bias: kind }, inputs)
+    apply_one(LinearOp { activation, bias: kind, precision: precision() }, inputs)
 }
 
 /// The layer on the last axis of a tensor of any rank, with a shared bias `[N]`.
@@ -119,7 +121,7 @@ pub(crate) fn linear_of_rows<const D: usize>(
     let kind = if bias.is_some() { BiasKind::Shared } else { BiasKind::None };
     let mut inputs = vec![x.into_dispatch(), weight.into_dispatch()];
     inputs.extend(bias.map(|b| b.into_dispatch()));
-    apply_one(LinearOp { activation, bias: kind }, inputs)
+    apply_one(LinearOp { activation, bias: kind, precision: precision() }, inputs)
 }
 
 #[cfg(feature = "gpu")]

@@ -16,6 +16,7 @@ mod linear;
 #[cfg(feature = "gpu")]
 mod on_gpu;
 pub mod pool;
+mod precision;
 #[cfg(test)]
 mod ragged_rays;
 mod scan;
@@ -36,6 +37,8 @@ pub(crate) use linear::linear_of_rows;
 #[cfg(feature = "gpu")]
 pub use on_gpu::{DeviceKernels, DeviceOutputs, OnDevice, tensors};
 pub use pool::{Indices, IndicesMut, Values, ValuesMut};
+pub(crate) use precision::precision;
+pub use precision::{Precision, with_precision};
 pub use scan::scan;
 pub use spherical_harmonics::spherical_harmonics;
 pub use ssim::ssim;

@@ -4,6 +4,7 @@ use super::Activation;
 use super::by_burn;
 use crate::bridge::work;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
+use crate::bridge::{Precision, precision};
 use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::conv2d::{self, Conv2d, Gradients, Images};
@@ -43,7 +44,7 @@ impl Conv {
 }
 
 #[derive(Clone, Debug)]
-pub(super) struct ConvOp(pub(super) Conv);
+pub(super) struct ConvOp(pub(super) Conv, pub(super) Precision);
 
 impl ConvOp {
     fn conv(&self, x: &[usize], w: &[usize]) -> (Conv2d, Images) {
@@ -57,6 +58,7 @@ impl ConvOp {
             dilation: s.dilation,
             groups: s.groups,
             activation: s.activation,
+            precision: self.1,
         };
         (conv, Images { batch: x[0], height: x[2], width: x[3] })
     }
@@ -167,5 +169,5 @@ impl SliceOp for ConvOp {
 pub fn conv2d(x: Tensor<4>, weight: Tensor<4>, bias: Option<Tensor<1>>, settings: Conv) -> Result<Tensor<4>, OpError> {
     let mut inputs = vec![x.into_dispatch(), weight.into_dispatch()];
     inputs.extend(bias.map(|b| b.into_dispatch()));
-    apply_one(ConvOp(settings), inputs)
+    apply_one(ConvOp(settings, precision()), inputs)
 }

@@ -5,13 +5,14 @@ use super::conv::{Wanted, bias, check_conv};
 use super::{Activation, Conv};
 use crate::bridge::work;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one};
+use crate::bridge::{Precision, precision};
 use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::conv_transpose2d::{self, ConvTranspose2d};
 use diorama_kernels::ops::conv2d::Images;
 
 #[derive(Clone, Debug)]
-pub(super) struct ConvTransposeOp(pub(super) Conv);
+pub(super) struct ConvTransposeOp(pub(super) Conv, pub(super) Precision);
 
 impl ConvTransposeOp {
     fn conv(&self, x: &[usize], w: &[usize]) -> (ConvTranspose2d, Images) {
@@ -26,6 +27,7 @@ impl ConvTransposeOp {
             dilation: s.dilation,
             groups: s.groups,
             activation: s.activation,
+            precision: self.1,
         };
         (conv, Images { batch: x[0], height: x[2], width: x[3] })
     }
@@ -89,5 +91,5 @@ impl SliceOp for ConvTransposeOp {
 pub fn conv_transpose2d(x: Tensor<4>, weight: Tensor<4>, bias: Option<Tensor<1>>, settings: Conv) -> Result<Tensor<4>, OpError> {
     let mut inputs = vec![x.into_dispatch(), weight.into_dispatch()];
     inputs.extend(bias.map(|b| b.into_dispatch()));
-    apply_one(ConvTransposeOp(settings), inputs)
+    apply_one(ConvTransposeOp(settings, precision()), inputs)
 }

@@ -20,6 +20,7 @@ mod sample;
 mod tests;
 
 pub use crate::bridge::work::flops;
+pub use crate::bridge::{Precision, with_precision};
 pub use attention::attention;
 pub use conv::{Conv, conv2d};
 pub use conv_transpose::conv_transpose2d;

@@ -182,6 +182,30 @@ fn convolutions_refuse_what_does_not_fit() {
 }
 
 #[test]
+fn layers_round_their_factors_in_bf16_forward_and_backward() {
+    let half = |v: Vec<f32>| -> Vec<f32> { v.iter().map(|v| half::bf16::from_f32(*v).to_f32()).collect() };
+    let run = |round: bool, precision: Precision| -> [Vec<f32>; 3] {
+        let value = |v: Vec<f32>| if round { half(v) } else { v };
+        let tensor = |n: usize, seed: u64| Tensor::<1>::from_data(TensorData::new(value(random(n, seed)), [n]), &Device::flex().autodiff());
+        let (x, w) = (tensor(2 * 5 * 7 * 9, 1).reshape([2, 5, 7, 9]).require_grad(), tensor(4 * 5 * 9, 2).reshape([4, 5, 3, 3]));
+        let v = tensor(9 * 6, 3).reshape([9, 6]);
+        let [conv, linear] = with_precision(precision, || {
+            let y = conv2d(x.clone(), w, None, Conv::same(3)).unwrap();
+            [y, super::linear(x.clone(), v, None, Activation::None).unwrap()]
+        });
+        // Gradients of outputs that bf16 holds exactly; outside of the scope, as training runs it.
+        let g = read_values(x.grad(&(conv.clone().sum() + linear.clone().sum()).backward()).unwrap());
+        [read_values(conv), read_values(linear), g]
+    };
+    let (exact, rounded, bf16) = (run(false, Precision::F32), run(true, Precision::F32), run(false, Precision::Bf16));
+    let want = if diorama_kernels::gemm::has_bf16() { &rounded } else { &exact };
+    for ((want, got), exact) in want.iter().zip(&bf16).zip(&exact) {
+        assert_close("bf16", got, &wide(want), 1e-5);
+        assert_eq!(got == exact, !diorama_kernels::gemm::has_bf16());
+    }
+}
+
+#[test]
 fn the_pool_is_told_about_every_buffer() {
     let before = pool::figures();
     let x = leaf([2, 3, 4, 4], 1);
@@ -220,9 +244,9 @@ fn burns_own_ops_give_the_same() {
     let f = Activation::Silu;
     for groups in [1, 2] {
         let settings = Conv { groups, ..Conv::same(3).stride(2) }.activation(Activation::Silu);
-        assert_by_burn(conv::ConvOp(settings), &[image, &[6, 4 / groups, 3, 3], &[6]]);
+        assert_by_burn(conv::ConvOp(settings, Precision::F32), &[image, &[6, 4 / groups, 3, 3], &[6]]);
         let settings = Conv { output_padding: [1; 2], ..settings }.activation(Activation::Gelu);
-        assert_by_burn(conv_transpose::ConvTransposeOp(settings), &[image, &[4, 6 / groups, 3, 3], &[6]]);
+        assert_by_burn(conv_transpose::ConvTransposeOp(settings, Precision::F32), &[image, &[4, 6 / groups, 3, 3], &[6]]);
     }
     assert_by_burn(elementwise::ActivationOp(Activation::Gelu), &[image]);
     assert_by_burn(elementwise::SumOp { relu: true }, &[image, image]);

@@ -1,7 +1,7 @@
 //! Training of networks: gradients by parameter, optimizers, schedules, averages, loading and augmentation of data.
 //!
-//! One step: [`Loader::next_batch`] → [`stack`] → `loss.backward()` → [`Gradients::take`] → clipping → [`Optimizer::step`]. [`saved`]
-//! is what a checkpoint must hold, [`resume`] goes on from it bit by bit.
+//! One step: [`Loader::next_batch`] → [`stack()`] → `loss.backward()` → [`Gradients::take`] → clipping → [`Optimizer::step`]. A checkpoint
+//! holds what [`saved()`] lists, and [`resume`] continues from it, bit-equal on the CPU.
 
 pub mod augment;
 mod ema;

@@ -1,11 +1,11 @@
-//! All numbers of a training run in one list, as a checkpoint holds them.
+//! All arrays of a training run in one list, for checkpoints.
 
 use super::{Ema, Optimizer, StateError};
 use crate::param::{self, Module};
 use crate::weights::{self, KeyMap, Mismatch, Strictness};
 use diorama_geom::NamedArray;
 
-/// Why a run cannot go on from what was saved.
+/// Why a run cannot be resumed.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ResumeError {
     #[error(transparent)]
@@ -14,17 +14,17 @@ pub enum ResumeError {
     State(#[from] StateError),
 }
 
-/// Weights, statistics, the optimizer's state, and the average where there is one: all that [`resume`] needs.
+/// Weights, statistics, the optimizer's state, and the average if there is one: all that [`resume`] needs.
 pub fn saved(module: &dyn Module, optimizer: &Optimizer, average: Option<&Ema>) -> Vec<NamedArray> {
     let average = average.map(Ema::state).unwrap_or_default();
     param::arrays(module).into_iter().chain(optimizer.state()).chain(average).collect()
 }
 
-/// Takes a saved run over; on the CPU it goes on as if it had never stopped, bit by bit. A [`super::Loader`] goes on from the batch
-/// of [`Optimizer::steps`], where each step takes one.
+/// Restores a saved run; on the CPU it continues bit-equal to an uninterrupted one. If each step takes one batch, a
+/// [`super::Loader`] continues from batch [`Optimizer::steps`].
 ///
 /// # Errors
-/// When an array is missing or does not fit; the run is as it was before then.
+/// When an array is missing or has another shape; nothing is changed then.
 pub fn resume(module: &dyn Module, optimizer: &mut Optimizer, average: Option<&mut Ema>, arrays: &[NamedArray]) -> Result<(), ResumeError> {
     let before = param::arrays(module);
     weights::load(module, arrays, &KeyMap::PLAIN, Strictness::AllowUnexpected)?;

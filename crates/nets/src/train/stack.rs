@@ -1,11 +1,11 @@
-//! Images as one tensor, the way networks take them.
+//! Converts images into the tensor that networks take.
 
 use crate::bridge::{OpError, ValuesMut};
 use burn::backend::{BackendTensor, DispatchAutodiffContext, DispatchTensor, DispatchTensorKind};
 use burn::tensor::{Device, Tensor, TensorData};
 use diorama_geom::Image;
 
-/// Stacks images of one size into a tensor, on the CPU in memory of the pool.
+/// Stacks images of equal size into a tensor, on the CPU in pool memory.
 ///
 /// # Shapes
 /// images `[H, W, C]` each; result `[N, C, H, W]`.

@@ -113,7 +113,7 @@ fn networks(t: &mut Table) {
         let (mut out, mut dx, mut dw) = (vec![0.0; m * n], vec![0.0; m * k], vec![0.0; k * n]);
         let shape = format!("{m}x{width}x{width} f32");
         let flops = (2 * k * n) as f64;
-        let l = Linear { rows: m, inputs: k, outputs: n, bias: BiasKind::None, activation: Activation::Relu };
+        let l = Linear { rows: m, inputs: k, outputs: n, bias: BiasKind::None, activation: Activation::Relu, precision: Precision::F32 };
         t.row("linear", &shape, "row", m, Work::Flops(flops), || linear::cpu::forward(&l, &x, &w, &[], &mut out));
         t.row("linear, forward and backward", &shape, "row", m, Work::Flops(3.0 * flops), || {
             linear::cpu::forward(&l, &x, &w, &[], &mut out);

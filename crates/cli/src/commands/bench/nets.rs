@@ -3,6 +3,7 @@
 use crate::commands::process::use_threads;
 use crate::commands::{Outcome, Verb};
 use clap::Args;
+use diorama_kernels::gemm::{Precision, has_bf16};
 use diorama_pipelines::bench::nets::{self, Figures, Wanted};
 use diorama_pipelines::{PipelineError, Result};
 
@@ -23,6 +24,9 @@ pub struct Nets {
     /// Repeat each figure for this many seconds
     #[arg(long, default_value_t = 0.5)]
     seconds: f64,
+    /// Round factors to bf16 (CPUs with AMX tiles)
+    #[arg(long)]
+    bf16: bool,
     /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
@@ -38,7 +42,11 @@ impl Verb for Nets {
         if self.repeats == 0 || !(0.0..=3600.0).contains(&self.seconds) {
             return Err(PipelineError::Usage("--repeats: at least 1; --seconds: 0 to 3600".into()));
         }
-        let wanted = Wanted { names: self.names.clone(), repeats: self.repeats, seconds: self.seconds };
+        if self.bf16 && !has_bf16() {
+            return Err(PipelineError::Usage("--bf16: this CPU multiplies no bf16 tiles (AMX); leave it out to measure f32".into()));
+        }
+        let precision = if self.bf16 { Precision::Bf16 } else { Precision::F32 };
+        let wanted = Wanted { precision, names: self.names.clone(), repeats: self.repeats, seconds: self.seconds };
         let report = nets::run(&wanted, &mut |f| {
             if !self.json {
                 print(f);

@@ -1,5 +1,6 @@
 //! Division of a batch of images into bands whose copies stay in the second-level cache, and scratch memory of threads.
 
+use crate::gemm::Rounded;
 use std::cell::RefCell;
 use std::ops::Range;
 
@@ -48,6 +49,7 @@ pub struct Scratch {
     pub taps: Vec<f32>,
     pub segments: Vec<crate::tile::Segment>,
     pub offsets: Vec<(u32, u32)>,
+    pub rounded: Rounded,
 }
 
 thread_local! {

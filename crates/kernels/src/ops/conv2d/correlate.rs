@@ -6,6 +6,7 @@ use super::depthwise;
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Phase, Tensors, offset};
 use super::winograd;
+use crate::gemm::{Gemm, Init, Precision, Rounded, View, has_bf16};
 use crate::ops::activation::Activation;
 use crate::simd;
 use crate::tile::{Kernel, Pack, Segment, Shared, Start, Tile, kernel};
@@ -13,9 +14,9 @@ use rayon::prelude::*;
 use std::ops::Range;
 
 /// Floats of the input that a tile reads per pass where it reads the copy itself, so that they stay in the first-level cache.
-const DIRECT: usize = 9 << 10;
+const DIRECT: usize = 6 << 10;
 /// Terms of a sum per pass where it reads a panel.
-const TERMS: usize = 288;
+const TERMS: usize = 192;
 /// Floats of sums that a band keeps between passes.
 const SUMS: usize = 96 << 10;
 /// Portions in which the input of a later pass is asked of memory.
@@ -74,7 +75,12 @@ impl Correlation {
         if self.channels == 1 && self.features <= 2 {
             return depthwise::run(self, t);
         }
-        let Err(t) = winograd::run(self, t) else { return };
+        let t = if self.is_rounded() {
+            t
+        } else {
+            let Err(t) = winograd::run(self, t) else { return };
+            t
+        };
         let level = simd::level();
         let job = self.job(t, kernel(level));
         let parts = self.features.div_ceil(job.features);
@@ -100,7 +106,7 @@ impl Correlation {
         let in_place = self.is_pointwise();
         let waste = planes.pitch_of(columns) - columns;
         // Pixels between rows cost time in proportion to the output channels, a panel costs the same for any number.
-        let direct = !in_place && rows * columns > FEWEST && waste * self.features <= 4 * columns;
+        let direct = !in_place && !self.is_rounded() && rows * columns > FEWEST && waste * self.features <= 4 * columns;
         let (features, pixels) = self.divide(rows, columns, kernel);
         let bands = Bands::plan(self.batch, rows, columns, pixels);
         let direct = direct && bands.images == 1;
@@ -128,6 +134,10 @@ impl Correlation {
             out: Shared(t.out.as_mut_ptr()),
             before: t.before.map(|b| Shared(b.as_mut_ptr())),
         }
+    }
+
+    fn is_rounded(&self) -> bool {
+        self.precision == Precision::Bf16 && has_bf16()
     }
 
     /// Whether every output pixel has one tap: the input pixel at its place.
@@ -180,7 +190,7 @@ impl Job<'_> {
         let (c, width) = (self.c, self.kernel.width());
         let passes = c.channels.div_ceil(self.block.max(1)).max(1);
         let tiles: usize = c.phases.iter().map(|p| self.cells(&self.clip(p, part)).div_ceil(width)).sum();
-        let Scratch { planes, panel, sums, segments, .. } = scratch;
+        let Scratch { planes, panel, sums, segments, taps, rounded, .. } = scratch;
         // What lies beyond the last channel is read by whole vectors, and dropped.
         let planes = aligned(planes, if self.in_place { 0 } else { self.block * self.planes.channel + self.planes.image + 2 * width });
         let most = self.terms.iter().map(|t| t.panel.len()).max().unwrap_or(0);
@@ -199,6 +209,9 @@ impl Job<'_> {
             let mut tile = 0;
             for (phase, terms) in c.phases.iter().zip(&self.terms) {
                 let cells = self.clip(phase, part);
+                if self.c.is_rounded() {
+                    self.pack_weights(part, &channels, &terms.panel[..channels.len() * phase.taps.len()], taps, rounded);
+                }
                 for first in (0..self.cells(&cells)).step_by(width) {
                     self.segments(&cells, first, segments);
                     let at = if passes > 1 { tile * part.features.len() * width } else { 0 };
@@ -208,7 +221,7 @@ impl Job<'_> {
                     if let Some((part, pass)) = ahead {
                         self.fetch(part, pass, tile * FETCHES / tiles..(tile + 1) * FETCHES / tiles);
                     }
-                    self.tile(&step, planes, panel, sums);
+                    self.tile(&step, planes, panel, sums, rounded);
                     tile += 1;
                 }
             }
@@ -275,7 +288,7 @@ impl Job<'_> {
     }
 
     /// One tile of pixels for all output channels of the part.
-    fn tile(&self, s: &Step, planes: &[f32], panel: &mut [f32], sums: &mut [f32]) {
+    fn tile(&self, s: &Step, planes: &[f32], panel: &mut [f32], sums: &mut [f32], rounded: &mut Rounded) {
         let Some(last) = s.segments.last() else { return };
         let (c, width, lanes) = (self.c, self.kernel.width(), self.kernel.lanes);
         let vectors = (last.at + last.len).div_ceil(lanes);
@@ -300,6 +313,9 @@ impl Job<'_> {
             unsafe { self.kernel.pack(&pack) };
             (panel.as_ptr(), &s.terms.panel[..count])
         };
+        if self.c.is_rounded() {
+            return self.rounded_tile(s, &panel[..count * width], last.at + last.len, sums, rounded);
+        }
         for (i, feature) in s.part.features.clone().enumerate().step_by(self.kernel.rows) {
             let rows = self.kernel.rows.min(s.part.features.end - feature);
             let weights = s.part.group * c.weight_group + feature * c.weight_feature + s.channels.start * c.weight_channel;
@@ -327,6 +343,36 @@ impl Job<'_> {
             unsafe { self.kernel.run(rows, vectors, &tile) };
             if s.last {
                 self.finish(s.segments, global, rows, sums);
+            }
+        }
+    }
+
+    /// Rounds the weights of a pass: `[features, terms]`, gathered where their channels do not follow one another.
+    fn pack_weights(&self, part: &Part, channels: &Range<usize>, terms: &[(u32, u32)], gathered: &mut Vec<f32>, rounded: &mut Rounded) {
+        let c = self.c;
+        gathered.clear();
+        for feature in part.features.clone() {
+            let first = part.group * c.weight_group + feature * c.weight_feature + channels.start * c.weight_channel;
+            gathered.extend(terms.iter().map(|t| self.weights[first + t.0 as usize]));
+        }
+        rounded.pack(&product_of(part.features.len(), terms.len(), 0, View::rows(gathered, terms.len()), &[], 0));
+    }
+
+    /// One tile on factors rounded to bf16, from its panel.
+    fn rounded_tile(&self, s: &Step, panel: &[f32], cells: usize, sums: &mut [f32], rounded: &mut Rounded) {
+        let (width, rows) = (self.kernel.width(), self.kernel.rows);
+        let first = s.part.group * self.c.features + s.part.features.start;
+        if s.channels.start == 0 {
+            for (i, sums) in sums.chunks_exact_mut(width).enumerate() {
+                sums.fill(self.bias.get(first + i).copied().unwrap_or(0.0));
+            }
+        }
+        let g = product_of(s.part.features.len(), s.channels.len() * s.taps, cells, View::rows(&[], 0), panel, width);
+        // SAFETY: the weights of this pass are packed; sums have a row for each output channel.
+        unsafe { rounded.multiply(&g, sums.as_mut_ptr()) };
+        if s.last {
+            for (i, sums) in sums.chunks_mut(rows * width).enumerate() {
+                self.finish(s.segments, first + i * rows, sums.len() / width, sums);
             }
         }
     }
@@ -369,6 +415,11 @@ impl Job<'_> {
             }
         }
     }
+}
+
+/// `c += a b` with rows of B and C as far apart as those of a panel.
+fn product_of<'a>(m: usize, k: usize, n: usize, a: View<'a>, b: &'a [f32], width: usize) -> Gemm<'a> {
+    Gemm { m, n, k, a, b, ldb: width, ldc: width, init: Init::Accumulate, relu: false }
 }
 
 /// One pass over one tile.

@@ -45,6 +45,7 @@ impl Conv2d {
             weight_group: self.channels_out / self.groups * self.weight_feature(),
             weight_feature: self.weight_feature(),
             weight_channel: self.taps(),
+            precision: self.precision,
         }
     }
 
@@ -84,6 +85,7 @@ impl Conv2d {
             weight_group: self.channels_out / self.groups * self.weight_feature(),
             weight_feature: self.taps(),
             weight_channel: self.weight_feature(),
+            precision: self.precision,
         }
     }
 

@@ -13,6 +13,7 @@ pub(crate) mod weights;
 mod winograd;
 
 use super::activation::Activation;
+use crate::gemm::Precision;
 
 /// What a convolution is besides its weights; pairs are (vertical, horizontal).
 ///
@@ -29,6 +30,9 @@ pub struct Conv2d {
     pub dilation: [usize; 2],
     pub groups: usize,
     pub activation: Activation,
+    /// Arithmetic of inputs, weights and outputs' gradients, of layers with more than one channel per group; sums and gradients of weights
+    /// are f32.
+    pub precision: Precision,
 }
 
 /// Images in a batch and their size in pixels.
@@ -72,6 +76,7 @@ impl Conv2d {
             dilation: [1; 2],
             groups: 1,
             activation: Activation::None,
+            precision: Precision::F32,
         }
     }
 

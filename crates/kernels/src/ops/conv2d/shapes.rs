@@ -1,5 +1,6 @@
 //! What is correlated and summed, whichever way it is computed.
 
+use crate::gemm::Precision;
 use crate::ops::activation::Activation;
 
 /// A weight and the input pixel that it multiplies, seen from a grid cell.
@@ -40,6 +41,7 @@ pub struct Correlation {
     pub weight_group: usize,
     pub weight_feature: usize,
     pub weight_channel: usize,
+    pub precision: Precision,
 }
 
 /// Tensors of a [`Correlation`].

@@ -1,4 +1,5 @@
 use super::*;
+use crate::gemm::has_bf16;
 use crate::ops::activation::tests::ALL as ACTIVATIONS;
 use crate::simd::{Level, with_level};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
@@ -149,9 +150,33 @@ fn square_kernels_on_many_channels_take_fewer_products() {
     for level in Level::available() {
         with_level(level, || {
             let c = Conv2d { padding: [1; 2], ..Conv2d::new(64, 64, 3) };
-            assert!(fewer(c) && fewer(Conv2d { groups: 2, ..c }));
+            assert!(fewer(c), "{level:?}");
+            assert!(fewer(Conv2d { groups: 2, ..c }), "{level:?} in groups");
             assert!(!fewer(Conv2d { stride: [2; 2], ..c }) && !fewer(Conv2d { dilation: [2; 2], ..c }));
             assert!(!fewer(Conv2d { channels_in: 3, ..c }) && !fewer(Conv2d { kernel: [3, 1], ..c }));
         });
+    }
+}
+
+#[test]
+fn bf16_equals_the_convolution_of_rounded_factors() {
+    if !has_bf16() {
+        println!("no bf16 tiles here");
+        return;
+    }
+    let round = |v: &[f32]| -> Vec<f32> { v.iter().map(|v| half::bf16::from_f32(*v).to_f32()).collect() };
+    for (c, images) in cases().into_iter().filter(|(c, _)| c.channels_in > c.groups && c.channels_out > c.groups) {
+        let what = format!("{c:?} on {images:?}");
+        let c = Conv2d { precision: Precision::Bf16, activation: Activation::Relu, ..c };
+        let [x, w, b, d] = tensors(&c, &images);
+        let [rx, rw, rd] = [&x, &w, &d].map(|v| wide(&round(v)));
+        let (mut out, mut dx) = (vec![9.0; d.len()], vec![9.0; x.len()]);
+        cpu::forward(&c, &images, &x, &w, &b, &mut out, None);
+        assert_close(&format!("out of {what}"), &out, &reference::forward(&c, &images, &rx, &rw, &wide(&b)), 1e-4);
+        let linear = Conv2d { activation: Activation::None, ..c };
+        let gradients = Gradients { input: Some(&mut dx), ..Gradients::default() };
+        cpu::backward(&linear, &images, &x, &w, &out, &d, gradients);
+        let want = reference::backward(&linear, &images, &rx, &rw, &wide(&b), &rd).0;
+        assert_close(&format!("input's gradient of {what}"), &dx, &want, 1e-4);
     }
 }

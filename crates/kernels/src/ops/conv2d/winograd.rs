@@ -111,13 +111,15 @@ impl Grid {
         let [height, columns] = c.output.map(|n| n.div_ceil(2).max(1));
         let of = |rows| Grid { height, columns, rows };
         let most = (TILES / (columns + 1)).clamp(1, height);
-        let cost = |rows: usize| {
-            let rest = height % rows;
-            let vectors = of(rows).vectors(rows, kernel) * (height / rows) + if rest > 0 { of(rows).vectors(rest, kernel) } else { 0 };
-            // Each band copies its first input rows again.
-            20 * vectors + vectors.div_ceil(rows)
-        };
+        // Each band reads all weights again.
+        let cost = |rows: usize| 19 * of(rows).vectors_of_image(kernel) + 16 * height.div_ceil(rows);
         of((1..=most).min_by_key(|&rows| cost(rows)).unwrap_or(1))
+    }
+
+    /// Vectors of all bands.
+    fn vectors_of_image(&self, kernel: &Kernel) -> usize {
+        let (bands, rest) = (self.height / self.rows, self.height % self.rows);
+        bands * self.vectors(self.rows, kernel) + if rest > 0 { self.vectors(rest, kernel) } else { 0 }
     }
 
     /// Tiles of some rows, with one between rows.
@@ -129,12 +131,11 @@ impl Grid {
         self.tiles(rows).div_ceil(kernel.lanes)
     }
 
-    /// Whether the products saved outweigh the transforms, whose costs in cycles per vector were measured.
+    /// Whether the products saved outweigh the transforms, in estimated cycles per vector of tiles.
     fn pays(&self, c: &Correlation, kernel: &Kernel) -> bool {
-        let bands = (c.batch * self.height.div_ceil(self.rows)) as f64;
         let transforms = 60.0 / c.features as f64 + 40.0 / c.channels as f64;
-        // Each band reads all weights again, after one has transformed them.
-        let ours = bands * (self.vectors(self.rows, kernel) as f64 * (8.0 + transforms) + 8.0) + 40.0;
+        let image = self.vectors_of_image(kernel) as f64 * (8.0 + transforms) + 8.0 * self.height.div_ceil(self.rows) as f64;
+        let ours = c.batch as f64 * image + 40.0;
         let direct = 4.5 * (c.batch * (c.output[0] * c.output[1]).div_ceil(kernel.lanes)) as f64;
         c.channels >= 8 && c.features >= 8 && ours < direct
     }

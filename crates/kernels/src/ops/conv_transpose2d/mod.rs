@@ -8,6 +8,7 @@ mod tests;
 use super::activation::Activation;
 use super::conv2d::Conv2d;
 pub use super::conv2d::{Gradients, Images};
+use crate::gemm::Precision;
 
 /// What a transposed convolution is besides its weights; pairs are (vertical, horizontal).
 ///
@@ -27,6 +28,8 @@ pub struct ConvTranspose2d {
     pub dilation: [usize; 2],
     pub groups: usize,
     pub activation: Activation,
+    /// As that of a convolution.
+    pub precision: Precision,
 }
 
 impl ConvTranspose2d {
@@ -42,6 +45,7 @@ impl ConvTranspose2d {
             dilation: [1; 2],
             groups: 1,
             activation: Activation::None,
+            precision: Precision::F32,
         }
     }
 
@@ -56,6 +60,7 @@ impl ConvTranspose2d {
             dilation: self.dilation,
             groups: self.groups,
             activation: Activation::None,
+            precision: self.precision,
         }
     }
 

@@ -129,7 +129,13 @@ pub fn forward(l: &Linear, x: &[f32], w: &[f32], bias: &[f32], out: &mut [f32]) 
         activate(l.activation, values);
     };
     let plain = l.bias == BiasKind::None && l.activation == Activation::None;
-    matmul_with(&Matmul::new(l.rows, n, l.inputs), x, w, out, if plain { None } else { Some(&finish) });
+    matmul_with(
+        &Matmul { precision: l.precision, ..Matmul::new(l.rows, n, l.inputs) },
+        x,
+        w,
+        out,
+        if plain { None } else { Some(&finish) },
+    );
 }
 
 /// Gradients of what is wanted, given the layer's output.
@@ -157,7 +163,7 @@ pub fn backward(l: &Linear, x: &[f32], w: &[f32], out: &[f32], d: &[f32], gradie
 
 /// Whole products, given the gradient before the activation.
 fn by_columns(l: &Linear, x: &[f32], w: &[f32], g: &[f32], gradients: Gradients) {
-    let s = Matmul::new(l.rows, l.outputs, l.inputs);
+    let s = Matmul { precision: l.precision, ..Matmul::new(l.rows, l.outputs, l.inputs) };
     if let Some(dx) = gradients.x {
         matmul(&s.gradient_a(), g, w, dx);
     }
@@ -202,7 +208,7 @@ fn by_rows(l: &Linear, x: &[f32], w: &[f32], out: &[f32], d: &[f32], gradients: 
                         l.before_activation(&out[span.clone()], &d[span], &mut g);
                         &g[..]
                     };
-                    let s = Matmul::new(rows.len(), n, k);
+                    let s = Matmul { precision: l.precision, ..Matmul::new(rows.len(), n, k) };
                     let inputs = rows.start * k..rows.end * k;
                     if let Some(dx) = &dx {
                         // SAFETY: each task has rows of its own.

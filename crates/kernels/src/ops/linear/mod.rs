@@ -9,6 +9,8 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
+use crate::gemm::Precision;
+
 /// Elementwise non-linearity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Activation {
@@ -65,6 +67,8 @@ pub struct Linear {
     pub outputs: usize,
     pub bias: BiasKind,
     pub activation: Activation,
+    /// Arithmetic of inputs, weights and gradients; sums are f32.
+    pub precision: Precision,
 }
 
 /// Destinations of a backward pass, overwritten; what is `None` is not computed.
@@ -94,6 +98,6 @@ impl Dense {
 
     /// The layer on so many rows.
     pub fn of_rows(&self, rows: usize) -> Linear {
-        Linear { rows, inputs: self.k, outputs: self.n, bias: self.bias, activation: self.activation }
+        Linear { rows, inputs: self.k, outputs: self.n, bias: self.bias, activation: self.activation, precision: Precision::F32 }
     }
 }

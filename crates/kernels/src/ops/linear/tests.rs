@@ -1,4 +1,5 @@
 use super::*;
+use crate::gemm::Precision;
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
 #[test]
@@ -36,7 +37,7 @@ fn reference_gradients_match_central_differences() {
 #[test]
 fn what_is_not_wanted_changes_nothing_else_and_threads_change_no_bit() {
     for (rows, activation) in [(50, Activation::Relu), (5000, Activation::Relu), (5000, Activation::None)] {
-        let l = Linear { rows, inputs: 40, outputs: 56, bias: BiasKind::Shared, activation };
+        let l = Linear { rows, inputs: 40, outputs: 56, bias: BiasKind::Shared, activation, precision: Precision::F32 };
         let (x, w, b, d) = (random(rows * 40, 1), random(40 * 56, 2), random(56, 3), random(rows * 56, 4));
         let run = |threads: usize, wanted: [bool; 3]| {
             rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(|| {

@@ -1,6 +1,7 @@
 //! Blocks of rows times panels of columns, which are copied to stay in the first-level cache.
 
 use super::Matmul;
+use crate::gemm::{Gemm, Init, Precision, View, has_bf16};
 use crate::ops::conv2d::bands::{Scratch, aligned, with_scratch};
 use crate::ops::conv2d::weights::interleave;
 use crate::simd;
@@ -14,6 +15,8 @@ use std::ops::Range;
 const ROWS: usize = 384;
 /// Fewest rows of a task, which share the copy of a panel.
 const FEWEST_ROWS: usize = 96;
+/// Terms of a sum per pass on factors rounded to bf16.
+const ROUNDED_TERMS: usize = 256;
 /// Parts that a long sum over few outputs is cut into at most, and terms that one has at least.
 const GROUPS: usize = 16;
 const GROUP_TERMS: usize = 2048;
@@ -166,6 +169,9 @@ impl<'a> Job<'a> {
     }
 
     fn compute(&self, part: &Part, scratch: &mut Scratch) {
+        if self.s.precision == Precision::Bf16 && has_bf16() {
+            return self.compute_rounded(part, scratch);
+        }
         let (s, width, height) = (&self.s, self.kernel.width(), self.kernel.rows);
         let a = &self.a[part.batch * s.m * s.k..][..s.m * s.k];
         let b = &self.b[part.batch * s.k * s.n..][..s.k * s.n];
@@ -215,6 +221,46 @@ impl<'a> Job<'a> {
                             for r in 0..tall {
                                 finish(i + r, j, std::slice::from_raw_parts_mut(part.c.at(to + r * s.n), count));
                             }
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// The same on factors rounded to bf16.
+    fn compute_rounded(&self, part: &Part, scratch: &mut Scratch) {
+        let (s, width) = (&self.s, self.kernel.width());
+        let a = &self.a[part.batch * s.m * s.k..][..s.m * s.k];
+        let b = &self.b[part.batch * s.k * s.n..][..s.k * s.n];
+        let Scratch { panel, rounded, .. } = scratch;
+        for p in part.terms.clone().step_by(ROUNDED_TERMS) {
+            let terms = p..(p + ROUNDED_TERMS).min(part.terms.end);
+            let (first, m, k) = (part.rows.start, part.rows.len(), terms.len());
+            let a = if s.a_transposed {
+                View { data: &a[terms.start * s.m + first..], row: 1, col: s.m }
+            } else {
+                View { data: &a[first * s.k + terms.start..], row: s.k, col: 1 }
+            };
+            let init = if p > part.terms.start || part.accumulate { Init::Accumulate } else { Init::Zero };
+            let g = Gemm { m, n: 0, k, a, b: &[], ldb: width, ldc: s.n, init, relu: false };
+            rounded.pack(&g);
+            let panel = aligned(panel, k * width);
+            for j in part.columns.clone().step_by(width) {
+                let n = width.min(part.columns.end - j);
+                let g = if s.b_transposed {
+                    self.pack(b, terms.clone(), j..j + n, panel);
+                    Gemm { n, b: panel, ..g }
+                } else {
+                    Gemm { n, b: &b[terms.start * s.n + j..], ldb: s.n, ..g }
+                };
+                let to = (part.batch * s.m + first) * s.n + j;
+                // SAFETY: A is packed; C's columns are this task's own.
+                unsafe {
+                    rounded.multiply(&g, part.c.at(to));
+                    if let Some(finish) = self.finish.filter(|_| terms.end == part.terms.end) {
+                        for r in 0..m {
+                            finish(first + r, j, std::slice::from_raw_parts_mut(part.c.at(to + r * s.n), n));
                         }
                     }
                 }

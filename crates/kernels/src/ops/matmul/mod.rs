@@ -5,6 +5,8 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
+use crate::gemm::Precision;
+
 /// Shapes of a batch of products.
 ///
 /// # Shapes
@@ -20,12 +22,14 @@ pub struct Matmul {
     pub b_transposed: bool,
     /// Whether products are added to `c`; else they overwrite it.
     pub accumulate: bool,
+    /// Arithmetic of the factors; sums are f32.
+    pub precision: Precision,
 }
 
 impl Matmul {
     /// `[m, k] · [k, n]`, none transposed.
     pub fn new(m: usize, n: usize, k: usize) -> Self {
-        Matmul { batch: 1, m, n, k, a_transposed: false, b_transposed: false, accumulate: false }
+        Matmul { batch: 1, m, n, k, a_transposed: false, b_transposed: false, accumulate: false, precision: Precision::F32 }
     }
 
     /// The product that gives A's gradient from C's and B: as `matmul(d_c, b)`, or `matmul(b, d_c)` where A is transposed.

@@ -1,4 +1,5 @@
 use super::*;
+use crate::gemm::has_bf16;
 use crate::simd::{Level, with_level};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
@@ -82,5 +83,21 @@ fn results_do_not_depend_on_the_number_of_threads_and_finish_sees_every_output_o
         };
         let one = run(1);
         assert!(one == run(2) && one == run(5), "{s:?}");
+    }
+}
+
+#[test]
+fn bf16_equals_the_product_of_rounded_factors() {
+    if !has_bf16() {
+        println!("no bf16 tiles here");
+        return;
+    }
+    let round = |v: &[f32]| -> Vec<f64> { v.iter().map(|v| half::bf16::from_f32(*v).to_f64()).collect() };
+    for s in cases().into_iter().map(|s| Matmul { precision: Precision::Bf16, ..s }) {
+        let (a, b, mut c) = (random(s.batch * s.m * s.k, 1), random(s.batch * s.k * s.n, 2), random(s.batch * s.m * s.n, 3));
+        let mut want = wide(&c);
+        reference::forward(&s, &round(&a), &round(&b), &mut want);
+        cpu::matmul(&s, &a, &b, &mut c);
+        assert_close(&format!("{s:?}"), &c, &want, 1e-4);
     }
 }

@@ -110,7 +110,13 @@ impl Layer {
     /// FLOP of a forward pass, seconds forward and in training.
     fn conv(&self, wanted: &Wanted) -> (f64, [f64; 2]) {
         let [from, to] = self.channels;
-        let c = Conv2d { stride: [self.stride; 2], padding: [self.padding; 2], groups: self.groups, ..Conv2d::new(from, to, self.kernel) };
+        let c = Conv2d {
+            stride: [self.stride; 2],
+            padding: [self.padding; 2],
+            groups: self.groups,
+            precision: wanted.precision,
+            ..Conv2d::new(from, to, self.kernel)
+        };
         let images = self.images();
         let outputs = self.batch * to * c.output(&images).pixels();
         let [x, w, b, d] = [self.batch * from * images.pixels(), c.weights_len(), to, outputs].map(|n| numbers(n as u64, n));
@@ -126,8 +132,12 @@ impl Layer {
 
     fn transpose(&self, wanted: &Wanted) -> (f64, [f64; 2]) {
         let [from, to] = self.channels;
-        let c =
-            ConvTranspose2d { padding: [self.padding; 2], groups: self.groups, ..ConvTranspose2d::new(from, to, self.kernel, self.stride) };
+        let c = ConvTranspose2d {
+            padding: [self.padding; 2],
+            groups: self.groups,
+            precision: wanted.precision,
+            ..ConvTranspose2d::new(from, to, self.kernel, self.stride)
+        };
         let images = self.images();
         let outputs = self.batch * to * c.output(&images).pixels();
         let [x, w, b, d] = [self.batch * from * images.pixels(), c.weights_len(), to, outputs].map(|n| numbers(n as u64, n));
@@ -143,7 +153,8 @@ impl Layer {
 
     fn linear(&self, wanted: &Wanted) -> (f64, [f64; 2]) {
         let (m, [k, n]) = (self.batch, self.channels);
-        let l = Linear { rows: m, inputs: k, outputs: n, bias: BiasKind::Shared, activation: Activation::None };
+        let l =
+            Linear { rows: m, inputs: k, outputs: n, bias: BiasKind::Shared, activation: Activation::None, precision: wanted.precision };
         let [x, w, b, d] = [m * k, k * n, n, m * n].map(|n| numbers(n as u64, n));
         let (mut out, mut dx, mut dw, mut db) = (d.clone(), x.clone(), w.clone(), b.clone());
         let forward = median(wanted, || linear::cpu::forward(&l, &x, &w, &b, &mut out));

@@ -4,6 +4,7 @@ mod layers;
 mod networks;
 
 use crate::error::{PipelineError, Result};
+use diorama_kernels::gemm::Precision;
 use diorama_kernels::probe;
 use serde::Serialize;
 use std::time::Instant;
@@ -56,6 +57,8 @@ pub enum Figures<'a> {
 pub struct Wanted {
     /// Parts of names, as `name_batch` for layers; all where there are none.
     pub names: Vec<String>,
+    /// Arithmetic of convolutions and fully connected layers.
+    pub precision: Precision,
     /// Fewest calls per figure; the median counts.
     pub repeats: usize,
     /// Calls go on for so long.

@@ -32,6 +32,10 @@ trait Case: Module {
 
 impl Network {
     pub fn measure(&self, wanted: &Wanted, threads: usize) -> Result<NetworkFigures> {
+        ops::with_precision(wanted.precision, || self.measure_as_set(wanted, threads))
+    }
+
+    fn measure_as_set(&self, wanted: &Wanted, threads: usize) -> Result<NetworkFigures> {
         pool::release();
         memory::reset_peak();
         let case = (self.make)();
