@@ -1,8 +1,8 @@
 //! Stands in for `gemm`, the matrix product of burn's CPU back end.
 //!
 //! Layers and networks of diorama call `diorama-kernels`; burn's own product is left to a `matmul` that somebody writes in burn's
-//! words. The crate in whose place this stands takes a tenth of a clean build and 9 MB of the program for types (complex numbers,
-//! f16) and instruction sets that nobody calls here.
+//! words. The crate in whose place this stands is mostly complex numbers, f16 and instruction sets that nobody calls here:
+//! four of its megabytes of code stood in the program.
 
 use half::f16;
 use std::any::TypeId;
@@ -106,6 +106,7 @@ pub unsafe fn gemm<T: 'static>(
 
 /// Pointers cross threads with the rows that each thread owns.
 struct Shared<T>(T);
+// SAFETY: every thread works on rows of its own.
 unsafe impl<T> Sync for Shared<T> {}
 
 /// # Safety
