@@ -1,13 +1,14 @@
-//! What a run tells the terminal, the metrics file and the viewer.
+//! Events of a run, which the terminal, the log and the viewer listen to.
 
-/// What one step did.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+use super::scalar::{Scalars, Scores};
+
+/// What one step came to.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct StepReport {
+    /// What the step minimized. One that is not finite takes the run back (see [`super::Trainee::recover`]).
     pub loss: f64,
-    /// Mean squared colour error of the step's rays.
-    pub mse: f64,
-    pub rays: u64,
-    pub samples: u64,
+    /// Whatever else is worth a line in the log.
+    pub scalars: Scalars,
 }
 
 /// Something that happened in a run.
@@ -19,26 +20,20 @@ pub enum Event {
         steps: Option<u64>,
         seconds: Option<f64>,
     },
-    /// Means since the last such event; totals are from the start of the run.
+    /// Mean loss and figures of the steps since the last such event.
     Progress {
         step: u64,
         seconds: f64,
+        /// Share of the budget that is spent, 0 to 1.
         progress: f64,
         loss: f64,
-        mse: f64,
-        psnr: f64,
-        rays: u64,
-        samples: u64,
-        rays_per_s: f64,
+        scalars: Scalars,
     },
-    /// Held-out pixels were judged.
+    /// What was learned was scored on held-out data.
     Evaluated {
         step: u64,
         seconds: f64,
-        psnr: f64,
-        mse: f64,
-        /// PSNR of each view, named by its frame.
-        views: Vec<(usize, f64)>,
+        scores: Scores,
     },
     Saved {
         step: u64,

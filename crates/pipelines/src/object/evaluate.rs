@@ -8,7 +8,7 @@ use super::scored_view::{Doing, ScoredView, admits, reference, score_view, where
 use crate::error::{PipelineError, Result};
 use diorama_data::{photo, weights};
 use diorama_engine::metrics::lpips::{self, Lpips};
-use diorama_engine::metrics::{self, Scores};
+use diorama_engine::metrics::{self, ImageScores};
 use diorama_engine::renderers::volume::Quality;
 use diorama_geom::Image;
 use diorama_geom::capture::Split;
@@ -147,7 +147,7 @@ pub fn evaluate_with_training(
         scores.push(score_view(model, i, full, quality, &mut |part, doing| count.tell(&frame.name, part, doing, false))?.scores);
         count.done += 1;
     }
-    let mean = |f: fn(&Scores) -> f64| mean_of_numbers(scores.iter().map(f));
+    let mean = |f: fn(&ImageScores) -> f64| mean_of_numbers(scores.iter().map(f));
     let training = TrainingScores { views: scores.len(), psnr: mean(|s| s.psnr), ssim: mean(|s| s.ssim) };
     let middle = fog::median(scores.iter().map(|s| s.psnr).filter(|p| !p.is_nan()).collect()).unwrap_or(training.psnr);
     let mut surfaces = None;

@@ -44,7 +44,11 @@ pub struct ObjectModel {
     pub train: Vec<usize>,
     /// Whether the photographs have transparent pixels.
     pub has_alpha: bool,
+    /// How far training is.
     pub origin: Origin,
+    /// Rays and samples that were trained on so far.
+    pub rays: u64,
+    pub samples: u64,
     /// Running mean of samples per ray, which sets the rays per step.
     pub samples_per_ray: f64,
     /// Lowered once after a loss that was not finite.
@@ -107,6 +111,8 @@ impl ObjectModel {
             train,
             has_alpha,
             origin: Origin::default(),
+            rays: 0,
+            samples: 0,
             samples_per_ray: 256.0,
             rate_scale: 1.0,
             accelerator: None,
@@ -312,6 +318,8 @@ impl ObjectModel {
             train: self.train.clone(),
             has_alpha: self.has_alpha,
             origin: self.origin,
+            rays: self.rays,
+            samples: self.samples,
             samples_per_ray: self.samples_per_ray,
             rate_scale: self.rate_scale,
             accelerator: None,

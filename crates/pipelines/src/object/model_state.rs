@@ -28,8 +28,8 @@ impl ObjectModel {
         let metadata = HashMap::from([
             ("method".to_string(), self.config.method.to_string()),
             ("step".into(), o.step.to_string()),
-            ("rays".into(), o.rays.to_string()),
-            ("samples".into(), o.samples.to_string()),
+            ("rays".into(), self.rays.to_string()),
+            ("samples".into(), self.samples.to_string()),
             ("seconds_bits".into(), o.seconds.to_bits().to_string()),
             ("samples_per_ray_bits".into(), self.samples_per_ray.to_bits().to_string()),
             ("rate_scale_bits".into(), self.rate_scale.to_bits().to_string()),
@@ -51,10 +51,10 @@ impl ObjectModel {
         let missing = |k: &str| wrong(format!("metadata {k} is missing or malformed"));
         self.origin = Origin {
             step: number(&c, "step").ok_or_else(|| missing("step"))?,
-            rays: number(&c, "rays").ok_or_else(|| missing("rays"))?,
-            samples: number(&c, "samples").ok_or_else(|| missing("samples"))?,
             seconds: f64::from_bits(number(&c, "seconds_bits").ok_or_else(|| missing("seconds_bits"))?),
         };
+        self.rays = number(&c, "rays").ok_or_else(|| missing("rays"))?;
+        self.samples = number(&c, "samples").ok_or_else(|| missing("samples"))?;
         self.samples_per_ray = f64::from_bits(number(&c, "samples_per_ray_bits").ok_or_else(|| missing("samples_per_ray_bits"))?);
         self.rate_scale = f32::from_bits(number(&c, "rate_scale_bits").ok_or_else(|| missing("rate_scale_bits"))?);
         self.has_alpha = number(&c, "has_alpha").ok_or_else(|| missing("has_alpha"))?;

@@ -13,7 +13,7 @@ use diorama_data::checkpoint;
 use diorama_engine::params::Schedule;
 use diorama_engine::samplers::pixels::Observation;
 use diorama_engine::step::{Backdrop, Figures, Loss, Placement, Probes, RaySource, Step};
-use diorama_engine::train::{HeldOut, StepReport, Trainee};
+use diorama_engine::train::{Scalar, Scalars, Scores, StepReport, Trainee};
 use diorama_geom::rng::Rng;
 use std::path::Path;
 
@@ -59,10 +59,14 @@ pub(super) struct Trainer<'a> {
     pub observations: Vec<Observation>,
     pub device: Device,
     pub held_out: Option<HeldOutPixels>,
+    /// PSNR of each held-out view when they were judged last, named by its frame.
+    pub judged: Vec<(usize, f64)>,
     /// Who looks on.
     pub view: Option<&'a RunView>,
     /// Samples before any were left out.
     pub marched: u64,
+    /// Rays that were trained on before this part of the run.
+    began: u64,
     checkpoints: &'a Path,
     schedule: Schedule,
     recovered: bool,
@@ -86,13 +90,16 @@ impl<'a> Trainer<'a> {
             observations,
             device,
             held_out: None,
+            judged: Vec::new(),
             view: None,
+            began: 0,
             marched: 0,
             checkpoints,
             schedule,
             recovered: false,
             setback: None,
         };
+        trainer.began = trainer.model.rays;
         trainer.begin()?;
         Ok(trainer)
     }
@@ -128,8 +135,8 @@ impl<'a> Trainer<'a> {
     /// Books what steps came to.
     fn count(&mut self, f: &Figures) {
         let m = &mut self.model;
-        let before = m.origin.samples;
-        m.origin.samples += f.trained as u64;
+        let before = m.samples;
+        m.samples += f.trained as u64;
         self.marched += f.marched as u64;
         // Without an occupancy grid, each ray has as many samples as the configuration says.
         if m.occupancy.is_none() && !self.device.is_gpu() {
@@ -184,7 +191,7 @@ impl<'a> Trainer<'a> {
         Step {
             number: step,
             rays: RaySource::Photographs { count: self.rays(step), rng: of(PIXELS) },
-            first: m.origin.rays,
+            first: m.rays,
             backdrop: if is_random { Backdrop::Random(of(BACKGROUND)) } else { Backdrop::Color(m.backdrop_color()) },
             placement,
             probes: is_probed.then(|| Probes { rng: of(OCCUPANCY), points: s.occupancy_points, block }),
@@ -244,12 +251,19 @@ impl Trainee for Trainer<'_> {
             }
         };
         let (rays, f) = (described.rays.count() as u64, done.shown);
-        let report = StepReport { loss: f.loss, mse: f.mse, rays, samples: (f.trained / f.steps.max(1) as f64) as u64 };
-        if report.loss.is_finite() {
-            self.model.origin.rays += rays;
+        if f.loss.is_finite() {
+            self.model.rays += rays;
             done.counted.iter().for_each(|f| self.count(f));
         }
-        Ok(report)
+        let m = &self.model;
+        let scalars = Scalars::from([
+            Scalar::new("mse", f.mse).logged_only(),
+            Scalar::psnr("psnr", f.mse),
+            Scalar::count("rays", m.rays),
+            Scalar::count("samples", m.samples),
+            Scalar::rate("rays_per_s", rays as f64),
+        ]);
+        Ok(StepReport { loss: f.loss, scalars })
     }
 
     fn save(&mut self, step: u64, seconds: f64) -> Result<bool> {
@@ -288,14 +302,25 @@ impl Trainee for Trainer<'_> {
         Ok(Some((self.model.origin.step, why)))
     }
 
-    fn evaluate(&mut self) -> Result<Option<HeldOut>> {
+    fn evaluate(&mut self) -> Result<Option<Scores>> {
         let Some(pixels) = &self.held_out else { return Ok(None) };
         match self.device.download(&mut self.model.trainees()) {
-            Ok(()) => Ok(Some(pixels.judge(&self.model))),
+            Ok(()) => {}
             // A device that fails here fails in the next step as well, which knows what to do.
-            Err(PipelineError::Device(_) | PipelineError::Memory(_)) => Ok(None),
-            Err(e) => Err(e),
+            Err(PipelineError::Device(_) | PipelineError::Memory(_)) => return Ok(None),
+            Err(e) => return Err(e),
         }
+        let judged = pixels.judge(&self.model);
+        let scores = judged.scores();
+        self.view.into_iter().for_each(|v| v.show_fog(&judged.views));
+        self.judged = judged.views;
+        Ok(Some(scores))
+    }
+
+    /// Its pixels take as long as if they were trained on.
+    fn evaluation_seconds(&self, seconds: f64) -> f64 {
+        let trained = self.model.rays.saturating_sub(self.began).max(1);
+        self.held_out.as_ref().map_or(0.0, |h| h.rays() as f64 * seconds / trained as f64)
     }
 }
 

@@ -6,15 +6,16 @@ use super::model::ObjectModel;
 use super::render::{self, Layer};
 use super::run_folder::{RunSummary, read_summary};
 use crate::error::{PipelineError, Result};
-use crate::run::metrics::{Row, read_rows};
+use crate::run::metrics::{Row, curve, read_rows};
 use diorama_data::camera_path_json;
 use diorama_data::{DataError, atomic, photo};
 use diorama_engine::renderers::volume::Quality;
-use diorama_engine::train::Event;
+use diorama_engine::train::{Event, Origin, scalar};
 use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
 use diorama_geom::view_controls::ViewLayer;
-use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewPoint, ViewRequest, ViewScene, ViewSource, ViewStatus};
+use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewChart, ViewFigure, ViewFrame, ViewLine};
+use diorama_geom::view_source::{ViewRequest, ViewScene, ViewSource, ViewStatus};
 use diorama_geom::{Camera, ImageU8, Similarity};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -26,6 +27,11 @@ use std::time::{Duration, Instant};
 const THUMBNAIL: usize = 160;
 /// How often a run in training is looked at, at most.
 const REFRESH: Duration = Duration::from_secs(2);
+
+/// Figures that the viewer shows, by the names that the log has, and what they are called there.
+const FIGURES: [(&str, &str); 4] = [("loss", "Loss"), (PSNR, "PSNR"), (HELD_OUT_PSNR, "Held out"), ("rays_per_s", "Rays")];
+const PSNR: &str = "psnr";
+const HELD_OUT_PSNR: &str = "val_psnr";
 
 /// Lowest and highest corner in the world.
 pub type Crop = ([f32; 3], [f32; 3]);
@@ -89,13 +95,45 @@ pub fn read_scale(run: &Path) -> Result<Option<Size>> {
 pub struct RunView {
     folder: PathBuf,
     model: RwLock<Arc<ObjectModel>>,
-    status: Mutex<ViewStatus>,
+    training: Mutex<Training>,
     shown: Mutex<Instant>,
     /// Whether anybody has looked since the model was last shown.
     looked: AtomicBool,
     saved: Mutex<Saved>,
     /// Held-out frames behind fog.
     behind_fog: Mutex<Vec<usize>>,
+}
+
+/// How far training is.
+#[derive(Clone, Debug, Default)]
+struct Training {
+    step: u64,
+    seconds: f64,
+    progress: f64,
+    is_running: bool,
+    /// Last value of each of [`FIGURES`].
+    figures: Vec<(&'static str, f64)>,
+}
+
+impl Training {
+    /// Takes over the figures that a row of the log has.
+    fn read(&mut self, row: &Row) {
+        (self.step, self.seconds) = (row.step, row.seconds);
+        self.figures = FIGURES.iter().filter_map(|(name, _)| Some((*name, row.get(name).or_else(|| self.figure(name))?))).collect();
+    }
+
+    fn figure(&self, name: &str) -> Option<f64> {
+        self.figures.iter().find(|f| f.0 == name).map(|f| f.1)
+    }
+
+    fn status(&self) -> ViewStatus {
+        let of = |(name, label): &(&str, &str)| {
+            let value = self.figure(name)?;
+            Some(ViewFigure { id: name.to_string(), label: label.to_string(), value, text: scalar::text(name, value) })
+        };
+        let (step, seconds, progress, running) = (self.step, self.seconds, self.progress, self.is_running);
+        ViewStatus { step, seconds, progress, running, figures: FIGURES.iter().filter_map(of).collect() }
+    }
 }
 
 /// What was saved in the viewer: in the world, as the page has it.
@@ -141,18 +179,21 @@ impl RunView {
     /// # Errors
     /// When what was saved in the viewer before cannot be read.
     pub fn new(folder: &Path, model: ObjectModel, running: bool) -> Result<Arc<RunView>> {
-        let RunSummary { behind_fog: names, psnr_held_out: held_out, .. } = read_summary(folder)?.unwrap_or_default();
-        let origin = model.origin;
-        let last = read_rows(folder).into_iter().rev().find(|r| r.psnr.is_some() && !running).unwrap_or_default();
-        let (loss, psnr) = (last.loss.unwrap_or_default(), last.psnr.unwrap_or_default());
-        let status = ViewStatus { step: origin.step, seconds: origin.seconds, loss, psnr, running, held_out, ..ViewStatus::default() };
+        let RunSummary { behind_fog: names, .. } = read_summary(folder)?.unwrap_or_default();
+        let mut training = Training::default();
+        if !running {
+            read_rows(folder).iter().for_each(|row| training.read(row));
+            training.figures.retain(|f| f.0 != "rays_per_s");
+        }
+        let Origin { step, seconds } = model.origin;
+        let training = Training { step, seconds, is_running: running, ..training };
         let behind_fog = (0..model.capture.frames.len()).filter(|i| names.contains(&model.capture.frames[*i].name)).collect();
         Ok(Arc::new(RunView {
             saved: Mutex::new(Saved::read(folder, &model.capture.world_from_capture)?),
             behind_fog: Mutex::new(behind_fog),
             folder: folder.to_path_buf(),
             model: RwLock::new(Arc::new(model)),
-            status: Mutex::new(status),
+            training: Mutex::new(training),
             shown: Mutex::new(Instant::now()),
             looked: AtomicBool::new(true),
         }))
@@ -188,19 +229,20 @@ impl RunView {
 
     /// Takes note of what training tells.
     pub fn hear(&self, event: &Event) {
-        let Ok(mut s) = self.status.lock() else { return };
+        let Ok(mut t) = self.training.lock() else { return };
+        Row::of(event).iter().for_each(|row| t.read(row));
         match event {
-            &Event::Progress { step, seconds, progress, loss, psnr, rays_per_s, .. } => {
-                *s = ViewStatus { step, seconds, loss, psnr, rays_per_s, progress, running: true, held_out: s.held_out };
-            }
-            Event::Evaluated { psnr, views, .. } => {
-                s.held_out = Some(*psnr);
-                if let Ok(mut fog) = self.behind_fog.lock() {
-                    *fog = held_out::far_below(views, s.psnr);
-                }
-            }
-            Event::Finished { step, .. } => (s.step, s.running) = (*step, false),
+            Event::Progress { progress, .. } => (t.progress, t.is_running) = (*progress, true),
+            Event::Finished { step, .. } => (t.step, t.is_running) = (*step, false),
             _ => {}
+        }
+    }
+
+    /// Marks the held-out views behind fog, of those that were judged just now, each named by its frame.
+    pub fn show_fog(&self, judged: &[(usize, f64)]) {
+        let training = self.training.lock().ok().and_then(|t| t.figure(PSNR));
+        if let (Some(training), Ok(mut fog)) = (training, self.behind_fog.lock()) {
+            *fog = held_out::far_below(judged, training);
         }
     }
 
@@ -248,12 +290,17 @@ impl ViewSource for RunView {
     }
 
     fn status(&self) -> ViewStatus {
-        self.status.lock().map(|s| *s).unwrap_or_default()
+        self.training.lock().map(|t| t.status()).unwrap_or_default()
     }
 
-    fn history(&self) -> Vec<ViewPoint> {
-        let point = |r: &Row| ViewPoint { step: r.step, psnr: r.psnr, held_out: r.val_psnr };
-        read_rows(&self.folder).iter().map(point).collect()
+    fn charts(&self) -> Vec<ViewChart> {
+        let rows = read_rows(&self.folder);
+        let line = |(figure, label): (&str, &str)| {
+            let (figure, points) = (figure.to_string(), curve(&rows, figure));
+            ViewLine { held_out: figure == HELD_OUT_PSNR, figure, label: label.into(), points }
+        };
+        let lines = [(PSNR, "training"), (HELD_OUT_PSNR, "held out")].map(line).into();
+        vec![ViewChart { label: "PSNR".into(), unit: "dB".into(), lines }]
     }
 
     fn behind_fog(&self) -> Vec<usize> {
