@@ -181,6 +181,7 @@ fn train(device: &mut Device) -> (Vec<f64>, Field) {
             probes: None,
             loss: Loss::Batch(&Loosely { wanted: &patch.wanted, step: number }),
             near_scaling: 0.0,
+            progress: number as f32 / STEPS as f32,
             rate_scale: 1.0,
             refresh_errors: false,
         };

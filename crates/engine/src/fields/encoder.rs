@@ -176,16 +176,17 @@ impl Encoder {
         }
     }
 
-    /// Encoded samples as the fused step takes them; `d_points` receives gradients of positions that are encoded there.
-    pub fn positions<'a>(&self, encoded: &'a mut Encoded, d_points: Option<&'a mut [f32]>) -> Positions<'a> {
+    /// Encoded samples as the fused step takes them; `d_points` receives gradients of positions that are encoded there, and features of a
+    /// table are replaced by their gradients if those are `wanted`.
+    pub fn positions<'a>(&self, encoded: &'a mut Encoded, d_points: Option<&'a mut [f32]>, wanted: bool) -> Positions<'a> {
         let in_block = match self {
             Encoder::Frequency(f) => BlockEncoding::Frequency(*f),
             Encoder::TriangleWave { bands } => BlockEncoding::TriangleWave { bands: *bands },
             Encoder::Hash { grid, .. } => {
-                return Positions::Features { data: &mut encoded.features, levels: grid.levels.len(), width: grid.config.features };
+                return Positions::Features { data: &mut encoded.features, levels: grid.levels.len(), width: grid.config.features, wanted };
             }
             Encoder::VoxelCorners { grid, .. } => {
-                return Positions::Features { data: &mut encoded.features, levels: 1, width: grid.features };
+                return Positions::Features { data: &mut encoded.features, levels: 1, width: grid.features, wanted };
             }
         };
         Positions::Encoded { encoding: in_block, points: &encoded.unit, d_points }

@@ -45,10 +45,10 @@ impl Shape {
                 (Encoder::VoxelCorners { voxels, features: grid.features }, 0)
             }
         };
-        // The features' where there is a table or positions move, and the appearance codes'; directions have none.
-        let mut wanted = vec![field.encoder.table().is_some() || moves];
+        // The features' where there is a table to be trained or positions move, and the appearance codes'; directions have none.
+        let mut wanted = vec![field.encoder.table().is_some_and(|t| !t.frozen) || moves];
         wanted.extend((field.codes.direction.dims() > 0).then_some(false));
-        wanted.extend(field.codes.appearance.as_ref().map(|_| true).into_iter().chain(field.codes.given.iter().map(|_| true)));
+        wanted.extend(field.codes.appearance.as_ref().map(|a| !a.group.frozen).into_iter().chain(field.codes.given.iter().map(|_| true)));
         let space = match (field.encoder.is_centered(), field.space) {
             (false, geom::Space::Contracted(edge)) => Space::Contracted(edge),
             (false, geom::Space::Cube(edge)) => Space::Cube(edge),

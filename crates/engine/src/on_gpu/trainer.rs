@@ -2,7 +2,7 @@
 
 use super::shape::Shape;
 use crate::fields::Field;
-use crate::params::ParamGroup;
+use crate::params::{ParamGroup, Schedule};
 use crate::samplers::occupancy::Occupancy;
 use crate::step::{self, Figures, GivenRays, Loss, Placement, Probes, RaySource, Scene, Step, Trainees};
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
@@ -31,6 +31,7 @@ struct GpuGroup {
     moment1: Buffer,
     moment2: Buffer,
     adam: Adam,
+    schedule: Schedule,
     sparse: bool,
     frozen: bool,
     /// Ranges that are trained; none: all.
@@ -44,6 +45,7 @@ impl GpuGroup {
             moment1: gpu.upload_or_zeros(&g.moment1),
             moment2: gpu.upload_or_zeros(&g.moment2),
             adam: g.adam,
+            schedule: g.schedule,
             sparse: !g.touched.is_empty(),
             frozen: g.frozen,
             trained: g.trained.clone(),
@@ -57,11 +59,12 @@ impl GpuGroup {
         Ok(())
     }
 
-    /// One step `t ≥ 1` along `grads`, which are cleared.
-    fn step(&self, gpu: &Gpu, (t, scale): (u32, f32), grads: &Buffer) {
+    /// One optimizer step along `grads`, which are cleared.
+    fn step(&self, gpu: &Gpu, s: &Step, grads: &Buffer) {
         if self.frozen {
             return;
         }
+        let (t, scale) = (s.number as u32 + 1, self.schedule.scale(s.progress) * s.rate_scale);
         let a = Adam { rate: self.adam.rate * scale, ..self.adam };
         let all = std::iter::once(0..self.values.len()).collect();
         for range in self.trained.as_ref().unwrap_or(&all) {
@@ -121,6 +124,7 @@ struct Learned {
 
 impl GpuField {
     fn upload(gpu: &Gpu, field: &Field, moves: bool) -> Self {
+        field.check_freezing();
         GpuField {
             shape: Shape::new(gpu, field, moves),
             table: field.encoder.table().map(|t| (GpuGroup::upload(gpu, t), gpu.zeros(t.values.len()))),
@@ -192,21 +196,20 @@ impl GpuField {
             (Some(d), true) => Some(self.shape.points_backward(gpu, &packed.rows(), &on.points, self.table(), d)),
             _ => None,
         };
-        let at = (s.number as u32 + 1, s.rate_scale);
-        self.weights.step(gpu, at, &g.params);
+        self.weights.step(gpu, s, &g.params);
         if let (Some((table, d_table)), Some(d)) = (&self.table, &g.features)
             && !table.frozen
         {
             self.shape.table_backward(gpu, &packed.rows(), &on.points, d, d_table);
-            table.step(gpu, at, d_table);
+            table.step(gpu, s, d_table);
         }
         let own = codes.len() - r.codes.len();
         let mut d_codes = g.codes;
         let d_given = d_codes.split_off(own.min(d_codes.len())).into_iter().flatten().collect();
-        if let (Some((group, dims)), Some(Some(d_codes))) = (&self.appearance, d_codes.last()) {
+        if let (Some((group, dims)), Some(Some(d_codes))) = (self.appearance.as_ref().filter(|a| !a.0.frozen), d_codes.last()) {
             let d = gpu.zeros(group.values.len());
             field::look_up_backward(gpu, d_codes, &r.drawn.images, *dims, &d);
-            group.step(gpu, at, &d);
+            group.step(gpu, s, &d);
         }
         Ok(Learned { errors, background: g.background, weights: composited, points, codes: d_given, loss })
     }
@@ -320,16 +323,15 @@ impl GpuTrainer {
             (f.steps, f.loss, f.trained, f.marched) = (f.steps + 1, f.loss + loss, f.trained + trained, f.marched + marched);
         }
         self.on_host.rays += s.rays.count() as u64;
-        let at = (s.number as u32 + 1, s.rate_scale);
-        if let (Some((group, activation)), Some((every_ray, codes, rgb))) = (&self.learned, &sky) {
+        if let (Some((group, activation)), Some((every_ray, codes, rgb))) = (self.learned.as_ref().filter(|l| !l.0.frozen), &sky) {
             let layer = Dense::without_bias(SKY, 3, *activation);
             let d = linear::gpu::backward(gpu, every_ray, &layer, codes, &group.values, rgb, &learned.background);
-            group.step(gpu, at, &d.w);
+            group.step(gpu, s, &d.w);
         }
         if let (Some((group, focal)), Some(d_points)) = (&self.corrections, &learned.points) {
             let (d_origins, d_dirs) = march::positions_backward(gpu, &rays.rays, &samples, d_points, self.field.shape.space);
             let d = self.cameras.backward(gpu, &rays.drawn.images, &rays.drawn.pixels, &rays.rays.dirs, &d_origins, &d_dirs);
-            group.step(gpu, at, &d);
+            group.step(gpu, s, &d);
             self.cameras.correct(gpu, &group.values, *focal);
         }
         let drawn_from = self.photographs.as_ref().filter(|_| s.rays.is_of_cameras());
@@ -380,7 +382,7 @@ impl GpuTrainer {
     /// Places samples and trains on them; the samples, the offsets of all that were marched, and what was learned.
     fn place(&self, s: &Step, r: &Rays) -> Result<(GpuPacked, Buffer<u32>, Learned), GpuError> {
         let (gpu, rays, left_out) = (&self.gpu, &r.rays, &r.drawn.left_out);
-        let moves = self.corrections.is_some() && s.rays.is_of_cameras();
+        let moves = self.corrections.as_ref().is_some_and(|(group, _)| !group.frozen) && s.rays.is_of_cameras();
         let all = |of: &GpuField, packed: &GpuPacked, is_main: bool| {
             let (points, features) = of.encode(gpu, rays, packed);
             let marched = &packed.offsets;

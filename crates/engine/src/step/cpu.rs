@@ -53,6 +53,12 @@ impl CpuTrainer {
         &self.field.d_given
     }
 
+    /// The main field's samples of the last step, as its network read them.
+    #[cfg(test)]
+    pub(super) fn encoded(&self) -> &crate::fields::Encoded {
+        &self.visible.encoded
+    }
+
     /// Brings the cameras up to date with their corrections.
     fn correct(&mut self, of: &Trainees) {
         self.cameras = match &of.corrections {
@@ -91,17 +97,17 @@ impl CpuTrainer {
         if !loss.is_finite() {
             return figures;
         }
-        if let Some(l) = &mut of.learned {
+        if let Some(l) = of.learned.as_mut().filter(|l| !l.group.frozen) {
             l.backward(&self.batch.dirs, &self.background, &self.field.out.d_background);
         }
-        let moves = s.rays.is_of_cameras();
+        let moves = of.moves_cameras(s);
         if let Some((group, _)) = of.corrections.as_mut().filter(|_| moves) {
             self.correct_cameras(group);
         }
         self.field.stages.done("score");
         optimise(of, s);
         self.field.stages.done("optimise");
-        if of.corrections.is_some() && moves {
+        if moves {
             self.correct(of);
         }
         if s.refresh_errors
@@ -206,6 +212,7 @@ impl CpuTrainer {
 
     /// Gradients of a field for its samples, and of the positions where cameras move; the loss.
     fn train(&mut self, of: &mut Trainees, s: &Step, which: Which) -> f64 {
+        let moves = of.moves_cameras(s) && matches!(which, Which::Main);
         let (field, on) = match which {
             Which::Main => (&mut *of.field, &mut self.visible),
             Which::Coarse => (&mut **of.coarse.as_mut().expect("a coarse field"), &mut self.guide),
@@ -218,7 +225,6 @@ impl CpuTrainer {
         };
         let (dirs, images, background) = (&self.batch.dirs[..], Some(&self.batch.images[..]), &self.background[..]);
         let b = Batch { samples, positions: &on.positions, dirs, images, given, background, near_scaling: s.near_scaling };
-        let moves = of.corrections.is_some() && s.rays.is_of_cameras() && matches!(which, Which::Main);
         let d_positions = moves.then_some(&mut self.d_positions);
         match s.loss {
             Loss::Batch(loss) => field.train(&b, &mut on.encoded, fields::Loss::Batch(loss), &mut self.field, d_positions),
@@ -297,17 +303,13 @@ fn encode(field: &Field, batch: &RayBatch, out: &mut VisibleSamples) {
     field.encode(&out.positions, &mut out.encoded);
 }
 
-/// One optimiser step for every group; focal lengths that are not refined stay as they were given.
+/// One optimizer step for every group; cameras only follow rays of their own, and focal lengths that are not refined stay as they were
+/// given.
 fn optimise(of: &mut Trainees, s: &Step) {
-    let t = s.number as u32 + 1;
-    let mut fields = vec![&mut *of.field];
-    fields.extend(of.coarse.as_deref_mut());
-    let groups = fields.into_iter().flat_map(Field::groups_mut).chain(of.learned.as_mut().map(|l| &mut l.group));
-    groups.for_each(|g| g.step(t, s.rate_scale));
-    if let Some((group, focal)) = of.corrections.as_mut().filter(|_| s.rays.is_of_cameras()) {
-        group.step(t, s.rate_scale);
-        if !*focal {
-            group.values.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);
-        }
+    let mut now = of.reborrow();
+    now.corrections = now.corrections.filter(|_| s.rays.is_of_cameras());
+    now.into_params().0.step(s.number, s.progress, s.rate_scale);
+    if let Some((group, false)) = of.corrections.as_mut().filter(|_| s.rays.is_of_cameras()) {
+        group.values.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);
     }
 }

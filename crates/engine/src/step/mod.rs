@@ -10,7 +10,7 @@ pub(crate) use cpu::relative;
 use crate::background::LearnedBackground;
 use crate::fields::{Field, Pruning};
 use crate::losses::Terms;
-use crate::params::ParamGroup;
+use crate::params::{ParamGroup, ParamSet};
 use crate::samplers::occupancy::Occupancy;
 use crate::samplers::pixels::{ErrorMap, Observation, PixelSource};
 use diorama_geom::rng::Rng;
@@ -34,7 +34,9 @@ pub struct Step<'a> {
     pub loss: Loss<'a>,
     /// Distance within which samples learn more slowly; 0: none.
     pub near_scaling: f32,
-    /// Times each group's own rate.
+    /// Share of the run that is done, 0 to 1, for the groups' schedules.
+    pub progress: f32,
+    /// Factor of each group's own rate.
     pub rate_scale: f32,
     /// Whether draws go by the errors as they are after this step.
     pub refresh_errors: bool,
@@ -150,6 +152,35 @@ pub struct Trainees<'a> {
     /// Of the cameras, `[cameras, 7]`, and whether focal lengths are among what is refined.
     pub corrections: Option<(&'a mut ParamGroup, bool)>,
     pub error_map: Option<&'a mut ErrorMap>,
+}
+
+impl<'a> Trainees<'a> {
+    /// The parameters among them, by the names that checkpoints have, then the grid and the map, which learn without gradients.
+    pub fn into_params(self) -> (ParamSet<'a>, Option<&'a mut Occupancy>, Option<&'a mut ErrorMap>) {
+        let mut params = ParamSet::default();
+        params.add("field", self.field.groups_mut());
+        params.add("coarse", self.coarse.into_iter().flat_map(Field::groups_mut));
+        params.add("", self.learned.map(|l| &mut l.group));
+        params.add("", self.corrections.map(|(group, _)| group));
+        (params, self.occupancy, self.error_map)
+    }
+
+    /// The same for a while.
+    pub fn reborrow(&mut self) -> Trainees<'_> {
+        Trainees {
+            field: self.field,
+            coarse: self.coarse.as_deref_mut(),
+            learned: self.learned.as_deref_mut(),
+            occupancy: self.occupancy.as_deref_mut(),
+            corrections: self.corrections.as_mut().map(|(group, focal)| (&mut **group, *focal)),
+            error_map: self.error_map.as_deref_mut(),
+        }
+    }
+
+    /// Whether the cameras learn from a step's rays.
+    pub(crate) fn moves_cameras(&self, s: &Step) -> bool {
+        self.corrections.as_ref().is_some_and(|(group, _)| !group.frozen) && s.rays.is_of_cameras()
+    }
 }
 
 /// What steps came to.

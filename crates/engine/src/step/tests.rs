@@ -50,6 +50,7 @@ fn step(number: u64, placement: Placement, loss: Loss<'_>) -> Step<'_> {
         probes: None,
         loss,
         near_scaling: 0.0,
+        progress: 0.0,
         rate_scale: 1.0,
         refresh_errors: false,
     }
@@ -234,4 +235,41 @@ fn rays_of_the_callers_teach_cameras_and_the_error_map_nothing() {
     let figures = trainer.step(&mut of, Some(&photographs), &Step { rays: RaySource::Given(given), ..described });
     assert!(figures.mse > 0.0 && figures.trained > 0.0, "{figures:?}");
     assert!(group.values.iter().all(|v| *v == 0.01) && map.errors == ErrorMap::new(2).errors);
+}
+
+#[test]
+fn what_is_frozen_stays_and_no_gradient_of_it_is_computed() {
+    let pixels = Plain([[0.9, 0.1, 0.1, 1.0], [0.1, 0.1, 0.9, 1.0]]);
+    let photographs = Photographs { pixels: &pixels, observations: &[] };
+    let config = HashGridConfig { levels: 2, features: 2, log2_size: 8, base: 4, finest: 8 };
+    for is_frozen in [false, true] {
+        // Two images, each with a code.
+        let mut field = fields::ngp(config, Space::Cube(1.0), 1e-2, 2, 4, 3);
+        if is_frozen {
+            field.freeze();
+        }
+        let before: Vec<Vec<f32>> = field.groups().iter().map(|g| g.values.clone()).collect();
+        let mut of = of(&mut field);
+        let mut trainer = CpuTrainer::new(scene(), &of);
+        let figures = trainer.step(&mut of, Some(&photographs), &step(0, stratified(), photometric(ColorLoss::Mse)));
+        assert!(figures.loss > 0.0);
+        let moved: Vec<bool> = field.groups().iter().zip(&before).map(|(g, b)| g.values != *b).collect();
+        assert_eq!(moved, [!is_frozen; 3], "table, weights and codes");
+        // Gradients of features take the features' place.
+        let visible = trainer.encoded();
+        let mut features = Vec::new();
+        field.encoder.forward(&visible.unit, &mut features);
+        assert_eq!(features == visible.features, is_frozen);
+    }
+}
+
+#[test]
+#[should_panic(expected = "Field::freeze_layers")]
+fn weights_that_are_frozen_beside_layers_that_are_not_are_refused() {
+    let pixels = Plain([[0.5; 4]; 2]);
+    let mut field = hash_field();
+    field.weights.frozen = true;
+    let mut of = of(&mut field);
+    let described = step(0, stratified(), photometric(ColorLoss::Mse));
+    CpuTrainer::new(scene(), &of).step(&mut of, Some(&Photographs { pixels: &pixels, observations: &[] }), &described);
 }

@@ -6,7 +6,7 @@ use crate::error::{PipelineError, Result};
 use diorama_engine::background::LearnedBackground;
 use diorama_engine::fields::{self, DensityQuery, Field, FieldBuffers, Pruning};
 use diorama_engine::losses::{ColorLoss, Terms};
-use diorama_engine::params::ParamGroup;
+use diorama_engine::params::{ParamGroup, Schedule};
 use diorama_engine::renderers::supervised::{Supervised, Unserved};
 use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Sampling, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
@@ -136,6 +136,9 @@ impl ObjectModel {
             let color = f.net.color_mut();
             (color.activation, color.shift) = color_head(is_linear);
         }
+        let o = &model.config.optim;
+        let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
+        model.trainees().into_params().0.groups().for_each(|(_, g)| g.schedule = schedule);
         Ok(model)
     }
 
@@ -284,23 +287,9 @@ impl ObjectModel {
         device.map_or("cpu".into(), |a| a.name().to_string())
     }
 
-    pub(super) fn groups(&self) -> Vec<(String, &ParamGroup)> {
-        let field = self.field.groups().into_iter().map(|g| (format!("field.{}", g.name), g));
-        let coarse = self.coarse.iter().flat_map(|f| f.groups()).map(|g| (format!("coarse.{}", g.name), g));
-        let rest = self.learned.iter().map(|l| &l.group).chain(self.corrections.iter()).map(|g| (g.name.to_string(), g));
-        field.chain(coarse).chain(rest).collect()
-    }
-
-    pub(super) fn groups_mut(&mut self) -> Vec<(String, &mut ParamGroup)> {
-        let field = self.field.groups_mut().into_iter().map(|g| (format!("field.{}", g.name), g));
-        let coarse = self.coarse.iter_mut().flat_map(|f| f.groups_mut()).map(|g| (format!("coarse.{}", g.name), g));
-        let rest = self.learned.iter_mut().map(|l| &mut l.group).chain(self.corrections.iter_mut()).map(|g| (g.name.to_string(), g));
-        field.chain(coarse).chain(rest).collect()
-    }
-
     /// Whether any parameter is not finite.
-    pub fn is_broken(&self) -> bool {
-        self.groups().iter().any(|(_, g)| g.is_broken())
+    pub fn is_broken(&mut self) -> bool {
+        self.trainees().into_params().0.is_broken()
     }
 
     /// A copy to look at, which cannot be trained.

@@ -10,7 +10,6 @@ use crate::error::{PipelineError, Result};
 use crate::run::device::{Aftermath, Device, Pictures, aftermath};
 use crate::run::photographs::StoredPhotographs;
 use diorama_data::checkpoint;
-use diorama_engine::params::Schedule;
 use diorama_engine::samplers::pixels::Observation;
 use diorama_engine::step::{Backdrop, Figures, Loss, Placement, Probes, RaySource, Step};
 use diorama_engine::train::{Scalar, Scalars, Scores, StepReport, Trainee};
@@ -68,7 +67,6 @@ pub(super) struct Trainer<'a> {
     /// Rays that were trained on before this part of the run.
     began: u64,
     checkpoints: &'a Path,
-    schedule: Schedule,
     recovered: bool,
     /// How a device failed, and what was made of it.
     setback: Option<Setback>,
@@ -82,8 +80,6 @@ impl<'a> Trainer<'a> {
         checkpoints: &'a Path,
         device: Device,
     ) -> Result<Self> {
-        let o = &model.config.optim;
-        let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
         let mut trainer = Trainer {
             model,
             photographs,
@@ -95,7 +91,6 @@ impl<'a> Trainer<'a> {
             began: 0,
             marched: 0,
             checkpoints,
-            schedule,
             recovered: false,
             setback: None,
         };
@@ -197,7 +192,8 @@ impl<'a> Trainer<'a> {
             probes: is_probed.then(|| Probes { rng: of(OCCUPANCY), points: s.occupancy_points, block }),
             loss: Loss::Photometric(m.terms(step)),
             near_scaling: c.loss.near_scaling,
-            rate_scale: self.schedule.scale(progress as f32) * m.rate_scale,
+            progress: progress as f32,
+            rate_scale: m.rate_scale,
             refresh_errors: step.is_multiple_of(ERROR_REFRESH),
         }
     }

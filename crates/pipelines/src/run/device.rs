@@ -135,6 +135,12 @@ impl Device {
     }
 }
 
+impl Device {
+    fn given_gradients_on_cpu(&self) -> Vec<Vec<f32>> {
+        self.cpu.as_ref().map_or_else(Vec::new, |c| c.given_gradients().to_vec())
+    }
+}
+
 /// What is drawn from, on either side.
 #[derive(Clone, Copy)]
 pub struct Pictures<'a> {
@@ -200,6 +206,14 @@ impl Device {
     /// None in this build.
     pub fn count(&mut self) -> Result<Option<Figures>> {
         Ok(None)
+    }
+
+    /// Gradients of the last step's given codes, `[R, width]` each.
+    ///
+    /// # Errors
+    /// None in this build.
+    pub fn given_gradients(&self) -> Result<Vec<Vec<f32>>> {
+        Ok(self.given_gradients_on_cpu())
     }
 
     /// Brings what is trained back.
@@ -283,6 +297,14 @@ impl Device {
     /// When the device was lost or is full.
     pub fn count(&mut self) -> Result<Option<Figures>> {
         self.gpu.as_mut().map_or(Ok(None), Running::count)
+    }
+
+    /// Gradients of the last step's given codes, `[R, width]` each.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn given_gradients(&self) -> Result<Vec<Vec<f32>>> {
+        self.gpu.as_ref().map_or_else(|| Ok(self.given_gradients_on_cpu()), Running::given_gradients)
     }
 
     /// Brings what is trained back.
@@ -369,6 +391,10 @@ mod running {
             }
             self.last = Some(self.trainer().figures().map_err(told)?);
             Ok(self.last)
+        }
+
+        pub fn given_gradients(&self) -> Result<Vec<Vec<f32>>> {
+            self.trainer.as_ref().expect("the run has begun").given_gradients().map_err(told)
         }
 
         pub fn download(&mut self, to: &mut Trainees) -> Result<()> {
