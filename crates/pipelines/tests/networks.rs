@@ -3,7 +3,9 @@
 use diorama_data::{checkpoint, weights as files};
 use diorama_engine::fields::{DirectionCode, Encoder, Field, RayCodes};
 use diorama_engine::params::ParamGroup;
-use diorama_engine::step::{Backdrop, GivenRays, Loss, Placement, RaySource, Scene, Step, Trainees};
+use diorama_engine::samplers::placement::Placement;
+use diorama_engine::step::{Backdrop, GivenRays, Loss, RaySource, Scene, Step, Trainees};
+use diorama_geom::NamedArray;
 use diorama_geom::contraction::Space;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::adam::Adam;
@@ -12,7 +14,6 @@ use diorama_kernels::ops::frequency::Frequency;
 use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
 use diorama_kernels::ops::linear as kernels;
 use diorama_nets::bridge::backward_from;
-use diorama_geom::NamedArray;
 use diorama_nets::layers::{BatchNorm, Conv2d, Init, Linear};
 use diorama_nets::ops::{self, Activation, Conv, Error};
 use diorama_nets::param::{self, Mode, Module, Visitor};
@@ -213,7 +214,8 @@ fn train_with_styles(is_frozen: bool) -> (Vec<f64>, bool, bool) {
             rays: RaySource::Given(given),
             first: number * rays as u64,
             backdrop: Backdrop::Color([0.0; 3]),
-            placement: Placement::Stratified { samples: 12, rng: Rng::new(3, 4) },
+            placement: Placement::Stratified { samples: 12, noise: None },
+            room: (0, 0),
             probes: None,
             loss: Loss::Batch(&TwoColors),
             near_scaling: 0.0,

@@ -5,7 +5,8 @@
 use diorama_engine::fields::{DirectionCode, Encoder, Field, Pruning, RayCodes, VoxelGrid};
 use diorama_engine::params::ParamGroup;
 use diorama_engine::samplers::occupancy::Occupancy;
-use diorama_engine::step::{Backdrop, GivenRays, Loss, Placement, RaySource, Scene, Step, Trainees};
+use diorama_engine::samplers::placement::Placement;
+use diorama_engine::step::{Backdrop, GivenRays, Loss, RaySource, Scene, Step, Trainees};
 use diorama_geom::contraction::Space;
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
@@ -173,11 +174,8 @@ fn train(device: &mut Device) -> (Vec<f64>, Field) {
             rays: RaySource::Given(given),
             first: number * rays as u64,
             backdrop: Backdrop::Color([0.0; 3]),
-            placement: Placement::Occupancy {
-                march,
-                pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 },
-                room: (1 << 15, 1 << 15),
-            },
+            placement: Placement::Occupancy { march, pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 } },
+            room: (1 << 15, 1 << 15),
             probes: None,
             loss: Loss::Batch(&Loosely { wanted: &patch.wanted, step: number }),
             near_scaling: 0.0,

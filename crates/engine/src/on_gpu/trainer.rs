@@ -1,10 +1,11 @@
 //! Training steps that stay on the device.
 
+use super::place::{self, FieldRef, GpuSamples, PlaceOn};
 use super::shape::Shape;
 use crate::fields::Field;
 use crate::params::{ParamGroup, Schedule};
 use crate::samplers::occupancy::Occupancy;
-use crate::step::{self, Figures, GivenRays, Loss, Placement, Probes, RaySource, Scene, Step, Trainees};
+use crate::step::{self, Figures, GivenRays, Loss, Probes, RaySource, Scene, Step, Trainees};
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
@@ -16,9 +17,7 @@ use diorama_kernels::ops::march::gpu::{self as march, GpuRays};
 use diorama_kernels::ops::photometric_loss::gpu::{self as loss, SUMS, Target, Terms};
 use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, Drawn, GpuPhotographs};
-use diorama_kernels::ops::prune::gpu as prune;
 use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
-use diorama_kernels::ops::sample_pdf::gpu::strata;
 use diorama_kernels::ops::{ray_aabb, spherical_harmonics};
 use std::ops::Range;
 
@@ -83,14 +82,8 @@ struct GpuField {
     appearance: Option<(GpuGroup, usize)>,
 }
 
-/// Samples that a field is trained on.
-struct Samples<'a> {
-    packed: &'a GpuPacked,
-    /// In the field's space, and encoded.
-    points: Buffer,
-    features: Buffer,
-    /// Offsets of all samples that were marched, `[R + 1]`.
-    marched: &'a Buffer<u32>,
+/// How a field is trained on samples.
+struct Pass<'a> {
     left_out: &'a Buffer<u32>,
     /// Whether the step is judged by them.
     is_main: bool,
@@ -122,6 +115,15 @@ struct Learned {
     loss: Option<f64>,
 }
 
+/// With what a step is carried out.
+#[derive(Clone, Copy)]
+struct Executor<'a> {
+    gpu: &'a Gpu,
+    step: &'a Step<'a>,
+    /// Of what is compared.
+    sums: &'a Buffer,
+}
+
 impl GpuField {
     fn upload(gpu: &Gpu, field: &Field, moves: bool) -> Self {
         field.check_freezing();
@@ -148,19 +150,17 @@ impl GpuField {
         self.table.as_ref().map(|(t, _)| &t.values)
     }
 
-    /// Points of samples in the field's space, and encoded.
-    fn encode(&self, gpu: &Gpu, rays: &GpuRays, packed: &GpuPacked) -> (Buffer, Buffer) {
-        let points = march::positions(gpu, rays, packed, self.shape.space);
-        let features = self.shape.features(gpu, &packed.rows(), &points, self.table());
-        (points, features)
+    fn read(&self) -> FieldRef<'_> {
+        FieldRef { shape: &self.shape, table: self.table(), weights: &self.weights.values }
     }
 
     /// Evaluates samples, compares them, and steps along the gradients.
     ///
     /// # Errors
     /// When the device was lost while a [`BatchLoss`] waited for it.
-    fn train(&self, gpu: &Gpu, s: &Step, sums: &Buffer, r: &Rays, on: &Samples) -> Result<Learned, GpuError> {
-        let (net, weights, packed) = (&self.shape.net, &self.weights.values, on.packed);
+    fn train(&self, at: &Executor, r: &Rays, on: &GpuSamples, pass: &Pass) -> Result<Learned, GpuError> {
+        let &Executor { gpu, step: s, sums } = at;
+        let (net, weights, packed) = (&self.shape.net, &self.weights.values, &on.packed);
         let direction = self.shape.direction(gpu, &r.rays.dirs);
         let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &r.drawn.images, *dims));
         let codes: Vec<&Buffer> = direction.iter().chain(&appearance).chain(&r.codes).collect();
@@ -177,13 +177,13 @@ impl GpuField {
                 assert_eq!(net.net.channels(), 3, "a photometric loss compares colors alone");
                 let terms = self.terms(&terms);
                 let (rgba, distance) = (&r.drawn.target, &r.drawn.distance);
-                let target = Target { rgba, background, left_out: on.left_out, distance };
-                let figures = loss::Figures { sums, marched: on.marched, is_main: on.is_main };
-                if !on.wants_weights {
-                    let at = net.evaluate(gpu, weights, &input, true);
+                let target = Target { rgba, background, left_out: pass.left_out, distance };
+                let figures = loss::Figures { sums, marched: &on.marched, is_main: pass.is_main };
+                if !pass.wants_weights {
+                    let out = net.evaluate(gpu, weights, &input, true);
                     let (d, errors) =
-                        loss::composite_and_loss(gpu, terms, packed, (&at.sigma, &at.outputs), target, s.near_scaling, figures);
-                    (net.gradients(gpu, weights, &at, &d), Some(errors), None, None)
+                        loss::composite_and_loss(gpu, terms, packed, (&out.sigma, &out.outputs), target, s.near_scaling, figures);
+                    (net.gradients(gpu, weights, &out, &d), Some(errors), None, None)
                 } else {
                     let step = net.forward(gpu, weights, &input, background, true);
                     let (d, errors) = loss::loss(gpu, terms, packed, &step.out, target, figures);
@@ -192,7 +192,7 @@ impl GpuField {
                 }
             }
         };
-        let points = match (&g.features, on.moves) {
+        let points = match (&g.features, pass.moves) {
             (Some(d), true) => Some(self.shape.points_backward(gpu, &packed.rows(), &on.points, self.table(), d)),
             _ => None,
         };
@@ -381,53 +381,38 @@ impl GpuTrainer {
 
     /// Places samples and trains on them; the samples, the offsets of all that were marched, and what was learned.
     fn place(&self, s: &Step, r: &Rays) -> Result<(GpuPacked, Buffer<u32>, Learned), GpuError> {
-        let (gpu, rays, left_out) = (&self.gpu, &r.rays, &r.drawn.left_out);
-        let moves = self.corrections.as_ref().is_some_and(|(group, _)| !group.frozen) && s.rays.is_of_cameras();
-        let all = |of: &GpuField, packed: &GpuPacked, is_main: bool| {
-            let (points, features) = of.encode(gpu, rays, packed);
-            let marched = &packed.offsets;
-            let on = Samples { packed, points, features, marched, left_out, is_main, wants_weights: !is_main, moves: moves && is_main };
-            of.train(gpu, s, &self.sums, r, &on)
+        let at = Executor { gpu: &self.gpu, step: s, sums: &self.sums };
+        let grid = self.occupancy.as_ref();
+        let on = PlaceOn {
+            field: self.field.read(),
+            grid: grid.map(|g| &g.bits),
+            rays: &r.rays,
+            first: s.first,
+            room: s.room,
+            all_or_none: false,
         };
-        match s.placement {
-            Placement::Occupancy { march: config, pruning, room } => {
-                // All samples in occupied cells: their densities decide which are trained, and keep the grid up to date.
-                let grid = self.occupancy.as_ref().expect("an occupancy grid");
-                let marched = march::march(gpu, &grid.bits, rays, &config, room.0);
-                let (points, features) = self.field.encode(gpu, rays, &marched.packed);
-                let all = marched.packed.rows();
-                let sigma = self.field.shape.net.density(gpu, &self.field.weights.values, &features, &all);
-                let pruned = prune::prune(gpu, &marched.packed, &sigma, &pruning, &marched.cut, room.1);
-                grid.record(gpu, &all, &marched.cells, &sigma);
-                let on = Samples {
-                    packed: &pruned.packed,
-                    points: pruned.take(gpu, &points, 3),
-                    features: self.field.shape.net.take(gpu, &pruned, &features),
-                    marched: &marched.packed.offsets,
-                    left_out: &gpu.either(left_out, &marched.cut),
-                    is_main: true,
-                    wants_weights: false,
-                    moves,
-                };
-                let learned = self.field.train(gpu, s, &self.sums, r, &on)?;
-                Ok((pruned.packed, marched.packed.offsets, learned))
+        let mut coarse_loss = None;
+        let mut train_coarse = |packed: &GpuPacked| {
+            let field = self.coarse.as_ref().expect("a coarse field");
+            let (points, features) = field.read().encode(at.gpu, &r.rays, packed);
+            let on = GpuSamples { packed: packed.clone(), points, features, marched: packed.offsets.clone(), march: None };
+            let pass = Pass { left_out: &r.drawn.left_out, is_main: false, wants_weights: true, moves: false };
+            let learned = field.train(&at, r, &on, &pass)?;
+            coarse_loss = learned.loss;
+            Ok(learned.weights.expect("weights were asked for"))
+        };
+        let samples = place::place(at.gpu, &s.placement, &on, &mut train_coarse)?.expect("rays without room are left out");
+        let left_out = match (&samples.march, grid) {
+            (Some(m), Some(grid)) => {
+                grid.record(at.gpu, &m.rows, &m.cells, &m.sigma);
+                at.gpu.either(&r.drawn.left_out, &m.cut)
             }
-            Placement::Stratified { samples, rng } => {
-                let packed = strata::stratified(gpu, &rays.near_far, samples, Some((rng, s.first)));
-                let learned = all(&self.field, &packed, true)?;
-                Ok((packed.clone(), packed.offsets, learned))
-            }
-            Placement::Hierarchical { samples, more, coarse, fine } => {
-                let guide = self.coarse.as_ref().expect("a coarse field");
-                let first = strata::stratified(gpu, &rays.near_far, samples, Some((coarse, s.first)));
-                let seen = all(guide, &first, false)?;
-                let weights = seen.weights.expect("weights were asked for");
-                let packed = strata::refine(gpu, &first, &weights, samples, more, Some((fine, s.first)));
-                let mut learned = all(&self.field, &packed, true)?;
-                learned.loss = learned.loss.map(|l| l + seen.loss.unwrap_or(0.0));
-                Ok((packed.clone(), packed.offsets, learned))
-            }
-        }
+            _ => r.drawn.left_out.clone(),
+        };
+        let moves = self.corrections.as_ref().is_some_and(|(group, _)| !group.frozen) && s.rays.is_of_cameras();
+        let mut learned = self.field.train(&at, r, &samples, &Pass { left_out: &left_out, is_main: true, wants_weights: false, moves })?;
+        learned.loss = learned.loss.map(|l| l + coarse_loss.unwrap_or(0.0));
+        Ok((samples.packed, samples.marched, learned))
     }
 
     /// Samples the field at random points of the cells that a camera sees, and decides anew which are occupied.

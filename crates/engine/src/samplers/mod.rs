@@ -2,6 +2,7 @@
 
 pub mod occupancy;
 pub mod pixels;
+pub mod placement;
 pub mod stereo;
 pub mod stratified;
 

@@ -8,14 +8,14 @@ pub use cpu::CpuTrainer;
 pub(crate) use cpu::relative;
 
 use crate::background::LearnedBackground;
-use crate::fields::{Field, Pruning};
+use crate::fields::Field;
 use crate::losses::Terms;
 use crate::params::{ParamGroup, ParamSet};
 use crate::samplers::occupancy::Occupancy;
 use crate::samplers::pixels::{ErrorMap, Observation, PixelSource};
+use crate::samplers::placement::Placement;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::field_step::BatchLoss;
-use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
 
 /// What a step depends on besides what is trained.
@@ -29,6 +29,9 @@ pub struct Step<'a> {
     /// Ignored where a background is learned.
     pub backdrop: Backdrop,
     pub placement: Placement,
+    /// Samples that a device has memory for where an occupancy grid places them: before and after those are dropped that cannot matter.
+    /// Rays beyond it are left out of the step.
+    pub room: (usize, usize),
     /// Where the occupancy grid is sampled before the step; none: nowhere.
     pub probes: Option<Probes>,
     pub loss: Loss<'a>,
@@ -92,18 +95,6 @@ pub enum Backdrop {
     Color([f32; 3]),
     /// Another color for every ray.
     Random(Rng),
-}
-
-/// How samples are placed on rays.
-#[derive(Clone, Copy, Debug)]
-pub enum Placement {
-    /// In occupied cells, but for those that cannot matter. `room`: samples that a device has memory for, before and after those are
-    /// left out; rays beyond it are left out of the step.
-    Occupancy { march: MarchConfig, pruning: Pruning, room: (usize, usize) },
-    /// One in each of equal intervals.
-    Stratified { samples: usize, rng: Rng },
-    /// As many for the coarse field, whose weights decide where `more` go for the main one.
-    Hierarchical { samples: usize, more: usize, coarse: Rng, fine: Rng },
 }
 
 /// Random points at which the occupancy grid is sampled.

@@ -9,6 +9,7 @@ use diorama_kernels::ops::field_step::{FieldNet, Output, RayGradients, RayOutput
 use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
 use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::linear::Activation;
+use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::pixel_gather::OBSERVED_EVERY;
 use diorama_testkit::random_unit;
 
@@ -47,6 +48,7 @@ fn step(number: u64, placement: Placement, loss: Loss<'_>) -> Step<'_> {
         first: number * 64,
         backdrop: Backdrop::Color([0.0; 3]),
         placement,
+        room: (0, 0),
         probes: None,
         loss,
         near_scaling: 0.0,
@@ -57,7 +59,7 @@ fn step(number: u64, placement: Placement, loss: Loss<'_>) -> Step<'_> {
 }
 
 fn stratified() -> Placement {
-    Placement::Stratified { samples: 16, rng: Rng::new(1, 2) }
+    Placement::Stratified { samples: 16, noise: Some(Rng::new(1, 2)) }
 }
 
 fn photometric(color: ColorLoss) -> Loss<'static> {
@@ -73,9 +75,9 @@ fn every_placement_learns_the_colors_of_photographs() {
     let pixels = Plain([[0.8, 0.3, 0.1, 1.0]; 2]);
     let photographs = Photographs { pixels: &pixels, observations: &[] };
     let march = MarchConfig { cone: 0.0, dt_min: 0.06, dt_max: 0.06, max_samples: 64, ..MarchConfig::default() };
-    let pruning = Pruning { stop: 1e-4, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 };
-    let hierarchical = Placement::Hierarchical { samples: 8, more: 8, coarse: Rng::new(1, 3), fine: Rng::new(1, 4) };
-    for placement in [stratified(), hierarchical, Placement::Occupancy { march, pruning, room: (0, 0) }] {
+    let pruning = fields::Pruning { stop: 1e-4, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 };
+    let hierarchical = Placement::Hierarchical { samples: 8, more: 8, noise: Some([Rng::new(1, 3), Rng::new(1, 4)]) };
+    for placement in [stratified(), hierarchical, Placement::Occupancy { march, pruning }] {
         let (mut field, mut coarse, mut occupancy) = (hash_field(), hash_field(), Occupancy::new(8, 1, false));
         let mut of = Trainees { coarse: Some(&mut coarse), occupancy: Some(&mut occupancy), ..of(&mut field) };
         let mut trainer = CpuTrainer::new(scene(), &of);

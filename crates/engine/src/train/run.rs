@@ -89,8 +89,7 @@ pub fn run<T: Trainee>(
     let clock = Clock { start: Instant::now(), before };
     let mut interval = Interval::new(before);
     let mut evaluations = Evaluations::new(options, origin);
-    let mut summary =
-        Summary { step, seconds: before, loss: f64::NAN, scalars: Scalars::default(), scores: None, interrupted: false };
+    let mut summary = Summary { step, seconds: before, loss: f64::NAN, scalars: Scalars::default(), scores: None, interrupted: false };
     let (mut last_save, mut fault) = (before, None);
     loop {
         let seconds = clock.seconds();

@@ -49,11 +49,9 @@ pub fn run(model: &ObjectModel, repeats: usize, device: String) -> Result<Render
         return Err(PipelineError::Usage("the run holds no views out; train with --split every:8".into()));
     };
     let camera = model.posed(first).camera;
-    let tracers = [
-        Tracer { shared_weight: 0.0, pruning: EXHAUSTIVE, ..model.tracer(Quality::Full) },
-        model.tracer(Quality::Full),
-        model.tracer(Quality::Fast),
-    ];
+    let full = model.tracer(Quality::Full);
+    let exhaustive = Tracer { shared_weight: 0.0, placement: full.placement.with_pruning(EXHAUSTIVE), ..full };
+    let tracers = [exhaustive, full, model.tracer(Quality::Fast)];
     let mut sums = [QualityFigure::default(); 3];
     let mut seconds = [0.0; 3];
     for &i in &frames {

@@ -52,12 +52,8 @@ mod tests {
     use super::*;
     #[cfg(feature = "gpu")]
     use diorama_engine::{
-        fields::Pruning,
-        renderers::{
-            supervised::Unserved,
-            volume::{Placement, Traced},
-        },
-        samplers::RayBatch,
+        renderers::{supervised::Unserved, volume::Traced},
+        samplers::{RayBatch, placement::Placement},
     };
 
     #[cfg(feature = "gpu")]
@@ -68,7 +64,7 @@ mod tests {
 
     #[cfg(feature = "gpu")]
     impl Accelerator for Unplugged {
-        fn trace(&self, _: &RayBatch, _: &Placement, _: Pruning, _: Option<u32>) -> std::result::Result<TracedRays, Unserved> {
+        fn trace(&self, _: &RayBatch, _: &Placement, _: Option<u32>) -> std::result::Result<TracedRays, Unserved> {
             Err(Unserved::Failed("unplugged".into()))
         }
         fn density(&self, _: &[f32]) -> std::result::Result<Vec<f32>, Unserved> {

@@ -8,9 +8,10 @@ use diorama_engine::fields::{self, DensityQuery, Field, FieldBuffers, Pruning};
 use diorama_engine::losses::{ColorLoss, Terms};
 use diorama_engine::params::{ParamGroup, Schedule};
 use diorama_engine::renderers::supervised::{Supervised, Unserved};
-use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Sampling, Tracer};
+use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::pixels::ErrorMap;
+use diorama_engine::samplers::placement::Placement;
 use diorama_engine::step::{self, Scene, Trainees};
 use diorama_engine::train::Origin;
 use diorama_geom::capture::{ColorSpace, Split};
@@ -250,21 +251,22 @@ impl ObjectModel {
     /// Ready to render, wearing the mean appearance.
     pub fn tracer(&self, quality: Quality) -> Tracer<'_> {
         let s = &self.config.sampling;
-        let sampling = match (&self.occupancy, &self.coarse) {
-            (Some(grid), _) => Sampling::Occupancy { grid, max_samples: s.max_samples },
-            (None, Some(coarse)) => Sampling::Hierarchical { coarse, samples: s.samples, more: s.importance },
-            (None, None) => Sampling::Stratified { samples: s.samples },
+        let placement = match (&self.occupancy, &self.coarse) {
+            (Some(grid), _) => Placement::occupied(grid, s.max_samples, quality.pruning()),
+            (None, Some(_)) => Placement::Hierarchical { samples: s.samples, more: s.importance, noise: None },
+            (None, None) => Placement::Stratified { samples: s.samples, noise: None },
         };
         Tracer {
             field: &self.field,
-            sampling,
+            coarse: self.coarse.as_ref(),
+            occupancy: self.occupancy.as_ref(),
+            placement,
             backdrop: self.learned.as_ref().map_or(Backdrop::Color(self.backdrop_color()), Backdrop::Learned),
             near: s.near,
             cube: self.cube(),
             clip: None,
             crop: None,
             is_linear: self.is_linear(),
-            pruning: quality.pruning(),
             shared_weight: quality.shared_weight(),
             appearance: None,
             tolerance: quality.tolerance(),

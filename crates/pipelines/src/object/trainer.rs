@@ -11,7 +11,8 @@ use crate::run::device::{Aftermath, Device, Pictures, aftermath};
 use crate::run::photographs::StoredPhotographs;
 use diorama_data::checkpoint;
 use diorama_engine::samplers::pixels::Observation;
-use diorama_engine::step::{Backdrop, Figures, Loss, Placement, Probes, RaySource, Step};
+use diorama_engine::samplers::placement::Placement;
+use diorama_engine::step::{Backdrop, Figures, Loss, Probes, RaySource, Step};
 use diorama_engine::train::{Scalar, Scalars, Scores, StepReport, Trainee};
 use diorama_geom::rng::Rng;
 use std::path::Path;
@@ -172,13 +173,11 @@ impl<'a> Trainer<'a> {
         };
         let of = |stream: u64| Rng::new(c.seed, stream);
         let placement = match (&m.occupancy, &m.coarse) {
-            (Some(grid), _) => Placement::Occupancy {
-                march: grid.march_config(s.max_samples).stretched(stretch(step)),
-                pruning: m.pruning(),
-                room: (self.batch_samples() * ROOM.0, self.batch_samples() * ROOM.1),
-            },
-            (None, Some(_)) => Placement::Hierarchical { samples: s.samples, more: s.importance, coarse: of(COARSE), fine: of(FINE) },
-            (None, None) => Placement::Stratified { samples: s.samples, rng: of(COARSE) },
+            (Some(grid), _) => {
+                Placement::Occupancy { march: grid.march_config(s.max_samples).stretched(stretch(step)), pruning: m.pruning() }
+            }
+            (None, Some(_)) => Placement::Hierarchical { samples: s.samples, more: s.importance, noise: Some([of(COARSE), of(FINE)]) },
+            (None, None) => Placement::Stratified { samples: s.samples, noise: Some(of(COARSE)) },
         };
         let (until, block) = OCCUPANCY_WARMUP;
         let block = if step <= until { block } else { 1 };
@@ -189,6 +188,7 @@ impl<'a> Trainer<'a> {
             first: m.rays,
             backdrop: if is_random { Backdrop::Random(of(BACKGROUND)) } else { Backdrop::Color(m.backdrop_color()) },
             placement,
+            room: (self.batch_samples() * ROOM.0, self.batch_samples() * ROOM.1),
             probes: is_probed.then(|| Probes { rng: of(OCCUPANCY), points: s.occupancy_points, block }),
             loss: Loss::Photometric(m.terms(step)),
             near_scaling: c.loss.near_scaling,
