@@ -13,7 +13,7 @@ use diorama_pipelines::object::memory;
 use diorama_pipelines::object::model::ObjectModel;
 use diorama_pipelines::object::recipe::{self, Trained};
 use diorama_pipelines::object::run_folder::read_config;
-use diorama_pipelines::object::viewing::RunView;
+use diorama_pipelines::object::viewing::{self, RunView};
 use diorama_pipelines::run::RunFolder;
 use diorama_pipelines::run::config::key_and_value;
 use diorama_pipelines::{Application, PipelineError, Result};
@@ -187,7 +187,7 @@ impl Train {
 /// The run as the viewer sees it while it trains, and a server that is bound and does not serve yet.
 fn watch(a: &Train, config: &Config, resumed: Option<&RunFolder>) -> Result<(Arc<RunView>, Server)> {
     let capture = resumed.map_or_else(|| recipe::load_capture(config), RunFolder::capture)?;
-    let view = RunView::new(&a.out, ObjectModel::new(config.clone(), capture, false)?, true)?;
+    let view = viewing::open(&a.out, ObjectModel::new(config.clone(), capture, false)?, true)?;
     let server = a.listen.bind(view.clone())?;
     eprintln!("view: {}", server.address());
     Ok((view, server))

@@ -30,4 +30,3 @@ pub mod seen_by;
 mod texture;
 mod trainer;
 pub mod viewing;
-pub mod viewing_points;

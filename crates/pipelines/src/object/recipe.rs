@@ -94,7 +94,7 @@ pub fn train(
         if let Err(e) = folder.log(e) {
             log_error.get_or_insert(e);
         }
-        view.into_iter().for_each(|v| v.hear(e));
+        view.into_iter().for_each(|v| v.update(e));
         events(e);
     });
     if let Some(e) = log_error {

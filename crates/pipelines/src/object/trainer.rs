@@ -232,7 +232,7 @@ impl Trainee for Trainer<'_> {
     type Error = PipelineError;
 
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport> {
-        if self.view.is_some_and(RunView::wants) {
+        if self.view.is_some_and(RunView::wants_update) {
             // A device that fails here fails in the step below as well, which knows what to do.
             let _ = self.show();
         }
@@ -308,7 +308,7 @@ impl Trainee for Trainer<'_> {
         }
         let judged = pixels.judge(&self.model);
         let scores = judged.scores();
-        self.view.into_iter().for_each(|v| v.show_fog(&judged.views));
+        self.view.into_iter().for_each(|v| v.mark_fog(&judged.views));
         self.judged = judged.views;
         Ok(Some(scores))
     }

@@ -10,6 +10,9 @@ pub mod param_state;
 pub mod photographs;
 pub mod profile;
 pub mod summary;
+pub mod viewer_files;
+pub mod viewing;
+pub mod viewing_points;
 
 pub use description::RunDescription;
 pub use folder::RunFolder;

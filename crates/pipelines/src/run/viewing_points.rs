@@ -1,5 +1,6 @@
 //! A data set, or a file of points or Gaussian splats, as the viewer sees it: no field yet, only what was there before.
 
+use super::viewing::THUMBNAIL;
 use crate::error::Result;
 use diorama_data::{colmap, json, photo, splat_ply};
 use diorama_engine::renderers::splat;
@@ -12,8 +13,6 @@ use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewRequ
 use diorama_geom::{Camera, Capture, Image, ImageU8, Pose, Similarity};
 use std::path::{Path, PathBuf};
 
-/// Longest side of a small photograph.
-const THUMBNAIL: usize = 160;
 /// Views around a file that has no photographs, in degrees of field of view.
 const AROUND: usize = 8;
 const FOV_DEG: f64 = 50.0;
