@@ -4,7 +4,7 @@ use diorama_data::{checkpoint, weights as files};
 use diorama_engine::fields::{DirectionCode, Encoder, Field, RayCodes};
 use diorama_engine::params::ParamGroup;
 use diorama_engine::samplers::placement::Placement;
-use diorama_engine::step::{Backdrop, GivenRays, Loss, RaySource, Scene, Step, Trainees};
+use diorama_engine::step::{GivenRays, Loss, RaySource, Scene, Step, Trainees};
 use diorama_geom::NamedArray;
 use diorama_geom::contraction::Space;
 use diorama_geom::rng::Rng;
@@ -190,7 +190,7 @@ fn train_with_styles(is_frozen: bool) -> (Vec<f64>, bool, bool) {
     }
     let (first_weights, first_styles) = (field.weights.values.clone(), param::arrays(&styles));
     let mut optimizer = Optimizer::new(&styles, Rule::ADAM_W, 2e-2, 0.0, &[]);
-    let mut of = Trainees { field: &mut field, coarse: None, learned: None, occupancy: None, corrections: None, error_map: None };
+    let mut of = Trainees::of(&mut field);
     let mut device = RunDevice::open("cpu").unwrap();
     device.begin(&of, Scene { cameras: Vec::new(), near: 0.05, cube: (0.0, 1.0) }, None).unwrap();
     let rays = 64;
@@ -209,20 +209,8 @@ fn train_with_styles(is_frozen: bool) -> (Vec<f64>, bool, bool) {
             background: &background,
             codes: &[&values],
         };
-        let step = Step {
-            number,
-            rays: RaySource::Given(given),
-            first: number * rays as u64,
-            backdrop: Backdrop::Color([0.0; 3]),
-            placement: Placement::Stratified { samples: 12, noise: None },
-            room: (0, 0),
-            probes: None,
-            loss: Loss::Batch(&TwoColors),
-            near_scaling: 0.0,
-            progress: 0.0,
-            rate_scale: 1.0,
-            refresh_errors: false,
-        };
+        let placement = Placement::Stratified { samples: 12, noise: None };
+        let step = Step::new(number, number * rays as u64, RaySource::Given(given), placement, Loss::Batch(&TwoColors));
         losses.push(device.step(&mut of, None, &step, 1).unwrap().shown.loss);
         let gradients = Gradients::take(&styles, backward_from(codes, &device.given_gradients().unwrap()[0]));
         optimizer.step(&styles, gradients, 1.0);

@@ -42,20 +42,8 @@ fn hash_field() -> Field {
 }
 
 fn step(number: u64, placement: Placement, loss: Loss<'_>) -> Step<'_> {
-    Step {
-        number,
-        rays: RaySource::Photographs { count: 64, rng: Rng::new(1, 1) },
-        first: number * 64,
-        backdrop: Backdrop::Color([0.0; 3]),
-        placement,
-        room: (0, 0),
-        probes: None,
-        loss,
-        near_scaling: 0.0,
-        progress: 0.0,
-        rate_scale: 1.0,
-        refresh_errors: false,
-    }
+    let rays = RaySource::Photographs { count: 64, rng: Rng::new(1, 1) };
+    Step::new(number, number * 64, rays, placement, loss)
 }
 
 fn stratified() -> Placement {
@@ -64,10 +52,6 @@ fn stratified() -> Placement {
 
 fn photometric(color: ColorLoss) -> Loss<'static> {
     Loss::Photometric(Terms { color, distortion: 0.0, depth: 0.0, alpha: 0.0 })
-}
-
-fn of(field: &mut Field) -> Trainees<'_> {
-    Trainees { field, coarse: None, learned: None, occupancy: None, corrections: None, error_map: None }
 }
 
 #[test]
@@ -79,7 +63,7 @@ fn every_placement_learns_the_colors_of_photographs() {
     let hierarchical = Placement::Hierarchical { samples: 8, more: 8, noise: Some([Rng::new(1, 3), Rng::new(1, 4)]) };
     for placement in [stratified(), hierarchical, Placement::Occupancy { march, pruning }] {
         let (mut field, mut coarse, mut occupancy) = (hash_field(), hash_field(), Occupancy::new(8, 1, false));
-        let mut of = Trainees { coarse: Some(&mut coarse), occupancy: Some(&mut occupancy), ..of(&mut field) };
+        let mut of = Trainees { coarse: Some(&mut coarse), occupancy: Some(&mut occupancy), ..Trainees::of(&mut field) };
         let mut trainer = CpuTrainer::new(scene(), &of);
         let mut run = |i: u64| {
             let probes = (i > 0 && i.is_multiple_of(16)).then_some(Probes { rng: Rng::new(1, 5), points: 256, block: 1 });
@@ -98,7 +82,7 @@ fn a_loss_that_is_not_finite_changes_nothing() {
     let photographs = Photographs { pixels: &pixels, observations: &[] };
     let mut field = hash_field();
     let before = field.weights.values.clone();
-    let mut of = of(&mut field);
+    let mut of = Trainees::of(&mut field);
     let figures = CpuTrainer::new(scene(), &of).step(&mut of, Some(&photographs), &step(0, stratified(), photometric(ColorLoss::Mse)));
     assert!(figures.loss.is_nan() && of.field.weights.values == before);
 }
@@ -110,7 +94,7 @@ fn cameras_follow_their_corrections_and_keep_focal_lengths_that_are_not_refined(
     for focal in [false, true] {
         let mut field = hash_field();
         let mut group = ParamGroup::dense("corrections", vec![0.0; 2 * CORRECTION], Adam::default());
-        let mut of = Trainees { corrections: Some((&mut group, focal)), ..of(&mut field) };
+        let mut of = Trainees { corrections: Some((&mut group, focal)), ..Trainees::of(&mut field) };
         let mut trainer = CpuTrainer::new(scene(), &of);
         for i in 0..20 {
             trainer.step(&mut of, Some(&photographs), &step(i, stratified(), photometric(ColorLoss::Mse)));
@@ -181,7 +165,7 @@ fn rays_of_the_callers_train_any_outputs_by_a_loss_of_the_batch_but_frozen_layer
         background: &background,
         codes: &[&style],
     };
-    let mut of = of(&mut field);
+    let mut of = Trainees::of(&mut field);
     let mut trainer = CpuTrainer::new(Scene { cameras: Vec::new(), near: 0.05, cube: (0.0, 1.0) }, &of);
     let mut run = |i: u64| {
         let described = step(i, stratified(), Loss::Batch(&Spread(0.7)));
@@ -202,7 +186,7 @@ fn rays_through_pixels_of_known_distance_and_masked_ones_are_told_apart() {
     let seen = [Observation { image: 1, x: 2, y: 3, distance: 1.5 }, Observation { image: 0, x: 7, y: 3, distance: 1.5 }];
     let photographs = Photographs { pixels: &pixels, observations: &seen };
     let mut field = hash_field();
-    let of = of(&mut field);
+    let of = Trainees::of(&mut field);
     let mut trainer = CpuTrainer::new(scene(), &of);
     trainer.draw(&of, Some(&photographs), &step(0, stratified(), photometric(ColorLoss::Mse)));
     let b = &trainer.batch;
@@ -231,7 +215,7 @@ fn rays_of_the_callers_teach_cameras_and_the_error_map_nothing() {
         background: &background,
         codes: &[],
     };
-    let mut of = Trainees { corrections: Some((&mut group, true)), error_map: Some(&mut map), ..of(&mut field) };
+    let mut of = Trainees { corrections: Some((&mut group, true)), error_map: Some(&mut map), ..Trainees::of(&mut field) };
     let mut trainer = CpuTrainer::new(scene(), &of);
     let described = step(0, stratified(), photometric(ColorLoss::Mse));
     let figures = trainer.step(&mut of, Some(&photographs), &Step { rays: RaySource::Given(given), ..described });
@@ -251,7 +235,7 @@ fn what_is_frozen_stays_and_no_gradient_of_it_is_computed() {
             field.freeze();
         }
         let before: Vec<Vec<f32>> = field.groups().iter().map(|g| g.values.clone()).collect();
-        let mut of = of(&mut field);
+        let mut of = Trainees::of(&mut field);
         let mut trainer = CpuTrainer::new(scene(), &of);
         let figures = trainer.step(&mut of, Some(&photographs), &step(0, stratified(), photometric(ColorLoss::Mse)));
         assert!(figures.loss > 0.0);
@@ -271,7 +255,7 @@ fn weights_that_are_frozen_beside_layers_that_are_not_are_refused() {
     let pixels = Plain([[0.5; 4]; 2]);
     let mut field = hash_field();
     field.weights.frozen = true;
-    let mut of = of(&mut field);
+    let mut of = Trainees::of(&mut field);
     let described = step(0, stratified(), photometric(ColorLoss::Mse));
     CpuTrainer::new(scene(), &of).step(&mut of, Some(&Photographs { pixels: &pixels, observations: &[] }), &described);
 }
