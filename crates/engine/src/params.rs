@@ -49,7 +49,7 @@ impl ParamGroup {
         ParamGroup { touched, ..ParamGroup::dense(name, values, adam) }
     }
 
-    /// One optimiser step `t ≥ 1` with the rate scaled, after which gradients are zero.
+    /// One optimizer step `t ≥ 1` with the rate times `rate_scale`. Gradients are zero afterwards.
     pub fn step(&mut self, t: u32, rate_scale: f32) {
         if self.frozen {
             self.grads.fill(0.0);
@@ -75,7 +75,7 @@ impl ParamGroup {
         self.touched.iter_mut().zip(lines).for_each(|(t, line)| *t |= line.iter().any(|g| *g != 0.0) as u8);
     }
 
-    /// A copy to look at, which cannot be trained.
+    /// A copy of the values alone, for rendering; it cannot be trained.
     pub fn values_only(&self) -> ParamGroup {
         ParamGroup {
             name: self.name,

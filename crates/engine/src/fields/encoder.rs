@@ -1,4 +1,4 @@
-//! Encodings of position: what a field's network reads in place of three coordinates.
+//! Encodings of position, which a field's network reads instead of coordinates.
 
 use crate::params::ParamGroup;
 use diorama_kernels::ops::field_step::{BlockEncoding, Positions};
@@ -7,7 +7,7 @@ use diorama_kernels::ops::hash_grid::{self, HashGrid};
 use diorama_kernels::ops::triangle_wave;
 use diorama_kernels::ops::trilinear_corner_grid::{self as corner_grid, Corners};
 
-/// How positions are encoded. Encodings that are learned hold their table.
+/// An encoding of positions. Learned encodings hold their table.
 #[derive(Clone, Debug)]
 pub enum Encoder {
     /// Multiresolution hash grid over the field's space as `[0, 1]³` (Müller et al. 2022).
@@ -91,7 +91,7 @@ impl VoxelGrid {
 pub struct Encoded {
     /// Positions in the encoder's coordinates, `[S, 3]`.
     pub unit: Vec<f32>,
-    /// Of encoders with a table: level-major features `[L, S, F]`, replaced by their gradients in training.
+    /// Level-major features `[L, S, F]` of encoders with a table; training replaces them by their gradients.
     pub features: Vec<f32>,
 }
 
@@ -134,8 +134,8 @@ impl Encoder {
         }
     }
 
-    /// A copy to look at, which cannot be trained.
-    pub fn to_look_at(&self) -> Encoder {
+    /// A copy of the values alone, for rendering; it cannot be trained.
+    pub fn for_rendering(&self) -> Encoder {
         match self {
             Encoder::Hash { grid, table } => Encoder::Hash { grid: grid.clone(), table: table.values_only() },
             Encoder::VoxelCorners { grid, table } => Encoder::VoxelCorners { grid: grid.clone(), table: table.values_only() },

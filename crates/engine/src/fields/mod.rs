@@ -32,7 +32,7 @@ pub struct Field {
     pub weights: ParamGroup,
 }
 
-/// What gives the density of points, whatever it is made of.
+/// Anything with a density at every point, for occupancy grids and meshing.
 pub trait DensityQuery {
     /// Densities `[N]` (per unit of model space) at model points `[N, 3]`.
     fn density(&self, model: &[f32], sigma: &mut [f32]);
@@ -56,7 +56,7 @@ pub struct Batch<'a> {
     pub near_scaling: f32,
 }
 
-/// What training minimizes.
+/// Loss that training minimizes.
 #[derive(Clone, Copy)]
 pub enum Loss<'a> {
     /// A sum over rays, which is computed while a block's activations are in cache.
@@ -128,7 +128,7 @@ impl Field {
         }
     }
 
-    /// Whether space has no bound.
+    /// Whether the field's space is unbounded.
     pub fn is_unbounded(&self) -> bool {
         matches!(self.space, Space::Contracted(_))
     }
@@ -150,7 +150,7 @@ impl Field {
         (buf.direction, buf.appearance) = (direction, appearance);
     }
 
-    /// The field's own outputs `[N, C]` at model points, seen along unit directions, wearing the mean appearance.
+    /// Outputs `[N, C]` of the field at model points `[N, 3]`, viewed along unit directions `[N, 3]`, with the mean appearance code.
     pub fn outputs_at<'a>(&self, model: &[f32], dirs: &[f32], buf: &'a mut FieldBuffers) -> &'a [f32] {
         // One sample per ray, so long that it is opaque.
         let n = model.len() / 3;
@@ -252,11 +252,11 @@ impl Field {
         (buf.direction, buf.appearance, buf.d_appearance, buf.d_given) = (direction, appearance, d_appearance, d_given);
     }
 
-    /// A copy to look at, which cannot be trained.
-    pub fn to_look_at(&self) -> Field {
+    /// A copy of the values alone, for rendering; it cannot be trained.
+    pub fn for_rendering(&self) -> Field {
         Field {
-            encoder: self.encoder.to_look_at(),
-            codes: self.codes.to_look_at(),
+            encoder: self.encoder.for_rendering(),
+            codes: self.codes.for_rendering(),
             net: self.net.clone(),
             space: self.space,
             weights: self.weights.values_only(),

@@ -1,4 +1,4 @@
-//! Losses over rays.
+//! Photometric loss of rays: color, distortion, opacity and known distances.
 
 use crate::samplers::RayBatch;
 use diorama_geom::color::srgb_from_linear;
@@ -9,7 +9,7 @@ use diorama_kernels::ops::{depth_loss, distortion};
 
 pub use diorama_kernels::ops::photometric_loss::ColorLoss;
 
-/// What counts in [`Photometric`], and how much.
+/// Weights of the terms of [`Photometric`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Terms {
     pub color: ColorLoss,
@@ -18,10 +18,10 @@ pub struct Terms {
     pub alpha: f32,
 }
 
-/// Colour, distortion and opacity terms of a batch, each a mean over its rays.
+/// Color, distortion and opacity terms of a batch, each a mean over its rays.
 pub struct Photometric<'a> {
     pub batch: &'a RayBatch,
-    /// In the distance that the distortion loss measures; not read without it.
+    /// Samples in the distance that the distortion loss measures; unused without that loss.
     pub samples: Packed<'a>,
     /// Background of each ray, `[R, 3]`: what transparent pixels are composited on.
     pub background: &'a [f32],
@@ -35,11 +35,11 @@ pub struct Photometric<'a> {
     pub alpha: f32,
     /// Weight of the light that ends away from surfaces of known distance ([`depth_loss`]).
     pub depth: f32,
-    /// In distance from the camera; not read without `depth`.
+    /// Samples in distance from the camera; unused where `depth` is 0.
     pub along: Packed<'a>,
 }
 
-/// What [`Photometric::relative`] is for linear light.
+/// Value of [`Photometric::relative`] for linear light.
 pub const RELATIVE: f32 = 1e-3;
 
 /// A linear value as it is shown: within white, along the sRGB curve.
@@ -59,7 +59,7 @@ impl Photometric<'_> {
         squared_error(rgb, target, self.relative > 0.0)
     }
 
-    /// What the ray should come to, background included.
+    /// Target color of a ray, background included.
     pub fn target(&self, r: usize) -> [f32; 3] {
         let t = &self.batch.target[r * 4..r * 4 + 4];
         std::array::from_fn(|k| t[k] * t[3] + self.background[r * 3 + k] * (1.0 - t[3]))

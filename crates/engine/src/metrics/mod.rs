@@ -1,4 +1,4 @@
-//! Image quality.
+//! Image quality: MSE, PSNR, SSIM and LPIPS.
 
 pub mod lpips;
 

@@ -1,4 +1,4 @@
-//! The parts of a training step on a device against what the CPU does.
+//! Checks of a device: the parts of a training step compared with the CPU's.
 
 mod draws;
 mod losses;

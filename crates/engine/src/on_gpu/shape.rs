@@ -1,4 +1,4 @@
-//! What a field is on the device besides its parameters.
+//! Device-side description of a field: encoding, network, space and precision. Parameters are kept apart.
 
 use crate::fields::{DirectionCode, Encoder as FieldEncoder, Field};
 use crate::step::relative;
@@ -19,21 +19,21 @@ enum Encoder {
     VoxelCorners { voxels: GpuVoxels, features: usize },
 }
 
-/// A field's shape on the device.
+/// Encoder, network and space of a field on the device; its parameters are passed to each call.
 pub struct Shape {
     encoder: Encoder,
     directions: DirectionCode,
     pub net: GpuNet,
-    /// In which positions are encoded.
+    /// Space in which positions are encoded.
     pub space: Space,
     /// Whether space has no bound.
     pub is_unbounded: bool,
-    /// What differences of linear light are divided by besides the prediction; else 0.
+    /// [`crate::losses::Photometric::relative`] of this field.
     pub relative: f32,
 }
 
 impl Shape {
-    /// `moves` says whether gradients of positions will be asked for.
+    /// `moves`: gradients of positions will be computed.
     pub fn new(gpu: &Gpu, field: &Field, moves: bool) -> Self {
         let arithmetic = if field.net.mlp.precision == Precision::F32 { Arithmetic::Exact } else { Arithmetic::Best };
         let (encoder, per_level) = match &field.encoder {

@@ -1,4 +1,4 @@
-//! Views by the device.
+//! Rendering on the device.
 
 use super::place::{self, FieldRef, PlaceOn};
 use super::shape::Shape;
@@ -13,10 +13,10 @@ use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays};
 
-/// Samples that there is room for, and where the CPU plays the device.
+/// Samples per call: on a GPU, and where the CPU plays one.
 const ROOM: usize = 1 << 20;
 const SOFTWARE_ROOM: usize = 1 << 17;
-/// Samples of a call where a network goes layer by layer and keeps all of its layers' outputs.
+/// Samples per call of networks that run layer by layer and keep the outputs of every layer.
 const LAYERED_ROOM: usize = 1 << 16;
 
 /// A trained field's parameters on the device.
@@ -43,7 +43,7 @@ impl ViewField {
         FieldRef { shape: &self.shape, table: self.table.as_ref(), weights: &self.weights }
     }
 
-    /// Samples composited before black.
+    /// Evaluates and composites encoded samples before black.
     fn shade(&self, gpu: &Gpu, rays: &GpuRays, packed: &GpuPacked, features: &Buffer, appearance: Option<u32>) -> GpuComposited {
         let n = packed.rays();
         let direction = self.shape.direction(gpu, &rays.dirs);
@@ -57,13 +57,13 @@ impl ViewField {
     }
 }
 
-/// A trained field on the device, ready to be looked at.
+/// Renders a trained field on the device.
 pub struct GpuTracer {
     gpu: Gpu,
     field: ViewField,
     coarse: Option<ViewField>,
     occupancy: Option<GpuOccupancy>,
-    /// Samples that there is room for.
+    /// Samples per call.
     room: usize,
 }
 
@@ -80,7 +80,7 @@ impl GpuTracer {
         }
     }
 
-    /// The same with room for other than the usual number of samples.
+    /// The same tracer with memory for `samples` samples per call.
     #[must_use]
     pub fn with_room(self, samples: usize) -> Self {
         GpuTracer { room: samples, ..self }
@@ -103,7 +103,7 @@ impl GpuTracer {
         Ok(out)
     }
 
-    /// The field's own colours `[N, 3]` at model points, seen along `dirs`, wearing the mean appearance.
+    /// Colors `[N, 3]` of the field at model points `[N, 3]`, viewed along unit directions `[N, 3]`, with the mean appearance code.
     ///
     /// # Errors
     /// When the device was lost.

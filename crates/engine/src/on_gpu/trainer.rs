@@ -1,4 +1,4 @@
-//! Training steps that stay on the device.
+//! Training steps on the device: parameters, samples and gradients stay in its memory.
 
 use super::place::{self, FieldRef, GpuSamples, PlaceOn};
 use super::shape::Shape;
@@ -22,7 +22,7 @@ use diorama_kernels::ops::{ray_aabb, spherical_harmonics};
 use std::ops::Range;
 
 /// Terms of the learned background per channel.
-const SKY: usize = 16;
+const BACKDROP_TERMS: usize = 16;
 
 /// A group of parameters on the device.
 struct GpuGroup {
@@ -82,17 +82,17 @@ struct GpuField {
     appearance: Option<(GpuGroup, usize)>,
 }
 
-/// How a field is trained on samples.
+/// What is computed for one field's samples.
 struct Pass<'a> {
     left_out: &'a Buffer<u32>,
-    /// Whether the step is judged by them.
+    /// Whether the step's loss and errors are those of these samples.
     is_main: bool,
     wants_weights: bool,
     /// Whether gradients of positions are wanted.
     moves: bool,
 }
 
-/// The rays of a step, and what belongs to them.
+/// Rays of a step with their targets, backgrounds and codes.
 struct Rays {
     rays: GpuRays,
     drawn: Drawn,
@@ -102,7 +102,7 @@ struct Rays {
     codes: Vec<Buffer>,
 }
 
-/// What training on samples gives besides better parameters.
+/// Results of a training pass besides updated parameters.
 struct Learned {
     /// Squared error of each ray; none: not compared with photographs.
     errors: Option<Buffer>,
@@ -111,16 +111,16 @@ struct Learned {
     points: Option<Buffer>,
     /// Gradients of the given codes.
     codes: Vec<Buffer>,
-    /// Of a [`BatchLoss`].
+    /// Value of a [`BatchLoss`].
     loss: Option<f64>,
 }
 
-/// With what a step is carried out.
+/// Device, step and the sums that steps add to.
 #[derive(Clone, Copy)]
 struct Executor<'a> {
     gpu: &'a Gpu,
     step: &'a Step<'a>,
-    /// Of what is compared.
+    /// Sums of losses, errors and counts, kept on the device.
     sums: &'a Buffer,
 }
 
@@ -169,7 +169,7 @@ impl GpuField {
         let (g, errors, composited, loss) = match s.loss {
             Loss::Batch(loss) => {
                 let step = net.forward(gpu, weights, &input, background, true);
-                let (d, value) = by_batch(gpu, loss, &step.out, net.net.channels(), packed)?;
+                let (d, value) = evaluate_batch_loss(gpu, loss, &step.out, net.net.channels(), packed)?;
                 let g = net.backward(gpu, weights, &step, &d, s.near_scaling);
                 (g, None, Some(step.out.weights), Some(value))
             }
@@ -214,15 +214,15 @@ impl GpuField {
         Ok(Learned { errors, background: g.background, weights: composited, points, codes: d_given, loss })
     }
 
-    /// What counts, as kernels take it.
+    /// The loss terms in the form that the kernels take.
     fn terms(&self, t: &crate::losses::Terms) -> Terms {
         let normalized = self.shape.is_unbounded;
         Terms { color: t.color, relative: self.shape.relative, distortion: t.distortion, normalized, alpha: t.alpha, depth: t.depth }
     }
 }
 
-/// The gradients that a batch's loss gives for what was composited, and its value.
-fn by_batch(
+/// Gradients of a batch loss for the composited outputs, and its value.
+fn evaluate_batch_loss(
     gpu: &Gpu,
     loss: &dyn BatchLoss,
     out: &GpuComposited,
@@ -242,7 +242,7 @@ fn by_batch(
     Ok((d, value))
 }
 
-/// See the module.
+/// Carries out [`Step`]s on a GPU; keeps parameters, photographs and buffers there.
 pub struct GpuTrainer {
     gpu: Gpu,
     field: GpuField,
@@ -262,7 +262,7 @@ pub struct GpuTrainer {
 }
 
 impl GpuTrainer {
-    /// Uploads all that training needs.
+    /// Uploads parameters, grid, photographs and cameras.
     pub fn new(gpu: Gpu, scene: Scene, of: &Trainees, photographs: Option<GpuPhotographs>) -> Self {
         let occupancy = |o: &Occupancy| {
             let thresholds: Vec<f32> = (0..o.bits.cascades).map(|c| o.most(c)).collect();
@@ -306,13 +306,13 @@ impl GpuTrainer {
         }
         let mut rays = self.rays(s);
         let gpu = &self.gpu;
-        let sky = self.learned.as_ref().map(|(g, activation)| {
-            let every_ray = Rows::all(gpu, s.rays.count());
+        let backdrop = self.learned.as_ref().map(|(g, activation)| {
+            let all_rays = Rows::all(gpu, s.rays.count());
             let codes = spherical_harmonics::gpu::forward(gpu, 4, &rays.rays.dirs);
-            let rgb = linear::gpu::forward(gpu, &every_ray, &Dense::without_bias(SKY, 3, *activation), &codes, &g.values, None);
-            (every_ray, codes, rgb)
+            let rgb = linear::gpu::forward(gpu, &all_rays, &Dense::without_bias(BACKDROP_TERMS, 3, *activation), &codes, &g.values, None);
+            (all_rays, codes, rgb)
         });
-        if let Some((_, _, rgb)) = &sky {
+        if let Some((_, _, rgb)) = &backdrop {
             rays.background = rgb.clone();
         }
         let (samples, marched, learned) = self.place(s, &rays)?;
@@ -323,9 +323,9 @@ impl GpuTrainer {
             (f.steps, f.loss, f.trained, f.marched) = (f.steps + 1, f.loss + loss, f.trained + trained, f.marched + marched);
         }
         self.on_host.rays += s.rays.count() as u64;
-        if let (Some((group, activation)), Some((every_ray, codes, rgb))) = (self.learned.as_ref().filter(|l| !l.0.frozen), &sky) {
-            let layer = Dense::without_bias(SKY, 3, *activation);
-            let d = linear::gpu::backward(gpu, every_ray, &layer, codes, &group.values, rgb, &learned.background);
+        if let (Some((group, activation)), Some((all_rays, codes, rgb))) = (self.learned.as_ref().filter(|l| !l.0.frozen), &backdrop) {
+            let layer = Dense::without_bias(BACKDROP_TERMS, 3, *activation);
+            let d = linear::gpu::backward(gpu, all_rays, &layer, codes, &group.values, rgb, &learned.background);
             group.step(gpu, s, &d.w);
         }
         if let (Some((group, focal)), Some(d_points)) = (&self.corrections, &learned.points) {
@@ -468,7 +468,7 @@ impl GpuTrainer {
     }
 }
 
-/// The caller's rays as if they had been drawn.
+/// Rays of the caller, in the form of drawn ones.
 fn given(gpu: &Gpu, g: &GivenRays) -> Drawn {
     let n = g.images.len();
     Drawn {

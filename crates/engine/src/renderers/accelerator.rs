@@ -1,4 +1,4 @@
-//! The device that traces rays instead of the CPU, as renderers see it.
+//! Interface of devices that render instead of the CPU.
 
 use super::traced::Traced;
 use crate::samplers::RayBatch;

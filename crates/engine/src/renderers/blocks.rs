@@ -23,7 +23,7 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
-/// What blocks read.
+/// Field, grid and limits that all blocks share.
 #[derive(Clone, Copy)]
 pub(super) struct Blocks<'a> {
     pub field: &'a Field,
@@ -186,7 +186,7 @@ impl Blocks<'_> {
     }
 }
 
-/// Where a block's results go.
+/// Output rows of a block.
 struct Traces<'a> {
     rgb: &'a mut [f32],
     opacity: &'a mut [f32],

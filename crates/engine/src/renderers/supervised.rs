@@ -1,4 +1,4 @@
-//! Failures of an accelerator: each is said once, and never hidden behind the CPU's own results.
+//! Handling of a device's failures: each is reported once, and never hidden behind results of the CPU.
 
 pub use super::accelerator::Unserved;
 
@@ -24,7 +24,7 @@ pub struct Supervised {
 }
 
 impl Supervised {
-    /// `named`: the user asked for this device; `say` is told that the CPU goes on, once.
+    /// `named`: the user asked for this device; `say` is called once, when the CPU takes over.
     pub fn new(device: Box<dyn Accelerator>, name: impl Into<String>, named: bool, say: Say) -> Self {
         Supervised { device, name: name.into(), named, say, failure: Mutex::new(None), served: AtomicUsize::new(0) }
     }

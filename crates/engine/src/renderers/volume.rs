@@ -1,4 +1,4 @@
-//! Volume rendering of whole images.
+//! Volume rendering of views: `Σ_i T_i α_i c_i` along each ray (Mildenhall et al. 2020, equation 3).
 
 pub use super::accelerator::Accelerator;
 pub use super::quality::Quality;
@@ -20,14 +20,14 @@ use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::march::MarchRays;
 use diorama_kernels::ops::ray_generation::PosedCamera;
 
-/// What stands behind the scene.
+/// Background of rendered views.
 #[derive(Clone, Copy)]
 pub enum Backdrop<'a> {
     Color([f32; 3]),
     Learned(&'a LearnedBackground),
 }
 
-/// A field ready to be looked at.
+/// Renders views of a field.
 #[derive(Clone, Copy)]
 pub struct Tracer<'a> {
     pub field: &'a Field,
@@ -42,9 +42,9 @@ pub struct Tracer<'a> {
     pub cube: (f32, f32),
     /// Only what lies in this box (lowest and highest corner, model space) is shown.
     pub clip: Option<([f32; 3], [f32; 3])>,
-    /// And only what lies in this box, which may be turned (model space).
+    /// Only what also lies in this box, which may be rotated, is shown (model space).
     pub crop: Option<OrientedBox>,
-    /// Training image whose appearance is worn; none: the mean.
+    /// Training image whose appearance code is used; none: the mean code.
     pub appearance: Option<u32>,
     /// Whether colors are linear light, which [`Tracer::view`] encodes to sRGB; values above 1 go on along the curve.
     pub is_linear: bool,
@@ -52,7 +52,7 @@ pub struct Tracer<'a> {
     pub shared_weight: f32,
     /// Pixels are interpolated where traced neighbours differ by no more than this; 0: all are traced.
     pub tolerance: f32,
-    /// Traces instead of the CPU, which goes on where it fails; rays of an abandoned device come back empty.
+    /// Device that traces instead of the CPU. Where it fails, the CPU goes on; rays of an abandoned device come back empty.
     pub accelerator: Option<&'a dyn Accelerator>,
 }
 
@@ -96,7 +96,7 @@ impl<'a> Tracer<'a> {
 }
 
 impl Tracer<'_> {
-    /// Renders the view of a camera that stands in model space; `progress` is told the rows done.
+    /// Renders the view of a camera that stands in model space; `progress` receives the number of rows done since the last call.
     pub fn view(&self, camera: &PosedCamera, progress: &mut dyn FnMut(usize)) -> View {
         let (w, h) = (camera.camera.width as usize, camera.camera.height as usize);
         let mut out = View::empty(w, h);
@@ -121,7 +121,7 @@ impl Tracer<'_> {
         out
     }
 
-    /// Traces the listed pixels of a view; `progress` is told how many rows' worth.
+    /// Traces the listed pixels of a view; `progress` receives the number of rows' worth of pixels.
     fn pixels(
         &self,
         camera: &PosedCamera,
@@ -215,7 +215,7 @@ impl Tracer<'_> {
         blocks.trace(&MarchRays { origins, dirs, near_far, jitter, resumed: false }, images.as_deref())
     }
 
-    /// Lets the backdrop show through.
+    /// Adds the background, weighted by the transmittance.
     fn before_backdrop(&self, batch: &RayBatch, mut out: Traced) -> Traced {
         let mut behind = Vec::new();
         match self.backdrop {
@@ -241,7 +241,7 @@ impl Tracer<'_> {
     }
 }
 
-/// Moves what a field rendered out of its buffers.
+/// Moves a field's rendered rays out of its buffers.
 fn take_traced(buf: &mut FieldBuffers) -> Traced {
     let o = &mut buf.out;
     Traced { rgb: std::mem::take(&mut o.values), opacity: std::mem::take(&mut o.opacity), depth: std::mem::take(&mut o.depth) }

@@ -1,4 +1,4 @@
-//! Where rays are drawn and where samples lie on them.
+//! Sampling: pixels and their rays, and the placement of samples on rays.
 
 pub mod occupancy;
 pub mod pixels;

@@ -41,6 +41,7 @@ const RIM: usize = 8;
 /// Cells per axis of the blocks in which visibility is decided.
 const SEEN_BLOCK: usize = 8;
 
+/// Which cells of nested cubes may hold matter, learned from densities that the field gives.
 #[derive(Clone, Debug)]
 pub struct Occupancy {
     pub bits: OccupancyBits,
@@ -48,11 +49,11 @@ pub struct Occupancy {
     pub unbounded: bool,
     /// Decayed maximum density per cell.
     pub density: Vec<f32>,
-    /// Highest density seen in each cell since the last update; 0 where nobody looked.
+    /// Highest density sampled in each cell since the last update; 0 where none was sampled.
     pub fresh: Vec<f32>,
     /// Cells that some camera sees.
     pub live: Vec<u32>,
-    /// How much of a stored density survives an update of its cell.
+    /// Factor of a stored density at each update of its cell.
     pub decay: f32,
 }
 
@@ -64,7 +65,7 @@ impl Occupancy {
         Occupancy { fresh: vec![0.0; bits.cells()], bits, unbounded, density, live, decay: 0.8 }
     }
 
-    /// The marching that belongs to this grid. `max_samples` bounds the samples of a ray.
+    /// Step lengths of marching through this grid; `max_samples` bounds the samples of a ray.
     pub fn march_config(&self, max_samples: usize) -> MarchConfig {
         let cascades = self.bits.cascades;
         let cone = if cascades > 1 { 1.0 / 256.0 } else { 0.0 };
@@ -128,7 +129,7 @@ impl Occupancy {
         self.bits.fill_with(|cell| density[cell] > thresholds[cell / cells]);
     }
 
-    /// Notes densities `[N]` that were met in `cells` `[N]`, but for negative ones; they count at the next update.
+    /// Records densities `[N]` sampled in `cells` `[N]` for the next update; negative ones are ignored.
     pub fn record(&mut self, cells: &[u32], sigma: &[f32]) {
         scatter_max(cells, sigma, &mut self.fresh);
     }

@@ -1,4 +1,4 @@
-//! Draws training pixels, optionally more often where the error is high.
+//! Drawing of training pixels, optionally more often where the error is high.
 
 use super::RayBatch;
 use diorama_geom::rng::Rng;
@@ -87,7 +87,7 @@ pub struct Observation {
     pub distance: f32,
 }
 
-/// What [`draw`] needs besides the pixels.
+/// Cameras, random numbers and optional guidance of [`draw`].
 pub struct DrawOptions<'a> {
     pub cameras: &'a [PosedCamera],
     /// Counter of the first ray: the number of rays drawn so far.

@@ -1,5 +1,5 @@
-//! Samples without an occupancy grid: one per equal interval (NeRF, eq. 2), and the union with new
-//! ones from a coarse pass.
+//! Samples without an occupancy grid: one per equal interval (Mildenhall et al. 2020, equation 2), and their union with samples drawn
+//! from the weights of a coarse pass.
 
 use super::RayBatch;
 use diorama_geom::rng::Rng;

@@ -42,7 +42,7 @@ impl CpuTrainer {
         trainer
     }
 
-    /// Where the time of steps goes.
+    /// Time that each stage of the steps took.
     pub fn stages(&mut self) -> &mut Stages {
         &mut self.field.stages
     }
@@ -152,7 +152,7 @@ impl CpuTrainer {
         }
     }
 
-    /// Takes the caller's rays.
+    /// Copies the caller's rays into the batch.
     fn take(&mut self, g: &GivenRays) {
         let b = &mut self.batch;
         b.images.copy_from_slice(g.images);
@@ -188,7 +188,7 @@ impl CpuTrainer {
         trained += main.samples.t.len();
         let mut marched = trained;
         if let (Placement::Occupancy { .. }, Some(grid)) = (s.placement, &mut of.occupancy) {
-            self.field.visible.seen().for_each(|(cells, sigma)| grid.record(cells, sigma));
+            self.field.visible.densities().for_each(|(cells, sigma)| grid.record(cells, sigma));
             marched = self.field.visible.marched();
         }
         drawn.train(of.field, main, &mut self.field, moves.then_some(&mut self.d_positions));
@@ -226,7 +226,7 @@ impl CpuTrainer {
     }
 }
 
-/// What a field is trained on besides its samples.
+/// Rays of a step, which fields are trained on.
 #[derive(Clone, Copy)]
 struct Drawn<'a> {
     batch: &'a RayBatch,
@@ -266,8 +266,7 @@ impl Drawn<'_> {
     }
 }
 
-/// What differences of linear light are divided by besides the prediction; 0 where colors are as photographs show them. Linear light has a
-/// color head of its own.
+/// [`Photometric::relative`] of a field: 0 unless its colors are linear light, which a color head of its own says.
 pub(crate) fn relative(field: &Field) -> f32 {
     let is_linear = field.net.outputs.first().is_some_and(|o| o.head.activation == Activation::TruncatedExp);
     if is_linear { RELATIVE } else { 0.0 }

@@ -2,12 +2,12 @@
 
 use super::scalar::{Scalars, Scores};
 
-/// What one step came to.
+/// Result of one step.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StepReport {
-    /// What the step minimized. One that is not finite takes the run back (see [`super::Trainee::recover`]).
+    /// Loss of the step. If it is not finite, the run goes back ([`super::Trainee::recover`]).
     pub loss: f64,
-    /// Whatever else is worth a line in the log.
+    /// Other figures for the log, the terminal and the viewer.
     pub scalars: Scalars,
 }
 
@@ -29,7 +29,7 @@ pub enum Event {
         loss: f64,
         scalars: Scalars,
     },
-    /// What was learned was scored on held-out data.
+    /// The model was scored on held-out data.
     Evaluated {
         step: u64,
         seconds: f64,
@@ -38,7 +38,7 @@ pub enum Event {
     Saved {
         step: u64,
     },
-    /// What went wrong at `step`; the run goes on from `to_step`.
+    /// The run failed at `step` because of `why` and goes on from `to_step`.
     Recovered {
         step: u64,
         to_step: u64,

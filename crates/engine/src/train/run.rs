@@ -1,4 +1,4 @@
-//! The loop.
+//! The training loop: steps until the budget is spent, with logging, checkpoints, evaluations and recovery.
 
 use super::{Event, Scalar, Scalars, Scores, StepReport};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -24,10 +24,10 @@ pub struct RunOptions {
     pub evaluate_every: Option<u64>,
 }
 
-/// What is trained.
+/// A model in training, as the loop drives it.
 pub trait Trainee {
     type Error;
-    /// One optimiser step; `progress` in [0, 1] drives the schedules.
+    /// One optimizer step; `progress` in [0, 1] drives the schedules.
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport, Self::Error>;
     /// Writes a checkpoint that `step` steps and `seconds` have gone into; false, with nothing written, where a
     /// parameter is not finite.
@@ -69,7 +69,7 @@ pub enum RunError<E> {
     Diverged { first: u64, again: u64 },
 }
 
-/// Where a run begins: zero, or what a checkpoint says.
+/// Step and seconds at which a run begins: zero, or those of a checkpoint.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Origin {
     pub step: u64,

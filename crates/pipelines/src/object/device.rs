@@ -1,4 +1,4 @@
-//! What the object application asks of its device: how much a step holds, and who renders.
+//! Use of the device by the object application: samples per step, and rendering.
 
 use super::config::{Config, Method};
 use super::model::ObjectModel;
@@ -11,7 +11,7 @@ use diorama_engine::renderers::supervised::Supervised;
 use diorama_engine::renderers::volume::Accelerator;
 
 /// Lets the named device evaluate a model's field; which that is, in words. `auto` is the best GPU that is no software,
-/// else the CPU, which goes on where that GPU fails: `say` is told so, once. The failure of a device that was named is
+/// else the CPU, which goes on where that GPU fails: `say` is then called once. The failure of a device that was named is
 /// [`ObjectModel::check_device`]'s.
 ///
 /// # Errors

@@ -1,4 +1,4 @@
-//! Held-out photographs: which they are, pixels of them by which training is judged while it runs, and views behind fog.
+//! Held-out photographs: their selection, the pixels that score training while it runs, and views behind fog.
 
 use super::config::Method;
 use super::model::ObjectModel;
@@ -28,10 +28,10 @@ const BUDGET: u64 = 64 << 20;
 
 /// A held-out view this many dB below the training views is behind fog, whatever its depth says.
 pub const FOG_DB: f64 = 6.0;
-/// Mean gap in dB between training and held-out views from which on users are told what that means.
+/// Mean gap in dB between training and held-out views from which on its meaning is explained to users.
 pub const GAP_DB: f64 = 3.0;
 
-/// What a gap means, and what helps.
+/// Explanation of a gap, and its cures.
 pub const GAP_MEANS: &str = "photographs are explained in ways that do not hold from other places: fog, surfaces at wrong distances, mostly \
 where few photographs look; what helps: more photographs between these, poses that were checked (diorama doctor DATA), \
 --set field.appearance=8 where light or exposure vary (docs/troubleshooting.md)";
@@ -53,7 +53,7 @@ pub fn far_below(views: &[(usize, f64)], training: f64) -> Vec<usize> {
     views.iter().filter(|(_, psnr)| *psnr < training - FOG_DB).map(|v| v.0).collect()
 }
 
-/// How held-out pixels look.
+/// Scores of held-out pixels.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Judged {
     /// Of all pixels together.

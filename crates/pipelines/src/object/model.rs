@@ -1,4 +1,4 @@
-//! A capture with the fields that are fitted to it: what a run folder holds.
+//! The model of the object application: a capture with the fields that are fitted to it.
 
 use super::config::{Background, Config, Method};
 use super::field_shape::{cascades, hash_grid, space, viewing_distance};
@@ -54,7 +54,7 @@ pub struct ObjectModel {
     pub samples_per_ray: f64,
     /// Lowered once after a loss that was not finite.
     pub rate_scale: f32,
-    /// Draws views instead of the CPU.
+    /// Device that renders instead of the CPU.
     pub accelerator: Option<Supervised>,
 }
 
@@ -180,18 +180,18 @@ impl ObjectModel {
         0.7 * self.field.net.density.shift.exp()
     }
 
-    /// Which samples of training are left out.
+    /// Limits below which samples are dropped in training.
     pub fn pruning(&self) -> Pruning {
         let s = &self.config.sampling;
         Pruning { stop: s.stop, min_alpha: s.min_alpha, thin: self.thin(), min_weight: 0.0 }
     }
 
-    /// Where rays of training begin and end.
+    /// Cameras and extent of the rays of training.
     pub fn scene(&self) -> Scene {
         Scene { cameras: self.base_cameras(), near: self.config.sampling.near, cube: self.cube() }
     }
 
-    /// All that a step trains.
+    /// Everything that a step changes.
     pub fn trainees(&mut self) -> Trainees<'_> {
         let focal = self.config.camera.refine_focal;
         Trainees {
@@ -204,7 +204,7 @@ impl ObjectModel {
         }
     }
 
-    /// What counts at a training step, and how much.
+    /// Weights of the loss at a training step.
     pub fn terms(&self, step: u64) -> Terms {
         let l = &self.config.loss;
         let color = if l.color == "huber" { ColorLoss::Huber(HUBER) } else { ColorLoss::Mse };
@@ -248,7 +248,7 @@ impl ObjectModel {
         is_linear(&self.capture)
     }
 
-    /// Ready to render, wearing the mean appearance.
+    /// A renderer of the model, with the mean appearance code.
     pub fn tracer(&self, quality: Quality) -> Tracer<'_> {
         let s = &self.config.sampling;
         let placement = match (&self.occupancy, &self.coarse) {
@@ -283,7 +283,7 @@ impl ObjectModel {
         }
     }
 
-    /// What has drawn views so far, in words: a device, unless it failed or was never asked.
+    /// Name of the device that has rendered so far; the CPU if it failed or was not used.
     pub fn drew_on(&self) -> String {
         let device = self.accelerator.as_ref().filter(|a| a.served() > 0 && a.failure().is_none());
         device.map_or("cpu".into(), |a| a.name().to_string())
@@ -294,16 +294,16 @@ impl ObjectModel {
         self.trainees().into_params().0.is_broken()
     }
 
-    /// A copy to look at, which cannot be trained.
-    pub fn to_look_at(&self) -> ObjectModel {
+    /// A copy of the values alone, for rendering; it cannot be trained.
+    pub fn for_rendering(&self) -> ObjectModel {
         ObjectModel {
             config: self.config.clone(),
             capture: self.capture.clone(),
             model_from_world: self.model_from_world,
-            field: self.field.to_look_at(),
-            coarse: self.coarse.as_ref().map(Field::to_look_at),
+            field: self.field.for_rendering(),
+            coarse: self.coarse.as_ref().map(Field::for_rendering),
             occupancy: self.occupancy.clone(),
-            learned: self.learned.as_ref().map(LearnedBackground::to_look_at),
+            learned: self.learned.as_ref().map(LearnedBackground::for_rendering),
             corrections: self.corrections.as_ref().map(ParamGroup::values_only),
             error_map: None,
             train: self.train.clone(),

@@ -1,4 +1,4 @@
-//! Training, from top to bottom.
+//! Training recipe of the object application, to be read from top to bottom.
 
 use super::config::Config;
 use super::exposure_spread;
@@ -39,7 +39,7 @@ pub fn device(config: &Config) -> Result<String> {
     Ok(if device.is_gpu() { device.name() } else { cpu_name() })
 }
 
-/// What training gives.
+/// Result of training.
 pub struct Trained {
     pub model: ObjectModel,
     pub summary: Summary,
@@ -49,7 +49,7 @@ pub struct Trained {
 
 /// Trains into `folder`, from the start or from its checkpoint.
 ///
-/// Capture → pixels → model → loop of steps → checkpoint; `events` hears of all of it, and `view` sees it.
+/// Capture → pixels → model → loop of steps → checkpoint. `events` receives every event, `view` shows the run in the viewer.
 pub fn train(
     config: &Config,
     folder: &mut RunFolder,
@@ -128,12 +128,12 @@ pub fn train(
     Ok(Trained { device: trainer.device.name(), model: trainer.model, summary })
 }
 
-/// What the user is told where photographs hold linear light.
+/// Note for the user where photographs hold linear light.
 fn white_note(white: f32) -> Option<String> {
     (white > 0.0).then(|| format!("the photographs hold linear light: {white} is shown as white (--set data.white={white})"))
 }
 
-/// Takes the model to the run's last checkpoint, or leaves it at its start; what the user is told.
+/// Restores the run's last checkpoint, or leaves the model at its start; a note for the user.
 fn go_on(model: &mut ObjectModel, folder: &mut RunFolder) -> Result<Option<String>> {
     let mut note = Some("the run was stopped before its first checkpoint: it begins again".into());
     if checkpoint::exists(&folder.checkpoints()) {
@@ -145,7 +145,7 @@ fn go_on(model: &mut ObjectModel, folder: &mut RunFolder) -> Result<Option<Strin
     Ok(note)
 }
 
-/// What a run that ended with an error leaves, in words.
+/// Description of what a run that failed leaves.
 fn kept(checkpoints: &Path) -> String {
     if checkpoint::exists(checkpoints) {
         format!("{} is the last good checkpoint", checkpoint::latest(checkpoints).display())
@@ -154,7 +154,7 @@ fn kept(checkpoints: &Path) -> String {
     }
 }
 
-/// What the first steps came to.
+/// Results of the first steps.
 pub struct Beginning {
     /// Per step.
     pub losses: Vec<f64>,
@@ -176,7 +176,7 @@ pub fn begin(config: &Config, steps: u64) -> Result<Beginning> {
     Ok(Beginning { losses, cameras })
 }
 
-/// Where a step's time goes: `warmup` steps, then `steps` measured ones; writes nothing.
+/// Measures the stages of a step: `warmup` steps, then `steps` measured ones; writes nothing.
 pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> {
     let mut trainer = scratch_trainer(config, false)?;
     for step in 0..warmup {

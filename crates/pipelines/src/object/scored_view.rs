@@ -72,7 +72,7 @@ pub(crate) fn reference(model: &ObjectModel, i: usize, full: Photo) -> Result<(I
 }
 
 /// Renders frame `i` and scores it against `full`, its photograph at full size, where its mask says that pixels count.
-/// `progress` is told the share that is drawn, and when scoring begins.
+/// `progress` receives the share that is drawn, and when scoring begins.
 ///
 /// # Errors
 /// When the mask cannot be decoded, or is not that of the photograph; or when the device that was named failed.

@@ -1,4 +1,4 @@
-//! The steps of a run, as its configuration describes them, on the CPU or on a GPU.
+//! Training of an object run: describes each step by the configuration, carries it out on the device, and saves, recovers and evaluates.
 
 use super::config::{Background, Method};
 use super::device;
@@ -61,7 +61,7 @@ pub(super) struct Trainer<'a> {
     pub held_out: Option<HeldOutPixels>,
     /// PSNR of each held-out view when they were judged last, named by its frame.
     pub judged: Vec<(usize, f64)>,
-    /// Who looks on.
+    /// Viewer of the run.
     pub view: Option<&'a RunView>,
     /// Samples before any were left out.
     pub marched: u64,
@@ -100,23 +100,23 @@ impl<'a> Trainer<'a> {
         Ok(trainer)
     }
 
-    /// Brings the model to the device.
+    /// Uploads the model to the device.
     fn begin(&mut self) -> Result<()> {
         let scene = self.model.scene();
         let pictures = Pictures { photographs: &self.photographs, observations: &self.observations };
         self.device.begin(&self.model.trainees(), scene, Some(pictures))
     }
 
-    /// Shows what has been learned so far.
+    /// Shows the model as it is now in the viewer.
     pub fn show(&mut self) -> Result<()> {
         if let Some(view) = self.view {
             self.download()?;
-            view.show(self.model.to_look_at());
+            view.show(self.model.for_rendering());
         }
         Ok(())
     }
 
-    /// Brings what was learned back to the host.
+    /// Downloads the model from the device.
     pub fn download(&mut self) -> Result<()> {
         self.device.download(&mut self.model.trainees())
     }
@@ -128,7 +128,7 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Books what steps came to.
+    /// Adds the counts of steps.
     fn count(&mut self, f: &Figures) {
         let m = &mut self.model;
         let before = m.samples;
@@ -210,7 +210,7 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// What follows from a device's failure.
+    /// Decides how to go on after a device's failure.
     fn survive(&mut self, e: PipelineError) -> Result<Setback> {
         let m = &self.model;
         let needs = memory::of_training(&m.config, &m.capture, self.photographs.store().format(), self.batch_samples()).to_string();

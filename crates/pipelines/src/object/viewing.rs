@@ -16,10 +16,10 @@ use diorama_geom::{Capture, ImageU8};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// A run of this application that is looked at.
+/// A run of this application in the viewer.
 pub type RunView = AnyRunView<ObjectModel>;
 
-/// Figure by which views behind fog are told.
+/// Figure that views behind fog are compared with.
 const PSNR: &str = "psnr";
 
 /// Opens the view of a run; `running` says whether it trains.

@@ -22,7 +22,7 @@ pub struct Row {
 }
 
 impl Row {
-    /// What an event says of a step; none of events that say nothing of it. Figures that are not finite are left out.
+    /// The row of an event that has figures; figures that are not finite are left out.
     pub fn of(event: &Event) -> Option<Row> {
         let (step, seconds, loss, prefix, Scalars(scalars)) = match event {
             Event::Progress { step, seconds, loss, scalars, .. } => (*step, *seconds, Some(*loss), "", scalars),

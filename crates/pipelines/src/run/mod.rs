@@ -1,4 +1,5 @@
-//! What the runs of all applications share: configuration, device, folder, kept capture, metrics, summary. It imports no application.
+//! Everything that runs of all applications share: configuration, device, folder, capture, checkpoints, metrics, summary and viewing.
+//! It imports no application.
 
 pub mod config;
 pub mod description;

@@ -1,4 +1,4 @@
-//! A run as the viewer sees it: finished, or while it trains.
+//! Source of the viewer for runs of any application, finished or in training.
 
 use super::metrics::{Row, curve, read_rows};
 use super::viewer_files::{self, Crop, Saved};
@@ -19,10 +19,10 @@ use std::time::{Duration, Instant};
 
 /// Longest side of a small photograph.
 pub const THUMBNAIL: usize = 160;
-/// How often a run in training is shown anew, at most.
+/// Least time between updates of a run in training.
 const REFRESH: Duration = Duration::from_secs(2);
 
-/// What the viewer asks of an application's model; [`RunView`] does the rest.
+/// Interface of an application's model to the viewer; [`RunView`] does the rest.
 pub trait ViewedModel: Send + Sync + 'static {
     /// Figures that are shown, by their names in the log, and what they are called on the page.
     const FIGURES: &'static [(&'static str, &'static str)];
@@ -32,7 +32,7 @@ pub trait ViewedModel: Send + Sync + 'static {
     /// Photographs and cameras.
     fn capture(&self) -> &Capture;
 
-    /// How far training is.
+    /// Step and seconds of training.
     fn origin(&self) -> Origin;
 
     /// Pictures that can be drawn of a view; the first is shown first.
@@ -59,19 +59,19 @@ pub trait ViewedModel: Send + Sync + 'static {
     fn export(&self, run: &Path, request: &MeshRequest, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<(PathBuf, f64)>;
 }
 
-/// A run that is looked at. While it trains, [`RunView::wants_update`] says when to [`RunView::show`] what has been learned.
+/// A run in the viewer. While it trains, [`RunView::wants_update`] says when to [`RunView::show`] what has been learned.
 pub struct RunView<M> {
     folder: PathBuf,
     model: RwLock<Arc<M>>,
     training: Mutex<Training>,
     shown: Mutex<Instant>,
-    /// Whether anybody has looked since the model was last shown.
+    /// Whether a view was asked for since the model was last shown.
     has_viewer: AtomicBool,
     saved: Mutex<Saved>,
     behind_fog: Mutex<Vec<usize>>,
 }
 
-/// How far training is.
+/// Progress and figures of training.
 #[derive(Clone, Debug, Default)]
 struct Training {
     step: u64,
@@ -132,7 +132,7 @@ impl<M: ViewedModel> RunView<M> {
         self.model.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Whether a newer model would be looked at.
+    /// Whether somebody looked since the model was last shown, and that was long enough ago.
     pub fn wants_update(&self) -> bool {
         self.has_viewer.load(Ordering::Relaxed) && lock(&self.shown).elapsed() >= REFRESH
     }
@@ -339,7 +339,7 @@ mod tests {
         assert!(view.wants_update());
         view.show(reader());
         *lock(&view.shown) -= REFRESH;
-        assert!(!view.wants_update(), "nobody looked at the last one");
+        assert!(!view.wants_update(), "nobody asked for a view of the last one");
         let s = view.scene();
         let camera = Camera::pinhole(8, 6, 0.8);
         let values = diorama_geom::view_controls::ControlValues::default();

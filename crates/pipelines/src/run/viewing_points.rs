@@ -1,4 +1,4 @@
-//! A data set, or a file of points or Gaussian splats, as the viewer sees it: no field yet, only what was there before.
+//! Source of the viewer for data sets and for files of points or Gaussian splats, of which there is no field yet.
 
 use super::viewing::THUMBNAIL;
 use crate::error::Result;
@@ -101,7 +101,7 @@ impl PointsView {
         PointsView { scene, photos, splats }
     }
 
-    /// How many there are.
+    /// Number of points.
     pub fn points(&self) -> usize {
         self.splats.len()
     }

@@ -1,4 +1,4 @@
-//! Pixels that are drawn, and the errors that guide the draws.
+//! Checks of drawn pixels and of the error map that guides the draws.
 
 use super::*;
 

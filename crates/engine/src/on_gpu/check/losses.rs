@@ -1,4 +1,4 @@
-//! The loss of a step: apart from compositing, and with it at once.
+//! Checks of the photometric loss: as a kernel of its own, and fused with compositing.
 
 use super::*;
 
@@ -29,7 +29,7 @@ impl Compared {
     }
 }
 
-/// What the CPU makes of it.
+/// Loss and gradients by the CPU.
 struct Expected {
     value: f64,
     /// Mean squared error of the rays that count, and of each ray.
@@ -68,7 +68,7 @@ impl Expected {
     }
 }
 
-/// The same rays on the device.
+/// The rays on the device.
 struct OnGpu {
     packed: GpuPacked,
     rgba: Buffer,

@@ -1,4 +1,4 @@
-//! Views by the device and by the CPU.
+//! Checks of rendering: views of the device compared with the CPU's.
 
 use super::*;
 
@@ -90,7 +90,6 @@ fn unit(v: &[f32]) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fields::Pruning;
     use crate::renderers::supervised::Unserved;
     use crate::renderers::volume::Traced;
 
