@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Most anonymous memory of a command: benches/anonymous.sh COMMAND...; prints KiB on stderr when it ends. Linux.
+# Measures the peak anonymous memory of a command and prints it in KiB on stderr (Linux): benches/anonymous.sh COMMAND...
 "$@" &
 pid=$!
 peak=0

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Trains every capture with the defaults and prints one table, so that no default is chosen on one of them:
+# Trains every capture with the defaults and prints one table, so that no default is chosen on one capture alone:
 #
 #     benches/captures.sh [--seconds 120] [--out FOLDER] CAPTURE[:DOWNSCALE]… [-- OPTIONS OF diorama train]
 #
-# DIORAMA names the program (target/release/diorama). Runs, scores and renders beside photographs stay in FOLDER
-# (target/captures); a run that is there already is judged again, not trained again.
+# DIORAMA names the program (target/release/diorama). Runs, scores, and renders beside photographs are written to FOLDER
+# (target/captures). An existing run is scored again, not trained again.
 set -euo pipefail
 diorama="${DIORAMA:-target/release/diorama}" seconds=120 out=target/captures
 captures=() options=()

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Measures this machine's CPU: ops, the training step on fox and lego, the lesser instruction sets.
-# usage: benches/cpu.sh DIORAMA DATA OUT     DATA holds fox/ and lego/; OUT gets one JSON file per figure.
+# Measures this machine's CPU: ops, the training step on fox and lego, and the lower instruction sets.
+# usage: benches/cpu.sh DIORAMA DATA OUT     DATA contains fox/ and lego/; one JSON file per figure is written to OUT.
 set -euo pipefail
 diorama=$1 data=$2 out=$3
 mkdir -p "$out"

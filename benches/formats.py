@@ -1,4 +1,4 @@
-"""Checks exported meshes with readers that this project did not write: Blender (GLB, OBJ, PLY, STL, DAE), usd-core (USDZ),
+"""Checks exported meshes with independent readers: Blender (GLB, OBJ, PLY, STL, DAE), usd-core (USDZ),
 pycollada (DAE), trimesh (GLB, OBJ, PLY, STL); and point clouds with trimesh (PLY), laspy (LAS), pye57 (E57).
 
     diorama export RUN -o OUT/m.{glb,obj,ply,stl,usdz,dae} ...
@@ -54,7 +54,7 @@ if bpy:
         read(f"{stem}.{kind}")
         (thing,) = [o for o in bpy.data.objects if o.type == "MESH"]
         pictures = [f'{i.name} {i.size[0]} x {i.size[1]}' for i in bpy.data.images]
-        looks = f"images {pictures}, uvs {len(thing.data.uv_layers)}, colours {len(thing.data.color_attributes)}"
+        looks = f"images {pictures}, uvs {len(thing.data.uv_layers)}, colors {len(thing.data.color_attributes)}"
         note(f"blender {kind}", [thing.matrix_world @ v.co for v in thing.data.vertices], looks)
 elif stem == "--points":
     import laspy

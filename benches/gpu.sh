@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Checks and measures one GPU: every op, the training step, PSNR against time, frames per second. Under 10 minutes.
 # usage: benches/gpu.sh DIORAMA DEVICE DATA OUT
-#   DEVICE is cuda, vulkan, metal or webgpu; DATA holds fox/ and lego/; OUT gets JSON files and a table on stdout.
+#   DEVICE is cuda, vulkan, metal or webgpu; DATA contains fox/ and lego/; JSON files are written to OUT, a table to stdout.
 set -euo pipefail
 diorama=$1 device=$2 data=$3 out=$4
 mkdir -p "$out"
@@ -10,7 +10,7 @@ mkdir -p "$out"
     nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader 2>/dev/null || true
     "$diorama" doctor
 } >"$out/machine.txt"
-# Memory in use on the card, sampled while all of this runs.
+# Memory in use on the card, sampled during all measurements.
 if command -v nvidia-smi >/dev/null; then
     nvidia-smi --query-gpu=memory.used --format=csv,noheader -lms 200 >"$out/memory.csv" &
     trap 'kill %1' EXIT

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Installs the foreign readers that crates/cli/tests/readers.rs hands exported meshes to, into FOLDER (DIORAMA_READERS, or target/readers):
-# trimesh, pycollada, usd-core, laspy and pye57 in a virtual environment, Khronos' glTF validator for Node.js; and ffmpeg 9 as
-# FOLDER/ffmpeg (DIORAMA_NEW_FFMPEG), where the machine's own may be older than the options of today.
+# Installs the independent readers with which crates/cli/tests/readers.rs opens exported meshes, into FOLDER (DIORAMA_READERS, or target/readers):
+# trimesh, pycollada, usd-core, laspy and pye57 in a virtual environment, Khronos's glTF validator for Node.js; and ffmpeg 9 as
+# FOLDER/ffmpeg (DIORAMA_NEW_FFMPEG), because the machine's own may lack recent options.
 #
 #     benches/readers.sh target/readers
 set -euo pipefail

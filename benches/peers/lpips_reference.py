@@ -1,9 +1,9 @@
-"""Numbers that crates/engine/src/metrics/lpips.rs and crates/data/src/weights.rs are tested against.
+"""Reference values for the tests of crates/engine/src/metrics/lpips.rs and crates/data/src/weights/mod.rs.
 
 pip install torch lpips; python benches/peers/lpips_reference.py [FOLDER]
 
-Prints the distances that the Python package `lpips` finds with weights of a small generator, which the tests
-repeat, so that no weights are kept and the tests need no Python. With FOLDER, writes one small state_dict there in
+Prints the distances that the Python package `lpips` computes with weights from a small generator. The tests use
+the same generator, so that no weights are stored and the tests need no Python. With FOLDER, writes one small state_dict there in
 both formats of torch.save.
 """
 

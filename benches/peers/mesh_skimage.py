@@ -3,7 +3,7 @@
     diorama bench mesh RUN --resolution 512 --save-grid GRID.npy
     python3 benches/peers/mesh_skimage.py GRID.npy LEVEL [REPEATS]
 
-Prints vertices, faces, the median time and the most memory in use above the grid.
+Prints vertices, faces, the median time, and the peak memory above the grid.
 """
 import os
 import sys

@@ -1,6 +1,6 @@
 """The NeRF network in PyTorch, with the weights that diorama wrote: prints the largest differences.
 
-Usage: nerf_forward.py FOLDER, where FOLDER holds weights.f32, points.f32 [N, 3] in [-1, 1], dirs.f32 [N, 3],
+Usage: nerf_forward.py FOLDER, where FOLDER contains weights.f32, points.f32 [N, 3] in [-1, 1], dirs.f32 [N, 3],
 sigma.f32 [N] and rgb.f32 [N, 3], as crates/pipelines/tests/nerf_torch.rs writes them.
 """
 

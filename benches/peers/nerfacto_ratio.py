@@ -7,7 +7,7 @@
 FOX is a capture with transforms.json and photographs of one size. Both train on the photographs at 1/4 size with
 every eighth one held out, one after the other on the same threads: nerfacto through nerfstudio's own Trainer, with
 its own losses, samplers and schedule in PyTorch, which is the only implementation of it for CPUs. nerfacto's PSNR
-is taken over a fixed random subset of each held-out view's pixels, because it takes minutes to draw one.
+is taken over a fixed random subset of each held-out view's pixels, because it takes minutes to render one view.
 """
 import argparse
 import copy

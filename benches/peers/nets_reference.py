@@ -1,5 +1,5 @@
-"""Networks at reduced width in PyTorch: random weights, inputs, outputs, and gradients of the inputs, as the fixtures that
-crates/nets/src/modules/tests.rs compares with. Run it with PyTorch and torchvision:
+"""Networks at reduced width in PyTorch: random weights, inputs, outputs, and gradients of the inputs, as the fixtures of
+crates/nets/src/modules/tests.rs. Run it with PyTorch and torchvision:
 
     python benches/peers/nets_reference.py crates/nets/tests/data
 """

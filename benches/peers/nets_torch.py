@@ -3,7 +3,7 @@
     cargo build --release
     python benches/peers/nets_torch.py target/release/diorama [--threads N] [--rounds N] [NAME...]
 
-Ours and PyTorch's take turns, each in a process of its own, so that the peak memory of a network is its own; medians of the rounds
+Ours and PyTorch's alternate. Each network runs in its own process, so that its peak memory can be measured. Medians of the rounds
 are compared. PyTorch's figure is the better of its two layouts.
 """
 

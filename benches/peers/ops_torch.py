@@ -1,7 +1,7 @@
 """Times the CPU ops of networks in PyTorch and in ours, in one call, and prints the ratios (above 1: ours is faster).
 
 Usage: ops_torch.py [NAME], for names that contain NAME, after `cargo build --release -p diorama-kernels --example ops-speed`.
-PyTorch allocates each output; so that it need not ask the system for memory each time, the C library keeps what is freed.
+PyTorch allocates each output; the C library is set to keep freed memory, so that it is not requested from the system each time.
 Backward is `autograd.grad` alone. Ours runs before and after; the faster of its medians counts, as does that of two rounds here.
 """
 

@@ -1,4 +1,4 @@
-//! Every parser of bytes that may come from strangers, as a function that must neither crash nor hang.
+//! Fuzz targets: every parser of untrusted bytes, as a function that must neither crash nor hang.
 
 use diorama_data::{
     archive, camera_path_json, checkpoint, colmap, import, llff, photo, photo_import, sparse_ply, splat_ply, transforms_json, weights,
@@ -12,14 +12,14 @@ use diorama_pipelines::run::viewer_files;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
-/// A parser with an input that it accepts.
+/// A parser with inputs that it accepts.
 pub struct Parser {
     pub name: &'static str,
     pub run: fn(&[u8]),
     pub seeds: fn() -> Vec<Vec<u8>>,
 }
 
-/// All of them.
+/// All parsers.
 pub const PARSERS: &[Parser] = &[
     Parser { name: "transforms_json", run: transforms_json, seeds: transforms_seeds },
     Parser { name: "camera_path_json", run: camera_path, seeds: path_seeds },
@@ -41,15 +41,15 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "weights", run: load_weights, seeds: weights_seeds },
 ];
 
-/// A parser by name.
+/// The parser with a given name.
 ///
 /// # Panics
-/// When there is none of that name.
+/// If there is no parser of that name.
 pub fn parser(name: &str) -> &'static Parser {
     PARSERS.iter().find(|p| p.name == name).unwrap_or_else(|| panic!("no parser {name}"))
 }
 
-/// A folder of this process with a small photograph, in memory where the system has such.
+/// A scratch folder of this process with a small photograph, in memory if the system supports it.
 fn folder() -> &'static PathBuf {
     static FOLDER: OnceLock<PathBuf> = OnceLock::new();
     FOLDER.get_or_init(|| {
@@ -63,7 +63,7 @@ fn folder() -> &'static PathBuf {
     })
 }
 
-/// Removes what [`PARSERS`] have left.
+/// Removes the scratch folder.
 pub fn clean_up() {
     let _ = std::fs::remove_dir_all(folder());
 }
@@ -89,7 +89,7 @@ fn camera_path(data: &[u8]) {
     }
 }
 
-/// Cameras and images in one input, divided where its first byte says.
+/// Cameras and images in one input, split at the position given by its first byte.
 fn halves(data: &[u8]) -> (&[u8], &[u8]) {
     let Some((&at, rest)) = data.split_first() else { return (data, data) };
     rest.split_at((at as usize * rest.len() / 255).min(rest.len()))
@@ -105,7 +105,7 @@ fn colmap_binary(data: &[u8]) {
     let _ = std::fs::create_dir_all(folder().join("binary/images"));
     file("binary/cameras.bin", cameras);
     file("binary/images.bin", images);
-    // Points of numbers 0 and 7, which keypoints may name.
+    // Points with ids 0 and 7, to which keypoints may refer.
     let point = |id: u64| [&id.to_le_bytes()[..], &[0; 43 - 8], &0u64.to_le_bytes()].concat();
     file("binary/points3D.bin", &[&2u64.to_le_bytes()[..], &point(0), &point(7)].concat());
     let _ = colmap::read(&folder().join("binary"));
@@ -142,16 +142,16 @@ fn load_checkpoint(data: &[u8]) {
 }
 
 fn decode_photo(data: &[u8]) {
-    // The format is told by the content.
+    // The format is detected from the content.
     let path = file("photo.png", data);
-    // Mutations may claim any size; those beyond the limits must be refused, those below need not be decoded here.
+    // Mutations may claim any size. Those above the limits must be refused; those below need not be decoded here.
     if photo::size(&path).is_ok_and(|(w, h)| w as u64 * h as u64 <= 1 << 16) {
         let _ = photo::load_full(&path);
     }
     let _ = photo::is_turned(&path);
 }
 
-/// Files of formats that nothing here can write.
+/// Files in formats that this crate cannot write.
 const FILES: [&[u8]; 5] = [
     include_bytes!("../../crates/data/tests/photos/baseline.jpg"),
     include_bytes!("../../crates/data/tests/photos/progressive.jpg"),
@@ -160,7 +160,7 @@ const FILES: [&[u8]; 5] = [
     include_bytes!("../../crates/data/tests/photos/deflate.tiff"),
 ];
 
-/// A photograph that is cut off must be refused, unless nothing of it is lost: a byte names the format, two the place of the cut in
+/// A truncated photograph must be refused, unless nothing of it is lost. One byte chooses the format, two the position of the cut in
 /// 65,536ths, one the width; the others are pixels.
 fn cut_photo(data: &[u8]) {
     let [kind, low, high, width, rest @ ..] = data else { return };
@@ -187,7 +187,7 @@ fn cut_photo(data: &[u8]) {
 fn strip_jpeg(data: &[u8]) {
     if let Some(clean) = photo_import::without_metadata(data) {
         assert!(clean.len() <= data.len());
-        assert_eq!(photo_import::without_metadata(&clean).as_deref(), Some(&clean[..]), "a clean file is clean");
+        assert_eq!(photo_import::without_metadata(&clean).as_deref(), Some(&clean[..]), "removing metadata twice changes nothing");
     }
 }
 
@@ -322,11 +322,11 @@ fn run_config(data: &[u8]) {
     let Ok(text) = std::str::from_utf8(data) else { return };
     if let Ok(mut config) = Config::from_toml(text) {
         let _ = config.check();
-        // What was read is written and set as it is.
+        // A configuration that was read can be written and set.
         let _ = Config::from_toml(&config.to_toml());
         let _ = config.set("data.downscale", text);
     }
-    // A flag's value may be anything.
+    // An option's value may be anything.
     let _ = Config::new(Method::Ngp, "x".into()).set(text, text);
 }
 
@@ -355,7 +355,7 @@ fn splats(data: &[u8]) {
     let _ = splat_ply::read(&path);
 }
 
-/// The capture whose points [`sparse_points`] reads: three points, two photographs.
+/// The capture for [`sparse_points`]: three points, two photographs.
 fn sparse() -> (Vec<SparsePoint>, Vec<Frame>) {
     let point =
         |i: u32| SparsePoint { position: DVec3::new(i as f64, 2.0, -1.0), color: [10, 20, 30], error: 0.5, frames: (0..=i % 2).collect() };
@@ -397,10 +397,10 @@ fn load_weights(data: &[u8]) {
     let Ok(arrays) = weights::read(&path, &|_| true) else { return };
     let numbers: usize = arrays.iter().map(|a| a.values.len()).sum();
     assert!(numbers <= data.len(), "{numbers} numbers of {} bytes", data.len());
-    assert!(arrays.iter().all(|a| a.shape.iter().product::<usize>() == a.values.len()), "arrays are as large as their shapes say");
+    assert!(arrays.iter().all(|a| a.shape.iter().product::<usize>() == a.values.len()), "array lengths match their shapes");
 }
 
-/// What PyTorch wrote in both of its formats, and a safetensors file.
+/// Files that PyTorch wrote in both formats, and a safetensors file.
 fn weights_seeds() -> Vec<Vec<u8>> {
     let of_torch =
         [&include_bytes!("../../crates/data/tests/data/small.pth")[..], include_bytes!("../../crates/data/tests/data/small_legacy.pth")];

@@ -1,4 +1,4 @@
-//! Mutates accepted inputs without looking at coverage, on any toolchain: `cargo run --release -p diorama-fuzz -- RUNS [PARSER…]`. For
+//! Mutates accepted inputs without coverage guidance, on any toolchain: `cargo run --release -p diorama-fuzz -- RUNS [PARSER…]`. For
 //! coverage-guided runs see TESTING.md.
 
 use diorama_fuzz::{PARSERS, Parser, clean_up};
@@ -6,12 +6,12 @@ use diorama_geom::rng::Rng;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-/// The longest that one input may take.
+/// Time limit of one input.
 const LONGEST: Duration = Duration::from_secs(5);
-/// The longest that one parser is fuzzed.
+/// Time limit of one parser.
 const BUDGET: Duration = Duration::from_secs(600);
 
-/// What is being parsed, for the report of a crash.
+/// The parser and input at work, for the report of a crash.
 static INPUT: Mutex<Vec<u8>> = Mutex::new(Vec::new());
 
 fn main() {
@@ -58,7 +58,7 @@ fn fuzz(p: &Parser, runs: u64) -> (u64, f64) {
     (runs, begin.elapsed().as_secs_f64())
 }
 
-/// A seed with up to eight changes: bits flipped, bytes set to edges, numbers, parts cut, doubled, moved or exchanged.
+/// A seed with up to eight changes: flipped bits, extreme bytes, numbers, and parts that are cut, doubled, moved or swapped.
 fn mutated(seeds: &[Vec<u8>], rng: &Rng) -> Vec<u8> {
     let mut counter = 0u64;
     let mut next = |n: usize| {

@@ -1,9 +1,9 @@
-//! What `.ci/run` must do before the tests: install what they look for, and make its absence a failure.
+//! Checks `.ci/run`: it must install what tests need before they run, and turn its absence into a failure.
 
-/// Packages whose absence would leave tests out.
+/// Packages without which tests would be skipped.
 const INSTALLED: [&str; 8] =
     ["mesa-vulkan-drivers", "g++", "chromium", "npm", "ffmpeg", "python3-venv", "python3-torch", "build-essential"];
-/// Variables that make a test fail, or run at all, where it would be skipped.
+/// Variables that make a test fail, or run, instead of being skipped.
 const REQUIRED: [&str; 6] = [
     "DIORAMA_REQUIRE_READERS=1",
     "DIORAMA_REQUIRE_FFMPEG=1",
@@ -15,14 +15,14 @@ const REQUIRED: [&str; 6] = [
 /// Checks that need a device or a browser.
 const CHECKS: [&str; 3] = ["cargo xtask gpu-check vulkan", "cargo xtask gpu-check webgpu,cuda", "cargo xtask viewer-check"];
 
-/// What is wrong with a script, one line each.
+/// Faults of a script, one line each.
 fn faults(script: &str) -> Vec<String> {
     let lines: Vec<&str> = script.lines().map(str::trim).filter(|l| !l.starts_with('#')).collect();
     let Some(tests) = lines.iter().position(|l| *l == "cargo xtask ci") else { return vec!["it runs no tests".into()] };
     let (before, after) = lines.split_at(tests);
     let mut out = Vec::new();
     if !lines.iter().any(|l| l.starts_with("set -e") && l.contains("pipefail")) {
-        out.push("it goes on after a failure".into());
+        out.push("it continues after a failure".into());
     }
     let words = |start: &str| -> Vec<&str> { before.iter().filter(|l| l.starts_with(start)).flat_map(|l| l.split_whitespace()).collect() };
     let (needed, exported) = (words("need '"), words("export "));
@@ -47,7 +47,7 @@ fn the_script_installs_before_it_tests_and_lets_nothing_be_skipped() {
     let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
     let script = std::fs::read_to_string(root.join(".ci/run")).unwrap();
     assert_eq!(faults(&script), Vec::<String>::new());
-    // Each of these would leave tests out.
+    // Each of these changes would skip tests.
     let tests = "\ncargo xtask ci\n";
     let without_tests = script.replace(tests, "\n");
     let (head, rest) = without_tests.split_once("\nmissing=()").unwrap();

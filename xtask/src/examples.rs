@@ -1,10 +1,10 @@
-//! The workspace's examples: all are built, and those of a list are run, each into a folder of its own.
+//! The workspace's examples: all are built, and those in a list are run, each in its own folder.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Examples that are run with a folder as their argument, and files that each must write there.
+/// Examples that are run with a folder as argument, and the files that each must write there.
 const RUN: [(&str, &[&str]); 9] = [
     ("cube", &["cube.glb", "cube.obj", "cube.ply", "cube.stl", "cube.usdz", "cube.dae"]),
     ("custom_loss", &["squares.png", "cauchy.png"]),
@@ -17,7 +17,7 @@ const RUN: [(&str, &[&str]); 9] = [
     ("train_from_code", &["view.png", "run/summary.json"]),
 ];
 
-/// Examples that are only built, and why.
+/// Examples that are only built, with the reason.
 const BUILT: [(&str, &str); 4] = [
     ("graph-check", "needs a device; `cargo xtask gpu-check` runs it"),
     ("ops-speed", "measures for minutes"),
@@ -25,11 +25,11 @@ const BUILT: [(&str, &str); 4] = [
     ("photographs", "renders a large capture"),
 ];
 
-/// Most lines of an example that is run, and the longest that it may take.
+/// Longest example that is run, in lines, and the time limit of a run.
 const LINES: usize = 150;
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIME_LIMIT: Duration = Duration::from_secs(60);
 
-/// Builds all examples and runs those of the list; whether all did what they say.
+/// Builds all examples and runs those in the list; returns whether all succeeded.
 pub fn run() -> bool {
     let mut breaches = check(&sources(Path::new("crates")));
     let built = crate::cargo(&["build", "--release", "--quiet", "--workspace", "--examples"]);
@@ -50,7 +50,7 @@ pub fn run() -> bool {
     breaches.is_empty()
 }
 
-/// Runs an example to its end and looks for what it writes.
+/// Runs an example and checks the files that it writes.
 fn run_one(name: &str, folder: &Path, files: &[&str]) -> Result<(), String> {
     std::fs::create_dir_all(folder).map_err(|e| format!("{}: {e}", folder.display()))?;
     let mut command = Command::new(Path::new("target/release/examples").join(name));
@@ -59,11 +59,11 @@ fn run_one(name: &str, folder: &Path, files: &[&str]) -> Result<(), String> {
     let status = loop {
         match child.try_wait() {
             Ok(Some(status)) => break status,
-            Ok(None) if start.elapsed() < PATIENCE => std::thread::sleep(Duration::from_millis(20)),
+            Ok(None) if start.elapsed() < TIME_LIMIT => std::thread::sleep(Duration::from_millis(20)),
             Ok(None) => {
                 let _ = child.kill();
                 let _ = child.wait();
-                return Err(format!("takes more than {} s", PATIENCE.as_secs()));
+                return Err(format!("takes more than {} s", TIME_LIMIT.as_secs()));
             }
             Err(e) => return Err(e.to_string()),
         }
@@ -87,7 +87,7 @@ fn sources(crates: &Path) -> Vec<(String, String)> {
     found
 }
 
-/// Examples that no list names, names without an example, and examples that are run and too long or do not say what they show.
+/// Examples in no list, listed names without an example, and examples that are too long or lack a first line of description.
 fn check(sources: &[(String, String)]) -> Vec<String> {
     let listed = || RUN.iter().map(|r| r.0).chain(BUILT.iter().map(|b| b.0));
     let mut breaches = Vec::new();
@@ -104,7 +104,7 @@ fn check(sources: &[(String, String)]) -> Vec<String> {
         }
     }
     let gone = listed().filter(|l| !sources.iter().any(|s| s.0 == *l));
-    breaches.extend(gone.map(|l| format!("{l}: is listed in xtask/src/examples.rs and is gone")));
+    breaches.extend(gone.map(|l| format!("{l}: is listed in xtask/src/examples.rs but does not exist")));
     breaches
 }
 

@@ -1,4 +1,4 @@
-//! Chores: `cargo xtask ci`, `examples`, `gpu-check`, `viewer-check` and `tidy`.
+//! Development tasks: `cargo xtask ci`, `examples`, `gpu-check`, `viewer-check` and `tidy`.
 
 #[cfg(test)]
 mod ci_script;
@@ -39,23 +39,23 @@ fn installed(tool: &str) -> bool {
     Command::new("cargo").args([tool, "--version"]).stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
 }
 
-/// The libraries' tests with a lesser instruction set than this machine's best.
+/// Runs the library tests with a lower instruction set than this machine's best.
 fn libraries_at(level: &str) -> bool {
     println!("\n$ DIORAMA_SIMD={level} cargo test --release --workspace --lib");
     let args = ["test", "--release", "--workspace", "--lib", "--", "--quiet"];
     Command::new("cargo").args(args).env("DIORAMA_SIMD", level).status().is_ok_and(|s| s.success())
 }
 
-/// Every parser with so many mutated inputs. Built with the workspace, so that what the tests were built with serves here too.
+/// Runs every parser with mutated inputs. Built with the whole workspace, so that the test build is reused.
 fn fuzz(runs: &str) -> bool {
     let built = cargo(&["build", "--release", "--quiet", "--workspace", "--bin", "diorama-fuzz"]);
     built && Command::new("target/release/diorama-fuzz").arg(runs).status().is_ok_and(|s| s.success())
 }
 
-/// Builds once for devices, separated by commas, and compares every op on each with its reference. Where the build is not the default one,
-/// which holds nothing of burn, ops in burn's graph are compared as well.
+/// Builds once for devices, separated by commas, and compares every op on each with its reference. Builds other than the default one
+/// contain burn's GPU backend; there, ops in burn's graph are compared too.
 fn gpu_check(devices: &str) -> bool {
-    // Vulkan, or Metal on macOS, is what the default build holds, so that nothing is built anew for it.
+    // The default build includes Vulkan (Metal on macOS), so these devices need no other build.
     let features: Vec<&str> = devices.split(',').map(|d| if ["vulkan", "metal"].contains(&d) { "native" } else { d }).collect();
     let features = features.join(",");
     let with_graph = features != "native";
@@ -66,7 +66,7 @@ fn gpu_check(devices: &str) -> bool {
     if !step("build", cargo(&build)) {
         return false;
     }
-    // Training is compared on a real capture where there is one.
+    // Training is compared on a real capture if there is one.
     let fox = std::env::var("DIORAMA_TEST_DATA").map(|d| format!("{d}/fox")).unwrap_or_default();
     let mut ok = true;
     for device in devices.split(',') {
@@ -82,12 +82,12 @@ fn gpu_check(devices: &str) -> bool {
     ok
 }
 
-/// Runs a check, with the CPU playing CUDA where there is no such device.
+/// Runs a check, with CUDA emulated on the CPU if there is no such device.
 fn on_device(device: &str, program: &str, args: &[&str]) -> bool {
     println!("\n$ {program} {}", args.join(" "));
     let mut check = Command::new(program);
     check.args(args);
-    let ready = device != "cuda" || has_nvidia() || play_cuda(&mut check);
+    let ready = device != "cuda" || has_nvidia() || emulate_cuda(&mut check);
     ready && check.status().is_ok_and(|s| s.success())
 }
 
@@ -95,12 +95,12 @@ fn has_nvidia() -> bool {
     Command::new("nvidia-smi").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
 }
 
-/// Has the CPU play CUDA's driver and compiler for a command; whether they could be built.
-fn play_cuda(command: &mut Command) -> bool {
+/// Sets a command up to use the CPU emulation of CUDA's driver and compiler; returns whether they could be built.
+fn emulate_cuda(command: &mut Command) -> bool {
     let (source, to) = (std::path::absolute("stubs/cuda-on-cpu"), std::path::absolute("target/cuda-on-cpu"));
     let (Ok(source), Ok(to)) = (source, to) else { return false };
-    println!("no NVIDIA driver here: the CPU plays CUDA");
-    // Kernels that an earlier driver compiled are no use.
+    println!("no NVIDIA driver found: CUDA is emulated on the CPU");
+    // Kernels cached by an earlier build of the emulation must not be used.
     let _ = std::fs::remove_dir_all(&to);
     let library = to.join("libcuda.so");
     command.env("CUDA_PATH", &source).env("LD_LIBRARY_PATH", &to);
@@ -121,7 +121,7 @@ fn ci() -> bool {
     let (passed, failed, skipped) = tests();
     ok &= step("tests", failed == 0 && passed > 0);
     for level in ["portable", "avx2"] {
-        // A level that this machine lacks falls back to the best it has.
+        // A level that this machine lacks falls back to the best available one.
         ok &= step(level, libraries_at(level));
     }
     ok &= step("examples", examples::run());
@@ -134,12 +134,12 @@ fn ci() -> bool {
             println!("skipped {tool}: not installed");
         }
     }
-    println!("\n{passed} tests ran, {skipped} skipped for want of data or tools; GPU cases are run by `cargo xtask gpu-check`");
+    println!("\n{passed} tests ran, {skipped} skipped because data or tools are missing; GPU cases are run by `cargo xtask gpu-check`");
     println!("{passed} passed, {failed} failed, {skipped} skipped");
     ok
 }
 
-/// Runs the tests and counts results; a test that prints a line `skipped: …` counts as skipped.
+/// Runs the tests and counts the results; a test that prints a line `skipped: …` counts as skipped.
 fn tests() -> (usize, usize, usize) {
     let args = ["test", "--release", "--workspace", "--no-fail-fast", "--", "--show-output"];
     println!("\n$ cargo {}", args.join(" "));
@@ -167,7 +167,7 @@ fn tests() -> (usize, usize, usize) {
     (passed.saturating_sub(skipped), failed, skipped)
 }
 
-/// The viewer's page: types, bundle as fresh as its sources, and the whole of it in headless Chromium.
+/// The viewer's page: type checks, a bundle that matches its sources, and all page checks in headless Chromium.
 fn viewer_check() -> bool {
     let web = std::path::Path::new("crates/viewer/web");
     let npm = |args: &[&str]| {
@@ -175,14 +175,14 @@ fn viewer_check() -> bool {
         Command::new("npm").args(args).current_dir(web).status().is_ok_and(|s| s.success())
     };
     let read = || ["app.js", "app.css", "index.html"].map(|f| std::fs::read(web.join("dist").join(f)).unwrap_or_default());
-    // esbuild's program comes with its package; no script of any package runs.
+    // esbuild's program is part of its package; install scripts of packages are not run.
     let mut ok = step("packages", npm(&["ci", "--ignore-scripts", "--no-audit", "--no-fund"]));
     ok &= step("types", npm(&["run", "check"]));
     let before = read();
     ok &= step("bundle", npm(&["run", "build"]) && read() == before);
     let run = std::env::temp_dir().join(format!("diorama-viewer-check-{}", std::process::id()));
     let diorama = "target/release/diorama";
-    // The page is also shown a source of layers and controls that no run has.
+    // The page is also tested with a source whose layers and controls no run has.
     let made = cargo(&["build", "--release"])
         && cargo(&["build", "--release", "-p", "diorama-viewer", "--example", "own_picture"])
         && Command::new(diorama)

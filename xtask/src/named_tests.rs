@@ -1,8 +1,8 @@
-//! TESTING.md's table of defects: every test that it names is there.
+//! Checks that every test named in TESTING.md's table of defects exists.
 
 use std::path::Path;
 
-/// Files and tests of the table's rows: `` `FILE` `::TEST`, `::TEST` ``.
+/// Files and tests in the table's rows: `` `FILE` `::TEST`, `::TEST` ``.
 fn named(text: &str) -> Vec<(String, String)> {
     let rows = text.lines().skip_while(|l| *l != "## Defects and their tests").filter(|l| l.starts_with("| "));
     let mut out = Vec::new();

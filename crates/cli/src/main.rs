@@ -12,7 +12,7 @@ use std::process::ExitCode;
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// Parses, runs, reports.
+/// Parses the arguments, runs the command, reports errors.
 fn main() -> ExitCode {
     diorama_kernels::device::quiet_drivers();
     diorama_kernels::device::settle_cuda_path();

@@ -1,5 +1,5 @@
-//! `println!` and `eprintln!` of this program: unlike those of the standard library, which they shadow, they do not panic where
-//! nobody reads on, as in `diorama info RUN | head -1`. The work goes on and the exit code is that of the work.
+//! `println!` and `eprintln!` of this program, which shadow those of the standard library. They do not panic if the reader has closed the
+//! pipe, as in `diorama info RUN | head -1`: the work continues, and the exit code is that of the work.
 
 use std::fmt::Arguments;
 use std::io::{ErrorKind, Write};
@@ -12,14 +12,13 @@ macro_rules! eprintln {
     ($($text:tt)*) => { $crate::print::error_line(format_args!($($text)*)) };
 }
 
-/// Writes a line to stdout. Ends the program with exit code 1 where the line cannot be written although somebody reads, as on a
-/// full disk.
+/// Writes a line to stdout. Ends the program with exit code 1 if the line cannot be written although the pipe is open, as on a full disk.
 pub fn line(text: Arguments) {
     let mut out = std::io::stdout().lock();
     finish(out.write_fmt(text).and_then(|()| out.write_all(b"\n")));
 }
 
-/// Writes bytes to stdout, as `line`.
+/// Writes bytes to stdout, like `line`.
 pub fn bytes(text: &[u8]) {
     let mut out = std::io::stdout().lock();
     finish(out.write_all(text).and_then(|()| out.flush()));
@@ -34,7 +33,7 @@ fn finish(written: std::io::Result<()>) {
     }
 }
 
-/// Writes a line to stderr; there is nobody to tell if that fails.
+/// Writes a line to stderr. A failure is ignored, because it could not be reported.
 pub fn error_line(text: Arguments) {
     let mut out = std::io::stderr().lock();
     let _ = out.write_fmt(text).and_then(|()| out.write_all(b"\n"));

@@ -7,17 +7,17 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
-/// Seconds between progress lines where there is no terminal.
+/// Seconds between progress lines without a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(5);
-/// Share of the work before which the time left is not guessed.
-const TOO_EARLY: f64 = 0.01;
+/// Share of the work before which no remaining time is estimated.
+const MIN_SHARE: f64 = 0.01;
 
 /// Exit codes (DESIGN: 0 done, 1 the work failed, 2 bad input or usage, 130 interrupted).
 pub const FAILED: u8 = 1;
 pub const USAGE: u8 = 2;
 pub const INTERRUPTED: u8 = 130;
 
-/// Prints an error in one line, and as JSON on stdout where asked; returns the exit code.
+/// Prints an error in one line, and as JSON on stdout if requested; returns the exit code.
 pub fn report(error: &PipelineError, json: bool) -> u8 {
     let line = error.to_string().replace('\n', " ");
     eprintln!("diorama: {line}");
@@ -55,7 +55,7 @@ impl Progress {
 
     pub fn event(&mut self, event: &Event) {
         match event {
-            Event::Started { step, .. } if *step > 0 => self.line(&format!("going on at step {step}")),
+            Event::Started { step, .. } if *step > 0 => self.line(&format!("continuing at step {step}")),
             Event::Started { .. } | Event::Saved { .. } => {}
             Event::Progress { step, seconds, progress, loss, scalars } => {
                 let mut text = format!("step {step}  {seconds:.0} s  {}", shown("", "loss", *loss));
@@ -88,7 +88,7 @@ fn shown(before: &str, name: &str, value: f64) -> String {
     format!("{before}{} {}", label(name), text(name, value))
 }
 
-/// Shows work whose done share is known: a bar on a terminal, a line every few seconds elsewhere, both with the time left.
+/// Shows the progress of work with a known share: a bar on a terminal, otherwise a line every few seconds; both with the remaining time.
 pub struct ShareShown {
     bar: Option<ProgressBar>,
     begin: Instant,
@@ -105,7 +105,7 @@ impl ShareShown {
         ShareShown { bar, begin: Instant::now(), last_line: None }
     }
 
-    /// Tells that `share` of the work is done and what is being done.
+    /// Sets the completed share and the description of the work.
     pub fn show(&mut self, share: f64, text: &str) {
         let now = Instant::now();
         let left = time_left(now - self.begin, share);
@@ -119,8 +119,8 @@ impl ShareShown {
         }
     }
 
-    /// Whether the last line is old enough for another, which then counts as the last. The first comes as soon as the time left
-    /// is known.
+    /// Whether enough time has passed since the last line; the next one is then counted as printed. The first line is printed as soon as
+    /// the remaining time is known.
     fn is_line_due(&mut self, now: Instant, is_known: bool) -> bool {
         let due = match self.last_line {
             Some(last) => now.duration_since(last) >= LINE_EVERY,
@@ -132,7 +132,7 @@ impl ShareShown {
         due
     }
 
-    /// A line that stays, above the bar.
+    /// Prints a permanent line above the bar.
     pub fn line(&self, text: &str) {
         match &self.bar {
             Some(b) => b.suspend(|| eprintln!("{text}")),
@@ -147,9 +147,9 @@ impl ShareShown {
     }
 }
 
-/// Time left in words, if the rest goes on as fast; none where too little is done to tell.
+/// Remaining time in words, assuming constant speed; `None` if too little is done for an estimate.
 fn time_left(elapsed: Duration, share: f64) -> Option<String> {
-    if share < TOO_EARLY {
+    if share < MIN_SHARE {
         return None;
     }
     let seconds = elapsed.as_secs_f64() * (1.0 - share.min(1.0)) / share;

@@ -1,5 +1,5 @@
-//! Twenty faults that a trusted system survives, against the program as it is shipped. Each test is named after its fault; faults of
-//! formats that the program does not read are met by refusing the file.
+//! Twenty faults that a trusted system survives, tested on the release program. Each test is named after its fault. For formats that the
+//! program does not read, the file must be refused.
 
 #[path = "program/mod.rs"]
 mod support;
@@ -30,7 +30,7 @@ struct Good {
     run: PathBuf,
 }
 
-/// A good capture with a short run on it, made once.
+/// A valid capture with a short run on it, made once.
 fn good() -> &'static Good {
     static GOOD: OnceLock<Good> = OnceLock::new();
     GOOD.get_or_init(|| {
@@ -55,7 +55,7 @@ fn edit(capture: &Path, change: impl FnOnce(&mut serde_json::Value)) {
     std::fs::write(file, json.to_string()).unwrap();
 }
 
-/// One line that names the fault, the given exit code, no panic.
+/// Expects one line that names the fault, the given exit code, and no panic.
 #[track_caller]
 fn fails(o: &Output, code: i32, expected: &[&str]) {
     let text = String::from_utf8_lossy(&o.stderr);
@@ -68,7 +68,7 @@ fn fails(o: &Output, code: i32, expected: &[&str]) {
     }
 }
 
-/// Trains on a spoiled copy of the good capture: refused, and nothing is left behind.
+/// Trains on a damaged copy of the valid capture: it must be refused and leave nothing behind.
 #[track_caller]
 fn refused(expected: &[&str], spoil: impl FnOnce(&Path)) {
     let (dir, capture) = copy(&good().capture);
@@ -78,7 +78,7 @@ fn refused(expected: &[&str], spoil: impl FnOnce(&Path)) {
     assert!(!run.exists(), "something was left behind");
 }
 
-/// A file that is no capture, under a name that says what it is.
+/// A file that is not a capture, under a name that says what it is.
 #[track_caller]
 fn not_read(name: &str, content: &[u8]) {
     let dir = tempfile::tempdir().unwrap();
@@ -92,7 +92,7 @@ fn not_read(name: &str, content: &[u8]) {
 
 #[test]
 fn fault_01_kill_in_a_save_leaves_a_file_that_loads_and_no_stale_temporaries() {
-    // Random kills are in kill_and_resume.rs; here what such a kill leaves is put there by hand.
+    // Random kills are tested in kill_and_resume.rs; this test places the leftovers of such a kill by hand.
     let (_dir, run) = copy(&good().run);
     let partial = run.join("checkpoints/latest.safetensors.partial");
     std::fs::write(&partial, b"half").unwrap();
@@ -148,7 +148,7 @@ fn fault_02_a_full_disk_names_the_file_and_keeps_the_old_one() {
         "cpu",
     ]);
     fails(&o, 1, &["frames/", "cannot write"]);
-    // A run that finds no room for its checkpoint.
+    // A run whose checkpoint does not fit on the disk.
     std::fs::remove_dir_all(&frames).unwrap();
     let o = train(&good().capture, &small.0.join("run"), &["--steps", "4", "--set", "field.log2_size=16"]);
     fails(&o, 1, &["small/run", "cannot write"]);
@@ -228,7 +228,7 @@ fn fault_05_a_checkpoint_of_another_version_is_told() {
 #[test]
 fn fault_06_numbers_that_are_not_finite_name_the_frame_and_never_reach_a_checkpoint() {
     refused(&["frames[1].transform_matrix"], |c| edit(c, |j| j["frames"][1]["transform_matrix"][0][3] = 1e300.into()));
-    // A rate at which the loss leaves all bounds after one step: begun again once, then stopped.
+    // With this learning rate the loss becomes non-finite after one step: the run is restarted once, then stopped.
     let dir = tempfile::tempdir().unwrap();
     let run = dir.path().join("run");
     let wild = ["--method", "mlp", "--steps", "8", "--set", "sampling.rays=64", "--set", "sampling.samples=8", "--set", "optim.rate=1e30"];
@@ -237,7 +237,7 @@ fn fault_06_numbers_that_are_not_finite_name_the_frame_and_never_reach_a_checkpo
     assert!(told.contains("step 1: the loss was not finite; the rate is lowered; back to step 0"), "{told}");
     fails(&o, 1, &["not finite at step 1, and again at step 1", "no checkpoint yet", "--set optim.rate"]);
     assert!(!told.contains("safetensors") && !run.exists(), "{told}");
-    // The same in a run that has a checkpoint: it is named, whole and finite.
+    // The same in a run that has a checkpoint, which stays valid and finite.
     let gentle = ["--method", "mlp", "--steps", "2", "--set", "sampling.rays=64", "--set", "sampling.samples=8"];
     assert!(train(&good().capture, &run, &gentle).status.success());
     let mut c = program();
@@ -313,7 +313,7 @@ fn fault_12_zip_slips_links_and_bombs() {
     fails(&make(&|w| w.add_symlink("images", "/etc", zip::write::SimpleFileOptions::default()).unwrap()), 2, &["is a link"]);
     fails(&make(&|w| put(w, "b", &vec![0; 16 << 20])), 2, &["a bomb"]);
     assert_eq!(dir.path().read_dir().unwrap().count(), 1, "something was unpacked");
-    // A good one trains.
+    // A valid capture trains.
     let o = make(&|w| {
         put(w, "chair/transforms.json", &std::fs::read(good().capture.join("transforms.json")).unwrap());
         for e in good().capture.join("images").read_dir().unwrap().flatten() {
@@ -361,7 +361,7 @@ fn fault_15_a_ply_that_claims_too_many_vertices() {
     std::fs::write(&file, claim).unwrap();
     fails(&diorama(&["view", file.to_str().unwrap(), "--port", "0"]), 2, &["claim.ply", "room"]);
     std::fs::remove_file(&file).unwrap();
-    // Named by a capture it is refused, too.
+    // It is also refused if a capture names it.
     let (dir, capture) = copy(&good().capture);
     std::fs::write(capture.join("x.ply"), b"ply\nformat ascii 1.0\nelement vertex 4000000000000\nend_header\n").unwrap();
     edit(&capture, |j| j["ply_file_path"] = "x.ply".into());
@@ -388,13 +388,13 @@ fn fault_18_pickles_are_not_read() {
     fails(&diorama(&["eval", run.to_str().unwrap()]), 2, &["latest.safetensors"]);
 }
 
-/// Weights are read from pickles, but nothing in them runs.
+/// Weights are read from pickles, but nothing in them is executed.
 #[test]
 fn fault_18_weights_that_would_run_a_program_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let (file, owned) = (dir.path().join("weights.pth"), dir.path().join("owned"));
     let command = format!("touch {}", owned.display());
-    // What torch.save wrote before 1.6: a magic number, a version, the system, and then a call instead of names and tensors.
+    // The format of torch.save before 1.6: a magic number, a version, system information, and then a call instead of names and tensors.
     let mut bytes =
         b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.\x80\x02M\xe9\x03.\x80\x02}.\x80\x02}X\x01\0\0\0wcposix\nsystem\nX"
             .to_vec();
@@ -426,7 +426,7 @@ fn fault_19_hostile_pages_slow_clients_and_huge_frames() {
     let ask = |head: &str| {
         let mut s = TcpStream::connect(&host).unwrap();
         s.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
-        // One that is turned away may be closed before all is written.
+        // A refused connection may be closed before the request is written completely.
         let _ = s.write_all(head.as_bytes());
         let mut answer = [0; 12];
         s.read_exact(&mut answer).map(|()| String::from_utf8_lossy(&answer[9..]).into_owned()).unwrap_or_default()
@@ -436,7 +436,7 @@ fn fault_19_hostile_pages_slow_clients_and_huge_frames() {
     assert_eq!(ask(&format!("GET /socket HTTP/1.1\r\nHost: {host}\r\nOrigin: http://evil.example\r\n{socket}")), "403");
     assert_eq!(ask(&format!("GET /socket HTTP/1.1\r\nHost: evil.example\r\nOrigin: http://evil.example\r\n{socket}")), "403");
     assert_ne!(ask(&format!("GET /{} HTTP/1.1\r\nHost: {host}\r\n\r\n", "x".repeat(20_000))), "200");
-    // Sixty clients that never finish their request do not keep others out for longer than their time.
+    // Sixty clients that never finish their requests block others only until their time limit.
     let slow: Vec<TcpStream> = (0..60).filter_map(|_| TcpStream::connect(&host).ok()).collect();
     let begin = Instant::now();
     while ask(&format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n")) != "200" {
@@ -456,7 +456,7 @@ fn fault_19_hostile_pages_slow_clients_and_huge_frames() {
     assert!(child.try_wait().unwrap().is_none());
     child.kill().unwrap();
     child.wait().unwrap();
-    // The port in use.
+    // The port is in use.
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let port = taken.local_addr().unwrap().port().to_string();
     fails(&diorama(&["view", good().run.to_str().unwrap(), "--port", &port, "--device", "cpu"]), 2, &["--port", "in use"]);
@@ -484,7 +484,7 @@ fn fault_20_missing_programs_and_devices_are_told_before_any_work() {
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;
-        // A COLMAP that fails says why, with the place of its log, and the work can go on later.
+        // If COLMAP fails, the error gives the reason and the location of its log, and the work can be resumed.
         let broken = dir.path().join("colmap");
         std::fs::write(&broken, "#!/bin/sh\necho out of memory >&2\nexit 7\n").unwrap();
         std::fs::set_permissions(&broken, std::fs::Permissions::from_mode(0o755)).unwrap();

@@ -1,4 +1,4 @@
-//! Bad input gets one line that names file, field and cure, exit code 2, and leaves nothing behind.
+//! Bad input gives one line that names file, field and remedy, and exit code 2, and leaves nothing behind.
 
 use diorama_pipelines::object::quickstart::write_capture;
 use std::path::Path;
@@ -9,7 +9,7 @@ fn diorama(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_diorama")).args(args).output().unwrap()
 }
 
-/// A good capture, made once.
+/// A valid capture, made once.
 fn good() -> &'static Path {
     static GOOD: OnceLock<tempfile::TempDir> = OnceLock::new();
     GOOD.get_or_init(|| {
@@ -20,7 +20,7 @@ fn good() -> &'static Path {
     .path()
 }
 
-/// A copy of the good capture that a case may spoil.
+/// A copy of the valid capture for a test to damage.
 fn copy() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     std::fs::create_dir(dir.path().join("images")).unwrap();
@@ -38,7 +38,7 @@ fn edit(dir: &Path, change: impl FnOnce(&mut serde_json::Value)) {
     std::fs::write(file, json.to_string()).unwrap();
 }
 
-/// Trains on `data` and checks the refusal.
+/// Trains on `data` and checks that it is refused.
 #[track_caller]
 fn refused(data: &Path, extra: &[&str], expected: &[&str]) {
     let out = tempfile::tempdir().unwrap();
@@ -61,7 +61,7 @@ fn check(o: &Output, expected: &[&str]) {
     }
 }
 
-/// Spoils the JSON, then expects a refusal that names it.
+/// Damages the JSON, then expects an error that names the damage.
 #[track_caller]
 fn json_refused(expected: &[&str], change: impl FnOnce(&mut serde_json::Value)) {
     let dir = copy();
@@ -232,7 +232,7 @@ fn cameras_that_all_stand_at_one_place() {
         let first = j["frames"][0]["transform_matrix"].clone();
         j["frames"].as_array_mut().unwrap().iter_mut().for_each(|f| f["transform_matrix"] = first.clone());
     });
-    refused(dir.path(), &[], &["same place"]);
+    refused(dir.path(), &[], &["same position"]);
 }
 
 #[test]
@@ -310,7 +310,7 @@ fn folders_of_runs() {
     let before = std::fs::read(run.join("checkpoints/latest.safetensors")).unwrap();
     check(&train(&[]), &["already holds a run", "--resume"]);
     assert_eq!(std::fs::read(run.join("checkpoints/latest.safetensors")).unwrap(), before);
-    // A forced run that cannot begin leaves the earlier one alone.
+    // A forced run that cannot start leaves the earlier run unchanged.
     let spoiled = copy();
     std::fs::write(spoiled.path().join("images/view_03.png"), b"").unwrap();
     check(&diorama(&["train", spoiled.path().to_str().unwrap(), "--out", r, "--force", "--steps", "1"]), &["0 bytes"]);
@@ -328,7 +328,7 @@ fn folders_of_runs() {
     std::fs::write(out.path().join("b.glb"), b"mine").unwrap();
     check(&diorama(&["export", r, "-o", out.path().join("b.glb").to_str().unwrap()]), &["b.glb", "--force"]);
     assert_eq!(std::fs::read(out.path().join("b.glb")).unwrap(), b"mine");
-    // A damaged checkpoint without a previous one, and one of another version.
+    // A damaged checkpoint without a previous one, and a checkpoint of another version.
     let _ = std::fs::remove_file(run.join("checkpoints/previous.safetensors"));
     std::fs::write(run.join("checkpoints/latest.safetensors"), &before[..before.len() - 5]).unwrap();
     check(&diorama(&["eval", r]), &["latest.safetensors", "not a whole checkpoint"]);

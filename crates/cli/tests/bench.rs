@@ -1,4 +1,4 @@
-//! `diorama bench`: what it prints, and that it leaves nothing behind.
+//! The output of `diorama bench`, and that it leaves nothing behind.
 
 use std::path::Path;
 use std::process::{Command, Output};
@@ -65,7 +65,7 @@ fn layers_and_networks_are_measured_forward_and_in_training() {
     }
     let [network] = &v["networks"].as_array().unwrap()[..] else { panic!("one network has this name: {v}") };
     assert_eq!(keys(network), ["name", "forward_ms", "train_ms", "peak_bytes"]);
-    // A step holds a forward pass, and the weights alone take 59 MB four times over.
+    // A step includes a forward pass, and the weights alone take 59 MB four times.
     assert!(network["forward_ms"].as_f64().unwrap() > 0.0 && network["train_ms"].as_f64() > network["forward_ms"].as_f64(), "{v}");
     assert!(network["peak_bytes"].as_u64().is_none_or(|b| b > 200 << 20), "{v}");
     let o = call(&["no such layer"]);

@@ -1,4 +1,4 @@
-//! What leaves a run: point clouds, cropped meshes, distances, perceptual scores, and output that nobody reads.
+//! Outputs of a run: point clouds, cropped meshes, distances, perceptual scores, and closed output pipes.
 
 use diorama_data::checkpoint;
 use diorama_geom::glam::DVec3;
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::{OnceLock, RwLock};
 
-/// A short run, made once; tests that leave files in it hold the lock alone, those that such files would change hold it with others.
+/// A short run, made once. Tests that write files to it lock it exclusively; tests that such files would affect share the lock.
 struct Good {
     _folder: tempfile::TempDir,
     run: PathBuf,
@@ -35,7 +35,7 @@ fn diorama(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_diorama")).args(arguments).output().unwrap()
 }
 
-/// What a call that succeeds prints.
+/// The output of a call that succeeds.
 #[track_caller]
 fn works(arguments: &[&str]) -> String {
     let o = diorama(arguments);
@@ -43,7 +43,7 @@ fn works(arguments: &[&str]) -> String {
     String::from_utf8(o.stdout).unwrap()
 }
 
-/// The line of a call that is refused.
+/// The error line of a call that is refused.
 #[track_caller]
 fn refused(arguments: &[&str]) -> String {
     let o = diorama(arguments);
@@ -60,7 +60,7 @@ fn export(file: &Path, more: &[&str]) -> serde_json::Value {
 
 type Corner = [f64; 3];
 
-/// Header and positions of a binary PLY whose vertices begin with x, y, z.
+/// Header and positions of a binary PLY whose vertices start with x, y, z.
 fn ply(file: &Path) -> (String, Vec<Corner>) {
     let bytes = std::fs::read(file).unwrap();
     let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
@@ -100,15 +100,15 @@ fn points_lie_where_the_mesh_does() {
     assert!(["nx", "nz", "red", "blue"].iter().all(|p| head.contains(p)) && !head.contains("element face"), "{head}");
     assert_eq!(points.len(), 20_000);
     let (_, vertices) = ply(&mesh);
-    // One of the two may hold a lump in the air that the other lacks.
+    // One of the two may contain a floater that the other lacks.
     let ((lo, hi), (mesh_lo, mesh_hi)) = (most(&points), most(&vertices));
     let longest = (0..3).map(|k| mesh_hi[k] - mesh_lo[k]).fold(0.0, f64::max);
     for k in 0..3 {
-        // What the thing stands on is seen from above alone: the mesh may reach deeper.
+        // The base of the object is seen only from above, so the mesh may reach deeper.
         let below = if k == 2 { (mesh_lo[k] - lo[k]).max(0.0) } else { (lo[k] - mesh_lo[k]).abs() };
         assert!(below < 0.12 * longest && (hi[k] - mesh_hi[k]).abs() < 0.12 * longest, "{lo:?} {mesh_lo:?} {hi:?} {mesh_hi:?}");
     }
-    // Nine of ten points are within a fortieth of the mesh's length of one of its vertices.
+    // Nine tenths of the points are within a fortieth of the mesh's length from one of its vertices.
     let near = points.iter().step_by(100).filter(|p| {
         let square = |v: &Corner| (0..3).map(|k| (v[k] - p[k]).powi(2)).sum::<f64>();
         vertices.iter().map(square).fold(f64::INFINITY, f64::min).sqrt() < longest / 40.0
@@ -159,7 +159,7 @@ fn the_mesh_lies_inside_the_crop_box_of_the_viewer() {
     let small = ["--resolution", "64", "--keep-unseen", "--floaters", "0"];
     export(&file, &small);
     let (lo, hi) = bounds(&in_world(ply(&file).1));
-    // A quarter off at one side of each axis.
+    // A quarter is cut off at one side of each axis.
     let size: Corner = std::array::from_fn(|k| hi[k] - lo[k]);
     let crop: (Corner, Corner) = (std::array::from_fn(|k| lo[k] + 0.25 * size[k]), std::array::from_fn(|k| hi[k] + 0.1 * size[k]));
     let saved = good().run.join("crop.json");
@@ -185,7 +185,7 @@ fn the_summary_says_how_many_faces_went() {
     assert!(text.contains("removed: ") && text.contains("fewer than three cameras see"), "{text}");
     let removed = export(&file, &["--resolution", "48", "--keep-unseen", "--force"])["removed"].clone();
     assert_eq!((removed["unseen"].as_u64(), removed["before_cameras"].as_u64()), (Some(0), Some(0)));
-    // A field that was trained shortly has parts that hardly a camera sees; what goes is what --keep-unseen keeps.
+    // A briefly trained field has parts that hardly any camera sees; the removed faces are those that --keep-unseen keeps.
     let all = ["--resolution", "64", "--floaters", "0", "--faces", "0", "--force"];
     let (seen, kept) = (export(&file, &all), export(&file, &[&all[..], &["--keep-unseen"]].concat()));
     let count = |made: &serde_json::Value, what: &str| made["removed"][what].as_u64().unwrap();
@@ -208,7 +208,7 @@ fn no_more_faces_than_asked_also_where_the_mesh_is_closed() {
     }
 }
 
-/// Values of a `.npy` of floats.
+/// Values of an `.npy` file of floats.
 fn npy(file: &Path) -> Vec<f32> {
     let bytes = std::fs::read(file).unwrap();
     let head = 10 + u16::from_le_bytes([bytes[8], bytes[9]]) as usize;
@@ -247,16 +247,16 @@ fn distances_follow_the_measured_length_and_are_not_cut_off() {
             farthest = farthest.max(*m);
         }
     }
-    // Beyond what thousandths in 16 bits hold.
+    // Beyond the range of 16 bits in thousandths.
     assert!(farthest > 66.0, "{farthest}");
 }
 
-/// Numbers of a 16-bit PNG.
+/// Values of a 16-bit PNG.
 fn image_numbers(file: &Path) -> Vec<u16> {
     diorama_data::depth::read_png(file).unwrap()
 }
 
-/// A tensor of small numbers that differ.
+/// A tensor of small distinct numbers.
 fn tensor(shape: &[usize], seed: u64, scale: f32) -> Vec<f32> {
     let rng = diorama_geom::rng::Rng::new(seed, 9);
     (0..shape.iter().product::<usize>() as u64).map(|i| (rng.uniform(i) - 0.5 + if seed >= 100 { 0.5 } else { 0.0 }) * scale).collect()
@@ -296,7 +296,7 @@ fn save_safetensors(folder: &Path, tensors: &[Tensor]) -> PathBuf {
     checkpoint::latest(folder)
 }
 
-/// Writes a `state_dict` as `torch.save` does: an archive of a pickle and of one storage per tensor.
+/// Writes a `state_dict` in the format of `torch.save`: an archive of a pickle and one storage per tensor.
 fn save_pth(file: &Path, tensors: &[Tensor]) {
     use std::io::Write;
     let mut zip = zip::ZipWriter::new(std::fs::File::create(file).unwrap());
@@ -310,7 +310,7 @@ fn save_pth(file: &Path, tensors: &[Tensor]) {
         let storage = [b"(", &text("storage")[..], b"ctorch\nFloatStorage\n", &text(&key.to_string()), &text("cpu"), &int(values.len())];
         let storage = [&storage.concat()[..], b"tQ"].concat();
         let rest = [int(0), tuple(shape), tuple(&strides)].concat();
-        // Without a gradient, and with no hooks.
+        // Without a gradient and without hooks.
         pickle.extend([&text(name)[..], b"ctorch._utils\n_rebuild_tensor_v2\n(", &storage, &rest].concat());
         pickle.extend(b"\x89ccollections\nOrderedDict\n)RtR");
         zip.start_file(format!("weights/data/{key}"), stored).unwrap();
@@ -345,7 +345,7 @@ fn eval_judges_by_lpips_with_the_users_weights() {
     let refused_with = |weights: &str| refused(&["eval", s(&good().run), "--device", "cpu", "--json", "--lpips", weights]);
     assert!(refused_with(s(&trunk)).contains("without the linear heads"));
     assert!(refused_with("no/such.pth").contains("no/such.pth"));
-    // What was cut off is refused by name.
+    // A truncated file is refused by name.
     let bytes = std::fs::read(&in_one).unwrap();
     std::fs::write(&in_one, &bytes[..bytes.len() / 2]).unwrap();
     assert!(refused_with(s(&in_one)).contains("alex.pth: cannot be read as weights"));
@@ -374,12 +374,12 @@ fn a_reader_that_goes_away_is_no_error() {
         let text = String::from_utf8_lossy(&o.stderr);
         assert!(o.status.success() && !text.contains("panicked"), "{arguments:?}: {:?} {text}", o.status);
     }
-    // A refusal stays one.
+    // A refused call keeps its exit code.
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
     let o = Command::new(env!("CARGO_BIN_EXE_diorama")).args(["info", "no/such", "--json"]).stdout(writer).output().unwrap();
     assert_eq!(o.status.code(), Some(2));
-    // Nobody reads the complaints either.
+    // stderr is closed, too.
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
     let status = Command::new(env!("CARGO_BIN_EXE_diorama")).args(["info", "no/such"]).stderr(writer).status().unwrap();

@@ -1,4 +1,4 @@
-//! A run that begins on a GPU and ends on the CPU. Without a device these tests are skipped, or fail where `DIORAMA_REQUIRE_GPU` is set.
+//! A run that starts on a GPU and ends on the CPU. Without a device these tests are skipped, or fail if `DIORAMA_REQUIRE_GPU` is set.
 #![cfg(feature = "gpu")]
 
 use diorama_pipelines::object::quickstart::write_capture;
@@ -13,7 +13,7 @@ fn json(out: Output) -> serde_json::Value {
     serde_json::from_slice(&out.stdout).unwrap()
 }
 
-/// A GPU, or what plays one.
+/// A GPU, or software that emulates one.
 fn device() -> Option<String> {
     let doctor = json(diorama(&["doctor", "--json"]));
     let found = doctor["devices"].as_array().unwrap().iter().filter_map(|d| d.as_str()).find(|d| *d != "cpu").map(str::to_string);
@@ -44,7 +44,7 @@ fn a_run_goes_on_where_another_device_left_it() {
         log.lines().map(|l| serde_json::from_str::<serde_json::Value>(l).unwrap()).filter_map(|v| v["loss"].as_f64()).collect();
     assert_eq!(losses.len(), 40);
     let mean = |part: &[f64]| part.iter().sum::<f64>() / part.len() as f64;
-    // It learns on either, and does not begin again in between.
+    // It learns on both, and does not restart in between.
     assert!(mean(&losses[15..20]) < 0.9 * mean(&losses[..5]), "{losses:?}");
     assert!(mean(&losses[20..25]) < 1.2 * mean(&losses[15..20]), "{losses:?}");
 }
@@ -56,7 +56,7 @@ fn every_method_trains_renders_and_exports_there() {
     let data = dir.path().join("data");
     write_capture(&data, 6, 24).unwrap();
     let data = data.to_str().unwrap();
-    // A budget that keeps one pixel of each square, too.
+    // The same with a budget that keeps one pixel of each square.
     let ngp = ["--set", "camera.refine=true", "--set", "sampling.error_map=true", "--set", "data.memory_budget=3000"];
     let small = ["--set", "sampling.rays=64", "--set", "sampling.samples=8", "--set", "sampling.importance=8"];
     for (method, sets) in [("ngp", &ngp[..]), ("nerf", &small), ("mlp", &small), ("baseline", &small)] {
@@ -75,7 +75,7 @@ fn every_method_trains_renders_and_exports_there() {
         };
         let (there, here) = (scores(&device), scores("cpu"));
         assert!((there - here).abs() < 0.02, "{method}: {there} dB there, {here} dB here");
-        // The CPU goes on from all of it: parameters, corrections, errors.
+        // The CPU continues from the full state: parameters, corrections, errors.
         let end = json(diorama(&["train", "-o", run, "--resume", "--device", "cpu", "--steps", "3", "--json"]));
         assert_eq!((end["device"].as_str(), end["steps"].as_u64()), (Some("cpu"), Some(3)), "{method}: {end}");
     }

@@ -1,4 +1,4 @@
-//! `kill -9` at random moments, `--resume`: the same run bit for bit as one that was left alone.
+//! `kill -9` at random moments, then `--resume`: the result is bit-equal to that of an uninterrupted run.
 
 use diorama_data::checkpoint;
 use diorama_pipelines::object::quickstart::write_capture;
@@ -42,7 +42,7 @@ fn curve(run: &Path) -> Vec<(u64, String)> {
         .collect()
 }
 
-/// Five, or as many as `DIORAMA_KILLS` says.
+/// Five kills, or as many as `DIORAMA_KILLS` says.
 #[test]
 fn kills_change_nothing() {
     let wanted: u64 = std::env::var("DIORAMA_KILLS").ok().and_then(|n| n.parse().ok()).unwrap_or(5);
@@ -67,7 +67,7 @@ fn kills_change_nothing() {
         let pause = whole.mul_f32(0.1 + 0.35 * rng.uniform(attempt));
         std::thread::sleep(pause.max(Duration::from_millis(5)));
         if attempt.is_multiple_of(2) {
-            // Every other time wait for the moment at which a checkpoint is being written.
+            // Every other time, waits until a checkpoint is being written.
             let partial = killed.join("checkpoints/latest.safetensors.partial");
             let until = Instant::now() + Duration::from_secs(3);
             while !partial.exists() && Instant::now() < until && child.try_wait().unwrap().is_none() {
@@ -83,7 +83,7 @@ fn kills_change_nothing() {
         }
         if let Some(status) = finished {
             assert!(status.success(), "{status}");
-            // It ended by itself: begin again with the kills that are left.
+            // The run finished: start a new one with the remaining kills.
             std::fs::remove_dir_all(&killed).unwrap();
             continue;
         }

@@ -1,4 +1,4 @@
-//! Photographs as people have them, through the whole program: cut off, resized, of linear light.
+//! Truncated, resized and linear photographs, through the whole program.
 
 use diorama_data::photo::{self, Photo};
 use diorama_data::photo_import;
@@ -46,7 +46,7 @@ fn eval(run: &Path) -> Value {
     report
 }
 
-/// Changes each photograph into a file with another extension, and the poses' file with it.
+/// Converts each photograph to another file format, and updates the file with the poses.
 fn convert(data: &Path, extension: &str, encode: impl Fn(&ImageU8, &Path)) {
     for p in photographs(data) {
         let im = photo::load(&p).unwrap();
@@ -72,7 +72,7 @@ fn photographs_that_were_cut_off_are_refused_or_left_out() {
         photo_import::write(&opaque(im), to.parent().unwrap(), to.file_stem().unwrap().to_str().unwrap()).unwrap();
     });
     let photos = photographs(&data);
-    // One that trains and one that is held out.
+    // One training photograph and one held-out photograph.
     for i in [3, 8] {
         let bytes = std::fs::read(&photos[i]).unwrap();
         std::fs::write(&photos[i], &bytes[..bytes.len() * 9 / 10]).unwrap();
@@ -86,7 +86,7 @@ fn photographs_that_were_cut_off_are_refused_or_left_out() {
     assert_eq!(code, Some(0), "{said}");
     let note = format!("2 broken photographs are left out: {}, {}", name(3), name(8));
     assert!(said.contains(&note), "{said}");
-    // They are no part of the run: the first and the ninth were to be held out.
+    // They are not part of the run: the first and the ninth would have been held out.
     assert_eq!(eval(&run)["views"], 1);
     let (code, said, _) = diorama(&["train", "--resume", "-o", text(&run), "--device", "cpu", "--steps", "30", "--skip-broken"]);
     assert_eq!(code, Some(0), "{said}");
@@ -117,7 +117,7 @@ fn resized_photographs_train_and_are_scored() {
     }
 }
 
-/// Light of a photograph of the still life, a thousand times as much as a screen shows.
+/// Linear light of a photograph of the still life, a thousand times as bright as a screen.
 fn lit(im: &ImageU8) -> Image {
     let light = |p: &[u8]| [0, 1, 2].map(|k| 1000.0 * linear_from_srgb(p[k] as f32 / 255.0).powi(2) + 2.0);
     let data = im.data.chunks_exact(4).flat_map(|p| [&light(p)[..], &[p[3] as f32 / 255.0]].concat()).collect();
@@ -142,13 +142,13 @@ fn linear_light_is_learned_beyond_white_and_rendered_with_it() {
     let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
     let white: f32 = config.lines().find_map(|l| l.strip_prefix("white = ")).unwrap().parse().unwrap();
     assert!((50.0..1003.0).contains(&white), "{white}");
-    // Where the photograph is bright, far beyond 1, the render is as bright.
+    // Where the photograph is bright, far above 1, the render is as bright.
     let both = want.data.chunks_exact(4).zip(got.data.chunks_exact(3)).filter(|(p, _)| p[3] == 1.0);
     let bright: Vec<(f32, f32)> = both.flat_map(|(p, q)| [0, 1, 2].map(|k| (p[k], q[k]))).filter(|(want, _)| *want > 0.2 * white).collect();
     assert!(bright.len() > 50, "{}", bright.len());
     let ratio = bright.iter().map(|v| v.1).sum::<f32>() / bright.iter().map(|v| v.0).sum::<f32>();
     assert!((ratio - 1.0).abs() < 0.2, "{ratio}");
-    // The PNG is the same light along the sRGB curve, up to white.
+    // The PNG shows the same light along the sRGB curve, up to white.
     let png = photo::load(&out.join("0000.png")).unwrap();
     for (p, v) in png.data.iter().zip(&got.data) {
         assert!((*p as f32 - 255.0 * srgb_from_linear((v / white).clamp(0.0, 1.0))).abs() <= 0.51, "{p} {v}");

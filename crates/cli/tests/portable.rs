@@ -1,4 +1,4 @@
-//! Machines without AVX-512 or AVX2: every level that this machine can run trains to the same loss.
+//! Machines without AVX-512 or AVX2: every instruction set that this machine supports trains to the same loss.
 
 use diorama_kernels::simd::Level;
 use diorama_pipelines::object::quickstart::write_capture;

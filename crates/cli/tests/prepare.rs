@@ -1,4 +1,4 @@
-//! `prepare` from photographs to a data set, with a stand-in for COLMAP that knows the answer.
+//! `prepare` from photographs to a data set, with a stand-in for COLMAP that returns the true model.
 #![cfg(unix)]
 
 use diorama_data::{colmap, import, photo, photo_import};
@@ -12,7 +12,7 @@ use std::process::Command;
 const VIEWS: usize = 16;
 const SIZE: u32 = 200;
 
-/// Every second photograph is so much darker, as a factor of linear light.
+/// Factor of linear light by which every second photograph is darker.
 const DARKER: f32 = 0.5;
 
 /// Photographs of the still life, of which every second is darker, and COLMAP's model of them.
@@ -33,7 +33,7 @@ fn capture(photos: &Path, model: &Path) {
         let data = im.data.chunks_exact(4).flat_map(over).collect();
         photo_import::write(&ImageU8 { channels: 3, data, ..im }, photos, &format!("view_{i:02}")).unwrap();
     }
-    // Points are what random rays hit; each appears in all views that see it.
+    // The points are hits of random rays; each is observed in all views that see it.
     let rng = Rng::new(8, 0);
     let mut points: Vec<DVec3> = Vec::new();
     for n in 0..2500u64 {
@@ -85,7 +85,7 @@ fn capture(photos: &Path, model: &Path) {
     assert_eq!(colmap::points(model).unwrap().len(), points.len());
 }
 
-/// A program that answers as COLMAP does, and gives out the model.
+/// A program that answers like COLMAP and writes the true model.
 fn stand_in(path: &Path, model: &Path) {
     use std::os::unix::fs::PermissionsExt;
     let script = format!(
@@ -148,7 +148,7 @@ fn photographs_become_a_finished_data_set() {
         assert!(f.image.ends_with(format!("finished/{}.png", f.image.file_stem().unwrap().to_string_lossy())));
         assert_eq!((im.width, im.height, im.channels), (160, 170, 4));
         assert_eq!((f.camera.cx, f.camera.cy), (80.0, 90.0));
-        // The middle of the picture is the still life, its rim is not.
+        // The center of the picture shows the still life, its border does not.
         let clear = im.data.chunks_exact(4).filter(|p| p[3] < 50).count();
         assert!(im.pixel(0, 0)[3] < 50 && clear * 4 > 160 * 170, "{clear}");
     }
@@ -169,14 +169,14 @@ fn photographs_become_a_finished_data_set() {
         let (code, text, _) = prepare(&[&["--resume"], &flags[..]].concat());
         assert!(code == Some(2) && text.contains(named), "{flags:?}: {text}");
     }
-    // None of these calls has taken away what was there, or left anything.
+    // None of these calls removed existing files or left new ones behind.
     assert!(!out.join("finished.partial").exists());
     let kept = import::import(&out, &Default::default()).unwrap();
     assert_eq!(kept.frames.len(), 12);
     assert!(kept.frames.iter().all(|f| photo::load(&f.image).is_ok()));
 }
 
-/// Calls `prepare`, where no COLMAP is needed or at hand.
+/// Calls `prepare` where COLMAP is neither needed nor available.
 fn prepare(input: &Path, out: &Path, more: &[&str]) -> (Option<i32>, String, serde_json::Value) {
     let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
     c.env("DIORAMA_COLMAP", "no/such/program").arg("prepare").arg(input).arg("-o").arg(out).args(more).arg("--json");
@@ -236,7 +236,7 @@ fn a_posed_capture_is_finished_without_colmap() {
         assert_eq!((im.width, im.height, im.channels, f.camera.cx), (160, 170, 4, 80.0));
         assert!(im.pixel(0, 0)[3] < 50 && clear * 4 > 160 * 170 && clear < 160 * 170, "{clear}");
     }
-    // COLMAP with the same model makes the same of it.
+    // COLMAP with the same model gives the same result.
     let (colmap, other) = (dir.path().join("colmap"), dir.path().join("other"));
     stand_in(&colmap, &input.join("sparse/0"));
     let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
@@ -246,7 +246,7 @@ fn a_posed_capture_is_finished_without_colmap() {
         let [a, b] = [&made, &found].map(|m| m[key].as_f64().unwrap());
         assert!((a / b - 1.0).abs() < 0.1, "{key}: {a} {b}");
     }
-    // The points of the data set serve where nobody says who sees them.
+    // The data set's points are used although nothing says which views see them.
     let again = dir.path().join("again");
     let more = ["--sfm", "none", "--normalize-exposure", "--remove-background", "auto", "--max-side", "100"];
     let (code, text, made) = prepare(&out, &again, &more);
@@ -265,7 +265,7 @@ fn masks_of_a_posed_capture_come_along() {
     std::fs::create_dir(input.join("masks")).unwrap();
     let n = SIZE as usize;
     for i in 0..VIEWS {
-        // White is left out; the columns that are kept differ a little.
+        // White is left out; the columns that are kept differ slightly.
         let data = (0..n * n).map(|p| if (60 + i..120 + i).contains(&(p % n)) { 0 } else { 255 }).collect();
         photo::save_png(&input.join(format!("masks/view_{i:02}.jpg.png")), &ImageU8 { width: n, height: n, channels: 1, data }).unwrap();
     }
@@ -304,7 +304,7 @@ fn two_at_once_are_refused_and_a_dead_ones_lock_is_not() {
     let (input, out) = (dir.path().join("posed"), dir.path().join("data"));
     posed(&input);
     std::fs::create_dir(&out).unwrap();
-    // What a process that was killed leaves.
+    // The leftovers of a process that was killed.
     std::fs::write(out.join(".lock"), b"").unwrap();
     let first = diorama_data::lock::take(&out).unwrap();
     let (code, text, _) = prepare(&input, &out, &["--sfm", "none"]);
@@ -325,7 +325,7 @@ fn two_at_once_are_refused_and_a_dead_ones_lock_is_not() {
 fn train_refuses_a_model_that_contradicts_itself_and_doctor_says_why() {
     let dir = tempfile::tempdir().unwrap();
     posed(dir.path());
-    // The poses of one reconstruction with the points of another: every point lies elsewhere.
+    // The poses of one reconstruction with the points of another: every point is elsewhere.
     let file = dir.path().join("sparse/0/points3D.bin");
     let mut all = std::fs::read(&file).unwrap();
     let mut at = 8;

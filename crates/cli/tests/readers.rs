@@ -1,11 +1,11 @@
-//! Exported meshes and point clouds in the hands of readers that this project did not write: Khronos' glTF validator, trimesh,
-//! usd-core, pycollada, laspy, pye57 (`benches/readers.sh` installs them, `DIORAMA_READERS` names their folder).
+//! Exported meshes and point clouds are opened by independent readers: Khronos's glTF validator, trimesh, usd-core, pycollada, laspy,
+//! pye57 (`benches/readers.sh` installs them, `DIORAMA_READERS` names their folder).
 
 use diorama_pipelines::object::quickstart::write_capture;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// The folder of readers; without it a line that says that the test was skipped, or with `DIORAMA_REQUIRE_READERS` a failure.
+/// The folder of readers. Without it, prints that the test was skipped, or fails if `DIORAMA_REQUIRE_READERS` is set.
 fn readers() -> Option<PathBuf> {
     let default = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../target/readers");
     let folder = std::env::var_os("DIORAMA_READERS").map_or(default, PathBuf::from);
@@ -31,7 +31,7 @@ fn diorama(arguments: &[&str]) {
     works(Command::new(env!("CARGO_BIN_EXE_diorama")).args(arguments));
 }
 
-/// Prints the validator's counts as JSON; fails where there are errors or warnings.
+/// Prints the validator's counts as JSON; fails on errors or warnings.
 const VALIDATE: &str = "
 const report = (r) => { console.log(JSON.stringify(r.issues)); process.exit(r.issues.numErrors + r.issues.numWarnings ? 1 : 0) };
 const bytes = new Uint8Array(require('fs').readFileSync(process.argv[1]));
@@ -84,7 +84,7 @@ fn every_export_is_read_by_foreign_readers() {
     for file in [&stem.with_extension("glb"), &lit, &plain] {
         println!("{}: {}", file.display(), works(&mut validate(file)));
     }
-    // Readers that take anything would show nothing: a face that names a vertex which is not there, and a file cut off.
+    // Readers that accept anything would prove nothing: a face with an invalid vertex index, and a truncated file.
     let mut damaged = std::fs::read(&plain).unwrap();
     let last = damaged.len() - 1;
     damaged[last - 8..].fill(0xff);

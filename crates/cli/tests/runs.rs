@@ -1,4 +1,4 @@
-//! Runs that are moved, repeated, interrupted, compared and judged, by the real program.
+//! Runs that are moved, repeated, interrupted, compared and scored, with the real program.
 
 mod program;
 
@@ -19,17 +19,17 @@ fn runs_and_photographs_may_move() {
     };
     let (home, elsewhere) = (at("home"), at("elsewhere"));
     write_capture(&home.join("data"), 8, 24).unwrap();
-    // Begun with paths that mean something in one folder only.
+    // Started with paths that are valid in one working folder only.
     works(&home, &[&["train", "data", "-o", "run", "--steps", "4"], &SMALL[..]].concat());
     let eval = |from: &Path, run: &str, more: &[&str]| works(from, &[&["eval", run, "--device", "cpu"], more].concat());
     eval(&elsewhere, "../home/run", &[]);
     works(&elsewhere, &["compare", "../home/run", "-o", "cmp"]);
     works(&elsewhere, &["train", "-o", "../home/run", "--resume", "--steps", "6"]);
-    // The whole of it to another place.
+    // Everything moves together.
     let moved = dir.path().join("moved");
     std::fs::rename(&home, &moved).unwrap();
     eval(&elsewhere, "../moved/run", &[]);
-    // Run and photographs to different places.
+    // Run and photographs move to different places.
     let (run, data) = (dir.path().join("far/run"), dir.path().join("photographs"));
     at("far");
     std::fs::rename(moved.join("run"), &run).unwrap();
@@ -40,11 +40,11 @@ fn runs_and_photographs_may_move() {
     eval(&elsewhere, s(&run), &["--data", s(&data)]);
     works(&elsewhere, &["compare", s(&run), "--data", "../photographs", "-o", "cmp"]);
     fails(&elsewhere, &["eval", s(&run), "--data", s(&elsewhere)], 2, &["elsewhere", "holds no images"]);
-    // Neither of these looks at photographs.
+    // These commands do not read photographs.
     works(&elsewhere, &["render", s(&run), "--frames", "1", "--size", "16x16", "--device", "cpu"]);
     works(&elsewhere, &["export", s(&run), "-o", "a.ply", "--resolution", "16", "--level", "0.01", "--device", "cpu"]);
     fails(&elsewhere, &["view", s(&data), "--data", s(&data), "--port", "0"], 2, &["--data", "is no run"]);
-    // Going on takes note of the new place.
+    // Resuming stores the new place.
     works(&elsewhere, &["train", "-o", s(&run), "--resume", "--data", "../photographs", "--steps", "8"]);
     eval(dir.path(), s(&run), &[]);
 }
@@ -60,7 +60,7 @@ fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
     works(dir.path(), &all);
     let summary = || std::fs::read_to_string(dir.path().join("run/summary.json")).unwrap();
     let before = summary();
-    // Nothing is left to do, and nothing of what the run came to is lost.
+    // Nothing is left to do, and the run's results are kept.
     let o = call(dir.path(), &[&all[..], &["--resume"]].concat());
     let said = String::from_utf8_lossy(&o.stderr);
     assert!(o.status.success() && said.contains("the run has its 4 steps") && !said.contains("NaN"), "{said}");
@@ -83,7 +83,7 @@ fn a_command_may_be_repeated_with_resume_and_a_change_names_both_values() {
     // Another capture.
     write_capture(&dir.path().join("other"), 6, 24).unwrap();
     fails(dir.path(), &["train", "other", "-o", "run", "--resume"], 2, &[capture, "not on other", "--data FOLDER"]);
-    // A configuration that the run began with, and one that says something else.
+    // A configuration equal to the run's, and one that differs.
     std::fs::copy(dir.path().join("run/config.toml"), dir.path().join("same.toml")).unwrap();
     let text = std::fs::read_to_string(dir.path().join("same.toml")).unwrap();
     std::fs::write(dir.path().join("other.toml"), text.replace("distortion = \"auto\"", "distortion = 0.5")).unwrap();
@@ -105,7 +105,7 @@ fn the_preset_of_the_report_gives_exactly_100_pixels() {
     assert!(report["psnr"].as_f64().unwrap().is_finite());
 }
 
-/// A call that may take so many bytes of memory.
+/// A call with limited memory.
 fn with_memory(folder: &Path, limit: &str, arguments: &[&str]) -> (Option<i32>, serde_json::Value, String) {
     let o = call_in(folder, &[("DIORAMA_MEMORY", limit)], arguments);
     (o.status.code(), serde_json::from_slice(&o.stdout).unwrap_or_default(), String::from_utf8_lossy(&o.stderr).into_owned())
@@ -116,7 +116,7 @@ fn what_does_not_fit_into_memory_is_refused_with_needs_has_and_cure() {
     let dir = tempfile::tempdir().unwrap();
     let table = ["--set", "field.log2_size=24", "--set", "field.levels=64", "--set", "field.features=8", "--json"];
     let all = [&["train", s(&good().capture), "-o", "run", "--steps", "1", "--device", "cpu"], &table[..]].concat();
-    // Large machines are refused it, too.
+    // The limit applies on large machines too.
     let (code, told, said) = with_memory(dir.path(), "64GiB", &all);
     assert_eq!((code, told["kind"].as_str(), told["exit_code"].as_i64()), (Some(1), Some("memory"), Some(1)), "{said}");
     let line = told["error"].as_str().unwrap();
@@ -144,7 +144,7 @@ fn an_export_that_does_not_fit_is_refused_with_needs_has_and_cure() {
         assert!(!line.contains('\n') && said.contains(line), "{said}");
     }
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0, "a refusal left something behind");
-    // What fits is written, and a limit that is none is no reason to go on without one.
+    // Work that fits is done; an invalid limit is an error.
     let small = [&export[..], &["--resolution", "16", "--texture", "64"]].concat();
     let (code, told, said) = with_memory(dir.path(), "1GiB", &small);
     assert_eq!(code, Some(0), "{said}");
@@ -166,7 +166,7 @@ fn training_and_exports_that_hardly_fit_say_so() {
         assert!(!dir.path().join(written).exists());
         let needs = told["error"].as_str().unwrap().strip_prefix(what).unwrap().split(" MiB").next().unwrap();
         let needs: f64 = needs.parse().unwrap();
-        // A tenth more than that is tight, three times as much is not.
+        // A tenth more than needed is tight, three times as much is not.
         for (factor, is_tight) in [(1.1, true), (3.0, false)] {
             let (code, _, said) = with_memory(dir.path(), &format!("{}MiB", needs * factor), &[arguments, &["--force"]].concat());
             assert_eq!(code, Some(0), "{said}");
@@ -182,7 +182,7 @@ fn eval_tells_the_view_and_the_time_left() {
     let said = String::from_utf8_lossy(&o.stderr).into_owned();
     assert!(o.status.success(), "{said}");
     let line = said.lines().find(|l| l.starts_with("view ")).unwrap_or_else(|| panic!("no progress in {said}"));
-    // Two views are held out, and two training views are judged beside them.
+    // Two held-out views and two training views are scored.
     let (view, left) = line.split_once("; ").unwrap_or_else(|| panic!("no time left in {line}"));
     assert!(view.starts_with("view 1 of 4 (images/view_00): "), "{line}");
     let time = left.strip_suffix(" s left").or(left.strip_suffix(" min left")).unwrap_or_else(|| panic!("{line}"));
@@ -201,7 +201,7 @@ fn eval_explains_how_many_training_views_see_what_a_view_shows() {
     for v in views {
         let shares: Vec<f64> = v["shares"].as_array().unwrap().iter().map(|s| s.as_f64().unwrap()).collect();
         assert!(shares.len() == 5 && (shares.iter().sum::<f64>() - 1.0).abs() < 1e-6, "{v}");
-        // Cameras all around the still life look at its middle.
+        // Cameras all around the still life look at its center.
         assert!(shares[4] > 0.3, "{v}");
         let errors = v["errors"].as_array().unwrap()[2..].iter().filter_map(|e| e.as_f64());
         let (worst, best) = errors.fold((f64::INFINITY, 0.0f64), |(w, b), e| (w.min(-10.0 * e.log10()), b.max(-10.0 * e.log10())));
@@ -215,7 +215,7 @@ fn eval_explains_how_many_training_views_see_what_a_view_shows() {
     assert!(told.contains("where two or more training views see it: psnr "), "{told}");
 }
 
-/// Frames of a film that the machine's ffmpeg decodes without a complaint, or a line that says that this was skipped.
+/// Number of video frames that the machine's ffmpeg decodes without complaint; without ffmpeg, prints that this was skipped.
 #[cfg(unix)]
 fn decoded(film: &Path) -> Option<usize> {
     let Ok(ffmpeg) = diorama_data::video::ffmpeg() else {
@@ -286,7 +286,7 @@ fn every_run_is_looked_at_before_the_first_is_judged() {
     let dir = tempfile::tempdir().unwrap();
     let (_copy, damaged) = copy();
     std::fs::remove_dir_all(damaged.join("checkpoints")).unwrap();
-    // Photographs that went after training, and a run that holds none out.
+    // Photographs that disappeared after training, and a run without held-out views.
     write_capture(&dir.path().join("data"), 8, 24).unwrap();
     works(dir.path(), &[&["train", "data", "-o", "bare", "--steps", "1"], &SMALL[..]].concat());
     works(dir.path(), &[&["train", "data", "-o", "all", "--steps", "1", "--split", "all"], &SMALL[..]].concat());
@@ -311,7 +311,7 @@ fn compare_shows_the_memory_of_training() {
     let dir = tempfile::tempdir().unwrap();
     let run = s(&good().run);
     let table: serde_json::Value = serde_json::from_str(&works(dir.path(), &["compare", run, "-o", "cmp", "--json"])).unwrap();
-    // An earlier comparison is replaced, a folder of other things is not.
+    // An earlier comparison is replaced, a folder with other content is not.
     let text = works(dir.path(), &["compare", run, "-o", "cmp"]);
     assert!(text.lines().next().unwrap().contains("memory"), "{text}");
     std::fs::create_dir(dir.path().join("mine")).unwrap();
@@ -345,7 +345,7 @@ fn what_was_saved_in_the_viewer_is_never_ignored() {
         for text in texts {
             std::fs::write(run.join(name), text).unwrap();
             for verb in verbs {
-                // A path that the user names is the user's: no word of what the viewer does.
+                // A path given by the user is the user's file: the error does not mention the viewer.
                 let cure = if std::ptr::eq(*verb, along) { name } else { "remove the file" };
                 fails(&run, verb, 2, &[name, cure]);
                 assert!(!run.join("new").exists(), "{verb:?} left something behind");
@@ -393,7 +393,7 @@ fn training_and_eval_tell_of_held_out_and_training_views() {
     let gap = report["training"]["psnr"].as_f64().unwrap() - report["psnr"].as_f64().unwrap();
     assert!((report["gap"].as_f64().unwrap() - gap).abs() < 1e-9);
     assert!(report["per_view"][0]["behind_fog"].is_boolean());
-    // A run that knows its training views by heart: two of them, opposite each other.
+    // A run that overfits its training views: two of them, opposite each other.
     let json = dir.path().join("few/transforms.json");
     copy_all(&good().capture, &dir.path().join("few"));
     let mut few: serde_json::Value = serde_json::from_slice(&std::fs::read(&json).unwrap()).unwrap();

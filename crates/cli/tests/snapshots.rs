@@ -1,5 +1,5 @@
-//! Texts that users see, as files in `snapshots/` that reviews read: the help of every verb, default configurations, errors.
-//! `INSTA_UPDATE=always cargo test --release -p diorama --test snapshots` writes them anew.
+//! Texts that users see, as files in `snapshots/` that can be reviewed: the help of every command, default configurations, errors.
+//! `INSTA_UPDATE=always cargo test --release -p diorama --test snapshots` rewrites them.
 
 mod program;
 
@@ -14,7 +14,7 @@ fn diorama(folder: &Path, arguments: &[&str]) -> Output {
     c.args(arguments).current_dir(folder).stdin(Stdio::null()).env_remove("DIORAMA_MEMORY").output().unwrap()
 }
 
-/// Names of the verbs, and of the verbs of nouns, as the help lists them.
+/// Names of the commands, and of the commands in groups, as listed in the help.
 fn verbs(noun: &[&str]) -> Vec<String> {
     let o = diorama(Path::new("."), &[noun, &["--help"]].concat());
     let text = String::from_utf8(o.stdout).unwrap();
@@ -47,7 +47,7 @@ fn default_configuration_of_every_method() {
     }
 }
 
-/// A folder with a capture, a run, and runs that are spoilt in one way each.
+/// A folder with a capture, a run, and runs that are damaged in one way each.
 fn folder() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
@@ -71,7 +71,7 @@ fn folder() -> tempfile::TempDir {
     dir
 }
 
-/// Calls that cannot be met, and what is printed: one line, the exit code.
+/// Calls that must fail, and their output: one line and the exit code.
 const WRONG: [&str; 38] = [
     "",
     "trian capture",

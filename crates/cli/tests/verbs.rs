@@ -1,4 +1,4 @@
-//! Verbs that work on a capture and a run, by the real program.
+//! Commands on a capture and a run, with the real program.
 
 use diorama_pipelines::object::quickstart::write_capture;
 use std::collections::HashMap;
@@ -33,7 +33,7 @@ fn diorama(arguments: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_diorama")).args(arguments).output().unwrap()
 }
 
-/// What a call that succeeds prints.
+/// The output of a call that succeeds.
 #[track_caller]
 fn works(arguments: &[&str]) -> String {
     let o = diorama(arguments);
@@ -46,7 +46,7 @@ fn export(file: &Path, more: &[&str]) -> serde_json::Value {
     serde_json::from_str(&works(&all)).unwrap()
 }
 
-/// Whether each edge of an STL, whose vertices have no numbers, has two faces.
+/// Whether each edge of an STL, whose vertices have no indices, has two faces.
 fn is_closed(stl: &[u8]) -> bool {
     let mut edges: HashMap<([u8; 12], [u8; 12]), i32> = HashMap::new();
     for f in stl[84..].chunks_exact(50) {

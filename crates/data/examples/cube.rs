@@ -1,4 +1,4 @@
-//! Writes a textured cube of one metre in every mesh format: `cargo run --release -p diorama-data --example cube -- FOLDER`.
+//! Writes a textured cube of one meter in every mesh format: `cargo run --release -p diorama-data --example cube -- FOLDER`.
 
 use diorama_data::{collada, glb, mesh_text, usdz};
 use diorama_geom::{ImageU8, Mesh};

@@ -1,4 +1,4 @@
-//! Captures that come as a zip: unpacked beside the archive, once.
+//! Captures in zip files: unpacked once, beside the archive.
 
 use crate::atomic;
 use crate::error::{DataError, Result};
@@ -7,13 +7,13 @@ use std::fs::File;
 use std::io::{BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 
-/// What an archive may hold.
+/// Limits on the content of an archive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ArchiveLimits {
     pub entries: usize,
-    /// Of all entries, unpacked.
+    /// Total size of all entries, unpacked.
     pub bytes: u64,
-    /// Unpacked over packed, of an entry larger than a mebibyte.
+    /// Largest ratio of unpacked to packed size, for entries larger than a mebibyte.
     pub ratio: u64,
 }
 
@@ -23,15 +23,15 @@ impl Default for ArchiveLimits {
     }
 }
 
-/// Marks a folder as the content of an archive.
+/// Name of the file that marks a folder as the unpacked content of an archive.
 const MARK: &str = ".unpacked";
 
-/// The folder that holds what is in `archive`: `capture.zip` becomes `capture/` beside it, unless it was unpacked before. Where all
-/// lies in one folder, that folder.
+/// Unpacks `archive` and returns the folder with its content: `capture.zip` becomes `capture/` beside it, unless it was unpacked before.
+/// If the archive contains a single folder, that folder is returned.
 ///
 /// # Errors
-/// When the archive is malformed, larger than its limits, holds links or names that lead out of the folder, or a folder of that
-/// name is there already and is not this archive's.
+/// If the archive is malformed, exceeds its limits, contains links or names that lead out of the folder, or if a folder of that name
+/// already exists and was not made from this archive.
 pub fn unpacked(archive: &Path, limits: &ArchiveLimits) -> Result<PathBuf> {
     let folder = archive.with_extension("");
     let meta = std::fs::metadata(archive).map_err(DataError::io(archive, "read"))?;
@@ -44,7 +44,10 @@ pub fn unpacked(archive: &Path, limits: &ArchiveLimits) -> Result<PathBuf> {
         } else {
             Err(DataError::input(
                 &folder,
-                format!("is there and is not what {} holds; move it away, or give the folder instead", archive.display()),
+                format!(
+                    "already exists and was not unpacked from {}; move it away, or give the folder instead of the archive",
+                    archive.display()
+                ),
             ))
         };
     }
@@ -60,7 +63,7 @@ pub fn unpacked(archive: &Path, limits: &ArchiveLimits) -> Result<PathBuf> {
     done.map(|()| root_of(&folder))
 }
 
-/// The one folder in a folder, if there is nothing else.
+/// The only entry of a folder, if that entry is a folder.
 fn root_of(folder: &Path) -> PathBuf {
     let inside: Vec<PathBuf> = folder
         .read_dir()
@@ -80,7 +83,7 @@ fn unpack(archive: &Path, folder: &Path, limits: &ArchiveLimits) -> Result<()> {
     let bad = |what: String| DataError::input(archive, what);
     let file = File::open(archive).map_err(DataError::io(archive, "read"))?;
     let mut zip =
-        zip::ZipArchive::new(BufReader::new(file)).map_err(|e| bad(format!("is not a zip that can be read ({e}); copy it again")))?;
+        zip::ZipArchive::new(BufReader::new(file)).map_err(|e| bad(format!("is not a readable zip file ({e}); copy it again")))?;
     if zip.len() > limits.entries {
         return Err(bad(format!("holds {} entries, more than the limit of {}", zip.len(), limits.entries)));
     }
@@ -101,12 +104,12 @@ fn unpack(archive: &Path, folder: &Path, limits: &ArchiveLimits) -> Result<()> {
             continue;
         }
         if !names.insert(inside) {
-            return Err(bad(format!("entry {name:?} is there twice; such an archive is not unpacked")));
+            return Err(bad(format!("entry {name:?} appears twice; such an archive is not unpacked")));
         }
         if let Some(parent) = target.parent() {
             std::fs::create_dir_all(parent).map_err(DataError::io(parent, "create"))?;
         }
-        // What the header says may be a lie: what comes out is counted.
+        // The size in the header may be false, so the bytes are counted.
         let packed = entry.compressed_size().max(1);
         let mut out = File::create_new(&target).map_err(DataError::io(&target, "create"))?;
         let (mut part, mut size) = (vec![0; 1 << 16], 0u64);

@@ -1,4 +1,4 @@
-//! Files appear whole or not at all: temporary file, fsync, rename, fsync of the folder.
+//! Atomic file writes: temporary file, fsync, rename, fsync of the folder. A file appears complete or not at all.
 
 use crate::error::{DataError, Result};
 use std::fs::File;
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 const SUFFIX: &str = ".partial";
 
-/// Writes `path` through `fill`; on any error the old file stays and the temporary one is removed.
+/// Writes `path` through `fill`. On any error the old file stays and the temporary file is removed.
 pub fn write_with(path: &Path, fill: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>) -> Result<()> {
     let temporary = temporary_name(path);
     let attempt = || -> std::io::Result<()> {
@@ -24,12 +24,12 @@ pub fn write_with(path: &Path, fill: impl FnOnce(&mut BufWriter<File>) -> std::i
     })
 }
 
-/// [`write_with`] for bytes at hand.
+/// [`write_with`] for bytes that are already in memory.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     write_with(path, |w| w.write_all(bytes))
 }
 
-/// Removes what interrupted writes left in a folder.
+/// Removes temporary files that interrupted writes left in a folder.
 pub fn sweep(folder: &Path) -> Result<()> {
     let entries = std::fs::read_dir(folder).map_err(DataError::io(folder, "read"))?;
     for entry in entries.flatten() {
@@ -49,7 +49,7 @@ fn temporary_name(path: &Path) -> PathBuf {
 
 fn sync_folder(path: &Path) -> std::io::Result<()> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    // Some systems cannot open folders; the rename itself is what must not fail.
+    // Some systems cannot open folders; only the rename must not fail.
     match File::open(folder) {
         Ok(f) => f.sync_all().or(Ok(())),
         Err(_) => Ok(()),

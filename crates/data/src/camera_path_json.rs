@@ -16,19 +16,19 @@ pub struct CameraPath {
     pub crop: Option<PathCrop>,
 }
 
-/// What a path shows of the scene.
+/// The part of the scene that a path shows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PathCrop {
-    /// Of the world.
+    /// Crop box in the world.
     pub within: OrientedBox,
-    /// What stands behind it; none: what the run has.
+    /// Color behind the box; `None`: the run's background.
     pub background_srgb: Option<[f32; 3]>,
 }
 
-/// Kinds of cameras that a path may have.
+/// Camera types that a path may have.
 const TYPES: &str = "perspective, fisheye or equirectangular";
 
-/// Reads a path whose cameras are given in the capture's frame.
+/// Reads a path whose cameras are in the capture's frame.
 pub fn read(path: &Path, world_from_capture: &Similarity) -> Result<CameraPath> {
     let map = json::read(path)?;
     let head = Object { path, place: "", map: &map };
@@ -75,7 +75,7 @@ pub fn read(path: &Path, world_from_capture: &Similarity) -> Result<CameraPath> 
     Ok(CameraPath { views: out, fps: head.positive("fps")?.unwrap_or(24.0), crop })
 }
 
-/// nerfstudio's crop: a box by its center, its sides and its turn (roll, pitch, yaw in radians), and the color behind it.
+/// nerfstudio's crop: a box given by center, sides and rotation (roll, pitch, yaw in radians), and the color behind it.
 fn read_crop(head: &Object, world_from_capture: &Similarity) -> Result<Option<PathCrop>> {
     let path = head.path;
     let map = match head.map.get("crop") {
@@ -142,11 +142,11 @@ pub fn write(path: &Path, p: &CameraPath, world_from_capture: &Similarity) -> Re
     crate::atomic::write(path, format!("{json:#}\n").as_bytes())
 }
 
-/// The same path with its cameras and keyframes in another frame, as the page shows and saves it; all else stays. `file` is named in
-/// errors.
+/// Transforms the cameras and keyframes of a path into another frame, for the viewer page; everything else is unchanged. Errors name
+/// `file`.
 ///
 /// # Errors
-/// When the text is no JSON object, a matrix is malformed, or the path asks for what the page does not show.
+/// If the text is not a JSON object, a matrix is malformed, or the path uses features that the page does not show.
 pub fn moved(text: &str, file: &Path, target_from_source: &Similarity) -> Result<String> {
     let map = json::parse(text.as_bytes(), file)?;
     let elsewhere = |what: String| DataError::input(file, format!("{what}; render such a path with diorama render --path FILE"));
@@ -230,7 +230,7 @@ mod tests {
             read(&file, &Similarity::IDENTITY).map(|p| p.views[0].camera)
         };
         let right_edge = |c: Camera| c.direction(64.0, 24.0).angle_between(DVec3::Z);
-        // nerfstudio's focal length is half the height by the tangent of half the angle, whatever the lens.
+        // nerfstudio's focal length is half the height divided by the tangent of half the angle, for every lens.
         assert!((right_edge(camera("perspective").unwrap()) - (32.0f64 / 24.0).atan()).abs() < 1e-12);
         assert!((right_edge(camera("fisheye").unwrap()) - 32.0 / 24.0).abs() < 1e-12);
         assert!((right_edge(camera("equirectangular").unwrap()) - std::f64::consts::PI).abs() < 1e-12);

@@ -1,28 +1,29 @@
-//! Checkpoints: safetensors files with version, method, progress and a hash of the content in their
-//! metadata, written atomically, the one before kept as `previous.safetensors`.
+//! Checkpoints: safetensors files with version, method, progress and a hash of the content in their metadata. They are written atomically,
+//! and the previous one is kept as `previous.safetensors`.
 
 use crate::atomic;
 use crate::error::{self, DataError, Result};
+use diorama_geom::NamedArray;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// Version of the layout.
+/// Version of the file layout.
 pub const VERSION: &str = "1";
 
 const LATEST: &str = "latest.safetensors";
 const PREVIOUS: &str = "previous.safetensors";
 const LIMIT: u64 = 64 << 30;
 
-/// Named f32 tensors and text.
+/// Content of a checkpoint: named f32 tensors, and text metadata.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Checkpoint {
     pub tensors: Vec<(String, Vec<usize>, Vec<f32>)>,
     pub metadata: HashMap<String, String>,
 }
 
-/// FNV-1a over eight bytes at a time: catches truncation and flipped bits, not malice.
+/// FNV-1a over eight bytes at a time. Detects truncation and flipped bits, not tampering.
 fn hash<'a>(tensors: impl Iterator<Item = (&'a str, &'a [u8])>) -> String {
     let mut h = 0xcbf2_9ce4_8422_2325u64;
     let mut mix = |bytes: &[u8]| {
@@ -42,18 +43,18 @@ fn hash<'a>(tensors: impl Iterator<Item = (&'a str, &'a [u8])>) -> String {
 }
 
 fn bytes_of(values: &[f32]) -> &[u8] {
-    // SAFETY: any f32 is four initialised bytes; the length is in bytes.
+    // SAFETY: any f32 is four initialized bytes; the length is in bytes.
     unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), std::mem::size_of_val(values)) }
 }
 
-/// A tensor to be saved, borrowed.
+/// A tensor to save, borrowed.
 pub struct Entry<'a> {
     pub name: String,
     pub shape: Vec<usize>,
     pub data: &'a [f32],
 }
 
-/// Saves into `folder`: the newest file so far becomes the previous one only once the new one is safe.
+/// Saves into `folder`. The newest file becomes the previous one only after the new file is complete.
 pub fn save(folder: &Path, entries: &[Entry], mut metadata: HashMap<String, String>) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(DataError::io(folder, "create"))?;
     let (latest, previous) = (folder.join(LATEST), folder.join(PREVIOUS));
@@ -64,12 +65,13 @@ pub fn save(folder: &Path, entries: &[Entry], mut metadata: HashMap<String, Stri
     let mut views = Vec::with_capacity(sorted.len());
     for e in &sorted {
         let view = TensorView::new(Dtype::F32, e.shape.clone(), bytes_of(e.data));
-        views.push((e.name.clone(), view.map_err(|e| DataError::input(&latest, format!("cannot be laid out: {e}")))?));
+        views.push((e.name.clone(), view.map_err(|e| DataError::input(&latest, format!("cannot be serialized: {e}")))?));
     }
     if cfg!(target_endian = "big") {
-        return Err(DataError::input(&latest, "checkpoints need a little-endian machine"));
+        return Err(DataError::input(&latest, "checkpoints can only be written on little-endian machines"));
     }
-    let bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| DataError::input(&latest, format!("cannot be laid out: {e}")))?;
+    let bytes =
+        safetensors::serialize(views, Some(metadata)).map_err(|e| DataError::input(&latest, format!("cannot be serialized: {e}")))?;
     if latest.exists() {
         // A second name for the old file: it survives the rename that replaces the first.
         let _ = std::fs::remove_file(&previous);
@@ -78,6 +80,12 @@ pub fn save(folder: &Path, entries: &[Entry], mut metadata: HashMap<String, Stri
         }
     }
     atomic::write_with(&latest, |w| w.write_all(&bytes))
+}
+
+/// Saves arrays into `folder`, as [`save`] does.
+pub fn save_arrays(folder: &Path, arrays: &[NamedArray], metadata: HashMap<String, String>) -> Result<()> {
+    let entries: Vec<Entry> = arrays.iter().map(|a| Entry { name: a.name.clone(), shape: a.shape.clone(), data: &a.values }).collect();
+    save(folder, &entries, metadata)
 }
 
 /// Reads one file and checks its hash.
@@ -113,13 +121,13 @@ pub fn read(path: &Path) -> Result<Checkpoint> {
     Ok(Checkpoint { tensors, metadata })
 }
 
-/// The newest checkpoint in `folder` that is whole, with a note when that is not the newest file.
+/// Reads the newest complete checkpoint in `folder`, with a note if that is not the newest file.
 pub fn load(folder: &Path) -> Result<(Checkpoint, Option<String>)> {
     let (latest, previous) = (folder.join(LATEST), folder.join(PREVIOUS));
     match read(&latest) {
         Ok(c) => Ok((c, None)),
         Err(e) if previous.exists() => match read(&previous) {
-            Ok(c) => Ok((c, Some(format!("{e}; going on from the previous checkpoint")))),
+            Ok(c) => Ok((c, Some(format!("{e}; continuing from the previous checkpoint")))),
             Err(_) => Err(e),
         },
         Err(e) => Err(e),
@@ -137,7 +145,12 @@ pub fn latest(folder: &Path) -> PathBuf {
 }
 
 impl Checkpoint {
-    /// Takes a tensor out.
+    /// All tensors, sorted by name.
+    pub fn into_arrays(self) -> Vec<NamedArray> {
+        self.tensors.into_iter().map(|(name, shape, values)| NamedArray { name, shape, values }).collect()
+    }
+
+    /// Removes a tensor and returns its values.
     pub fn take(&mut self, name: &str) -> Option<Vec<f32>> {
         let i = self.tensors.iter().position(|t| t.0 == name)?;
         Some(self.tensors.swap_remove(i).2)

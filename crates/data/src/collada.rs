@@ -1,5 +1,4 @@
-//! COLLADA 1.4.1 for SketchUp and other CAD programs: z up, metres, one material with a PNG beside the file or with
-//! vertex colours.
+//! COLLADA 1.4.1 for SketchUp and other CAD programs: z up, meters, one material with a PNG texture beside the file or with vertex colors.
 
 use crate::error::Result;
 use crate::{atomic, mesh_text};
@@ -10,7 +9,7 @@ use std::path::Path;
 /// Writes a `.dae`, and its texture beside it.
 ///
 /// # Errors
-/// When the mesh is empty or the disk refuses.
+/// If the mesh is empty or the file cannot be written.
 pub fn save(path: &Path, mesh: &Mesh) -> Result<()> {
     mesh_text::check(path, mesh)?;
     let texture = mesh_text::save_texture(path, mesh)?;
@@ -21,7 +20,7 @@ fn write(w: &mut impl Write, mesh: &Mesh, texture: Option<&str>) -> std::io::Res
     let n = mesh.positions.len();
     writeln!(w, r#"<?xml version="1.0" encoding="utf-8"?>"#)?;
     writeln!(w, r#"<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">"#)?;
-    // A fixed date keeps equal meshes equal files.
+    // The date is fixed so that equal meshes give equal files.
     let date = "2026-01-01T00:00:00Z";
     writeln!(w, "<asset><contributor><authoring_tool>diorama {}</authoring_tool></contributor>", env!("CARGO_PKG_VERSION"))?;
     writeln!(w, r#"<created>{date}</created><modified>{date}</modified><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset>"#)?;

@@ -1,4 +1,4 @@
-//! Captures from COLMAP models and back.
+//! Reads captures from COLMAP models, and writes them.
 
 pub use crate::colmap_model::{Observed, Point, find_model, observations, points, registered};
 
@@ -10,7 +10,7 @@ use diorama_geom::capture::Frame;
 use diorama_geom::{Camera, Capture, Lens};
 use std::path::Path;
 
-/// Reads the largest model under `root`, whose photographs lie in `root/images`, in `root`, or reduced in `root/images_2` and so on.
+/// Reads the largest model under `root`. Its photographs are in `root/images`, in `root`, or reduced in `root/images_2` and so on.
 pub fn read(root: &Path) -> Result<Imported> {
     let model = find_model(root)
         .ok_or_else(|| DataError::input(root, "holds no COLMAP model (images.bin or images.txt, in sparse/0 for example)"))?;
@@ -28,7 +28,7 @@ pub fn read(root: &Path) -> Result<Imported> {
     for i in order {
         let im = &mut images[i];
         let camera = *cameras.get(&im.camera).ok_or_else(|| {
-            DataError::input(&file, format!("image {} names camera {}, which the cameras file does not hold", im.name, im.camera))
+            DataError::input(&file, format!("image {} names camera {}, which is not in the cameras file", im.name, im.camera))
         })?;
         let pose = crate::transforms_json::rigid(im.world_from_camera)
             .map_err(|e| DataError::input(&file, format!("image {}: {e}; run COLMAP again", im.name)))?;
@@ -74,7 +74,7 @@ pub fn write_text(folder: &Path, capture: &Capture) -> Result<()> {
     crate::atomic::write(&folder.join("points3D.txt"), b"")
 }
 
-/// Number and parameters of the model that describes a camera.
+/// COLMAP's model id and parameters for a camera.
 fn model_of(c: &Camera) -> (usize, Vec<f64>) {
     let mut p = vec![c.fx, c.fy, c.cx, c.cy];
     let model = match c.lens {

@@ -1,4 +1,5 @@
-//! The files of a COLMAP model: `cameras`, `images` and `points3D`, binary or text; world to camera, quaternion (w, x, y, z).
+//! Files of a COLMAP model: `cameras`, `images` and `points3D`, binary or text. Poses are camera-from-world, with quaternions (w, x, y,
+//! z).
 
 use crate::error::{self, DataError, Result};
 use diorama_geom::glam::DVec3;
@@ -7,10 +8,10 @@ use diorama_geom::{Camera, Lens, Pose};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-/// Most bytes of one file.
+/// Largest file that is read, in bytes.
 const LIMIT: u64 = 16 << 30;
 
-/// Names of the camera models by number, with their parameter counts.
+/// Camera models by COLMAP's id: name and number of parameters.
 pub(crate) const MODELS: [(&str, usize); 11] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -29,12 +30,12 @@ pub(crate) const MODELS: [(&str, usize); 11] = [
 pub(crate) struct Registered {
     pub id: u32,
     pub name: String,
-    /// COLMAP's number of its camera.
+    /// COLMAP's id of its camera.
     pub camera: u32,
     pub world_from_camera: Pose,
 }
 
-/// A place in an image at which something was matched.
+/// A keypoint that was matched with a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Keypoint {
     pub px: [f64; 2],
@@ -42,7 +43,7 @@ pub(crate) struct Keypoint {
     pub point: Option<u64>,
 }
 
-/// The folder of a model at or below `root`; of several sub-models the one with most images.
+/// Finds the folder of a model at or below `root`; of several sub-models, the one with the most images.
 pub fn find_model(root: &Path) -> Option<PathBuf> {
     let mut candidates = vec![root.to_path_buf()];
     for base in ["sparse", "colmap/sparse", "colmap"] {
@@ -64,7 +65,7 @@ pub fn find_model(root: &Path) -> Option<PathBuf> {
     best.map(|b| b.1)
 }
 
-/// A point that structure from motion found.
+/// A 3D point found by structure from motion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
     pub id: u64,
@@ -72,16 +73,16 @@ pub struct Point {
     pub rgb: [u8; 3],
     /// Mean reprojection error in pixels, as the model states it.
     pub error: f64,
-    /// Images in which it was matched.
+    /// Ids of the images in which it was matched.
     pub images: usize,
 }
 
-/// Images that a binary model has registered.
+/// Registered images of a model.
 pub fn registered(model: &Path) -> Result<Vec<String>> {
     Ok(read_images_bin(&model.join("images.bin"), &mut |_, _| {})?.into_iter().map(|i| i.name).collect())
 }
 
-/// Where points appear in an image.
+/// Keypoints of one image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Observed {
     pub image: String,
@@ -89,7 +90,7 @@ pub struct Observed {
     pub points: Vec<([f64; 2], u64)>,
 }
 
-/// Where the points of a model appear, image by image.
+/// Keypoints of all images of a model.
 pub fn observations(model: &Path) -> Result<Vec<Observed>> {
     let mut out = Vec::new();
     read_images(model, &mut |image, keypoints| {
@@ -99,17 +100,17 @@ pub fn observations(model: &Path) -> Result<Vec<Observed>> {
     Ok(out)
 }
 
-/// Points of a model; none where it holds no file of them.
+/// Reads the points of a model; empty if it has no points file.
 ///
 /// # Errors
-/// When the file ends too early or is malformed.
+/// If the file ends too early or is malformed.
 pub fn points(model: &Path) -> Result<Vec<Point>> {
     let mut out = Vec::new();
     each_point(model, &mut |point, _| out.push(point))?;
     Ok(out)
 }
 
-/// Hands every point to `each` with its track: images by number, and which of their keypoints show it.
+/// Calls `each` for every point with its track: pairs of image id and keypoint index.
 pub(crate) fn each_point(model: &Path, each: &mut dyn FnMut(Point, &[(u32, u32)])) -> Result<()> {
     let (binary, text) = (model.join("points3D.bin"), model.join("points3D.txt"));
     if binary.exists() {
@@ -166,19 +167,19 @@ fn each_point_txt(file: &Path, each: &mut dyn FnMut(Point, &[(u32, u32)])) -> Re
     Ok(())
 }
 
-/// The cameras of a model by their number.
+/// Reads the cameras of a model, by their ids.
 pub(crate) fn read_cameras(model: &Path) -> Result<HashMap<u32, Camera>> {
     let binary = model.join("cameras.bin");
     if model.join("images.bin").exists() { read_cameras_bin(&binary) } else { read_cameras_txt(&model.join("cameras.txt")) }
 }
 
-/// Registered images; `each` is handed every one with its keypoints.
+/// Reads the registered images; `each` is called for every image with its keypoints.
 pub(crate) fn read_images(model: &Path, each: &mut dyn FnMut(&Registered, &[Keypoint])) -> Result<Vec<Registered>> {
     let binary = model.join("images.bin");
     if binary.exists() { read_images_bin(&binary, each) } else { read_images_txt(&model.join("images.txt"), each) }
 }
 
-/// A camera from a model's number, size and parameters.
+/// Builds a camera from a model's id, size and parameters.
 fn camera(file: &Path, model: usize, width: u64, height: u64, p: &[f64]) -> Result<Camera> {
     let &(name, n) = MODELS.get(model).ok_or_else(|| {
         DataError::input(file, format!("camera model {model} is not supported; use one of {}", MODELS.map(|m| m.0).join(", ")))
@@ -212,7 +213,7 @@ fn pose(q: [f64; 4], t: [f64; 3]) -> Pose {
     Pose { rotation: rotation_from_quaternion(q), translation: DVec3::from_array(t) }.inverse()
 }
 
-/// A cursor over bytes that names the file when they end too early.
+/// Byte cursor whose errors name the file if the bytes end too early.
 struct Bytes<'a> {
     file: &'a Path,
     data: &'a [u8],
@@ -256,7 +257,7 @@ fn read_cameras_bin(file: &Path) -> Result<HashMap<u32, Camera>> {
 }
 
 fn read_images_bin(file: &Path, each: &mut dyn FnMut(&Registered, &[Keypoint])) -> Result<Vec<Registered>> {
-    /// COLMAP's number of a keypoint that is no point's.
+    /// COLMAP's id of a keypoint that belongs to no point.
     const NONE: u64 = u64::MAX;
     let data = error::read(file, LIMIT)?;
     let mut b = Bytes { file, data: &data };
@@ -333,7 +334,7 @@ fn read_images_txt(file: &Path, each: &mut dyn FnMut(&Registered, &[Keypoint])) 
         let world_from_camera = pose([v[1], v[2], v[3], v[4]], [v[5], v[6], v[7]]);
         let image = Registered { id: v[0] as u32, name: f[9..].join(" "), camera: v[8] as u32, world_from_camera };
         keypoints.clear();
-        // The line of keypoints, which may be empty.
+        // The line of keypoints may be empty.
         if let Some((k, line)) = lines.next() {
             let wrong = || malformed(file, k, "expected groups of X Y POINT3D_ID");
             let numbers: Vec<&str> = line.split_whitespace().collect();

@@ -1,4 +1,4 @@
-//! Models of COLMAP: good ones of every camera model, and broken ones.
+//! Tests of reading COLMAP models: valid ones of every camera model, and broken ones.
 
 use super::*;
 use diorama_geom::glam::DVec3;
@@ -14,7 +14,7 @@ fn binary(dir: &Path, model: u32, params: &[f64], names: &[&str]) {
     let mut images = (names.len() as u64).to_le_bytes().to_vec();
     for (i, n) in names.iter().enumerate() {
         images.extend((i as u32 + 1).to_le_bytes());
-        // 90° about y, centre at (i, 2, 3): t = −R c.
+        // 90° about y, center at (i, 2, 3): t = −R c.
         let h = std::f64::consts::FRAC_1_SQRT_2;
         let r = rotation_from_quaternion([h, 0.0, h, 0.0]);
         let t = -(r * DVec3::new(i as f64, 2.0, 3.0));
@@ -36,7 +36,7 @@ fn binary(dir: &Path, model: u32, params: &[f64], names: &[&str]) {
 }
 
 #[test]
-fn binary_models_give_camera_centres_and_axes() {
+fn binary_models_give_camera_centers_and_axes() {
     let dir = tempfile::tempdir().unwrap();
     binary(dir.path(), 4, &[50.0, 51.0, 32.0, 24.0, 0.1, 0.2, 0.3, 0.4], &["b.jpg", "a b.jpg"]);
     let got = read(dir.path()).unwrap();

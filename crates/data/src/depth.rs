@@ -1,5 +1,5 @@
-//! Sequences of depth maps: 16-bit PNG with one step for the whole sequence, EXR or NumPy's `.npy` in 32-bit floats, and
-//! `depth.json` beside them, which says what the numbers mean.
+//! Sequences of depth maps: 16-bit PNG with one step for the whole sequence, or EXR or NumPy's `.npy` with 32-bit floats. `depth.json`
+//! beside them gives unit and step.
 
 use crate::error::{DataError, Result};
 use crate::{atomic, photo};
@@ -9,10 +9,10 @@ use serde::Serialize;
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 
-/// How a depth map is kept.
+/// File format of a depth map.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum DepthFormat {
-    /// 16 bits; the distance is the number times the sequence's step.
+    /// 16 bits; the distance is the pixel value times the sequence's step.
     #[default]
     Png,
     /// OpenEXR with one channel `Z`.
@@ -34,16 +34,16 @@ impl std::str::FromStr for DepthFormat {
     }
 }
 
-/// What `depth.json` says.
+/// Content of `depth.json`.
 #[derive(Serialize)]
 struct Meaning {
     files: &'static str,
     frames: usize,
-    /// `m`, or `units of the capture` where nothing was measured.
+    /// `m`, or `units of the capture` if no length was measured.
     unit: &'static str,
-    /// Units per step of the numbers.
+    /// Length of one step, in units.
     step: f64,
-    /// Number where nothing was met.
+    /// Pixel value where the ray meets no surface.
     unknown: u8,
     distance: &'static str,
 }
@@ -57,18 +57,18 @@ pub struct DepthSequence {
     frames: usize,
 }
 
-/// The longest distance that has been met leaves this much room for longer ones.
+/// Free range above the longest distance so far, as a factor, so that slightly longer ones fit.
 const ROOM: f64 = 1.5;
 
 impl DepthSequence {
-    /// Distances are in meters where the capture's size is known, else in its own units.
+    /// Starts a sequence. Distances are in meters if the scale of the capture is known, else in its own units.
     pub fn new(folder: &Path, format: DepthFormat, is_measured: bool) -> DepthSequence {
         let unit = if is_measured { "m" } else { "units of the capture" };
         DepthSequence { folder: folder.to_path_buf(), format, unit, step: 1.0, frames: 0 }
     }
 
-    /// Adds the next frame: distances along the rays, 0 where nothing was met, `[H, W, 1]`. Where one exceeds what 16 bits
-    /// hold at the present step, the frames so far are written again with a longer one.
+    /// Adds the next frame: distances along the rays, 0 where a ray meets no surface, `[H, W, 1]`. If a distance exceeds 16 bits at the
+    /// present step, the earlier frames are written again with a larger step.
     pub fn push(&mut self, depth: &Image) -> Result<()> {
         match self.format {
             DepthFormat::Png => {
@@ -109,7 +109,7 @@ impl DepthSequence {
         })
     }
 
-    /// Multiplies the numbers of a frame.
+    /// Multiplies the values of a frame.
     fn rescale(&self, i: usize, by: f64) -> Result<()> {
         let file = self.file(i);
         let (width, height) = photo::size(&file)?;
@@ -118,12 +118,12 @@ impl DepthSequence {
     }
 }
 
-/// The nearest number of steps; what was met has at least one.
+/// Nearest number of steps; at least 1 for a nonzero distance.
 fn steps(distance: f64) -> u16 {
     if distance > 0.0 { distance.round().clamp(1.0, u16::MAX as f64) as u16 } else { 0 }
 }
 
-/// The least of 1, 2, 5, 10, … times a power of ten that is no shorter.
+/// Smallest of 1, 2, 5, 10, … times a power of ten that is not below a value.
 fn round_step(least: f64) -> f64 {
     if least <= 0.0 || !least.is_finite() {
         return 1e-3;
@@ -133,15 +133,15 @@ fn round_step(least: f64) -> f64 {
     [1.0, 2.0, 5.0].map(|m| m * power(exponent)).into_iter().find(|s| *s >= least).unwrap_or(power(exponent + 1))
 }
 
-/// The numbers of a 16-bit PNG, row by row.
+/// Reads the values of a 16-bit PNG, row by row.
 ///
 /// # Errors
-/// When the file is no 16-bit PNG of one channel.
+/// If the file is not a 16-bit PNG with one channel.
 pub fn read_png(path: &Path) -> Result<Vec<u16>> {
     let bytes = std::fs::read(path).map_err(DataError::io(path, "read"))?;
     match photo::as_stored(&bytes) {
         Ok(DynamicImage::ImageLuma16(im)) => Ok(im.into_raw()),
-        Ok(_) => Err(DataError::input(path, "is no picture of 16-bit distances")),
+        Ok(_) => Err(DataError::input(path, "is not a 16-bit depth map: expected a PNG of 16-bit distances with one channel")),
         Err(e) => Err(DataError::input(path, format!("cannot be decoded: {e}"))),
     }
 }
@@ -163,14 +163,14 @@ fn save_exr(path: &Path, depth: &Image) -> Result<()> {
     exr::prelude::Image::from_channels((depth.width, depth.height), channels)
         .write()
         .to_buffered(&mut out)
-        .map_err(|e| DataError::failed(path, format!("cannot be laid out as EXR: {e}")))?;
+        .map_err(|e| DataError::failed(path, format!("cannot be encoded as EXR: {e}")))?;
     atomic::write(path, out.get_ref())
 }
 
 fn save_npy(path: &Path, depth: &Image) -> Result<()> {
     atomic::write_with(path, |w| {
         let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({}, {}), }}", depth.height, depth.width);
-        // The numbers begin at a multiple of 64 bytes.
+        // The data begin at a multiple of 64 bytes.
         let used = 10 + header.len() + 1;
         header.push_str(&" ".repeat(used.next_multiple_of(64) - used));
         header.push('\n');

@@ -1,4 +1,4 @@
-//! Films in the format that their file's name says.
+//! Videos, in the format of their file extension.
 
 use crate::error::{DataError, Result};
 use crate::gif::Gif;
@@ -6,7 +6,7 @@ use crate::mp4::Video;
 use diorama_geom::ImageU8;
 use std::path::Path;
 
-/// Formats of films.
+/// Video formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FilmFormat {
     /// H.264.
@@ -15,32 +15,32 @@ pub enum FilmFormat {
 }
 
 impl FilmFormat {
-    /// The format of a file by its name.
+    /// The format for a file name.
     ///
     /// # Errors
-    /// When it is none of those that are written.
+    /// If the extension is not one of these formats.
     pub fn of(path: &Path) -> Result<FilmFormat> {
         let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
         match extension.as_deref() {
             Some("mp4") => Ok(FilmFormat::Mp4),
             Some("gif") => Ok(FilmFormat::Gif),
-            Some(other) => Err(DataError::input(path, format!("films are written as .mp4 or .gif, not as .{other}; choose one of them"))),
-            None => Err(DataError::input(path, "names no format; films are written as .mp4 or .gif")),
+            Some(other) => Err(DataError::input(path, format!("videos are written as .mp4 or .gif, not as .{other}; choose one of them"))),
+            None => Err(DataError::input(path, "names no format; add the extension .mp4 or .gif")),
         }
     }
 }
 
-/// A film being written; nothing appears on disk before [`Film::finish`].
+/// A video being written; no file appears before [`Film::finish`].
 pub enum Film {
     Mp4(Box<Video>),
     Gif(Gif),
 }
 
 impl Film {
-    /// For frames of one size.
+    /// Starts a video with frames of one size.
     ///
     /// # Errors
-    /// When the format is unknown, does not take the size or the rate, or the file's folder is not there.
+    /// If the format is unknown or does not support the size or frame rate, or if the file's folder does not exist.
     pub fn create(path: &Path, width: usize, height: usize, fps: u32) -> Result<Film> {
         if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty() && !p.is_dir()) {
             return Err(DataError::input(folder, "is not a folder; create it or choose another --video"));
@@ -54,7 +54,7 @@ impl Film {
     /// Adds a frame `[H, W, 3]`.
     ///
     /// # Errors
-    /// When the encoder fails.
+    /// If the encoder fails.
     pub fn push(&mut self, frame: &ImageU8) -> Result<()> {
         match self {
             Film::Mp4(f) => f.push(frame),
@@ -62,10 +62,10 @@ impl Film {
         }
     }
 
-    /// Writes the file with all frames so far.
+    /// Writes the file with all frames added so far.
     ///
     /// # Errors
-    /// When there is none, or the file cannot be written.
+    /// If there are none, or the file cannot be written.
     pub fn finish(self) -> Result<()> {
         match self {
             Film::Mp4(f) => f.finish(),

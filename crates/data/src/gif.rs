@@ -1,4 +1,4 @@
-//! Animated GIFs: 256 colors per frame, times in hundredths of a second.
+//! Animated GIFs: 256 colors per frame, delays in hundredths of a second.
 
 use crate::atomic;
 use crate::error::{DataError, Result};
@@ -9,13 +9,13 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-/// Browsers slow down what is faster.
+/// Highest frame rate; browsers slow down faster GIFs.
 const FASTEST: u32 = 50;
 const LARGEST: usize = 65_535;
-/// The encoder's compromise between the time that it takes and the colors that it finds: 1 the best, 30 the fastest.
+/// The encoder's trade-off between time and color quality: 1 is best, 30 fastest.
 const SPEED: i32 = 10;
 
-/// Bytes that an encoder and its owner share.
+/// Byte buffer that the encoder and its owner share.
 #[derive(Clone, Default)]
 struct Bytes(Rc<RefCell<Vec<u8>>>);
 
@@ -28,7 +28,7 @@ impl Write for Bytes {
     }
 }
 
-/// A GIF being written, which repeats for ever; nothing appears on disk before [`Gif::finish`].
+/// A GIF being written, which loops forever; no file appears before [`Gif::finish`].
 pub struct Gif {
     path: PathBuf,
     encoder: GifEncoder<Bytes>,
@@ -39,13 +39,16 @@ pub struct Gif {
 }
 
 impl Gif {
-    /// For frames of one size.
+    /// Starts a GIF with frames of one size.
     ///
     /// # Errors
-    /// When the size or the rate is beyond what the format has.
+    /// If the format does not support the size or frame rate.
     pub fn create(path: &Path, width: usize, height: usize, fps: u32) -> Result<Gif> {
         if width == 0 || height == 0 || width > LARGEST || height > LARGEST {
-            return Err(DataError::input(path, format!("a GIF of {width}×{height}: the format takes up to 65535 a side; choose --size")));
+            return Err(DataError::input(
+                path,
+                format!("a GIF of {width}×{height}: sides can have at most 65535 pixels; choose a smaller --size"),
+            ));
         }
         if !(1..=FASTEST).contains(&fps) {
             let message = format!("a GIF of {fps} frames per second: programs show at most {FASTEST}; choose --fps {FASTEST} or .mp4");
@@ -60,12 +63,12 @@ impl Gif {
     /// Adds a frame `[H, W, 3]`.
     ///
     /// # Errors
-    /// When it has another size.
+    /// If the frame has another size.
     pub fn push(&mut self, frame: &ImageU8) -> Result<()> {
         let rgba = frame.data.chunks_exact(3).flat_map(|p| [p[0], p[1], p[2], 255]).collect();
         let image = image::RgbaImage::from_raw(self.size.0 as u32, self.size.1 as u32, rgba)
             .ok_or_else(|| DataError::input(&self.path, "frames of a GIF must have one size"))?;
-        // Hundredths of a second that add up to the frame rate.
+        // Delays in hundredths of a second whose sum follows the frame rate.
         let until = |n: u32| (n as f64 * 100.0 / self.fps as f64).round() as u32;
         let delay = image::Delay::from_numer_denom_ms((until(self.frames + 1) - until(self.frames)) * 10, 1);
         self.frames += 1;
@@ -75,12 +78,12 @@ impl Gif {
     /// Writes the file.
     ///
     /// # Errors
-    /// When there is no frame, or the file cannot be written.
+    /// If there is no frame, or the file cannot be written.
     pub fn finish(self) -> Result<()> {
         if self.frames == 0 {
             return Err(DataError::input(&self.path, "a GIF needs at least one frame"));
         }
-        // Its end is written when the encoder goes.
+        // The encoder writes the trailer when it is dropped.
         drop(self.encoder);
         let bytes = self.bytes.0.take();
         atomic::write(&self.path, &bytes)

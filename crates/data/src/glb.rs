@@ -1,5 +1,5 @@
-//! Binary glTF 2.0 with a texture or vertex colours; the material is unlit unless there is a normal map. glTF is y up: (x, y, z) is written as
-//! (x, z, −y). COLOR_0 is linear by the standard.
+//! Binary glTF 2.0 with a texture or vertex colors. The material is unlit unless there is a normal map. glTF is y up: (x, y, z) is written
+//! as (x, z, −y). COLOR_0 is linear, as the standard requires.
 
 use crate::error::{DataError, Result};
 use crate::{atomic, photo};
@@ -12,11 +12,11 @@ fn y_up(p: [f32; 3]) -> [f32; 3] {
     [p[0], p[2], -p[1]]
 }
 
-/// Targets of buffer views: attributes of vertices, and indices.
+/// Buffer view targets: vertex attributes, and indices.
 const ARRAY: u32 = 34962;
 const ELEMENTS: u32 = 34963;
 
-/// The binary chunk while it grows, and what describes it.
+/// The binary chunk under construction, with its buffer views and accessors.
 #[derive(Default)]
 struct Chunk {
     bytes: Vec<u8>,
@@ -25,7 +25,7 @@ struct Chunk {
 }
 
 impl Chunk {
-    /// Appends bytes with a description of where they are; returns the number of that view.
+    /// Appends bytes and a buffer view for them; returns the index of the view.
     fn view(&mut self, data: Vec<u8>, target: Option<u32>) -> usize {
         let mut view = json!({ "buffer": 0, "byteOffset": self.bytes.len(), "byteLength": data.len() });
         if let Some(target) = target {
@@ -37,7 +37,7 @@ impl Chunk {
         self.views.len() - 1
     }
 
-    /// Appends what an accessor reads; returns the accessor's number.
+    /// Appends data and an accessor for them; returns the index of the accessor.
     fn add(&mut self, data: Vec<u8>, target: u32, mut accessor: Value) -> Value {
         accessor["bufferView"] = self.view(data, Some(target)).into();
         self.accessors.push(accessor);
@@ -45,10 +45,10 @@ impl Chunk {
     }
 }
 
-/// The file's bytes.
+/// Encodes a mesh as GLB.
 ///
 /// # Errors
-/// When the mesh is empty, since glTF has no empty accessors, or exceeds what the format holds.
+/// If the mesh is empty (glTF has no empty accessors) or exceeds the format's limits.
 pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
     if mesh.faces.is_empty() {
         return Err(DataError::input(path, "the mesh is empty: nothing is denser than the level; lower --level or train longer"));
@@ -85,7 +85,7 @@ pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
         "accessors": chunk.accessors,
     });
     if texture.is_some() {
-        // Linear filters with mipmaps; repeated coordinates would bring the far edge in.
+        // Linear filters with mipmaps. Repeating coordinates would blend in the opposite edge.
         root["samplers"] = json!([{ "magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071 }]);
         root["textures"] = (0..images.len()).map(|i| json!({ "sampler": 0, "source": i })).collect();
         root["images"] = images.into();
@@ -96,7 +96,7 @@ pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
     join(&root, &chunk.bytes, path)
 }
 
-/// Positions, normals, and texture coordinates or colors of the vertices.
+/// Positions, normals, and texture coordinates or vertex colors.
 fn attributes(mesh: &Mesh, is_textured: bool, chunk: &mut Chunk) -> Value {
     let n = mesh.positions.len();
     let floats = |v: &mut dyn Iterator<Item = [f32; 3]>| v.flat_map(|p| p.map(f32::to_le_bytes)).flatten().collect::<Vec<u8>>();
@@ -122,7 +122,7 @@ fn attributes(mesh: &Mesh, is_textured: bool, chunk: &mut Chunk) -> Value {
     attributes
 }
 
-/// What light falls on the surface is in its colors already; with a normal map the user's own lights are meant.
+/// Vertex and texture colors already include the lighting, so the material is unlit. A normal map is meant for the user's own lights.
 fn material(is_textured: bool, is_lit: bool) -> Value {
     let mut material = json!({ "name": "radiance", "pbrMetallicRoughness": { "metallicFactor": 0.0, "roughnessFactor": 1.0 } });
     if !is_lit {
@@ -137,7 +137,7 @@ fn material(is_textured: bool, is_lit: bool) -> Value {
     material
 }
 
-/// The container with its two chunks.
+/// The file: header, JSON chunk and binary chunk.
 fn join(root: &Value, binary: &[u8], path: &Path) -> Result<Vec<u8>> {
     let mut text = serde_json::to_vec(root).expect("JSON of plain values");
     text.resize(text.len().next_multiple_of(4), b' ');

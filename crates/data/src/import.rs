@@ -1,4 +1,4 @@
-//! From a folder of photographs with poses to a [`Capture`].
+//! Reads folders of photographs with poses into a [`Capture`].
 
 use crate::archive::{self, ArchiveLimits};
 use crate::error::{DataError, Result};
@@ -12,7 +12,7 @@ use diorama_geom::glam::DVec3;
 use diorama_geom::{Capture, SceneBox, Similarity};
 use std::path::{Path, PathBuf};
 
-/// Descriptions of a capture that can be read.
+/// Formats of capture descriptions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     /// `transforms.json` of instant-ngp or nerfstudio.
@@ -51,18 +51,18 @@ impl std::str::FromStr for Format {
     }
 }
 
-/// How to read a capture.
+/// Options for reading a capture.
 #[derive(Clone, Debug)]
 pub struct ImportOptions {
     pub format: Option<Format>,
     pub split: SplitRule,
     pub seed: u64,
-    /// Fewest usable views.
+    /// Fewest usable views that are accepted.
     pub min_views: usize,
     pub masks: MaskOptions,
-    /// Read a model whose poses contradict its points as well: to look at it, not to train on it.
+    /// Also read COLMAP models whose poses contradict their points, to inspect them, not to train on them.
     pub allow_broken: bool,
-    /// Leave out photographs whose head cannot be read; see [`photo_check::leave_out_broken`] for all else.
+    /// Leave out photographs whose header cannot be read; [`photo_check::leave_out_broken`] handles all other damage.
     pub skip_broken: bool,
 }
 
@@ -82,7 +82,8 @@ impl Default for ImportOptions {
 
 /// Reads a capture: a folder, one of the description files in it, or a zip of it.
 ///
-/// `transforms.json` wins over the Blender set, COLMAP and LLFF unless `options.format` says otherwise.
+/// If a folder has several formats, `transforms.json` is preferred to the Blender set, COLMAP and LLFF, in this order, unless
+/// `options.format` is set.
 pub fn import(data: &Path, options: &ImportOptions) -> Result<Capture> {
     if !data.exists() {
         return Err(DataError::input(
@@ -118,7 +119,7 @@ pub fn import(data: &Path, options: &ImportOptions) -> Result<Capture> {
     capture.map_err(|e| if was_chosen { e } else { beside_others(e, root, format) })
 }
 
-/// The error, with the other descriptions of the folder that may be read instead.
+/// Adds to an error the other formats that the folder contains.
 fn beside_others(e: DataError, root: &Path, format: Format) -> DataError {
     let others: Vec<String> = found(root).into_iter().filter(|f| *f != format).map(|f| format!("--format {}", f.name())).collect();
     match e {
@@ -129,11 +130,11 @@ fn beside_others(e: DataError, root: &Path, format: Format) -> DataError {
     }
 }
 
-/// The folder that the paths of a capture lie in: the capture itself, the folder of its description, or what its zip
-/// was unpacked to.
+/// The folder that relative paths of a capture refer to: the capture itself, the folder of its description, or the folder that its zip was
+/// unpacked to.
 ///
 /// # Errors
-/// When there is nothing, or the zip cannot be unpacked.
+/// If the path does not exist, or the zip cannot be unpacked.
 pub fn root(data: &Path) -> Result<PathBuf> {
     if data.is_dir() {
         return Ok(data.to_path_buf());
@@ -148,7 +149,7 @@ pub fn root(data: &Path) -> Result<PathBuf> {
     Ok(parent.unwrap_or(Path::new(".")).to_path_buf())
 }
 
-/// The descriptions that a folder holds, in the order of their ranks.
+/// The formats that a folder contains, in order of preference.
 fn found(root: &Path) -> Vec<Format> {
     let holds = |name: &str| root.join(name).exists();
     let all = [
@@ -160,15 +161,15 @@ fn found(root: &Path) -> Vec<Format> {
     all.into_iter().filter(|f| f.1).map(|f| f.0).collect()
 }
 
-/// The format of a folder.
+/// The preferred format of a folder.
 ///
 /// # Errors
-/// When there is none that can be read.
+/// If the folder contains no format that can be read.
 pub fn detect(root: &Path) -> Result<Format> {
     if let Some(first) = found(root).first() {
         Ok(*first)
     } else if root.join("config.toml").exists() && root.join("capture.json").exists() {
-        Err(DataError::input(root, "is the folder of a run; give that of the photographs (diorama info RUN names it)"))
+        Err(DataError::input(root, "is the folder of a run; give the folder of the photographs (diorama info RUN prints it)"))
     } else {
         Err(DataError::input(
             root,
@@ -198,7 +199,7 @@ fn finish(data: &Path, root: &Path, mut imported: Imported, options: &ImportOpti
     }
     let first = imported.frames[0].world_from_camera;
     if n > 1 && imported.frames.iter().all(|f| (f.world_from_camera.translation - first.translation).length() < 1e-9) {
-        return Err(DataError::input(data, "all cameras stand at the same place, so depth cannot be found; estimate the poses again"));
+        return Err(DataError::input(data, "all cameras have the same position, so depth cannot be estimated; estimate the poses again"));
     }
     if let Some(a) = &imported.agreement {
         if a.is_broken() && !options.allow_broken {
@@ -214,7 +215,7 @@ fn finish(data: &Path, root: &Path, mut imported: Imported, options: &ImportOpti
     if let Some(twice) = imported.frames.iter().find(|f| !seen.insert(&f.image)) {
         notes.push(format!("{} is listed more than once", twice.name));
     }
-    let rule = masks::settle(root, &mut imported.frames, &options.masks, imported.mask_meaning, &mut notes)?;
+    let rule = masks::assign(root, &mut imported.frames, &options.masks, imported.mask_meaning, &mut notes)?;
     let leveled = if imported.unknown_up { level(&mut imported.frames) } else { Similarity::IDENTITY };
     imported.points.iter_mut().for_each(|p| p.position = leveled.point(p.position));
     let world_from_capture = imported.frames_from_capture.map_or(leveled, |f| leveled.after(&f));
@@ -235,7 +236,7 @@ fn finish(data: &Path, root: &Path, mut imported: Imported, options: &ImportOpti
     })
 }
 
-/// Turns the world so that the cameras' mean up direction is +z.
+/// Rotates the world so that the mean up direction of the cameras is +z.
 fn level(frames: &mut [Frame]) -> Similarity {
     let up: DVec3 = frames.iter().map(|f| -f.world_from_camera.rotation.y_axis).sum();
     if up.length() < 1e-6 {
@@ -248,8 +249,8 @@ fn level(frames: &mut [Frame]) -> Similarity {
     s
 }
 
-/// A box around what the cameras look at: the inner cube is half as wide as the cameras are far, the
-/// outer one eight times that.
+/// Chooses a box around the point that the cameras look at. The edge of the inner cube is the median distance of the cameras from that
+/// point; the outer cube is eight times as wide.
 fn automatic_scene(frames: &[Frame]) -> SceneBox {
     let poses: Vec<_> = frames.iter().map(|f| f.world_from_camera).collect();
     let (center, distance) = focus_point(&poses);

@@ -1,4 +1,5 @@
-//! What a reader of one format hands to [`crate::import`], and what readers share: where photographs lie, and which of them have no pose.
+//! The result that each format's reader returns to [`crate::import`], and functions that readers share: finding photographs, and listing
+//! those without pose.
 
 use crate::error::{DataError, Result};
 use crate::photo_import;
@@ -7,39 +8,39 @@ use diorama_geom::{SceneBox, Similarity, SparsePoint};
 use std::collections::{BTreeSet, HashSet};
 use std::path::{Component, Path, PathBuf};
 
-/// What a reader of one format returns.
+/// Result of a reader.
 #[derive(Debug, Default)]
 pub struct Imported {
     pub frames: Vec<Frame>,
-    /// The scene's box, where the format states it.
+    /// The scene's box, if the format defines it.
     pub scene: Option<SceneBox>,
     /// Names of listed images that do not exist.
     pub missing: Vec<String>,
     pub has_own_split: bool,
-    /// Undoes what the file's author did to the poses; none: nothing.
+    /// Inverse of a transform that the file's author applied to the poses; `None` if there was none.
     pub frames_from_capture: Option<Similarity>,
-    /// Whether the world is not z up yet and must be turned by the cameras' up directions.
+    /// Whether the world may not be z up and must be rotated by the cameras' up directions.
     pub unknown_up: bool,
-    /// What the file says that masks leave out.
+    /// What masked-out pixels mean, if the file says so.
     pub mask_meaning: Option<MaskMeaning>,
-    /// Points of structure from motion, in the frames' world.
+    /// Points from structure from motion, in the same world as the frames.
     pub points: Vec<SparsePoint>,
-    /// How well they agree with the poses, where the format tells.
+    /// How well the points agree with the poses, if the format allows to compare them.
     pub agreement: Option<Agreement>,
-    /// Folder of the model that says so.
+    /// Folder of the COLMAP model, if there is one.
     pub model: Option<PathBuf>,
     /// What was skipped or assumed, one line each.
     pub notes: Vec<String>,
 }
 
-/// Folders that photographs may lie in, the best first; the last are copies of the first at a part of its size.
+/// Folders that may contain the photographs, in order of preference; the last ones hold reduced copies.
 pub const IMAGE_FOLDERS: [&str; 5] = ["images", ".", "images_2", "images_4", "images_8"];
 
-/// A note that names the photographs beside those of a model that the model does not hold; none where there are none. The folder of
-/// the capture itself may hold other pictures.
+/// A note that lists photographs beside the model's that are not in the model; `None` if there are none. The capture's own folder is not
+/// searched, because it may contain other pictures.
 ///
 /// # Errors
-/// When a folder of photographs cannot be read.
+/// If a folder of photographs cannot be read.
 pub(crate) fn without_pose(root: &Path, frames: &[Frame]) -> Result<Option<String>> {
     let known: HashSet<&Path> = frames.iter().map(|f| &*f.image).collect();
     let folders: BTreeSet<&Path> = known.iter().filter_map(|i| i.parent()).filter(|f| *f != root && *f != root.join(".")).collect();
@@ -52,10 +53,10 @@ pub(crate) fn without_pose(root: &Path, frames: &[Frame]) -> Result<Option<Strin
     Ok((!unknown.is_empty()).then(|| note(unknown.len())))
 }
 
-/// Finds a file that a description names, inside `root` only; a missing extension is completed.
+/// Finds a file that a description names, inside `root` only. A missing extension is added.
 ///
 /// # Errors
-/// When the name leads out of `root`.
+/// If the name leads out of `root`.
 pub fn locate(root: &Path, name: &str, file: &Path, field: &str) -> Result<Option<PathBuf>> {
     let escape = || DataError::input(file, format!("{field}: {name} leads out of the dataset folder; move the file into it"));
     let relative = Path::new(name);
@@ -92,7 +93,7 @@ pub fn locate(root: &Path, name: &str, file: &Path, field: &str) -> Result<Optio
     Ok(Some(found))
 }
 
-/// The first three of these names.
+/// The first three names, for messages.
 pub(crate) fn few(names: &[String]) -> String {
     format!("{}{}", names[..names.len().min(3)].join(", "), if names.len() > 3 { ", …" } else { "" })
 }

@@ -1,9 +1,9 @@
-//! JPEG files without decoding them (ITU T.81): size and orientation from their head, and whether their data are all there.
+//! JPEG files without decoding them (ITU T.81): size and orientation from the header, and a check whether the image data are complete.
 
 use std::borrow::Cow;
 use std::io::{self, BufRead, Read, Seek, SeekFrom};
 
-/// What a file's head says.
+/// What a file's header says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     /// As stored, before `orientation`.
@@ -13,10 +13,10 @@ pub struct Header {
     pub orientation: u8,
 }
 
-/// Reads a file's markers up to its frame header; none where it is no JPEG or ends before.
+/// Reads a file's markers up to its frame header; `None` if it is not a JPEG or ends before that.
 ///
 /// # Errors
-/// When the reader fails.
+/// If the reader fails.
 pub fn header(reader: &mut (impl BufRead + Seek)) -> io::Result<Option<Header>> {
     match markers(reader) {
         Err(e) if e.kind() == io::ErrorKind::UnexpectedEof => Ok(None),
@@ -35,7 +35,7 @@ fn markers(reader: &mut (impl BufRead + Seek)) -> io::Result<Option<Header>> {
     }
     let mut orientation = 1;
     loop {
-        // Fill bytes, and what careless programs leave between segments, are passed over.
+        // Skips fill bytes, and garbage that faulty writers leave between segments.
         while byte(reader)? != 0xff {}
         let mut marker = 0xff;
         while marker == 0xff {
@@ -65,16 +65,16 @@ fn markers(reader: &mut (impl BufRead + Seek)) -> io::Result<Option<Header>> {
     }
 }
 
-/// A file that holds all data of its picture, with its end marker; none where it ends early. Where the marker is missing, the coded
+/// A complete file, with its end marker added if it is missing; `None` if the image data end early. Only if the marker is missing, the coded
 /// data are counted.
 pub fn whole(file: &[u8]) -> Option<Cow<'_, [u8]>> {
-    if walk(file)? {
+    if has_end_marker(file)? {
         return Some(file.into());
     }
     Some([file.strip_suffix(&[0xff]).unwrap_or(file), &[0xff, 0xd9]].concat().into())
 }
 
-/// Where the coded data of a scan end: at the next marker that is neither a stuffed byte, nor a restart, nor a fill byte.
+/// Position at which the coded data of a scan end: the next marker that is neither a stuffed byte, nor a restart, nor a fill byte.
 pub(crate) fn end_of_scan(file: &[u8], from: usize) -> Option<usize> {
     let mut at = from;
     loop {
@@ -92,12 +92,12 @@ struct Component {
     id: u8,
     horizontal: usize,
     vertical: usize,
-    /// Blocks of the picture, across and down, and across with the padding of interleaved scans.
+    /// Blocks of the picture, across and down; and across with the padding of interleaved scans.
     blocks: (usize, usize),
     stride: usize,
-    /// Coefficients of each block that are not 0, one bit each: refining scans depend on them.
+    /// Bits of each block's nonzero coefficients: refining scans depend on them.
     filled: Vec<u64>,
-    /// Coefficients that have come to their last bit.
+    /// Coefficients that are complete down to their last bit.
     done: u64,
 }
 
@@ -105,25 +105,25 @@ struct Component {
 struct Frame {
     is_progressive: bool,
     components: Vec<Component>,
-    /// Units of interleaved scans, across and down.
+    /// MCUs of interleaved scans, across and down.
     units: (usize, usize),
 }
 
-/// Most blocks that are counted: of a picture of 65535 by 4096 pixels, which is beyond what [`crate::photo::PhotoLimits`] lets pass.
+/// Most blocks that are counted: those of a picture of 65535 by 4096 pixels, which exceeds [`crate::photo::PhotoLimits`].
 const MOST_BLOCKS: usize = 1 << 23;
 
 /// Most scans: progressive files have about ten.
 const MOST_SCANS: usize = 1000;
 
-/// Most bytes behind the last data of a scan.
+/// Most padding bytes after the last data of a scan.
 const PADDING: usize = 16;
 
-/// True at the end marker, false where the file ends after the last of the data, none where it ends before.
-fn walk(file: &[u8]) -> Option<bool> {
+/// `Some(true)` at the end marker, `Some(false)` if the file ends after the last data, `None` if it ends before.
+fn has_end_marker(file: &[u8]) -> Option<bool> {
     let mut frame = Frame::default();
     let (mut tables, mut restart) = (Tables::default(), 0usize);
     let mut at = 2;
-    // Counting begins where the end marker turns out to be missing, so most files are passed over fast.
+    // Counting starts only when the end marker turns out to be missing, so most files are checked quickly.
     let mut count = false;
     let mut scans = Vec::new();
     loop {
@@ -148,7 +148,7 @@ fn walk(file: &[u8]) -> Option<bool> {
                 }
                 scans.push((body, at, tables.clone(), restart));
                 if end.is_none() {
-                    // Where a copy broke off, the rest may have been filled with zeros, which can be read as data.
+                    // An interrupted copy may be filled with zeros, which could be read as data.
                     if file[at..].iter().rev().take_while(|b| **b == 0).count() >= PADDING {
                         return None;
                     }
@@ -166,7 +166,7 @@ fn walk(file: &[u8]) -> Option<bool> {
     }
 }
 
-/// Moves behind the next marker and tells it.
+/// Moves past the next marker and returns it.
 fn next_marker(file: &[u8], at: &mut usize) -> Option<u8> {
     loop {
         *at += file.get(*at..)?.iter().position(|b| *b == 0xff)?;
@@ -191,7 +191,7 @@ struct Huffman {
 
 #[derive(Clone, Default)]
 struct Tables {
-    /// Direct and alternating current, four each.
+    /// DC and AC tables, four each.
     tables: [[Huffman; 4]; 2],
 }
 
@@ -208,7 +208,7 @@ impl Tables {
     }
 }
 
-/// The bits of a scan; none where they end.
+/// Bit reader of a scan; `None` at its end.
 struct Bits<'a> {
     data: &'a [u8],
     at: usize,
@@ -250,7 +250,7 @@ impl Bits<'_> {
         None
     }
 
-    /// Passes a restart marker.
+    /// Skips a restart marker.
     fn restart(&mut self) -> Option<()> {
         if self.left > 0 {
             let byte = self.data[self.at];
@@ -266,7 +266,7 @@ impl Bits<'_> {
     }
 }
 
-/// What a scan brings: its coefficients and bits.
+/// Header of a scan: its components, coefficients and bits.
 struct Band {
     from: usize,
     to: usize,
@@ -299,7 +299,7 @@ impl Frame {
         Some(Frame { is_progressive: marker == 0xc2, components, units })
     }
 
-    /// Passes over the data of a scan; none where they end too early.
+    /// Parses the data of a scan; `None` if they end too early.
     fn scan(&mut self, head: &[u8], data: &[u8], tables: &Tables, restart: usize) -> Option<()> {
         let n = *head.first()? as usize;
         let listed = head.get(1..1 + 2 * n)?;
@@ -368,7 +368,7 @@ fn sequential(bits: &mut Bits, direct: &Huffman, alternating: &Huffman) -> Optio
     Some(())
 }
 
-/// A block of a progressive scan (T.81, G.1.2); `run` counts the blocks that hold nothing more.
+/// A block of a progressive scan (T.81, G.1.2); `run` counts the following blocks that are empty.
 fn progressive(bits: &mut Bits, band: &Band, direct: &Huffman, alternating: &Huffman, filled: &mut u64, run: &mut usize) -> Option<()> {
     if band.from == 0 {
         let size = if band.high == 0 { bits.symbol(direct)? as usize } else { 1 };
@@ -385,7 +385,7 @@ fn progressive(bits: &mut Bits, band: &Band, direct: &Huffman, alternating: &Huf
                 break;
             }
             bits.bits(if refines { size.min(1) } else { size })?;
-            // In a refining scan, coefficients that are known take a bit each and are not among the zeros.
+            // In a refining scan, each known coefficient takes one bit and does not count as a zero.
             while k <= band.to {
                 if refines && *filled >> k & 1 == 1 {
                     bits.bit()?;

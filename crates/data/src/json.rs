@@ -1,13 +1,13 @@
-//! Reading JSON with errors that name the field.
+//! JSON readers whose errors name the field.
 
 use crate::error::{self, DataError, Result};
 use serde_json::Value;
 use std::path::Path;
 
-/// Largest JSON file that is read.
+/// Largest JSON file that is read, in bytes.
 const LIMIT: u64 = 512 << 20;
 
-/// A JSON object and where it stands, for messages.
+/// A JSON object with its file and position, for messages.
 #[derive(Clone, Copy)]
 pub struct Object<'a> {
     pub path: &'a Path,
@@ -36,7 +36,7 @@ impl<'a> Object<'a> {
         DataError::input(self.path, format!("{}{key}: {what}", self.place))
     }
 
-    /// A finite number, if the key is there.
+    /// A finite number, if the key exists.
     pub fn number(&self, key: &str) -> Result<Option<f64>> {
         let Some(v) = self.map.get(key) else { return Ok(None) };
         let x = v.as_f64().ok_or_else(|| self.wrong(key, &format!("expected a number, found {v:.40}")))?;
@@ -46,7 +46,7 @@ impl<'a> Object<'a> {
         Ok(Some(x))
     }
 
-    /// A number that must be positive.
+    /// A positive number, if the key exists.
     pub fn positive(&self, key: &str) -> Result<Option<f64>> {
         match self.number(key)? {
             Some(x) if x <= 0.0 => Err(self.wrong(key, &format!("{x} must be greater than 0"))),
@@ -54,6 +54,7 @@ impl<'a> Object<'a> {
         }
     }
 
+    /// Text, if the key exists.
     pub fn text(&self, key: &str) -> Result<Option<&'a str>> {
         match self.map.get(key) {
             None | Some(Value::Null) => Ok(None),
@@ -62,6 +63,7 @@ impl<'a> Object<'a> {
         }
     }
 
+    /// A boolean, if the key exists.
     pub fn flag(&self, key: &str) -> Result<Option<bool>> {
         match self.map.get(key) {
             None => Ok(None),
@@ -70,6 +72,7 @@ impl<'a> Object<'a> {
         }
     }
 
+    /// A list, if the key exists.
     pub fn array(&self, key: &str) -> Result<Option<&'a Vec<Value>>> {
         match self.map.get(key) {
             None => Ok(None),
@@ -78,7 +81,7 @@ impl<'a> Object<'a> {
         }
     }
 
-    /// Numbers of a fixed count.
+    /// A list of exactly `N` numbers.
     pub fn numbers<const N: usize>(&self, key: &str) -> Result<Option<[f64; N]>> {
         let Some(a) = self.array(key)? else { return Ok(None) };
         if a.len() != N {

@@ -1,5 +1,5 @@
-//! `poses_bounds.npy` of LLFF (Mildenhall et al. 2019): per image a 3×5 matrix (axes down, right, back;
-//! centre; height, width, focal length) and the nearest and farthest depth.
+//! `poses_bounds.npy` of LLFF (Mildenhall et al. 2019): per image a 3×5 matrix (axes down, right, back; center; height, width, focal
+//! length) and the nearest and farthest depth.
 
 use crate::error::{self, DataError, Result};
 use crate::imported::{self, Imported};
@@ -8,7 +8,7 @@ use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::{Camera, Lens, Pose};
 use std::path::{Path, PathBuf};
 
-/// Reads `poses_bounds.npy` and the photographs in `images` (or reduced in `images_2` and so on), matched in order of name.
+/// Reads `poses_bounds.npy` and the photographs in `images` (or reduced in `images_2` and so on), matched in the order of their names.
 pub fn read(root: &Path) -> Result<Imported> {
     let file = root.join("poses_bounds.npy");
     let (shape, values) = read_npy(&file)?;
@@ -56,7 +56,7 @@ pub fn read(root: &Path) -> Result<Imported> {
     Ok(out)
 }
 
-/// Shape and values of a little-endian f4 or f8 array in C order. Sizes are checked against the file first.
+/// Shape and values of a little-endian f4 or f8 array in C order. The size is compared with the file before anything is allocated.
 pub fn read_npy(file: &Path) -> Result<(Vec<usize>, Vec<f64>)> {
     let data = error::read(file, 1 << 30)?;
     let bad = |what: &str| DataError::input(file, format!("is not a usable .npy file: {what}"));

@@ -1,16 +1,16 @@
-//! A folder that one process at a time may fill. The system frees the lock when its holder ends, however it ends.
+//! A lock that lets one process at a time write to a folder. The system releases the lock when its holder ends, even after a crash.
 
 use crate::error::{DataError, Result};
 use std::fs::File;
 use std::path::Path;
 
-/// Name of the file that is locked.
+/// Name of the lock file.
 pub const NAME: &str = ".lock";
 
-/// Locks `folder`, which must exist, for as long as the file is kept.
+/// Locks `folder`, which must exist, as long as the returned file is open.
 ///
 /// # Errors
-/// When another process holds it.
+/// If another process holds the lock.
 pub fn take(folder: &Path) -> Result<File> {
     let name = folder.join(NAME);
     let lock = File::create(&name).map_err(DataError::io(&name, "create"))?;

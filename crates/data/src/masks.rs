@@ -1,4 +1,4 @@
-//! Masks: where they lie beside photographs, what they leave out, and how they are read.
+//! Masks: where they are found beside photographs, what they leave out, and how they are read.
 
 use crate::error::{DataError, Result};
 use crate::photo::{self, Photo};
@@ -8,29 +8,29 @@ use rayon::prelude::*;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-/// Names of folders of masks.
+/// Folder names that may contain masks.
 const FOLDERS: [&str; 2] = ["masks", "mask"];
-/// Most masks that are opened to tell what masks mean, and the side at which they are looked at.
-const OPENED: usize = 16;
-const LOOK_PX: usize = 96;
-/// Values from which a mask's pixel counts.
+/// Most masks that are decoded to choose their meaning, and the side in pixels at which they are examined.
+const EXAMINED_MASKS: usize = 16;
+const EXAMINED_PX: usize = 96;
+/// Mask values from this on are kept.
 pub const COUNTS: u8 = 128;
-/// Masks show one object if they keep at most this share of the picture, and at most this share of its rim.
+/// Masks show one object if they keep at most this share of the picture and at most this share of its border.
 const OBJECT: (f64, f64) = (0.6, 0.1);
-/// Masks are one and the same if at most this share of their pixels differs.
+/// Masks are considered identical if at most this share of their pixels differs.
 const SAME: f64 = 0.01;
-/// Largest difference of a mask's aspect from its photograph's.
+/// Largest difference between the aspect ratios of a mask and its photograph.
 const ASPECT: f64 = 0.01;
 
 /// What to do with masks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum MaskUse {
-    /// Black is left out.
+    /// Black pixels are left out.
     #[default]
     Use,
-    /// White is left out.
+    /// White pixels are left out.
     Invert,
-    /// As if there were none.
+    /// Masks are ignored.
     Ignore,
 }
 
@@ -47,18 +47,18 @@ impl std::str::FromStr for MaskUse {
     }
 }
 
-/// How a capture's masks are to be taken.
+/// Options for the masks of a capture.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MaskOptions {
     pub usage: MaskUse,
-    /// None: told by what the masks cover.
+    /// `None`: chosen from what the masks cover.
     pub meaning: Option<MaskMeaning>,
 }
 
-/// A meaning, or none for `auto`.
+/// Parses a meaning; `None` for `auto`.
 ///
 /// # Errors
-/// When the text is none of auto, object and unknown.
+/// If the text is not auto, object or unknown.
 pub fn parse_meaning(s: &str) -> std::result::Result<Option<MaskMeaning>, String> {
     match s {
         "auto" => Ok(None),
@@ -68,12 +68,12 @@ pub fn parse_meaning(s: &str) -> std::result::Result<Option<MaskMeaning>, String
     }
 }
 
-/// Gives frames that name no mask the ones that lie beside their photographs, tells what masks mean unless the options or else the
-/// capture's file have `stated` it, and says so in `notes`.
+/// Assigns masks that lie beside the photographs to frames that name none, and chooses what masks mean: as in the options, else as
+/// `stated` in the capture's file, else from what they cover. The choice is added to `notes`.
 ///
 /// # Errors
-/// When a mask that is looked at cannot be decoded, or has another aspect than its photograph.
-pub fn settle(
+/// If a mask that is examined cannot be decoded, or has another aspect ratio than its photograph.
+pub fn assign(
     root: &Path,
     frames: &mut [Frame],
     options: &MaskOptions,
@@ -97,9 +97,9 @@ pub fn settle(
     }
     let inverted = options.usage == MaskUse::Invert;
     let (meaning, why) = match (options.meaning, stated) {
-        (Some(m), _) => (m, "as told by --mask-meaning".to_string()),
+        (Some(m), _) => (m, "as --mask-meaning says".to_string()),
         (None, Some(m)) if !inverted => (m, "as the capture's file says".to_string()),
-        _ => judge(&with, frames.len(), inverted)?,
+        _ => choose_meaning(&with, frames.len(), inverted)?,
     };
     let place = with[0].mask.as_ref().and_then(|m| m.parent()).unwrap_or(root).display();
     let read = if inverted { ", white left out (--mask invert)" } else { "" };
@@ -116,15 +116,15 @@ pub fn settle(
     Ok(MaskRule { meaning, inverted })
 }
 
-/// Files of folders by their names in lower case.
+/// Finds mask files; the files of each folder are indexed by lower-case name.
 struct Finder<'a> {
     root: &'a Path,
     folders: HashMap<PathBuf, HashMap<String, PathBuf>>,
 }
 
 impl Finder<'_> {
-    /// The mask of a photograph: `dynamic_mask_NAME.png` beside it, or `NAME.png`, `NAME.jpg.png` and the like in a folder of masks
-    /// that stands where the folder of photographs stands, or below the root.
+    /// The mask of a photograph: `dynamic_mask_NAME.png` beside it, or `NAME.png`, `NAME.jpg.png` and the like in a mask folder beside the
+    /// folder of photographs or below the root.
     fn find(&mut self, image: &Path) -> Option<PathBuf> {
         let stem = image.file_stem()?.to_string_lossy().to_lowercase();
         let whole = image.file_name()?.to_string_lossy().to_lowercase();
@@ -136,11 +136,11 @@ impl Finder<'_> {
         let parts: Vec<_> = inside.components().collect();
         let mut candidates = Vec::new();
         for name in FOLDERS {
-            // The nearest folder first: `a/images/b` may have `a/images/masks`, `a/masks/b` or `masks/images/b`.
+            // Nearest folder first: the masks of `a/images/b` may be in `a/images/masks`, `a/masks/b` or `masks/images/b`.
             for k in (0..parts.len()).rev() {
                 let (before, after): (PathBuf, PathBuf) = (parts[..k].iter().collect(), parts[k + 1..].iter().collect());
                 let called = parts[k].as_os_str().to_string_lossy();
-                // `masks_4` goes with `images_4`.
+                // `masks_4` belongs to `images_4`.
                 let suffix = called.strip_prefix("images").unwrap_or("");
                 if !suffix.is_empty() {
                     candidates.push(self.root.join(&before).join(format!("{name}{suffix}")).join(&after));
@@ -154,7 +154,7 @@ impl Finder<'_> {
         candidates.into_iter().find_map(|c| self.named(&c, &whole).or_else(|| self.named(&c, &stem)))
     }
 
-    /// The picture of a name, to which an extension is added, in a folder.
+    /// Finds an image file in a folder by its name without extension.
     fn named(&mut self, folder: &Path, name: &str) -> Option<PathBuf> {
         let files = self.folders.entry(folder.to_path_buf()).or_insert_with(|| {
             let entries = folder.read_dir().into_iter().flatten().flatten().map(|e| e.path()).filter(|p| p.is_file());
@@ -163,7 +163,7 @@ impl Finder<'_> {
         ["png", "jpg", "jpeg", "webp", "tif", "tiff"].iter().find_map(|e| files.get(&format!("{name}.{e}")).cloned())
     }
 
-    /// A line on a folder of masks in which no photograph has found its own.
+    /// A note on a mask folder in which no photograph has a mask.
     fn unused(&self) -> Option<String> {
         let is_folder = |p: &&PathBuf| p.file_name().is_some_and(|n| FOLDERS.contains(&&*n.to_string_lossy()));
         let with_files = self.folders.iter().filter(|(_, files)| !files.is_empty()).map(|(p, _)| p);
@@ -172,68 +172,68 @@ impl Finder<'_> {
     }
 }
 
-/// What the masks of some frames mean, and why.
-fn judge(with: &[&Frame], frames: usize, inverted: bool) -> Result<(MaskMeaning, String)> {
+/// Chooses the meaning of some frames' masks, with the reason.
+fn choose_meaning(with: &[&Frame], frames: usize, inverted: bool) -> Result<(MaskMeaning, String)> {
     let is_dynamic = |f: &&Frame| f.mask.as_ref().is_some_and(|m| marks_ignored(m));
     if with.iter().all(is_dynamic) {
         return Ok((MaskMeaning::Unknown, format!("as {}* files mean", photo::DYNAMIC_MASK)));
     }
     if with.len() < frames {
-        return Ok((MaskMeaning::Unknown, "for some photographs have none".into()));
+        return Ok((MaskMeaning::Unknown, "because some photographs have none".into()));
     }
-    let step = with.len().div_ceil(OPENED);
+    let step = with.len().div_ceil(EXAMINED_MASKS);
     let opened: Vec<&&Frame> = with.iter().step_by(step).collect();
     let rule = MaskRule { meaning: MaskMeaning::Unknown, inverted };
     let looks: Vec<Vec<bool>> = opened.par_iter().map(|f| look(f, &rule)).collect::<Result<_>>()?;
     let share = |of: &dyn Fn(&[bool]) -> f64| looks.iter().map(|l| of(l)).sum::<f64>() / looks.len() as f64;
     let kept = share(&kept_share);
-    let says = |what: &str| format!("for they keep {:.0} % of the pictures{what}", 100.0 * kept);
+    let says = |what: &str| format!("because they keep {:.0} % of the pictures{what}", 100.0 * kept);
     let differ = |a: &[bool], b: &[bool]| a.iter().zip(b).filter(|(a, b)| a != b).count() as f64 / a.len() as f64;
     if looks.len() > 1 && looks.iter().all(|l| differ(l, &looks[0]) <= SAME) {
         return Ok((MaskMeaning::Unknown, says(", the same part of each")));
     }
-    let shows_object = |l: &Vec<bool>| kept_share(l) <= OBJECT.0 && rim_share(l) <= OBJECT.1;
-    // A few photographs may cut the thing off.
+    let shows_object = |l: &Vec<bool>| kept_share(l) <= OBJECT.0 && border_share(l) <= OBJECT.1;
+    // In a few photographs the object may be cut off by the border.
     let showing = looks.iter().filter(|l| shows_object(l)).count();
     if kept > 0.001 && showing * 10 >= looks.len() * 9 {
-        Ok((MaskMeaning::Object, says(", away from their rims: one thing, cut out")))
+        Ok((MaskMeaning::Object, says(", away from their borders: one object is cut out")))
     } else {
         Ok((MaskMeaning::Unknown, says("")))
     }
 }
 
-/// Which pixels of a mask count, at [`LOOK_PX`] squared.
+/// Which pixels of a mask are kept, at [`EXAMINED_PX`] squared.
 fn look(f: &Frame, rule: &MaskRule) -> Result<Vec<bool>> {
     let c = &f.camera;
-    let Some(mask) = of_frame(f, rule, (c.width as usize, c.height as usize))? else { return Ok(vec![true; LOOK_PX * LOOK_PX]) };
-    Ok(mask.downsampled(LOOK_PX, LOOK_PX).data.iter().map(|v| *v >= COUNTS).collect())
+    let Some(mask) = of_frame(f, rule, (c.width as usize, c.height as usize))? else { return Ok(vec![true; EXAMINED_PX * EXAMINED_PX]) };
+    Ok(mask.downsampled(EXAMINED_PX, EXAMINED_PX).data.iter().map(|v| *v >= COUNTS).collect())
 }
 
 fn kept_share(l: &[bool]) -> f64 {
     l.iter().filter(|v| **v).count() as f64 / l.len() as f64
 }
 
-fn rim_share(l: &[bool]) -> f64 {
-    let n = LOOK_PX;
+fn border_share(l: &[bool]) -> f64 {
+    let n = EXAMINED_PX;
     let rim = (0..n * n).filter(|i| [i % n, i / n].iter().any(|v| *v == 0 || *v == n - 1));
     let (kept, all) = rim.fold((0, 0), |(kept, all), i| (kept + l[i] as usize, all + 1));
     kept as f64 / all as f64
 }
 
-/// Whether a mask marks what is left out, as instant-ngp's do, instead of what counts.
+/// Whether a mask marks the pixels to leave out, as instant-ngp's do, instead of those to keep.
 fn marks_ignored(mask: &Path) -> bool {
     mask.file_name().is_some_and(|n| n.to_string_lossy().starts_with(photo::DYNAMIC_MASK))
 }
 
-/// The mask of a frame at the size of its photograph, where it has one: 255 where pixels count, 0 where they are left out.
+/// The mask of a frame at the size of its photograph, if it has one: 255 for kept pixels, 0 for the others.
 ///
 /// # Errors
-/// When it cannot be decoded, or has another aspect than the photograph.
+/// If it cannot be decoded, or has another aspect ratio than the photograph.
 pub fn of_frame(frame: &Frame, rule: &MaskRule, (width, height): (usize, usize)) -> Result<Option<ImageU8>> {
     let Some(path) = &frame.mask else { return Ok(None) };
     let mut mask = photo::load_mask(path)?;
     let (mw, mh) = (mask.width as f64, mask.height as f64);
-    // Sizes are whole pixels, so small pictures have no exact aspect.
+    // Sizes are whole pixels, so the aspect ratio of small pictures is inexact.
     let (by_width, by_height) = (width as f64 * mh / mw, height as f64);
     if (by_width - by_height).abs() > (ASPECT * by_height).max(1.0 + mh / mw) {
         return Err(DataError::input(
@@ -246,7 +246,7 @@ pub fn of_frame(frame: &Frame, rule: &MaskRule, (width, height): (usize, usize))
             ),
         ));
     }
-    // Classes instead of shades: 1 is what counts.
+    // Masks may hold class numbers instead of gray values: 1 is kept.
     if mask.data.iter().all(|v| *v <= 1) {
         mask.data.iter_mut().for_each(|v| *v *= 255);
     }
@@ -256,7 +256,7 @@ pub fn of_frame(frame: &Frame, rule: &MaskRule, (width, height): (usize, usize))
     Ok(Some(mask.downsampled(width, height)))
 }
 
-/// A photograph whose pixels outside of the mask are transparent, with all of its range.
+/// A photograph whose pixels outside the mask are transparent, at its full range of values.
 pub fn cut_out(photo: &Photo, mask: &ImageU8) -> Photo {
     let in_floats = |im: &Image| {
         let data = rgba(&im.data, im.channels, 1.0, mask, |alpha, m| alpha * m as f32 / 255.0);
@@ -272,7 +272,7 @@ pub fn cut_out(photo: &Photo, mask: &ImageU8) -> Photo {
     }
 }
 
-/// Pixels with an alpha that `through` makes of their own and of the mask.
+/// Pixels with new alpha, which `through` computes from their own alpha and the mask.
 fn rgba<T: Copy>(data: &[T], channels: usize, opaque: T, mask: &ImageU8, through: impl Fn(T, u8) -> T) -> Vec<T> {
     let pixels = data.chunks_exact(channels).zip(&mask.data).flat_map(|(p, m)| {
         let at = |k: usize| p[k.min(p.len() - 1)];
@@ -282,7 +282,7 @@ fn rgba<T: Copy>(data: &[T], channels: usize, opaque: T, mask: &ImageU8, through
     pixels.collect()
 }
 
-/// A photograph with what its mask makes of it: transparent pixels where masks mean an object, else the mask itself.
+/// A photograph with its mask applied: transparent pixels if masks mean an object, else the mask itself.
 ///
 /// # Errors
 /// As [`of_frame`].
@@ -301,7 +301,7 @@ mod tests {
 
     const SIZE: (usize, usize) = (60, 40);
 
-    /// Frames whose photographs lie at `images`, without pixels, and masks as `inside` says, in `masks`.
+    /// Frames with photographs at `images` (without pixels) and masks as `inside` says, in `masks`.
     fn frames(root: &Path, n: usize, inside: impl Fn(usize, f64, f64) -> bool) -> Vec<Frame> {
         let (w, h) = SIZE;
         std::fs::create_dir_all(root.join("images")).unwrap();
@@ -321,7 +321,7 @@ mod tests {
 
     fn settled(root: &Path, frames: &mut [Frame], options: MaskOptions) -> (MaskRule, String) {
         let mut notes = Vec::new();
-        let rule = settle(root, frames, &options, None, &mut notes).unwrap();
+        let rule = assign(root, frames, &options, None, &mut notes).unwrap();
         (rule, notes.join("\n"))
     }
 
@@ -430,11 +430,11 @@ mod tests {
         assert!(mask.is_none());
         let Photo::Eight(cut) = cut else { panic!("8 bits stay 8 bits") };
         assert_eq!(cut.data.chunks_exact(4).map(|p| (p[0], p[3])).collect::<Vec<_>>(), [(9, 0), (9, 255), (9, 255), (9, 0)]);
-        // What was transparent stays so.
+        // Transparent pixels stay transparent.
         let (cut, _) = apply(f, &rule, Photo::Eight(ImageU8 { channels: 4, data: vec![9; 16], ..cut })).unwrap();
         let Photo::Eight(cut) = cut else { panic!("8 bits stay 8 bits") };
         assert_eq!((cut.pixel(0, 0)[3], cut.pixel(1, 0)[3]), (0, 9));
-        // 16 bits and light brighter than white keep their range.
+        // 16-bit values and light brighter than white keep their range.
         let bright = Image { width: 4, height: 1, channels: 3, data: vec![7.5; 12] };
         for photo in [Photo::Sixteen(bright.clone()), Photo::Linear(bright)] {
             let (cut, _) = apply(f, &rule, photo.clone()).unwrap();

@@ -1,48 +1,48 @@
-//! Memory of the machine and of this process, as the system tells: `/proc` and control groups on Linux, `sysctl` and
-//! `vm_stat` on macOS, nothing elsewhere.
+//! Memory of the machine and of this process, as reported by the system: `/proc` and control groups on Linux, `sysctl` and `vm_stat` on
+//! macOS. Other systems report nothing.
 
 use std::path::Path;
 
-/// Bytes of memory that the machine has, and those that a process could take now.
+/// Bytes of memory that the machine has, and that this process could still allocate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct MachineMemory {
     pub total: Option<u64>,
-    /// Without what others use, and no more than the process' control groups allow.
+    /// Memory that other processes do not use, limited by this process's control groups.
     pub available: Option<u64>,
 }
 
-/// What the machine has.
+/// Queries the machine's memory.
 pub fn of_machine() -> MachineMemory {
     if cfg!(target_os = "macos") {
-        of_macos(&said_by("sysctl", &["-n", "hw.memsize"]), &said_by("vm_stat", &[]))
+        of_macos(&output_of("sysctl", &["-n", "hw.memsize"]), &output_of("vm_stat", &[]))
     } else {
         under(Path::new("/"))
     }
 }
 
-/// Most bytes that this process has had in memory (Linux), else those that it has now; none where the system does not tell.
+/// Peak memory of this process in bytes (Linux), or its present memory; `None` if the system does not report it.
 pub fn peak_of_process() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     kibibytes(&status, "VmHWM:").or_else(|| {
-        let resident = if cfg!(unix) { said_by("ps", &["-o", "rss=", "-p", &std::process::id().to_string()]) } else { String::new() };
+        let resident = if cfg!(unix) { output_of("ps", &["-o", "rss=", "-p", &std::process::id().to_string()]) } else { String::new() };
         resident.trim().parse::<u64>().ok().map(|k| k << 10)
     })
 }
 
-/// Begins to count [`peak_of_process`] anew from what the process has now (Linux); elsewhere nothing happens.
+/// Resets [`peak_of_process`] to the present memory (Linux); elsewhere nothing happens.
 pub fn reset_peak() {
-    // Where the system refuses, the peak is that since the process began.
+    // If the system refuses, the peak since the start of the process is reported.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 
-/// A file's line `KEY: N kB`, in bytes.
+/// Value of a file's line `KEY: N kB`, in bytes.
 fn kibibytes(text: &str, key: &str) -> Option<u64> {
     let line = text.lines().find(|l| l.starts_with(key))?;
     line.split_whitespace().nth(1)?.parse::<u64>().ok().map(|k| k << 10)
 }
 
-/// What a program of the system prints; empty where there is none.
-fn said_by(program: &str, arguments: &[&str]) -> String {
+/// Output of a system program; empty if it does not exist.
+fn output_of(program: &str, arguments: &[&str]) -> String {
     let out = std::process::Command::new(program).args(arguments).output();
     out.map(|o| String::from_utf8_lossy(&o.stdout).into_owned()).unwrap_or_default()
 }
@@ -57,17 +57,17 @@ fn of_macos(total: &str, vm_stat: &str) -> MachineMemory {
     MachineMemory { total: total.trim().parse().ok(), available: page.zip(free).map(|(page, free)| page * free) }
 }
 
-/// What the files of a Linux system say that stands below `root`.
+/// Memory from the files of a Linux system below `root`.
 fn under(root: &Path) -> MachineMemory {
     let read = |path: &str| std::fs::read_to_string(root.join(path)).unwrap_or_default();
     let info = read("proc/meminfo");
     let allowed = of_groups(&read);
-    // What could be swapped out makes room, too.
+    // Memory that can be swapped out is available too.
     let available = kibibytes(&info, "MemAvailable:").map(|a| a + kibibytes(&info, "SwapFree:").unwrap_or(0));
     MachineMemory { total: kibibytes(&info, "MemTotal:"), available: available.into_iter().chain(allowed).min() }
 }
 
-/// What the control groups of this process still allow, version 2 and 1.
+/// Memory that the control groups of this process still allow, versions 2 and 1.
 fn of_groups(read: &dyn Fn(&str) -> String) -> Option<u64> {
     let number = |path: &str| read(path).trim().parse::<u64>().ok();
     let field = |text: &str, key: &str| {
@@ -76,7 +76,7 @@ fn of_groups(read: &dyn Fn(&str) -> String) -> Option<u64> {
     };
     let left = |folder: &str, limit: &str, usage: &str, cached: &str| {
         let limit = number(&format!("{folder}/{limit}"))?;
-        // The file cache is given back when room is needed.
+        // The file cache is released when memory is needed.
         let cache = field(&read(&format!("{folder}/memory.stat")), cached).unwrap_or(0);
         Some(limit.saturating_sub(number(&format!("{folder}/{usage}"))?.saturating_sub(cache)))
     };
@@ -89,7 +89,7 @@ fn of_groups(read: &dyn Fn(&str) -> String) -> Option<u64> {
             continue;
         }
         let base = if version2 { "sys/fs/cgroup" } else { "sys/fs/cgroup/memory" };
-        // A group's limit holds for all groups below it.
+        // A group's limit applies to all groups below it.
         let mut at = path.trim_matches('/');
         loop {
             let folder = if at.is_empty() { base.to_string() } else { format!("{base}/{at}") };

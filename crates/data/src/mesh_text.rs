@@ -1,4 +1,4 @@
-//! OBJ with a texture or vertex colours, binary little-endian PLY, and binary STL, all in the mesh's own axes.
+//! OBJ with a texture or vertex colors, binary little-endian PLY, and binary STL, all in the mesh's own axes.
 
 use crate::error::{DataError, Result};
 use crate::{atomic, photo};
@@ -8,8 +8,8 @@ use diorama_geom::mesh::{cross, sub};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// Writes the texture of `model.obj` as `model.png` beside it and gives its name, in which blanks, at which many readers stop,
-/// are underscores; none without texture.
+/// Writes the texture of `model.obj` as `model.png` beside it and returns that name; `None` without a texture. Blanks in the name become
+/// underscores, because many readers cannot handle blanks.
 pub(crate) fn save_texture(path: &Path, mesh: &Mesh) -> Result<Option<String>> {
     let Some(t) = mesh.texture.as_ref().filter(|_| mesh.uvs.len() == mesh.positions.len()) else { return Ok(None) };
     let name = beside(path, "png");
@@ -17,7 +17,7 @@ pub(crate) fn save_texture(path: &Path, mesh: &Mesh) -> Result<Option<String>> {
     Ok(Some(name))
 }
 
-/// Files that saving a textured mesh as `path` writes beside it.
+/// Additional files that are written when a textured mesh is saved as `path`.
 pub fn companions(path: &Path) -> Vec<PathBuf> {
     let extensions: &[&str] = match path.extension().and_then(|e| e.to_str()).unwrap_or_default() {
         "obj" => &["mtl", "png", NORMALS],
@@ -27,17 +27,17 @@ pub fn companions(path: &Path) -> Vec<PathBuf> {
     extensions.iter().map(|e| path.with_file_name(beside(path, e))).collect()
 }
 
-/// Ending of the file with an OBJ's normal map.
+/// File name suffix of an OBJ's normal map.
 const NORMALS: &str = "normal.png";
 
-/// The name of a file that goes with `path`.
+/// Name of an additional file of `path`.
 fn beside(path: &Path, extension: &str) -> String {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     format!("{}.{extension}", stem.replace(char::is_whitespace, "_"))
 }
 
-/// Writes an OBJ: `v x y z`, with `r g b` where there is no texture, normals, texture coordinates, 1-based faces. A texture
-/// goes into `.mtl` and `.png` files beside it.
+/// Writes an OBJ: `v x y z`, with `r g b` if there is no texture; normals, texture coordinates, 1-based faces. A texture is written to
+/// `.mtl` and `.png` files beside it.
 pub fn save_obj(path: &Path, mesh: &Mesh) -> Result<()> {
     check(path, mesh)?;
     let texture = save_texture(path, mesh)?;
@@ -47,7 +47,7 @@ pub fn save_obj(path: &Path, mesh: &Mesh) -> Result<()> {
         if let Some(map) = &mesh.normal_map {
             let name = beside(path, NORMALS);
             photo::save_png(&path.with_file_name(&name), map)?;
-            // `norm` is what readers of physically based materials know, the second what others do.
+            // Readers of physically based materials use `norm`, others `map_Bump`.
             text += &format!("norm {name}\nmap_Bump {name}\n");
         }
         atomic::write(&path.with_file_name(&material), text.as_bytes())?;
@@ -120,7 +120,7 @@ pub fn save_ply(path: &Path, mesh: &Mesh) -> Result<()> {
     })
 }
 
-/// Writes a binary STL, which has neither colours nor shared vertices.
+/// Writes a binary STL, which has neither colors nor shared vertices.
 pub fn save_stl(path: &Path, mesh: &Mesh) -> Result<()> {
     check(path, mesh)?;
     let count = u32::try_from(mesh.faces.len()).map_err(|_| DataError::input(path, "too many faces for STL; lower --faces"))?;
@@ -143,7 +143,7 @@ pub fn save_stl(path: &Path, mesh: &Mesh) -> Result<()> {
     })
 }
 
-/// An empty mesh is an error.
+/// Refuses an empty mesh.
 pub(crate) fn check(path: &Path, mesh: &Mesh) -> Result<()> {
     if mesh.faces.is_empty() {
         return Err(DataError::input(path, "the mesh is empty: nothing is denser than the level; lower --level or train longer"));

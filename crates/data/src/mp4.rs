@@ -7,7 +7,7 @@ use openh264::encoder::{BitRate, Encoder, EncoderConfig, FrameRate, RateControlM
 use openh264::formats::{RgbSliceU8, YUVBuffer};
 use std::path::{Path, PathBuf};
 
-/// A video being written; nothing appears on disk before [`Video::finish`].
+/// A video being written; no file appears before [`Video::finish`].
 pub struct Video {
     path: PathBuf,
     encoder: Encoder,
@@ -15,17 +15,20 @@ pub struct Video {
     size: (usize, usize),
     sps: Vec<u8>,
     pps: Vec<u8>,
-    /// Sample data, and each sample's length and whether it is a key frame.
+    /// Sample data; and for each sample its length and whether it is a key frame.
     data: Vec<u8>,
     samples: Vec<(u32, bool)>,
 }
 
 impl Video {
-    /// For frames of one size, which is cut to even numbers.
+    /// Starts a video with frames of one size, which is reduced to even numbers.
     pub fn create(path: &Path, width: usize, height: usize, fps: u32) -> Result<Video> {
         let size = (width & !1, height & !1);
         if size.0 < 16 || size.1 < 16 || size.0 > 3840 || size.1 > 2160 {
-            return Err(DataError::input(path, format!("video of {width}×{height}: the encoder takes 16×16 to 3840×2160; choose --size")));
+            return Err(DataError::input(
+                path,
+                format!("video of {width}×{height}: the encoder accepts 16×16 to 3840×2160; choose another --size"),
+            ));
         }
         let rate = (size.0 * size.1) as f64 * fps as f64 * 0.25;
         let config = EncoderConfig::new()
@@ -34,8 +37,8 @@ impl Video {
             .rate_control_mode(RateControlMode::Off)
             .skip_frames(false);
         let api = openh264::OpenH264API::from_source();
-        let encoder =
-            Encoder::with_api_config(api, config).map_err(|e| DataError::input(path, format!("the video encoder refuses: {e}")))?;
+        let encoder = Encoder::with_api_config(api, config)
+            .map_err(|e| DataError::input(path, format!("the video encoder could not be started: {e}")))?;
         Ok(Video { path: path.to_path_buf(), encoder, fps, size, sps: vec![], pps: vec![], data: vec![], samples: vec![] })
     }
 
@@ -68,7 +71,7 @@ impl Video {
             return Err(DataError::input(&self.path, "a video needs at least one frame"));
         }
         let ftyp = atom(b"ftyp", &[b"isom", &0u32.to_be_bytes()[..], b"isomavc1"].concat());
-        // The offset of the samples depends only on sizes before them.
+        // The offset of the samples depends only on the sizes of the parts before them.
         let moov_size = self.moov(0).len();
         let offset = (ftyp.len() + moov_size + 8) as u32;
         let out = [ftyp, self.moov(offset), atom(b"mdat", &self.data)].concat();
@@ -141,7 +144,7 @@ fn sized(nal: &[u8]) -> Vec<u8> {
     [&(nal.len() as u16).to_be_bytes()[..], nal].concat()
 }
 
-/// Units of an Annex B stream, without their start codes.
+/// NAL units of an Annex B stream, without their start codes.
 fn nal_units(stream: &[u8]) -> Vec<&[u8]> {
     let mut starts = Vec::new();
     let mut i = 0;

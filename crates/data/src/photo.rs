@@ -1,5 +1,5 @@
-//! Decoding photographs: JPEG with EXIF orientation, PNG (8, 16 bit, alpha), WebP, TIFF, and linear EXR and HDR. A file that ends
-//! early is refused, whatever its format.
+//! Decodes photographs: JPEG with EXIF orientation, PNG (8 and 16 bits, alpha), WebP, TIFF, and linear EXR and HDR. Truncated files of
+//! every format are refused.
 
 use crate::error::{DataError, Result};
 use crate::jpeg;
@@ -11,7 +11,7 @@ use image::{DynamicImage, ExtendedColorType, ImageDecoder, ImageEncoder, ImageRe
 use std::io::{BufRead, Cursor, Seek};
 use std::path::Path;
 
-/// Limits on what a photograph may claim to be.
+/// Limits on the size that a photograph may claim to have.
 #[derive(Clone, Copy, Debug)]
 pub struct PhotoLimits {
     pub max_side: u32,
@@ -24,39 +24,40 @@ impl Default for PhotoLimits {
     }
 }
 
-/// How finely a photograph's values are stored.
+/// Number format in which a photograph's values are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Depth {
     Eight,
     Sixteen,
-    /// Floating point, in linear light.
+    /// Floating point, linear light.
     Linear,
 }
 
-/// What a photograph's head says.
+/// What a photograph's header says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
-    /// Width and height as shown, that is after EXIF orientation.
+    /// Width and height as displayed, after EXIF orientation.
     pub size: (u32, u32),
-    /// Whether metadata say that the picture is to be turned or mirrored.
+    /// Whether metadata ask to rotate or mirror the picture.
     pub is_turned: bool,
     pub depth: Depth,
 }
 
 impl Header {
+    /// Whether the values are sRGB or linear light.
     pub fn color_space(&self) -> ColorSpace {
         if self.depth == Depth::Linear { ColorSpace::Linear } else { ColorSpace::Srgb }
     }
 }
 
-/// A decoded photograph of 1, 3 or 4 channels, alpha straight.
+/// A decoded photograph with 1, 3 or 4 channels, alpha not premultiplied.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Photo {
     /// sRGB in 8 bits.
     Eight(ImageU8),
     /// sRGB of 16 bits, as values in [0, 1].
     Sixteen(Image),
-    /// Linear light, 1 is white, brighter is more.
+    /// Linear light; white is 1, and brighter values are larger.
     Linear(Image),
 }
 
@@ -77,7 +78,7 @@ impl Photo {
         }
     }
 
-    /// Area average over the exact pixel footprint, in the photograph's own space.
+    /// Area average over the exact pixel footprint, in the photograph's own color space.
     pub fn downsampled(&self, width: usize, height: usize) -> Photo {
         match self {
             Photo::Eight(im) => Photo::Eight(im.downsampled(width, height)),
@@ -86,7 +87,7 @@ impl Photo {
         }
     }
 
-    /// sRGB in 8 bits; what is brighter than white is white.
+    /// sRGB in 8 bits; values brighter than white become white.
     pub fn into_8_bits(self) -> ImageU8 {
         match self {
             Photo::Eight(im) => im,
@@ -95,7 +96,7 @@ impl Photo {
         }
     }
 
-    /// sRGB as floats; what is brighter than white goes on along the curve.
+    /// sRGB as floats; values brighter than white continue along the curve.
     pub fn into_srgb(self) -> Image {
         match self {
             Photo::Eight(im) => im.to_f32(),
@@ -105,7 +106,7 @@ impl Photo {
     }
 }
 
-/// Linear colors along the sRGB curve, alpha as it is.
+/// Maps linear colors to sRGB; alpha is unchanged.
 fn encoded(im: &Image) -> Image {
     let mut out = im.clone();
     for p in out.data.chunks_exact_mut(im.channels) {
@@ -114,15 +115,15 @@ fn encoded(im: &Image) -> Image {
     out
 }
 
-/// Whether two sizes are the same picture, but for the rounding of sides.
+/// Whether two sizes have the same aspect ratio, except for the rounding of sides.
 pub fn is_same_aspect(a: (u32, u32), b: (u32, u32)) -> bool {
     let ([aw, ah], [bw, bh]) = ([a.0, a.1].map(f64::from), [b.0, b.1].map(f64::from));
-    // The larger picture's shape, at the smaller one's size, differs by less than a pixel.
+    // The larger size, scaled to the smaller one, differs by less than a pixel.
     let ((w, h), (large_w, large_h)) = if aw * ah <= bw * bh { ((aw, ah), (bw, bh)) } else { ((bw, bh), (aw, ah)) };
     (large_h * w / large_w - h).abs() <= 1.0 || (large_w * h / large_h - w).abs() <= 1.0
 }
 
-/// What helps where a file is damaged.
+/// Remedy for damaged files.
 const CURE: &str = "copy it again, or leave such photographs out with --skip-broken";
 
 fn undecodable(path: &Path, e: impl std::fmt::Display) -> DataError {
@@ -130,10 +131,10 @@ fn undecodable(path: &Path, e: impl std::fmt::Display) -> DataError {
 }
 
 fn ends_early(path: &Path) -> DataError {
-    DataError::input(path, format!("the image file ends early, as if it was cut off; {CURE}"))
+    DataError::input(path, format!("the image file ends early, as if it was truncated; {CURE}"))
 }
 
-/// The error of a decoder, in words.
+/// Describes the error of a decoder.
 fn failed(path: &Path, limits: &PhotoLimits, e: image::ImageError) -> DataError {
     let mut cause: Option<&dyn std::error::Error> = Some(&e);
     while let Some(c) = cause {
@@ -142,7 +143,7 @@ fn failed(path: &Path, limits: &PhotoLimits, e: image::ImageError) -> DataError 
         }
         cause = c.source();
     }
-    // Some decoders pass the error on as text alone.
+    // Some decoders return the error only as text.
     let text = e.to_string();
     if ["unexpected end of file", "failed to fill whole buffer", "unexpected EOF"].iter().any(|t| text.contains(t)) {
         return ends_early(path);
@@ -153,7 +154,7 @@ fn failed(path: &Path, limits: &PhotoLimits, e: image::ImageError) -> DataError 
     }
 }
 
-/// A picture's file, or its bytes: one type, so that decoders are compiled once.
+/// Reader of an image file or of bytes in memory. It is one type, so that decoders are compiled only once.
 trait Source: BufRead + Seek {}
 impl<T: BufRead + Seek> Source for T {}
 
@@ -183,7 +184,7 @@ fn turns_sides(o: Orientation) -> bool {
     matches!(o, Orientation::Rotate90 | Orientation::Rotate270 | Orientation::Rotate90FlipH | Orientation::Rotate270FlipH)
 }
 
-/// Reads a photograph's head, not its pixels.
+/// Reads a photograph's header, not its pixels.
 pub fn header(path: &Path) -> Result<Header> {
     let limits = PhotoLimits::default();
     let file = std::fs::File::open(path).map_err(DataError::io(path, "read"))?;
@@ -219,33 +220,33 @@ fn depth_of(color: image::ColorType) -> Depth {
     }
 }
 
-/// Whether metadata say that the picture is to be turned or mirrored.
+/// Whether metadata ask to rotate or mirror the picture.
 pub fn is_turned(path: &Path) -> Result<bool> {
     Ok(header(path)?.is_turned)
 }
 
-/// Width and height as shown, that is after EXIF orientation.
+/// Width and height as displayed, after EXIF orientation.
 pub fn size(path: &Path) -> Result<(u32, u32)> {
     Ok(header(path)?.size)
 }
 
-/// Decodes a picture as its file holds it: not turned, its channels as they are.
+/// Decodes a picture as stored: not rotated, with its own channels.
 pub(crate) fn as_stored(bytes: &[u8]) -> image::ImageResult<DynamicImage> {
     let source: Box<dyn Source + '_> = Box::new(Cursor::new(bytes));
     ImageReader::new(source).with_guessed_format()?.decode()
 }
 
-/// Decodes a photograph with all of its range.
+/// Decodes a photograph at its full range of values.
 ///
 /// # Errors
-/// When the file is no image, ends early, or holds a value that is not a number.
+/// If the file is not an image, ends early, or contains a value that is not a number.
 pub fn load_full(path: &Path) -> Result<Photo> {
     let limits = PhotoLimits::default();
     let bytes = std::fs::read(path).map_err(DataError::io(path, "read"))?;
     if bytes.is_empty() {
         return Err(DataError::input(path, format!("the image file is empty (0 bytes); {CURE}")));
     }
-    // The decoder fills up with gray what a JPEG lacks.
+    // The decoder fills missing JPEG data with gray.
     let bytes = if bytes.starts_with(&[0xff, 0xd8]) { jpeg::whole(&bytes).ok_or_else(|| ends_early(path))? } else { (&bytes[..]).into() };
     let is_exr = bytes.starts_with(&[0x76, 0x2f, 0x31, 0x01]);
     let mut decoder = decoder(path, &limits, Box::new(Cursor::new(&*bytes)))?;
@@ -268,7 +269,7 @@ pub fn load_full(path: &Path) -> Result<Photo> {
             let mut im = floats(im);
             check_range(path, &im)?;
             if is_exr && channels == 4 {
-                straighten(&mut im);
+                unpremultiply(&mut im);
             }
             Photo::Linear(im)
         }
@@ -286,15 +287,15 @@ fn check_range(path: &Path, im: &Image) -> Result<()> {
     Err(DataError::input(
         path,
         if value.is_nan() {
-            format!("pixel ({x}, {y}) is not a number (NaN, {channel}); mend it, or {}", "leave such photographs out with --skip-broken")
+            format!("pixel ({x}, {y}) is not a number (NaN, {channel}); repair it, or {}", "leave such photographs out with --skip-broken")
         } else {
             format!("pixel ({x}, {y}) is {value} ({channel}), beyond ±{LARGEST}; scale or clamp the photograph's values")
         },
     ))
 }
 
-/// EXR's colors are multiplied by alpha.
-fn straighten(im: &mut Image) {
+/// EXR stores colors premultiplied by alpha.
+fn unpremultiply(im: &mut Image) {
     for p in im.data.chunks_exact_mut(4).filter(|p| p[3] > 0.0) {
         let alpha = p[3];
         p.iter_mut().take(3).for_each(|v| *v = (*v / alpha).clamp(-LARGEST, LARGEST));
@@ -306,7 +307,7 @@ pub fn load(path: &Path) -> Result<ImageU8> {
     load_full(path).map(Photo::into_8_bits)
 }
 
-/// Decodes a photograph to RGB, its longer side at most `side`; what is clear is white.
+/// Decodes a photograph to RGB with at most `side` pixels along its longer side; transparent pixels become white.
 pub fn load_small(path: &Path, side: usize) -> Result<ImageU8> {
     let full = load(path)?;
     let by = (side as f64 / full.width.max(full.height) as f64).min(1.0);
@@ -321,10 +322,10 @@ pub fn load_small(path: &Path, side: usize) -> Result<ImageU8> {
     Ok(ImageU8 { channels: 3, data: small.data.chunks_exact(small.channels).flat_map(rgb).collect(), ..small })
 }
 
-/// How names of instant-ngp's masks begin; in them, what is not black is to be ignored.
+/// Prefix of instant-ngp's mask files; their non-black pixels are to be ignored.
 pub const DYNAMIC_MASK: &str = "dynamic_mask_";
 
-/// Decodes a mask to one channel: 0 where the pixel is to be ignored.
+/// Decodes a mask to one channel; pixels with 0 are to be ignored.
 pub fn load_mask(path: &Path) -> Result<ImageU8> {
     let im = load(path)?;
     let marks_ignored = path.file_name().is_some_and(|n| n.to_string_lossy().starts_with(DYNAMIC_MASK));
@@ -360,7 +361,7 @@ pub fn save_exr(path: &Path, im: &Image) -> Result<()> {
     crate::atomic::write(path, &encode_exr(im))
 }
 
-/// Encodes EXR in memory, its colors multiplied by alpha.
+/// Encodes EXR in memory, with colors premultiplied by alpha.
 pub(crate) fn encode_exr(im: &Image) -> Vec<u8> {
     let bytes = |v: f32| v.to_ne_bytes();
     let (bytes, color): (Vec<u8>, _) = if im.channels == 4 {
@@ -375,7 +376,7 @@ pub(crate) fn encode_exr(im: &Image) -> Vec<u8> {
     out.into_inner()
 }
 
-/// Encodes a PNG of 16 bits in memory, of values in [0, 1].
+/// Encodes values in [0, 1] as a 16-bit PNG in memory.
 pub(crate) fn encode_png_16(im: &Image) -> Vec<u8> {
     let bytes: Vec<u8> = im.data.iter().flat_map(|v| u16_from_unit(*v).to_ne_bytes()).collect();
     let color = if im.channels == 4 { ExtendedColorType::Rgba16 } else { ExtendedColorType::Rgb16 };

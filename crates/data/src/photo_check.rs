@@ -1,4 +1,4 @@
-//! Photographs against the cameras that were found for them: sizes, color spaces, depth maps, and whether the files are whole.
+//! Checks photographs against their cameras: sizes, color spaces, depth maps, and whether the files are complete.
 
 use crate::error::{DataError, Result};
 use crate::photo::{self, Depth, Header, Photo};
@@ -9,22 +9,22 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What [`fit`] found.
+/// Result of [`fit`].
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Fitted {
-    /// What is worth a line each.
+    /// Notes for the user, one line each.
     pub notes: Vec<String>,
-    /// Numbers of the frames that stay, ascending.
+    /// Indices of the frames that are kept, ascending.
     pub kept: Vec<usize>,
     /// Names of the photographs that were left out.
     pub broken: Vec<String>,
 }
 
-/// Reads every photograph's head; fits cameras to photographs of another size, notes color spaces, checks depth maps. With
+/// Reads the header of every photograph, adapts cameras to photographs of another size, notes color spaces, and checks depth maps. With
 /// `skip_broken`, photographs that cannot be read are left out and listed.
 ///
 /// # Errors
-/// When a photograph cannot be read, has another aspect than its camera, or holds another kind of light than the others.
+/// If a photograph cannot be read, has another aspect ratio than its camera, or another kind of light (sRGB or linear) than the others.
 pub fn fit(frames: &mut Vec<Frame>, skip_broken: bool) -> Result<Fitted> {
     let mut notes = Vec::new();
     let headers: Vec<Result<Header>> = frames.par_iter().map(|f| photo::header(&f.image)).collect();
@@ -58,7 +58,7 @@ pub fn fit(frames: &mut Vec<Frame>, skip_broken: bool) -> Result<Fitted> {
 /// Decodes every photograph, drops the frames of those that cannot be decoded, and lists them in the capture's notes.
 ///
 /// # Errors
-/// When the disk fails, or too few training views are left.
+/// If reading fails, or too few training views remain.
 pub fn leave_out_broken(capture: &mut Capture) -> Result<()> {
     let verdicts: Vec<Result<()>> = capture.frames.par_iter().map(|f| photo::load_full(&f.image).map(drop)).collect();
     let mut broken = Vec::new();
@@ -94,24 +94,24 @@ fn names(broken: &[DataError]) -> Vec<String> {
     broken.iter().map(|e| broken_file(e).file_name().unwrap_or_default().to_string_lossy().into_owned()).collect()
 }
 
-/// A note that lists what was left out.
+/// A note that lists the photographs that were left out.
 pub fn left_out(broken: &[DataError]) -> Option<String> {
     let names = names(broken);
     let some = if names.len() == 1 { "broken photograph is" } else { "broken photographs are" };
     (!names.is_empty()).then(|| format!("{} {some} left out: {}", names.len(), names.join(", ")))
 }
 
-/// Photographs that [`white`] looks at.
-const LOOKED_AT: usize = 12;
+/// Most photographs that [`white`] reads.
+const WHITE_SAMPLES: usize = 12;
 /// Share of the values that are darker than white.
 const DARKER: f32 = 0.97;
 
-/// The linear light of some photographs that is fit to be shown as white: nearly all of them is darker.
+/// A value of linear light that can be displayed as white: nearly all values of some photographs are darker.
 ///
 /// # Errors
-/// When one cannot be decoded, or all are black.
+/// If a photograph cannot be decoded, or all are black.
 pub fn white(frames: &[&Frame]) -> Result<f32> {
-    let n = frames.len().min(LOOKED_AT);
+    let n = frames.len().min(WHITE_SAMPLES);
     let looks = (0..n).into_par_iter().map(|i| {
         let photo = photo::load_full(&frames[i * frames.len() / n].image)?;
         let (w, h) = photo.size();
@@ -125,42 +125,44 @@ pub fn white(frames: &[&Frame]) -> Result<f32> {
     values.sort_by(f32::total_cmp);
     let found = values.get(((values.len() as f32 * DARKER) as usize).min(values.len().saturating_sub(1))).copied().unwrap_or(0.0);
     match (found > 0.0, frames.first()) {
-        (false, Some(f)) => Err(DataError::input(&f.image, "is black, like the other photographs; give some that show something")),
+        (false, Some(f)) => {
+            Err(DataError::input(&f.image, "is black, and so are the other photographs; give photographs that show something"))
+        }
         _ => Ok(found),
     }
 }
 
-/// Gives cameras their photographs' sizes.
+/// Scales cameras to the sizes of their photographs.
 fn scaled(frames: &mut [(Frame, Header)]) -> Result<Vec<String>> {
     let mut changes: BTreeMap<((u32, u32), (u32, u32)), usize> = BTreeMap::new();
     for (f, header) in frames.iter_mut() {
-        let (is, said) = (header.size, (f.camera.width, f.camera.height));
-        if is == said {
+        let (is, expected) = (header.size, (f.camera.width, f.camera.height));
+        if is == expected {
             continue;
         }
-        let turned = header.is_turned && photo::is_same_aspect((is.1, is.0), said);
+        let turned = header.is_turned && photo::is_same_aspect((is.1, is.0), expected);
         if turned {
             return Err(DataError::input(
                 &f.image,
                 format!(
-                    "the photograph is {}×{} once turned as its metadata ask, but its camera says {}×{}; the poses are those of unturned \
+                    "the photograph is {}×{} after the rotation in its metadata, but its camera says {}×{}; the poses belong to unrotated \
                      photographs: remove the orientation (exiftool -Orientation= FILE)",
-                    is.0, is.1, said.0, said.1
+                    is.0, is.1, expected.0, expected.1
                 ),
             ));
         }
-        if !photo::is_same_aspect(is, said) {
+        if !photo::is_same_aspect(is, expected) {
             return Err(DataError::input(
                 &f.image,
                 format!(
-                    "the photograph is {}×{} but its camera says {}×{}, which is another shape; use the photographs that the poses were \
-                     found for, or copies of them that are only resized",
-                    is.0, is.1, said.0, said.1
+                    "the photograph is {}×{} but its camera says {}×{}, which has another aspect ratio; use the photographs that the poses \
+                     were found for, or copies of them that are only resized",
+                    is.0, is.1, expected.0, expected.1
                 ),
             ));
         }
         f.camera = f.camera.resized(is.0, is.1);
-        *changes.entry((is, said)).or_default() += 1;
+        *changes.entry((is, expected)).or_default() += 1;
     }
     let note = |(((w, h), (cw, ch)), n): (&((u32, u32), (u32, u32)), &usize)| {
         format!("{n} photographs are {w}×{h} where the poses' file says {cw}×{ch}: focal lengths and centers are scaled")
@@ -175,7 +177,7 @@ fn one_kind_of_light(frames: &[Frame]) -> Result<()> {
     Err(DataError::input(&linear.image, format!("holds linear light, but {other} does not; give photographs of one kind")))
 }
 
-/// Checks that a frame's depth map is one, and of its photograph's shape.
+/// Checks that a frame's depth map is readable and has the aspect ratio of its photograph.
 fn depth_fits(f: &Frame) -> Result<()> {
     let Some(file) = &f.depth else { return Ok(()) };
     let extension = file.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
@@ -200,7 +202,7 @@ fn depth_fits(f: &Frame) -> Result<()> {
     Err(DataError::input(
         file,
         format!(
-            "the depth map is {}×{} but its photograph is {}×{}, which is another shape; remove depth_file_path or give the right one",
+            "the depth map is {}×{} but its photograph is {}×{}, which has another aspect ratio; remove depth_file_path or give the right one",
             size.0, size.1, photo.0, photo.1
         ),
     ))

@@ -1,4 +1,4 @@
-//! Photographs into a data set: upright, at most so large, without metadata.
+//! Copies photographs into a data set: upright, limited in size, without metadata.
 
 use crate::atomic;
 use crate::error::{DataError, Result};
@@ -6,24 +6,27 @@ use crate::photo::{self, Photo};
 use diorama_geom::ImageU8;
 use std::path::{Path, PathBuf};
 
-/// Extensions of files that are taken for photographs.
+/// File extensions of photographs.
 pub const EXTENSIONS: [&str; 8] = ["jpg", "jpeg", "png", "webp", "tif", "tiff", "exr", "hdr"];
-/// Quality of photographs that had to be encoded anew.
+/// JPEG quality of photographs that are encoded again.
 const JPEG_QUALITY: u8 = 96;
 
-/// The photographs of a folder in order of their names; numbers in names count as numbers.
+/// Lists the photographs of a folder in the order of their names; numbers in names are compared as numbers.
 ///
 /// # Errors
-/// When the folder cannot be read or holds none.
+/// If the folder cannot be read or contains none.
 pub fn list(folder: &Path) -> Result<Vec<PathBuf>> {
     let found = found(folder)?;
     if found.is_empty() {
-        return Err(DataError::input(folder, format!("holds no photographs ({}); give the folder they lie in", EXTENSIONS.join(", "))));
+        return Err(DataError::input(
+            folder,
+            format!("holds no photographs ({}); give the folder that contains them", EXTENSIONS.join(", ")),
+        ));
     }
     Ok(found)
 }
 
-/// [`list`], which may be empty.
+/// [`list`], but an empty result is no error.
 pub(crate) fn found(folder: &Path) -> Result<Vec<PathBuf>> {
     let entries = folder.read_dir().map_err(DataError::io(folder, "read"))?;
     let is_photo = |p: &PathBuf| {
@@ -37,7 +40,7 @@ pub(crate) fn found(folder: &Path) -> Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// A key under which IMG_9 comes before IMG_10: texts with the numbers that follow them.
+/// Sort key by which IMG_9 comes before IMG_10: pairs of a text and the number that follows it.
 fn natural(name: &str) -> Vec<(String, Option<u64>)> {
     let mut key = vec![(String::new(), None)];
     for c in name.chars() {
@@ -51,10 +54,10 @@ fn natural(name: &str) -> Vec<(String, Option<u64>)> {
     key
 }
 
-/// Focal length over the longer side, both in pixels, as the camera wrote it into the photograph (the equivalent for 35 mm film, by
-/// the diagonal).
+/// Focal length divided by the longer side, both in pixels, from the photograph's EXIF data (35 mm equivalent focal length, which refers
+/// to the diagonal).
 pub fn focal_ratio(photo: &Path) -> Option<f64> {
-    /// Diagonal of the film in millimetres.
+    /// Diagonal of 35 mm film in millimeters.
     const FILM: f64 = 43.267;
     let mut file = std::io::BufReader::new(std::fs::File::open(photo).ok()?);
     let exif = exif::Reader::new().read_from_container(&mut file).ok()?;
@@ -65,18 +68,18 @@ pub fn focal_ratio(photo: &Path) -> Option<f64> {
     Some(mm / FILM * w.hypot(h) / w.max(h))
 }
 
-/// Writes a photograph as `folder/stem` with its extension. A JPEG that needs no change keeps its pixels bit for bit, and what was
-/// stored without loss stays so, with all of its range; metadata go in any case.
+/// Writes a photograph as `folder/stem` with its extension. A JPEG that needs no change keeps its coded pixels bit for bit. Lossless
+/// photographs stay lossless, at their full range of values. Metadata are always removed.
 ///
 /// # Errors
-/// When it cannot be decoded, or the disk refuses.
+/// If the photograph cannot be decoded, or the file cannot be written.
 pub fn import(source: &Path, folder: &Path, stem: &str, max_side: u32) -> Result<PathBuf> {
     let header = photo::header(source)?;
     let (w, h) = header.size;
     let shrink = w.max(h) > max_side;
     let bytes = std::fs::read(source).map_err(DataError::io(source, "read"))?;
     if !shrink && bytes.starts_with(&[0xff, 0xd8]) && !header.is_turned {
-        // Decoding it shows whether it is whole.
+        // Decoding shows whether the file is complete.
         photo::load_full(source)?;
         if let Some(clean) = without_metadata(&bytes) {
             let target = folder.join(format!("{stem}.jpg"));
@@ -100,12 +103,12 @@ pub fn import(source: &Path, folder: &Path, stem: &str, max_side: u32) -> Result
     Ok(target)
 }
 
-/// Whether a photograph was stored without loss.
+/// Whether a photograph was stored losslessly.
 fn is_lossless(file: &[u8]) -> bool {
     if file.get(8..12) != Some(b"WEBP") {
         return !file.starts_with(&[0xff, 0xd8]);
     }
-    // Of the chunks, the one that holds the picture.
+    // Finds the chunk that contains the picture.
     let mut at = 12;
     while let (Some(name), Some(length)) = (file.get(at..at + 4), file.get(at + 4..at + 8)) {
         if matches!(name, b"VP8 " | b"VP8L") {
@@ -117,13 +120,13 @@ fn is_lossless(file: &[u8]) -> bool {
     false
 }
 
-/// Writes pixels that were made of a photograph: as PNG where that was stored without loss or there is alpha, else as JPEG.
+/// Writes pixels computed from a photograph: as PNG if the photograph was stored losslessly or has alpha, else as JPEG.
 pub fn write_like(source: &Path, image: &ImageU8, folder: &Path, stem: &str) -> Result<PathBuf> {
     let bytes = std::fs::read(source).map_err(DataError::io(source, "read"))?;
     write_as(image, folder, stem, is_lossless(&bytes))
 }
 
-/// Writes pixels as JPEG, or as PNG where there is alpha.
+/// Writes pixels as JPEG, or as PNG if there is alpha.
 pub fn write(image: &ImageU8, folder: &Path, stem: &str) -> Result<PathBuf> {
     write_as(image, folder, stem, false)
 }
@@ -143,7 +146,7 @@ fn write_as(image: &ImageU8, folder: &Path, stem: &str, keeps_all: bool) -> Resu
     Ok(target)
 }
 
-/// A JPEG without EXIF, XMP, comments, previews and whatever follows its end; colour profiles stay. None where it is malformed.
+/// Removes EXIF, XMP, comments, previews and data after the end from a JPEG; color profiles stay. `None` if it is malformed.
 pub fn without_metadata(jpeg: &[u8]) -> Option<Vec<u8>> {
     let mut out = jpeg.strip_prefix(&[0xff, 0xd8]).map(|_| vec![0xff, 0xd8])?;
     let mut at = 2;
@@ -161,7 +164,7 @@ pub fn without_metadata(jpeg: &[u8]) -> Option<Vec<u8>> {
                 out.extend([0xff, 0xd9]);
                 return Some(out);
             }
-            // Stuffed bytes and markers without length have no place between segments.
+            // Stuffed bytes and markers without a length are not allowed between segments.
             0x00 | 0x01 | 0xd0..=0xd8 => return None,
             _ => {}
         }
@@ -196,7 +199,7 @@ mod tests {
         ImageU8 { width: 32, height: 24, channels: 3, data }
     }
 
-    /// The picture as JPEG with a position in EXIF, a comment, and a second image behind the end.
+    /// A test picture as JPEG, with a position in EXIF, a comment, and a second image after the end.
     fn with_metadata(dir: &Path) -> PathBuf {
         let plain = write(&picture(), dir, "plain").unwrap();
         let bytes = std::fs::read(&plain).unwrap();
@@ -277,7 +280,7 @@ mod tests {
             let target = import(&source, &out, "a", 100).unwrap();
             assert_eq!(target.extension().unwrap(), made, "{name}");
             assert!(photo::load_full(&target).unwrap() == photo::load_full(&source).unwrap(), "{name}");
-            // Reduced, it is encoded anew, and still not as JPEG.
+            // The reduced copy is encoded again, but not as JPEG.
             assert_eq!(import(&source, &out, "b", 16).unwrap().extension().unwrap(), made, "{name}");
             assert_eq!(write_like(&source, &picture(), &out, "c").unwrap().extension().unwrap(), "png", "{name}");
         }
@@ -297,7 +300,7 @@ mod tests {
         let end = bytes.len() - b"GPS again".len();
         assert_eq!(&bytes[end - 2..end], [0xff, 0xd9]);
         for n in 0..end {
-            // Without its end nothing is clean, and nothing is written.
+            // Without the end marker the file is refused, and nothing is written.
             assert_eq!(without_metadata(&bytes[..n]), None, "{n}");
         }
         for n in [10, 200, end / 2, end - 40] {

@@ -1,15 +1,15 @@
-//! The part of Python's pickle format (protocols 2 to 5) that `torch.save` writes for named tensors. Nothing is executed:
-//! a class or function is a name, and calling one makes a [`Node::Call`].
+//! The part of Python's pickle format (protocols 2 to 5) that `torch.save` writes for named tensors. Nothing is executed: a class or
+//! function is stored as a name, and a call as a [`Node::Call`].
 
 use std::io::Read;
 
-/// Most bytes of one pickle.
+/// Largest pickle that is read, in bytes.
 const LIMIT: usize = 64 << 20;
 
 /// Index of a value in a [`Pickle`].
 pub type Id = u32;
 
-/// One value; the parts of compound values are indices, so that no nesting, however deep, can exhaust the stack.
+/// One value. Elements of compound values are indices, so that deep nesting cannot exhaust the stack.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Node {
     None,
@@ -25,7 +25,7 @@ pub enum Node {
     Global(String),
     /// A function or class with its arguments.
     Call(Id, Id),
-    /// What lies outside of the pickle.
+    /// A reference to data outside the pickle.
     Persistent(Id),
 }
 
@@ -37,20 +37,22 @@ pub struct Pickle {
 }
 
 impl Pickle {
+    /// The value that the pickle describes.
     pub fn root(&self) -> &Node {
         &self.nodes[self.root as usize]
     }
 
-    /// All values, in the order in which they were made.
+    /// All values, in the order of their creation.
     pub fn nodes(&self) -> &[Node] {
         &self.nodes
     }
 
+    /// The value with an index.
     pub fn get(&self, id: Id) -> &Node {
         &self.nodes[id as usize]
     }
 
-    /// The elements of a tuple or list; none of anything else.
+    /// The elements of a tuple or list; `None` for other values.
     pub fn list(&self, id: Id) -> Option<&[Id]> {
         match self.get(id) {
             Node::List(v) => Some(v),
@@ -58,6 +60,7 @@ impl Pickle {
         }
     }
 
+    /// An integer; `None` for other values.
     pub fn int(&self, id: Id) -> Option<i64> {
         match self.get(id) {
             Node::Int(v) => Some(*v),
@@ -65,6 +68,7 @@ impl Pickle {
         }
     }
 
+    /// A text; `None` for other values.
     pub fn text(&self, id: Id) -> Option<&str> {
         match self.get(id) {
             Node::Text(v) => Some(v),
@@ -73,10 +77,10 @@ impl Pickle {
     }
 }
 
-/// Reads one pickle and leaves the reader behind it.
+/// Reads one pickle; the reader is left after it.
 ///
 /// # Errors
-/// A line that says what is wrong, for malformed pickles, opcodes that `torch.save` has no use for, and more than 64 MiB.
+/// A message for malformed pickles, opcodes that `torch.save` does not use, and pickles of more than 64 MiB.
 pub fn read(from: &mut dyn Read) -> Result<Pickle, String> {
     let mut machine = Machine { from, left: LIMIT, out: Pickle::default(), stack: Vec::new(), marks: Vec::new(), memo: Vec::new() };
     machine.run()?;
@@ -89,7 +93,7 @@ struct Machine<'a> {
     left: usize,
     out: Pickle,
     stack: Vec<Id>,
-    /// Heights of the stack.
+    /// Stack heights at the marks.
     marks: Vec<usize>,
     memo: Vec<Option<Id>>,
 }
@@ -112,7 +116,7 @@ impl Machine<'_> {
                     return Ok(());
                 }
                 b'(' => self.marks.push(self.stack.len()),
-                // The state of an object says nothing about its tensors.
+                // The state of an object contains nothing about its tensors.
                 b'0' | b'b' => drop(self.pop()?),
                 _ if self.push_scalar(op)? || self.fill_container(op)? || self.push_object(op)? || self.use_memo(op)? => {}
                 _ => return Err(format!("pickle opcode 0x{op:02x}, which torch.save does not write")),
@@ -120,7 +124,7 @@ impl Machine<'_> {
         }
     }
 
-    /// Pushes a number, text or bytes; whether `op` is one of these opcodes.
+    /// Pushes a number, text or bytes. Returns whether `op` is one of these opcodes.
     fn push_scalar(&mut self, op: u8) -> Result<bool, String> {
         let node = match op {
             b'N' => Node::None,
@@ -142,7 +146,7 @@ impl Machine<'_> {
         Ok(true)
     }
 
-    /// Makes or fills a tuple, list, set or dictionary; whether `op` is one of these opcodes.
+    /// Creates or extends a tuple, list, set or dictionary. Returns whether `op` is one of these opcodes.
     fn fill_container(&mut self, op: u8) -> Result<bool, String> {
         match op {
             b']' | b')' | 0x8f => self.push(Node::List(Vec::new())),
@@ -178,7 +182,7 @@ impl Machine<'_> {
         Ok(true)
     }
 
-    /// Names a class or function, notes a call of one, or a reference out of the pickle; whether `op` is one of these opcodes.
+    /// Pushes the name of a class or function, a call of one, or a persistent reference. Returns whether `op` is one of these opcodes.
     fn push_object(&mut self, op: u8) -> Result<bool, String> {
         match op {
             b'c' => {
@@ -205,7 +209,7 @@ impl Machine<'_> {
         Ok(true)
     }
 
-    /// Stores the top of the stack in the memo or pushes what the memo holds; whether `op` is one of these opcodes.
+    /// Stores the top of the stack in the memo, or pushes an entry of the memo. Returns whether `op` is one of these opcodes.
     fn use_memo(&mut self, op: u8) -> Result<bool, String> {
         match op {
             b'q' => {
@@ -233,7 +237,7 @@ impl Machine<'_> {
     fn take(&mut self, n: usize) -> Result<Vec<u8>, String> {
         self.left = self.left.checked_sub(n).ok_or("a pickle of more than 64 MiB")?;
         let mut out = Vec::new();
-        // Grows with what is there, whatever length is claimed.
+        // Memory grows with the bytes that are read, not with the claimed length.
         let got = (&mut *self.from).take(n as u64).read_to_end(&mut out).map_err(|e| e.to_string())?;
         if got == n { Ok(out) } else { Err("it ends too early; copy the file again".into()) }
     }
@@ -256,13 +260,13 @@ impl Machine<'_> {
         }
     }
 
-    /// Bytes after their number, which is one byte.
+    /// Bytes with a one-byte length before them.
     fn short_bytes(&mut self) -> Result<Vec<u8>, String> {
         let [n] = self.bytes()?;
         self.take(n as usize)
     }
 
-    /// Bytes after their number, which is four bytes.
+    /// Bytes with a four-byte length before them.
     fn long_bytes(&mut self) -> Result<Vec<u8>, String> {
         let n = u32::from_le_bytes(self.bytes()?);
         self.take(n as usize)
@@ -273,7 +277,7 @@ impl Machine<'_> {
         self.out.nodes.push(node);
     }
 
-    /// Height of the stack at the last mark; only opcodes that look for the mark go below it.
+    /// Stack height at the last mark; only opcodes that use the mark may go below it.
     fn floor(&self) -> usize {
         self.marks.last().copied().unwrap_or(0)
     }
@@ -316,7 +320,7 @@ impl Machine<'_> {
     }
 
     fn memo_put(&mut self, i: usize) -> Result<(), String> {
-        // Numbers are given one after the other; a gap as wide as the pickle is long is none of torch.save's.
+        // Memo indices are assigned in order; a gap as wide as the pickle is long cannot come from torch.save.
         if i > self.memo.len() + 256 {
             return Err("a memo out of order".into());
         }
@@ -343,7 +347,7 @@ fn short() -> String {
     "a pickle that takes more than it gave".into()
 }
 
-/// A little-endian number in two's complement; wider than 64 bits, the bytes themselves.
+/// A little-endian two's complement integer; if it is wider than 64 bits, its bytes.
 fn long(v: &[u8]) -> Node {
     if v.len() > 8 {
         return Node::Bytes(v.to_vec());
@@ -400,10 +404,10 @@ mod tests {
             let e = of(bytes).unwrap_err();
             assert!(e.contains(what), "{bytes:?}: {e}");
         }
-        // A million tuples, each in the next.
+        // A million nested tuples.
         let deep = [&b")"[..], &vec![0x85; 1_000_000], b"."].concat();
         assert!(of(&deep).is_ok());
-        // A list in itself.
+        // A list that contains itself.
         assert!(of(b"]q\x00h\x00a.").is_ok());
     }
 }

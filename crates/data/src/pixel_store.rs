@@ -1,6 +1,6 @@
-//! The pixels of a capture in memory, in 8 bits, 16 bits or half floats by what the photographs hold: all of them while they fit a
-//! budget, else one of each square of some, drawn at random. Training draws far fewer pixels than such captures have, and memory stays
-//! bounded however large they are.
+//! The pixels of a capture in memory, in 8 bits, 16 bits or half floats, depending on the photographs. If all pixels exceed a budget, one
+//! randomly chosen pixel of each square is kept. Training uses far fewer pixels than such captures have, and memory stays bounded for
+//! captures of any size.
 
 use crate::error::{DataError, Result};
 use crate::masks::{self, COUNTS};
@@ -12,26 +12,26 @@ use diorama_geom::{ImageU8, PixelFormat, Reduction};
 use half::f16;
 use rayon::prelude::*;
 
-/// Bytes that pixels may take.
+/// Default memory budget for pixels, in bytes.
 pub const DEFAULT_BUDGET: u64 = 4 << 30;
 
-/// Stream of the random numbers by which pixels are kept.
+/// Random stream that chooses the pixels to keep.
 const KEPT: u64 = 15;
 
 /// The largest half float.
 const LARGEST: f32 = 65504.0;
 
-/// Pixels of some frames, four values each: RGB and alpha (opaque where the photograph has none). Colors are sRGB, but for
+/// Pixels of some frames, four values each: RGB and alpha (opaque if the photograph has none). Colors are sRGB, except in
 /// [`PixelFormat::Half`], which holds linear light.
 pub struct PixelStore {
     values: Values,
     format: PixelFormat,
     /// One of each `stride × stride` pixels is kept.
     stride: u32,
-    /// First value of each frame, and of the one after the last.
+    /// Index of the first value of each frame, and one past the last frame's values.
     offsets: Vec<usize>,
     sizes: Vec<(u32, u32)>,
-    /// 0 where a kept pixel is masked away.
+    /// 0 for kept pixels that are masked out.
     masks: Vec<Option<Vec<u8>>>,
     pub has_alpha: bool,
 }
@@ -42,17 +42,17 @@ enum Values {
     Words(Vec<u16>),
 }
 
-/// What to decode.
+/// Options for decoding.
 pub struct StoreOptions {
     pub reduction: Reduction,
     pub budget: u64,
     pub masks: MaskRule,
-    /// Linear light that is stored as 1.
+    /// Radiance that is stored as 1, for linear light.
     pub white: f32,
 }
 
 impl PixelStore {
-    /// Decodes `frames`, reduced, in parallel; `progress` is called once per photograph.
+    /// Decodes and reduces `frames` in parallel; `progress` is called once per photograph.
     pub fn load(frames: &[&Frame], options: &StoreOptions, progress: &(dyn Fn() + Sync)) -> Result<PixelStore> {
         let sizes: Vec<(u32, u32)> = frames
             .iter()
@@ -72,7 +72,7 @@ impl PixelStore {
             _ => Values::Words(vec![0; offsets[frames.len()]]),
         };
         let mut out = PixelStore { values, format, stride, offsets, sizes, masks: Vec::new(), has_alpha: false };
-        // A few photographs at a time: decoded ones are larger than what is kept.
+        // A few photographs at a time: decoded photographs are larger than the pixels that are kept.
         let batch = rayon::current_num_threads().max(1) * 2;
         for first in (0..frames.len()).step_by(batch) {
             let last = (first + batch).min(frames.len());
@@ -101,7 +101,7 @@ impl PixelStore {
         Ok(out)
     }
 
-    /// The kept pixels of a photograph in the store's format.
+    /// The kept pixels of a photograph, in the store's format.
     fn values_of(&self, i: usize, photo: Photo, white: f32) -> Values {
         match (self.format, photo) {
             (PixelFormat::Half, Photo::Linear(im)) => {
@@ -121,14 +121,14 @@ impl PixelStore {
         }
     }
 
-    /// What a frame has at the pixels that are kept of it.
+    /// Values of `at` for the kept pixels of a frame.
     fn keep<T>(&self, i: usize, at: impl Fn(usize, usize) -> T) -> Vec<T> {
         let ((w, h), s) = (self.sizes[i], self.stride);
         let places = (0..h.div_ceil(s)).flat_map(|by| (0..w.div_ceil(s)).map(move |bx| (bx, by)));
         places.map(|(bx, by)| self.snap(i, bx * s, by * s)).map(|(x, y)| at(x as usize, y as usize)).collect()
     }
 
-    /// The pixel that is kept of the square in which a pixel lies.
+    /// The pixel that is kept for the square that contains a given pixel.
     #[inline]
     pub fn snap(&self, i: usize, x: u32, y: u32) -> (u32, u32) {
         let s = self.stride;
@@ -137,17 +137,17 @@ impl PixelStore {
         }
         let ((w, h), (x0, y0)) = (self.sizes[i], (x / s * s, y / s * s));
         let random = self.kept_by(i).bits((y0 as u64) << 32 | x0 as u64);
-        // Squares at the right and lower edge are cut off.
+        // Squares at the right and lower border are smaller.
         (x0 + random as u32 % s.min(w - x0), y0 + (random >> 32) as u32 % s.min(h - y0))
     }
 
-    /// The random numbers by which frame `i`'s pixels were kept: number `y << 32 | x` of a square's corner gives the
-    /// place in the square, x by the lower half, y by the upper.
+    /// The random numbers that choose frame `i`'s kept pixels: number `y << 32 | x` of a square's corner gives the position in the square,
+    /// x by the lower half of its bits, y by the upper.
     pub fn kept_by(&self, i: usize) -> Rng {
         Rng::new(i as u64, KEPT)
     }
 
-    /// Multiplies the light of frame `i`, channel by channel; what then exceeds the format's range is cut off.
+    /// Multiplies the linear light of frame `i` per channel; results beyond the format's range are clamped.
     pub fn brighten(&mut self, i: usize, by: [f32; 3]) {
         let own = self.offsets[i]..self.offsets[i + 1];
         let srgb = |v: f32, k: usize| srgb_from_linear((linear_from_srgb(v) * by[k]).min(1.0));
@@ -167,17 +167,18 @@ impl PixelStore {
         }
     }
 
-    /// How values are written.
+    /// Number format of the values.
     pub fn format(&self) -> PixelFormat {
         self.format
     }
 
-    /// How many pixels are kept of frame `i`.
+    /// Number of kept pixels of frame `i`.
     pub fn kept(&self, i: usize) -> usize {
         (self.offsets[i + 1] - self.offsets[i]) / 4
     }
 
-    /// RGBA of frame `i`'s kept pixels, square by square: one word each of 8-bit values, two of others; the first value is lowest.
+    /// RGBA of frame `i`'s kept pixels, square by square: one word per pixel for 8-bit values, two for others; the first value is in the
+    /// lowest bits.
     pub fn words(&self, i: usize) -> Vec<u32> {
         let own = self.offsets[i]..self.offsets[i + 1];
         match &self.values {
@@ -186,15 +187,17 @@ impl PixelStore {
         }
     }
 
-    /// Which of them count; none: all.
+    /// Which of the kept pixels the mask keeps; `None`: all.
     pub fn counting(&self, i: usize) -> Option<impl Iterator<Item = bool>> {
         self.masks[i].as_ref().map(|m| m.iter().map(|v| *v >= COUNTS))
     }
 
+    /// Number of frames.
     pub fn len(&self) -> usize {
         self.sizes.len()
     }
 
+    /// Whether there are no frames.
     pub fn is_empty(&self) -> bool {
         self.sizes.is_empty()
     }
@@ -204,13 +207,14 @@ impl PixelStore {
         self.sizes[i]
     }
 
-    /// Place of the square in which a pixel lies.
+    /// Index of the square that contains a pixel.
     #[inline]
     fn square(&self, i: usize, x: u32, y: u32) -> usize {
         (y / self.stride) as usize * self.sizes[i].0.div_ceil(self.stride) as usize + (x / self.stride) as usize
     }
 
-    /// RGBA of a pixel that [`PixelStore::snap`] gave, as [`PixelStore::words`] has it; the second word counts where a pixel has two.
+    /// RGBA of a pixel returned by [`PixelStore::snap`], in the format of [`PixelStore::words`]; the second word is used only if a pixel
+    /// has two.
     #[inline]
     pub fn pixel(&self, i: usize, x: u32, y: u32) -> [u32; 2] {
         let at = self.offsets[i] + self.square(i, x, y) * 4;
@@ -220,22 +224,22 @@ impl PixelStore {
         }
     }
 
-    /// Whether such a pixel counts: not masked away.
+    /// Whether such a pixel is kept by the mask.
     #[inline]
     pub fn counts(&self, i: usize, x: u32, y: u32) -> bool {
         self.masks[i].as_ref().is_none_or(|m| m[self.square(i, x, y)] >= COUNTS)
     }
 
-    /// One of so many by so many pixels is kept; 1: all are.
+    /// Edge of the squares of which one pixel is kept; 1: all pixels are kept.
     pub fn stride(&self) -> u32 {
         self.stride
     }
 }
 
-/// The format that holds all that frames have.
+/// The smallest format that can hold the values of all frames.
 ///
 /// # Errors
-/// When a photograph's head cannot be read.
+/// If a photograph's header cannot be read.
 pub fn format_of(frames: &[&Frame]) -> Result<PixelFormat> {
     if frames.iter().all(|f| f.color_space == ColorSpace::Linear) && !frames.is_empty() {
         return Ok(PixelFormat::Half);
@@ -244,7 +248,7 @@ pub fn format_of(frames: &[&Frame]) -> Result<PixelFormat> {
     Ok(if depths.contains(&Depth::Sixteen) { PixelFormat::Unorm16 } else { PixelFormat::Unorm8 })
 }
 
-/// What is kept of a frame.
+/// Kept pixels of one frame.
 struct Kept {
     values: Values,
     mask: Option<Vec<u8>>,
@@ -267,7 +271,7 @@ fn decode(frame: &Frame, rule: &MaskRule, size: (u32, u32)) -> Result<(Photo, Op
     Ok((full.downsampled(w, h), mask.map(|m| m.downsampled(w, h))))
 }
 
-/// RGBA of a pixel of any number of channels.
+/// RGBA of a pixel with any number of channels.
 fn four<T: Copy + Default>(pixel: &[T], opaque: T) -> [T; 4] {
     match *pixel {
         [r, g, b, a] => [r, g, b, a],
@@ -289,7 +293,7 @@ mod tests {
         Frame::new(name, image, Camera::pinhole(w as u32, h as u32, 1.0), Pose::IDENTITY)
     }
 
-    /// A photograph whose pixels tell where they are.
+    /// A photograph whose pixel values encode their positions.
     fn places(dir: &Path, w: usize, h: usize) -> Frame {
         let data = (0..w * h).flat_map(|i| [(i % w) as u8, (i / w) as u8, 7]).collect();
         let f = frame(dir, "places.png", w, h, 0);
@@ -363,7 +367,7 @@ mod tests {
         let im = Image { width: 5, height: 4, channels: 3, data: (0..60).map(|i| value(i) / 65535.0).collect() };
         let mut f = frame(dir.path(), "a.png", 5, 4, 0);
         std::fs::write(&f.image, photo::encode_png_16(&im)).unwrap();
-        // Beside a photograph of 8 bits.
+        // Together with an 8-bit photograph.
         let other = frame(dir.path(), "b.png", 5, 4, 77);
         let s = PixelStore::load(&[&f, &other], &options, &|| {}).unwrap();
         assert_eq!((s.format(), s.words(0).len(), s.kept(0)), (PixelFormat::Unorm16, 40, 20));
@@ -385,7 +389,7 @@ mod tests {
             assert_eq!(s.pixel(0, i as u32 % 5, i as u32 / 5), [s.words(0)[i * 2], s.words(0)[i * 2 + 1]]);
             assert_eq!(got[3], 1.0);
         }
-        // A run that was begun before stays in sRGB.
+        // A run that was started with an earlier version stays in sRGB.
         f.color_space = ColorSpace::Srgb;
         assert_eq!(PixelStore::load(&[&f], &options, &|| {}).unwrap().format(), PixelFormat::Unorm8);
     }

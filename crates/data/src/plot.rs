@@ -25,7 +25,7 @@ const MARGIN: [f64; 4] = [64.0, 16.0, 34.0, 44.0];
 const COLORS: [[u8; 3]; 8] =
     [[31, 119, 180], [214, 39, 40], [44, 160, 44], [255, 127, 14], [148, 103, 189], [23, 190, 207], [140, 86, 75], [127, 127, 127]];
 
-/// What both outputs draw.
+/// Drawing primitives that both outputs support.
 enum Mark {
     Line {
         points: Vec<(f64, f64)>,
@@ -93,7 +93,7 @@ fn marks(chart: &Chart, top: f64) -> Vec<Mark> {
     out.push(Mark::Line { points: vec![(left, up), (left, down), (right, down)], color: ink, width: 1.0 });
     out.push(Mark::Text { at: ((left + right) / 2.0, down + 26.0), text: chart.x.clone(), anchor: 0.5, color: ink });
     out.push(Mark::Text { at: (left - 56.0, up - 14.0), text: chart.y.clone(), anchor: 0.0, color: ink });
-    // The names stand where the curves do not end.
+    // The names are placed where no curve ends.
     let at_the_right: Vec<f64> = all.iter().filter(|p| px(p.0) > 0.25 * left + 0.75 * right).map(|p| py(p.1)).collect();
     let end = at_the_right.iter().sum::<f64>() / at_the_right.len().max(1) as f64;
     let names = if end < 0.5 * (up + down) { down - 4.0 - 13.0 * chart.series.len() as f64 } else { up + 4.0 };
@@ -106,7 +106,7 @@ fn marks(chart: &Chart, top: f64) -> Vec<Mark> {
     out
 }
 
-/// Charts below each other as SVG text.
+/// Renders charts, one below the other, as SVG text.
 pub fn svg(charts: &[Chart]) -> String {
     let h = HEIGHT * charts.len() as f64;
     let mut out = format!(
@@ -137,7 +137,7 @@ pub fn svg(charts: &[Chart]) -> String {
     out + "</svg>\n"
 }
 
-/// Charts below each other as an image, twice the SVG's size.
+/// Renders charts, one below the other, as an image of twice the SVG's size.
 pub fn raster(charts: &[Chart]) -> ImageU8 {
     let s = 2.0;
     let (w, h) = ((WIDTH * s) as usize, (HEIGHT * s) as usize * charts.len().max(1));
@@ -239,7 +239,7 @@ pub fn caption(text: &str) -> ImageU8 {
     im
 }
 
-/// Edge of a glyph's dots, and pixels from one glyph to the next.
+/// Edge of a glyph's dots in pixels, and distance from one glyph to the next.
 const DOT: usize = 2;
 const ADVANCE: usize = 6 * DOT;
 

@@ -1,4 +1,4 @@
-//! Point clouds as surveyors exchange them: LAS (ASPRS 1.2, point format 2) and E57 (ASTM E2807). PLY is in [`crate::mesh_text`].
+//! Point clouds in surveying formats: LAS (ASPRS 1.2, point format 2) and E57 (ASTM E2807). PLY is in [`crate::mesh_text`].
 
 use crate::error::{DataError, Result};
 use crate::{atomic, mesh_text};
@@ -8,29 +8,29 @@ use e57::{E57Writer, Extension, Record, RecordDataType, RecordName, RecordValue}
 use std::io::{Cursor, Write};
 use std::path::Path;
 
-/// Writes the vertices of a mesh, which have normals and colors, as PLY.
+/// Writes the vertices of a mesh, with their normals and colors, as PLY.
 pub fn save_ply(path: &Path, points: &Mesh) -> Result<()> {
     check(path, points)?;
     mesh_text::save_ply(path, points)
 }
 
-/// Bytes of LAS's header, of the head of a record of variable length, of a description of further bytes, and of a point.
+/// Sizes in bytes of LAS's header, of a variable-length record's header, of an extra-bytes description, and of a point.
 const HEADER: usize = 227;
 const RECORD_HEAD: usize = 54;
 const DESCRIPTION: usize = 192;
 const POINT: usize = 26 + 12;
 
-/// Writes the vertices of a mesh, which have normals and colors, as LAS. Normals are further bytes of each point, named
-/// `NormalX` to `NormalZ`, for which the format has no field of its own.
+/// Writes the vertices of a mesh, with their normals and colors, as LAS. The format has no field for normals; they are extra bytes of each
+/// point, named `NormalX` to `NormalZ`.
 ///
 /// # Errors
-/// For an empty cloud, more than 2³² points, and when the disk refuses.
+/// For an empty cloud, more than 2³² points, or if the file cannot be written.
 pub fn save_las(path: &Path, points: &Mesh) -> Result<()> {
     check(path, points)?;
     let (lo, hi) = points.bounds().unwrap_or_default();
     let count = u32::try_from(points.positions.len()).map_err(|_| DataError::input(path, "too many points for LAS; lower --points"))?;
     let middle: [f64; 3] = std::array::from_fn(|k| (0.5 * (lo[k] as f64 + hi[k] as f64)).round());
-    // Coordinates are whole numbers of steps from the middle.
+    // Coordinates are integers: steps from the center.
     let reach = (0..3).map(|k| (hi[k] as f64 - middle[k]).abs().max((lo[k] as f64 - middle[k]).abs())).fold(1e-9, f64::max);
     let step = 10f64.powi((reach / 1e9).log10().ceil() as i32);
     atomic::write_with(path, |w| {
@@ -39,7 +39,7 @@ pub fn save_las(path: &Path, points: &Mesh) -> Result<()> {
             for k in 0..3 {
                 w.write_all(&(((points.positions[i][k] as f64 - middle[k]) / step).round() as i32).to_le_bytes())?;
             }
-            // No intensity; the first return of one; no class, angle, user's data or source.
+            // No intensity; first of one return; no class, angle, user data or source.
             w.write_all(&[0, 0, 1 | 1 << 3, 0, 0, 0, 0, 0])?;
             for v in points.colors_srgb[i] {
                 // Sixteen bits: 255 becomes 65535.
@@ -61,7 +61,7 @@ fn las_head(count: u32, step: f64, middle: [f64; 3], (lo, hi): ([f32; 3], [f32; 
     out.extend([1, 2]);
     text(&mut out, "EXTRACTION", 32);
     text(&mut out, concat!("diorama ", env!("CARGO_PKG_VERSION")), 32);
-    // The day is left open, so that the same run makes the same file.
+    // The date is left empty, so that the same run gives the same file.
     out.extend([0; 4]);
     out.extend((HEADER as u16).to_le_bytes());
     out.extend(((HEADER + RECORD_HEAD + 3 * DESCRIPTION) as u32).to_le_bytes());
@@ -69,7 +69,7 @@ fn las_head(count: u32, step: f64, middle: [f64; 3], (lo, hi): ([f32; 3], [f32; 
     out.push(2);
     out.extend((POINT as u16).to_le_bytes());
     out.extend(count.to_le_bytes());
-    // All are first returns.
+    // All points are first returns.
     [count, 0, 0, 0, 0].iter().for_each(|n| out.extend(n.to_le_bytes()));
     [step; 3].iter().chain(&middle).for_each(|v| out.extend(v.to_le_bytes()));
     (0..3).for_each(|k| [hi[k], lo[k]].iter().for_each(|v| out.extend((*v as f64).to_le_bytes())));
@@ -80,7 +80,7 @@ fn las_head(count: u32, step: f64, middle: [f64; 3], (lo, hi): ([f32; 3], [f32; 
     out.extend((3 * DESCRIPTION as u16).to_le_bytes());
     text(&mut out, "Extra Bytes", 32);
     for name in ["NormalX", "NormalY", "NormalZ"] {
-        // Kind 9: a float.
+        // Type 9 is a float.
         out.extend([0, 0, 9, 0]);
         text(&mut out, name, 32);
         out.extend([0; 124]);
@@ -89,20 +89,19 @@ fn las_head(count: u32, step: f64, middle: [f64; 3], (lo, hi): ([f32; 3], [f32; 
     out
 }
 
-/// Writes the vertices of a mesh in meters, which have normals and colors, as E57. Normals follow the extension for surface
-/// normals (`nor`).
+/// Writes the vertices of a mesh in meters, with their normals and colors, as E57. Normals use the extension for surface normals (`nor`).
 ///
 /// # Errors
-/// For an empty cloud, and when the disk refuses.
+/// For an empty cloud, or if the file cannot be written.
 pub fn save_e57(path: &Path, points: &Mesh) -> Result<()> {
     check(path, points)?;
-    let bytes = e57_bytes(points).map_err(|e| DataError::failed(path, format!("cannot be laid out as E57: {e}")))?;
+    let bytes = e57_bytes(points).map_err(|e| DataError::failed(path, format!("cannot be encoded as E57: {e}")))?;
     atomic::write(path, &bytes)
 }
 
 fn e57_bytes(points: &Mesh) -> e57::Result<Vec<u8>> {
     let mut bytes = Vec::new();
-    // The same run makes the same name.
+    // A fixed name, so that the same run gives the same file.
     let id =
         points.positions.iter().flatten().fold(0xcbf2_9ce4_8422_2325u64, |h, v| (h ^ v.to_bits() as u64).wrapping_mul(0x0100_0000_01b3));
     let name = |k: u8| format!("{{{:08x}-{:04x}-4000-8000-0000000000{k:02x}}}", id >> 32, id & 0xffff);

@@ -1,4 +1,4 @@
-//! Programs of the system that are found and driven at run time.
+//! Finds and runs other programs.
 
 use crate::error::{DataError, Result};
 use std::fs::File;
@@ -9,24 +9,24 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
-/// How long a program may stay silent before it counts as hung.
-const SILENCE: Duration = Duration::from_secs(30 * 60);
-/// Lines of a failed program that are shown.
-const LAST_WORDS: usize = 3;
-/// How often an interrupt is looked for.
-const GLANCE: Duration = Duration::from_millis(100);
+/// Time without output after which a program counts as hung.
+const SILENCE_LIMIT: Duration = Duration::from_secs(30 * 60);
+/// Output lines of a failed program that are shown.
+const SHOWN_LINES: usize = 3;
+/// Interval at which an interrupt is checked.
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
-/// How a program ended, failures apart.
+/// How a program ended, if it did not fail.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ended {
     Done,
     Interrupted,
 }
 
-/// A program's path, or the file that `variable` names instead.
+/// Path of a program, or the path that the environment variable `variable` gives.
 ///
 /// # Errors
-/// When there is none; `package` tells what to install.
+/// If the program does not exist; `package` says what to install.
 pub fn find(name: &'static str, variable: &str, package: &str) -> Result<PathBuf> {
     if let Some(given) = std::env::var_os(variable) {
         let given = PathBuf::from(given);
@@ -39,18 +39,18 @@ pub fn find(name: &'static str, variable: &str, package: &str) -> Result<PathBuf
     let paths = std::env::var_os("PATH").unwrap_or_default();
     let names = [name.to_string(), format!("{name}.exe"), format!("{name}.bat")];
     let found = std::env::split_paths(&paths).flat_map(|d| names.iter().map(move |n| d.join(n)).collect::<Vec<_>>()).find(|p| p.is_file());
-    found.ok_or_else(|| DataError::input(name, format!("not found; install it ({package}) or name it in {variable}")))
+    found.ok_or_else(|| DataError::input(name, format!("not found; install it ({package}) or give its path in {variable}")))
 }
 
-/// Runs a program to its end; all that it says goes into `log` and, line by line, to `on_line`.
+/// Runs a program to its end. Its output is written to `log` and passed line by line to `on_line`.
 ///
 /// # Errors
-/// When it cannot be started, fails, or says nothing for half an hour.
+/// If it cannot be started, fails, or prints nothing for half an hour.
 pub fn run(command: &mut Command, log: &Path, interrupt: &AtomicBool, on_line: &mut dyn FnMut(&str)) -> Result<Ended> {
     let program = PathBuf::from(command.get_program());
     let mut sink = File::options().create(true).append(true).open(log).map_err(DataError::io(log, "write"))?;
-    let told: Vec<_> = command.get_args().map(|a| a.to_string_lossy().into_owned()).collect();
-    writeln!(sink, "$ {} {}", program.display(), told.join(" ")).map_err(DataError::io(log, "write"))?;
+    let arguments: Vec<_> = command.get_args().map(|a| a.to_string_lossy().into_owned()).collect();
+    writeln!(sink, "$ {} {}", program.display(), arguments.join(" ")).map_err(DataError::io(log, "write"))?;
     command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = command.spawn().map_err(DataError::io(&program, "start"))?;
     let (send, lines) = channel();
@@ -62,7 +62,7 @@ pub fn run(command: &mut Command, log: &Path, interrupt: &AtomicBool, on_line: &
             let mut reader = BufReader::new(pipe);
             let mut line = Vec::new();
             while reader.read_until(b'\n', &mut line).is_ok_and(|n| n > 0) {
-                // A line that is overwritten by the next one ends in a carriage return.
+                // Progress lines, which overwrite each other, end in a carriage return.
                 let text = String::from_utf8_lossy(&line).trim_end().to_string();
                 if send.send(text).is_err() {
                     break;
@@ -79,21 +79,21 @@ pub fn run(command: &mut Command, log: &Path, interrupt: &AtomicBool, on_line: &
             end(&mut child);
             return Ok(Ended::Interrupted);
         }
-        match lines.recv_timeout(GLANCE) {
+        match lines.recv_timeout(POLL_INTERVAL) {
             Ok(line) => {
                 heard = Instant::now();
                 writeln!(sink, "{line}").map_err(DataError::io(log, "write"))?;
                 on_line(&line);
                 if !line.trim().is_empty() {
                     last.push_back(line);
-                    if last.len() > LAST_WORDS {
+                    if last.len() > SHOWN_LINES {
                         last.pop_front();
                     }
                 }
             }
-            Err(RecvTimeoutError::Timeout) if heard.elapsed() > SILENCE => {
+            Err(RecvTimeoutError::Timeout) if heard.elapsed() > SILENCE_LIMIT => {
                 end(&mut child);
-                return Err(DataError::failed(&program, format!("said nothing for 30 minutes and was stopped; see {}", log.display())));
+                return Err(DataError::failed(&program, format!("printed nothing for 30 minutes and was stopped; see {}", log.display())));
             }
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => break,
@@ -106,24 +106,24 @@ pub fn run(command: &mut Command, log: &Path, interrupt: &AtomicBool, on_line: &
     if !status.success() {
         return Err(DataError::failed(
             &program,
-            format!("failed ({status}): {}; see {}", last_words(last.iter().map(String::as_str)), log.display()),
+            format!("failed ({status}): {}; see {}", last_lines(last.iter().map(String::as_str)), log.display()),
         ));
     }
     Ok(Ended::Done)
 }
 
-/// Runs a program and hands its standard output to `read`.
+/// Runs a program and passes its standard output to `read`.
 ///
 /// # Errors
-/// When it cannot be started or fails.
+/// If it cannot be started or fails.
 pub fn read_output(command: &mut Command, read: &mut dyn FnMut(&mut dyn Read) -> std::io::Result<()>) -> Result<()> {
     let program = PathBuf::from(command.get_program());
     command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     let mut child = command.spawn().map_err(DataError::io(&program, "start"))?;
-    let mut said = child.stderr.take().expect("piped");
+    let mut errors = child.stderr.take().expect("piped");
     let complaints = std::thread::spawn(move || {
         let mut text = Vec::new();
-        let _ = said.read_to_end(&mut text);
+        let _ = errors.read_to_end(&mut text);
         String::from_utf8_lossy(&text).into_owned()
     });
     let mut out = child.stdout.take().expect("piped");
@@ -133,17 +133,17 @@ pub fn read_output(command: &mut Command, read: &mut dyn FnMut(&mut dyn Read) ->
         end(&mut child);
     }
     let status = child.wait().map_err(DataError::io(&program, "wait for"))?;
-    let said = complaints.join().unwrap_or_default();
+    let messages = complaints.join().unwrap_or_default();
     result.map_err(DataError::io(&program, "read from"))?;
     if !status.success() {
-        return Err(DataError::failed(&program, format!("failed ({status}): {}", last_words(said.lines()))));
+        return Err(DataError::failed(&program, format!("failed ({status}): {}", last_lines(messages.lines()))));
     }
     Ok(())
 }
 
-/// The last lines that a program said, in one.
-fn last_words<'a>(lines: impl DoubleEndedIterator<Item = &'a str>) -> String {
-    let mut last: Vec<&str> = lines.rev().map(str::trim).filter(|l| !l.is_empty()).take(LAST_WORDS).collect();
+/// The last lines of a program's output, joined into one.
+fn last_lines<'a>(lines: impl DoubleEndedIterator<Item = &'a str>) -> String {
+    let mut last: Vec<&str> = lines.rev().map(str::trim).filter(|l| !l.is_empty()).take(SHOWN_LINES).collect();
     last.reverse();
     if last.is_empty() { "no reason given".into() } else { last.join("; ") }
 }

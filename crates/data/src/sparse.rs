@@ -1,4 +1,4 @@
-//! The points of a structure-from-motion model: which photographs see them, and whether they lie where the poses say.
+//! The points of a structure-from-motion model: which photographs see them, and whether they agree with the poses.
 
 use crate::colmap_model::{self, Keypoint, Registered};
 use crate::error::Result;
@@ -8,27 +8,27 @@ use diorama_geom::{Camera, Pose, SparsePoint};
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Most observations of one photograph that are compared with its pose.
+/// Most observations per photograph that are compared with its pose.
 const COMPARED: usize = 500;
-/// Errors above this share of the diagonal and this many pixels are worth a word.
+/// Errors above this share of the diagonal and this many pixels are reported.
 const INEXACT: (f64, f64) = (0.003, 3.0);
-/// A photograph whose mean error is so many times the middle one's does not fit the others.
+/// A photograph does not fit the others if its mean error is this many times the median.
 const OUTLIER: f64 = 4.0;
-/// Most names in one note.
+/// Most names listed in one note.
 const NAMED: usize = 5;
 
-/// A point in a photograph: where the pose puts it, and where it was seen.
+/// A point in a photograph: where the pose projects it, and where it was observed.
 struct Sample {
     image: u32,
-    /// None where the point lies behind the camera.
+    /// `None` if the point is behind the camera.
     projected: Option<DVec2>,
     seen: DVec2,
 }
 
-/// Points of a model, gathered image by image.
+/// Points of a model, collected image by image.
 pub(crate) struct Sparse {
     index: HashMap<u64, u32>,
-    /// Frames are numbers of registered images until [`Sparse::finish`].
+    /// Frame numbers are ids of registered images until [`Sparse::finish`].
     points: Vec<SparsePoint>,
     samples: Vec<Sample>,
     observations: usize,
@@ -37,7 +37,7 @@ pub(crate) struct Sparse {
 }
 
 impl Sparse {
-    /// The model's points; nobody sees them yet.
+    /// Starts with the model's points, without observations.
     pub fn read(model: &Path) -> Result<Sparse> {
         let mut out = Sparse { index: HashMap::new(), points: Vec::new(), samples: Vec::new(), observations: 0, absent: 0, images: 0 };
         colmap_model::each_point(model, &mut |p, _| {
@@ -47,7 +47,7 @@ impl Sparse {
         Ok(out)
     }
 
-    /// Takes in the next registered image.
+    /// Adds the observations of the next registered image.
     pub fn observe(&mut self, camera: Option<&Camera>, world_from_camera: &Pose, keypoints: &[Keypoint]) {
         let image = self.images;
         self.images += 1;
@@ -81,7 +81,7 @@ impl Sparse {
         }
     }
 
-    /// Where most observations are of points that the model does not hold, compares by the points' own tracks instead.
+    /// If most observations refer to points that are not in the model, compares by the points' own tracks instead.
     pub fn check_tracks<'a>(
         &mut self,
         model: &Path,
@@ -120,7 +120,7 @@ impl Sparse {
         Ok(())
     }
 
-    /// Points with the frames that see them, and how well these agree; `frame_of` says which frame a registered image has become.
+    /// The points with the frames that see them, and how well they agree; `frame_of` maps registered images to frames.
     pub fn finish(mut self, frame_of: &[Option<u32>], frames: &[Frame]) -> (Vec<SparsePoint>, Option<Agreement>) {
         let mut shared = vec![0; frames.len()];
         for p in &mut self.points {
@@ -155,7 +155,7 @@ impl Sparse {
         (self.points, Some(agreement))
     }
 
-    /// How much larger keypoints' coordinates are than the cameras': not 1 where the cameras were changed for photographs of another size.
+    /// Ratio of keypoint coordinates to camera coordinates. It is not 1 if the cameras were scaled for photographs of another size.
     fn keypoint_scale(&self, diagonal_px: f64) -> f64 {
         let at = |scale: f64| {
             let error = |s: &Sample| s.projected.map_or(f64::INFINITY, |p| (p - s.seen / scale).length());
@@ -165,7 +165,7 @@ impl Sparse {
         if plain < INEXACT.0 * diagonal_px {
             return 1.0;
         }
-        // Ratios of places close to the corner would be anything.
+        // Ratios of positions close to the corner are unreliable.
         let inside = |p: &DVec2| p.min_element() > 0.1 * diagonal_px && p.max_element() < diagonal_px;
         let ratio = |s: &Sample| s.projected.filter(inside).map(|p| s.seen.length() / p.length());
         match median(self.samples.iter().filter_map(ratio)) {
@@ -184,7 +184,7 @@ fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     Some(*v.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// Why a model whose poses contradict its points is of no use, and what helps.
+/// Message for a model whose poses contradict its points.
 pub fn broken(a: &Agreement) -> String {
     let (_, middle) = a.error_px.unwrap_or_default();
     let mixed = match a.is_mixed() {
@@ -196,22 +196,26 @@ pub fn broken(a: &Agreement) -> String {
     )
 }
 
-/// What helps against [`broken`] models.
+/// Remedy for [`broken`] models.
 pub const BROKEN_CURE: &str =
     "run `diorama prepare` on the photographs; or remove points3D.bin (or .txt) if the poses are known to be right";
 
-/// Other lists of images in a model's folder, of which one may be the right one; none where there are none, or the folder cannot be
-/// listed: it is a hint beside an error.
+/// Other image lists in a model's folder, one of which may be the right one. `None` if there are none or the folder cannot be listed,
+/// since this is only a hint in an error message.
 pub fn others_beside(model: &Path) -> Option<String> {
     let is_other = |n: &String| n.starts_with("images") && (n.ends_with(".bin") || n.ends_with(".txt")) && n.len() > "images.bin".len();
     let names = std::fs::read_dir(model).ok()?.flatten().map(|e| e.file_name().to_string_lossy().into_owned());
     let mut others: Vec<String> = names.filter(is_other).collect();
     others.sort();
-    (!others.is_empty())
-        .then(|| format!("{} lies beside the model's images: if it is the right one, give it their name", others.join(", ")))
+    (!others.is_empty()).then(|| {
+        format!(
+            "{} is in the model's folder too: if it is the right one, rename it to replace the present list of images",
+            others.join(", ")
+        )
+    })
 }
 
-/// What is worth knowing about a model, one line each; frames in the capture's order.
+/// Notes about a model, one line each; frames are in the capture's order.
 pub fn warnings(a: &Agreement, frames: &[Frame]) -> Vec<String> {
     let mut out = Vec::new();
     if a.is_broken() {
@@ -223,7 +227,7 @@ pub fn warnings(a: &Agreement, frames: &[Frame]) -> Vec<String> {
             None => "poses and points could not be compared".into(),
         };
         out.push(format!(
-            "{} of the model's {} observations are of points that are not in it (points were removed, or its files are of different runs); {checked}",
+            "{} of the model's {} observations are of points that are not in it (points were removed, or its files come from different reconstructions); {checked}",
             a.absent, a.observations
         ));
     }
@@ -235,26 +239,26 @@ pub fn warnings(a: &Agreement, frames: &[Frame]) -> Vec<String> {
              run `diorama prepare` on the photographs, or train with --set camera.refine=true"
         ));
     }
-    let list = |which: &[usize], tell: &dyn Fn(usize) -> String| {
-        let shown: Vec<String> = which.iter().take(NAMED).map(|i| tell(*i)).collect();
+    let list = |which: &[usize], describe: &dyn Fn(usize) -> String| {
+        let shown: Vec<String> = which.iter().take(NAMED).map(|i| describe(*i)).collect();
         shown.join(", ") + if which.len() > NAMED { ", …" } else { "" }
     };
     let usual = median(a.frames.iter().filter_map(|f| f.error_px)).unwrap_or(0.0);
     let off = |f: &FrameAgreement| f.error_px.is_some_and(|e| e > limit.max(OUTLIER * usual));
     let wrong: Vec<usize> = (0..a.frames.len()).filter(|i| off(&a.frames[*i])).collect();
     if !wrong.is_empty() {
-        let tell = |i: usize| format!("{} ({:.1} pixels)", frames[i].name, a.frames[i].error_px.unwrap_or(0.0));
+        let describe = |i: usize| format!("{} ({:.1} pixels)", frames[i].name, a.frames[i].error_px.unwrap_or(0.0));
         out.push(format!(
             "{} of {} photographs do not fit the model's points: {}; their poses may be wrong: leave them out, or run `diorama prepare`",
             wrong.len(),
             frames.len(),
-            list(&wrong, &tell)
+            list(&wrong, &describe)
         ));
     }
     let alone: Vec<usize> = (0..a.frames.len()).filter(|i| a.frames[*i].shared == 0).collect();
     if !alone.is_empty() && a.error_px.is_some() {
         out.push(format!(
-            "{} of {} photographs share no points with others: {}; nothing says that their poses are right: leave them out, or run `diorama prepare`",
+            "{} of {} photographs share no points with others: {}; nothing confirms their poses: leave them out, or run `diorama prepare`",
             alone.len(),
             frames.len(),
             list(&alone, &|i| frames[i].name.clone())
@@ -263,13 +267,14 @@ pub fn warnings(a: &Agreement, frames: &[Frame]) -> Vec<String> {
     out
 }
 
-/// Follows frames that were left out; `kept` are the numbers of those that stay, ascending. Points that only the others see go, too.
+/// Updates the points after frames were left out; `kept` are the indices of the remaining frames, ascending. Points seen only by the
+/// others are removed.
 pub fn keep(points: &mut Vec<SparsePoint>, agreement: Option<&mut Agreement>, kept: &[usize]) {
     let number: HashMap<u32, u32> = kept.iter().enumerate().map(|(new, old)| (*old as u32, new as u32)).collect();
     points.retain_mut(|p| {
-        let was_told = !p.frames.is_empty();
+        let was_seen = !p.frames.is_empty();
         p.frames = p.frames.iter().filter_map(|f| number.get(f).copied()).collect();
-        !was_told || !p.frames.is_empty()
+        !was_seen || !p.frames.is_empty()
     });
     if let Some(a) = agreement {
         a.frames = kept.iter().filter_map(|i| a.frames.get(*i).copied()).collect();

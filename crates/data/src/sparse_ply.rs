@@ -1,5 +1,5 @@
-//! Sparse points as a PLY that any reader of point clouds opens, with what other programs skip: each point's reprojection error,
-//! and after the points an element `observation` of pairs, which point is seen by which frame. Comments name the frames.
+//! Sparse points as a PLY that any reader of point clouds opens. It also holds data that other programs skip: each point's reprojection
+//! error, and after the points an element `observation` with pairs of point and frame. Comments name the frames.
 
 use crate::atomic;
 use crate::error::{DataError, Result};
@@ -13,11 +13,11 @@ use std::path::Path;
 const POINT: &str = "property float x\nproperty float y\nproperty float z\n\
 property uchar red\nproperty uchar green\nproperty uchar blue\nproperty float error\n";
 const POINT_BYTES: usize = 19;
-/// Where in a point's bytes its error lies.
+/// Byte offset of a point's error.
 const ERROR_AT: usize = 15;
 const OBSERVATION: &str = "property uint point\nproperty uint frame\n";
 const OBSERVATION_BYTES: usize = 8;
-/// Begins the comment that names a frame's image.
+/// Start of a comment that names a frame's image.
 const FRAME: &str = "comment frame ";
 
 /// Writes points, whose frames are indices into `frames`; images are named relative to `root`.
@@ -44,14 +44,15 @@ pub fn write(path: &Path, points: &[SparsePoint], frames: &[Frame], root: &Path)
     })
 }
 
-/// Adds errors and frames to points that were read from the file's vertices, in their order; files that [`write()`] did not write
-/// say nothing of them. Images, relative to `root`, that are not among `frames` are left out.
+/// Adds errors and frames to points that were read from the file's vertices, in their order. Files not written by [`write()`] have
+/// neither. Observations by images (relative to `root`) that are not among `frames` are dropped.
 ///
 /// # Errors
-/// When the file ends early, or a pair names a point or an image that is not there.
+/// If the file ends early, or a pair names a point or an image that does not exist.
 pub fn observe(path: &Path, root: &Path, data: &[u8], frames: &[Frame], points: &mut [SparsePoint]) -> Result<()> {
     let Some((names, [n, pairs], body)) = head(data) else { return Ok(()) };
-    let count = |text: &str| text.parse().map_err(|_| DataError::input(path, format!("element: {text:?} is no count; run prepare again")));
+    let count =
+        |text: &str| text.parse().map_err(|_| DataError::input(path, format!("element: {text:?} is not a count; run prepare again")));
     let (n, pairs): (usize, usize) = (count(n)?, count(pairs)?);
     let end_of = |from: usize, n: usize, bytes: usize| n.checked_mul(bytes)?.checked_add(from).filter(|end| *end <= data.len());
     let ends = end_of(body, n, POINT_BYTES).and_then(|v| Some((v, end_of(v, pairs, OBSERVATION_BYTES)?)));
@@ -72,7 +73,7 @@ pub fn observe(path: &Path, root: &Path, data: &[u8], frames: &[Frame], points: 
         let (Some(p), Some(frame)) = (points.get_mut(point), frame_of.get(name)) else {
             return Err(DataError::input(
                 path,
-                format!("point {point} is seen by image {name}, one of which is not there; run prepare again"),
+                format!("point {point} is seen by image {name}, one of which does not exist; run prepare again"),
             ));
         };
         p.frames.extend(frame);
@@ -84,7 +85,7 @@ pub fn observe(path: &Path, root: &Path, data: &[u8], frames: &[Frame], points: 
     Ok(())
 }
 
-/// Images, what says how many points and observations there are, and where the points begin; none where the head is not of [`write()`].
+/// The images, the text with the counts, and the position of the points; `None` if the header was not written by [`write()`].
 fn head(data: &[u8]) -> Option<(Vec<&str>, [&str; 2], usize)> {
     let mark = b"end_header\n";
     let body = data.windows(mark.len()).position(|w| w == mark)? + mark.len();
@@ -133,7 +134,7 @@ mod tests {
         observe(&file, root, &data, &all, &mut read).unwrap();
         assert_eq!(read, points());
 
-        // Frames in another order, one of them gone.
+        // Frames in another order, one of them missing.
         let mut fewer = bare();
         observe(&file, root, &data, &frames(&["images/c.jpg", "images/a.jpg"]), &mut fewer).unwrap();
         assert_eq!(fewer.iter().map(|p| p.frames.clone()).collect::<Vec<_>>(), [vec![0, 1], vec![], vec![0]]);
@@ -146,13 +147,13 @@ mod tests {
         let e = observe(&file, root, &wrong, &all, &mut bare()).unwrap_err().to_string();
         assert!(e.contains("image 9"), "{e}");
 
-        // Counts beyond what a machine can add.
+        // Counts whose sum overflows.
         let text = String::from_utf8_lossy(&data[..400]).replace("observation 4", "observation 2305843009213693951");
         let e = observe(&file, root, text.as_bytes(), &all, &mut bare()).unwrap_err().to_string();
         assert!(e.contains("2305843009213693951 observations"), "{e}");
         let text = String::from_utf8_lossy(&data[..400]).replace("observation 4", "observation four");
         let e = observe(&file, root, text.as_bytes(), &all, &mut bare()).unwrap_err().to_string();
-        assert!(e.contains("\"four\" is no count"), "{e}");
+        assert!(e.contains("\"four\" is not a count"), "{e}");
         let e = observe(&file, root, &data, &all, &mut bare()[..2]).unwrap_err().to_string();
         assert!(e.contains("2 of 3 points are finite"), "{e}");
     }

@@ -1,5 +1,5 @@
-//! PLY files of points and of Gaussian splats as 3D Gaussian Splatting writes them: `x y z`, colours as `red green blue` or as the constant
-//! spherical harmonic `f_dc_0..2`, `opacity` (logit), `scale_0..2` (logarithm), `rot_0..3`. ASCII and binary little-endian.
+//! PLY files of points, and of Gaussian splats in the format of 3D Gaussian Splatting: `x y z`, colors as `red green blue` or as the
+//! constant spherical harmonic `f_dc_0..2`, `opacity` (logit), `scale_0..2` (logarithm), `rot_0..3`. ASCII and binary little-endian.
 
 use crate::error::{self, DataError, Result};
 use diorama_geom::splats::Splats;
@@ -9,7 +9,7 @@ const LIMIT: u64 = 8 << 30;
 /// Value of the constant spherical harmonic.
 const HARMONIC: f32 = 0.282_094_8;
 
-/// How a number is stored.
+/// Storage type of a number.
 #[derive(Clone, Copy, PartialEq)]
 enum Kind {
     I8,
@@ -60,12 +60,12 @@ impl Kind {
     }
 }
 
-/// What the head of a file says of its vertices.
+/// Description of the vertices in a file's header.
 struct Head {
     ascii: bool,
     count: usize,
     properties: Vec<(String, Kind)>,
-    /// Where the vertices begin.
+    /// Byte offset of the vertices.
     body: usize,
 }
 
@@ -86,7 +86,7 @@ fn head(path: &Path, data: &[u8]) -> Result<Head> {
             ["format", other, ..] => return Err(wrong(format!("format {other} is not read, ascii and binary_little_endian are"))),
             ["element", "vertex", n] if elements == 0 => {
                 elements += 1;
-                count = Some(n.parse::<usize>().map_err(|_| wrong(format!("element vertex: {n:?} is no count")))?);
+                count = Some(n.parse::<usize>().map_err(|_| wrong(format!("element vertex: {n:?} is not a count")))?);
             }
             ["element", "vertex", ..] => return Err(wrong("element vertex is not the first".into())),
             ["element", ..] => elements += 1,
@@ -101,7 +101,7 @@ fn head(path: &Path, data: &[u8]) -> Result<Head> {
     }
     let ascii = ascii.ok_or_else(|| wrong("has no format line".into()))?;
     let count = count.ok_or_else(|| wrong("has no element vertex".into()))?;
-    // The shortest number in a text is a digit and a blank.
+    // The shortest number in a text file is one digit and a blank.
     let stride: usize = properties.iter().map(|p| if ascii { 2 } else { p.1.bytes() }).sum();
     if stride == 0 || count.checked_mul(stride).is_none_or(|n| n > data.len() - at + ascii as usize) {
         return Err(wrong(format!("claims {count} vertices, more than the file has room for")));
@@ -112,7 +112,7 @@ fn head(path: &Path, data: &[u8]) -> Result<Head> {
 /// Reads points or splats.
 ///
 /// # Errors
-/// When the file is no such PLY, or ends too early.
+/// If the file is not such a PLY, or ends too early.
 pub fn read(path: &Path) -> Result<Splats> {
     let data = error::read(path, LIMIT)?;
     let head = head(path, &data)?;
@@ -140,7 +140,7 @@ pub fn read(path: &Path) -> Result<Splats> {
         let q = if length > 1e-12 && length.is_finite() { q.map(|v| v / length) } else { [1.0, 0.0, 0.0, 0.0] };
         let s = scale.map_or([0.0; 3], |i| i.map(|i| v[i].min(20.0).exp()));
         let p = place.map(|i| v[i]);
-        // What is nowhere is not shown.
+        // Points with non-finite positions are not shown.
         if p.iter().chain(&color).chain(&s).all(|v| v.is_finite()) && opaque.is_finite() {
             out.push(p, color.map(|v| v.clamp(0.0, 1.0)), opaque, s, q);
         }
@@ -152,7 +152,7 @@ pub fn read(path: &Path) -> Result<Splats> {
         for i in 0..head.count {
             for v in &mut values {
                 let word = numbers.next().ok_or_else(|| DataError::input(path, format!("ends at vertex {i} of {}", head.count)))?;
-                *v = word.parse().map_err(|_| DataError::input(path, format!("vertex {i}: {word:?} is no number")))?;
+                *v = word.parse().map_err(|_| DataError::input(path, format!("vertex {i}: {word:?} is not a number")))?;
             }
             take(&values);
         }
@@ -211,18 +211,18 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("x.ply");
         let vertex = "property float x\nproperty float y\nproperty float z\nend_header\n";
-        for (text, told) in [
+        for (text, expected) in [
             ("".into(), "end_header"),
             ("solid\n".into(), "begin with ply"),
             (format!("ply\nformat binary_big_endian 1.0\nelement vertex 1\n{vertex}"), "big_endian"),
             (format!("ply\nformat binary_little_endian 1.0\nelement vertex 4000000000000\n{vertex}"), "room"),
-            (format!("ply\nformat ascii 1.0\nelement vertex 99999999999999999999999\n{vertex}"), "no count"),
-            (format!("ply\nformat ascii 1.0\nelement vertex 1\n{vertex}1 2 x\n"), "no number"),
+            (format!("ply\nformat ascii 1.0\nelement vertex 99999999999999999999999\n{vertex}"), "not a count"),
+            (format!("ply\nformat ascii 1.0\nelement vertex 1\n{vertex}1 2 x\n"), "not a number"),
             ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1 2\n".into(), "x, y and z"),
         ] {
             std::fs::write(&file, &text).unwrap();
             let e = read(&file).unwrap_err();
-            assert!(e.is_input() && e.to_string().contains(told) && e.to_string().contains("x.ply"), "{e}");
+            assert!(e.is_input() && e.to_string().contains(expected) && e.to_string().contains("x.ply"), "{e}");
         }
     }
 }

@@ -1,18 +1,18 @@
-//! Rules that divide a capture into training and held-out views.
+//! Rules that split a capture into training and held-out views.
 
 use diorama_geom::capture::{Frame, Split};
 use diorama_geom::rng::Rng;
 
-/// How frames are divided.
+/// How frames are split.
 #[derive(Clone, Debug, PartialEq)]
 pub enum SplitRule {
-    /// As the capture's own files say; every eighth where they say nothing.
+    /// As the capture's own files say; every eighth frame is held out if they say nothing.
     File,
     /// Frames 0, n, 2n, … are held out.
     Every(usize),
     /// Shares of training, validation and test in percent, drawn by seed.
     Shares(u32, u32, u32),
-    /// Everything trains, nothing is held out.
+    /// All frames are used for training.
     All,
 }
 
@@ -48,7 +48,7 @@ impl std::fmt::Display for SplitRule {
     }
 }
 
-/// Applies a rule; `has_own` says whether the frames already carry the capture's own division.
+/// Applies a rule; `has_own` says whether the frames already have a split from the capture's files.
 pub fn apply(rule: &SplitRule, frames: &mut [Frame], has_own: bool, seed: u64) {
     match *rule {
         SplitRule::File if has_own => {}

@@ -10,13 +10,13 @@ use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::{Camera, Lens, Pose, SceneBox, Similarity, SparsePoint};
 use std::path::Path;
 
-/// Camera models that the JSON may name.
+/// Supported camera models.
 const MODELS: &str = "PINHOLE, SIMPLE_PINHOLE, OPENCV, OPENCV_FISHEYE, EQUIRECTANGULAR";
 
 /// Most sparse points that are kept.
 const MOST_POINTS: usize = 2_000_000;
 
-/// Half the edge of the Blender scenes' box: the cube that instant-ngp's scale of 0.33 maps to [0, 1].
+/// Half the edge of the box of Blender scenes: the cube that instant-ngp's scale of 0.33 maps to [0, 1].
 const BLENDER_HALF: f64 = 0.5 / 0.33;
 
 /// Reads one `transforms.json`.
@@ -33,7 +33,7 @@ pub fn read(file: &Path, root: &Path) -> Result<Imported> {
     Ok(out)
 }
 
-/// nerfstudio's `ply_file_path`: points in the frames' world. Which photographs see them only our own files say.
+/// nerfstudio's `ply_file_path`: points in the frames' world. Only files written by this program say which photographs see them.
 fn read_points(head: &Object, root: &Path, out: &mut Imported) -> Result<()> {
     let Some(name) = head.text("ply_file_path")? else { return Ok(()) };
     let Some(file) = locate(root, name, head.path, "ply_file_path")? else {
@@ -62,7 +62,7 @@ fn read_points(head: &Object, root: &Path, out: &mut Imported) -> Result<()> {
     Ok(())
 }
 
-/// Reads a Blender set: `transforms_train.json` and those of `val` and `test` that exist.
+/// Reads a Blender set: `transforms_train.json`, and those of `val` and `test` if they exist.
 pub fn read_blender(root: &Path) -> Result<Imported> {
     let mut out = Imported::default();
     for (name, split) in [("train", Split::Train), ("val", Split::Val), ("test", Split::Test)] {
@@ -91,7 +91,7 @@ pub fn read_blender(root: &Path) -> Result<Imported> {
     Ok(out)
 }
 
-/// instant-ngp's box, where `aabb_scale` is given: `x_model = x · scale + offset`.
+/// instant-ngp's box, if `aabb_scale` is given: `x_model = x · scale + offset`.
 fn ngp_scene(head: &Object) -> Result<Option<SceneBox>> {
     let Some(aabb) = head.positive("aabb_scale")? else { return Ok(None) };
     if aabb.fract() != 0.0 || !(aabb as u64).is_power_of_two() || aabb > 128.0 {
@@ -106,8 +106,8 @@ fn ngp_scene(head: &Object) -> Result<Option<SceneBox>> {
     Ok(Some(SceneBox { center, half: 0.5 / scale, aabb_scale: aabb as u32 }))
 }
 
-/// nerfstudio's `applied_transform` and `applied_scale`: what was done to the poses after structure from motion, which is undone
-/// where things go back to the input's frame.
+/// nerfstudio's `applied_transform` and `applied_scale`: what was applied to the poses after structure from motion. It is inverted when
+/// results are written in the input's frame.
 fn applied(head: &Object) -> Result<Option<Similarity>> {
     let (matrix, scale) = (head.matrix("applied_transform", 3)?, head.positive("applied_scale")?);
     if matrix.is_none() && scale.is_none() {
@@ -170,7 +170,7 @@ fn read_pose(frame: &Object) -> Result<Pose> {
     })
 }
 
-/// Checks that a pose is nearly rigid and makes it exactly so.
+/// Checks that a pose is nearly rigid and makes it exactly rigid.
 pub fn rigid(pose: Pose) -> std::result::Result<Pose, String> {
     let error = pose.rigidity_error();
     if pose.rotation == DMat3::ZERO {
@@ -188,7 +188,7 @@ pub fn rigid(pose: Pose) -> std::result::Result<Pose, String> {
 }
 
 fn read_camera(head: &Object, frame: &Object, image: &Path, sizes: &mut Option<(u32, u32)>) -> Result<Camera> {
-    // A frame's own value wins over the file's.
+    // A frame's own value takes precedence over the file's.
     let number = |key: &str| -> Result<Option<f64>> { Ok(frame.number(key)?.or(head.number(key)?)) };
     let positive = |key: &str| -> Result<Option<f64>> { Ok(frame.positive(key)?.or(head.positive(key)?)) };
     let (width, height) = match (positive("w")?, positive("h")?) {
@@ -237,7 +237,7 @@ fn read_camera(head: &Object, frame: &Object, image: &Path, sizes: &mut Option<(
     Ok(Camera { width, height, fx, fy, cx, cy, lens })
 }
 
-/// nerfstudio's `train_filenames`, `val_filenames`, `test_filenames`; true when any is there.
+/// nerfstudio's `train_filenames`, `val_filenames`, `test_filenames`; returns whether any of them exists.
 fn apply_file_lists(head: &Object, frames: &mut [Frame]) -> Result<bool> {
     let mut any = false;
     for (key, split) in [("train_filenames", Split::Train), ("val_filenames", Split::Val), ("test_filenames", Split::Test)] {
@@ -255,8 +255,8 @@ fn apply_file_lists(head: &Object, frames: &mut [Frame]) -> Result<bool> {
     Ok(any)
 }
 
-/// Writes a capture as `transforms.json`, in the capture's frame, image paths relative to `root`; `points` is the name of a PLY file
-/// there, if any.
+/// Writes a capture as `transforms.json`, in the capture's frame, with image paths relative to `root`; `points` is the name of a PLY file
+/// in `root`, if there is one.
 pub fn write(path: &Path, root: &Path, capture: &diorama_geom::Capture, points: Option<&str>) -> Result<()> {
     let to_capture: Similarity = capture.world_from_capture.inverse();
     let frames: Vec<serde_json::Value> = capture

@@ -1,5 +1,5 @@
-//! USDZ for AR: a stored zip whose entries begin at multiples of 64 bytes, with a scene as text (`.usda`) and its texture.
-//! USD here is y up in metres, since AR viewers expect that: (x, y, z) is written as (x, z, −y).
+//! USDZ for AR: an uncompressed zip whose entries start at multiples of 64 bytes, with a scene as text (`.usda`) and its texture. The
+//! scene is y up and in meters, as AR viewers expect: (x, y, z) is written as (x, z, −y).
 
 use crate::error::{DataError, Result};
 use crate::{atomic, mesh_text, photo};
@@ -8,13 +8,13 @@ use diorama_geom::color::linear_from_srgb;
 use std::fmt::Write;
 use std::path::Path;
 
-/// Alignment of the data of each entry.
+/// Alignment of the data of each entry, in bytes.
 const ALIGNMENT: usize = 64;
 
 /// Writes a `.usdz`.
 ///
 /// # Errors
-/// When the mesh is empty, the file would exceed 4 GiB, or the disk refuses.
+/// If the mesh is empty, the file would exceed 4 GiB, or the file cannot be written.
 pub fn save(path: &Path, mesh: &Mesh) -> Result<()> {
     mesh_text::check(path, mesh)?;
     let mut entries = vec![("scene.usda", scene(mesh).into_bytes())];
@@ -25,7 +25,7 @@ pub fn save(path: &Path, mesh: &Mesh) -> Result<()> {
     atomic::write(path, &bytes)
 }
 
-/// The scene as text.
+/// The scene as `.usda` text.
 fn scene(mesh: &Mesh) -> String {
     let n = mesh.positions.len();
     let y_up = |p: &[f32; 3]| [p[0], p[2], -p[1]];
@@ -102,12 +102,12 @@ fn numbers(s: &mut String, name: &str, values: impl Iterator<Item = u32>) {
     s.push_str("]\n");
 }
 
-/// A zip without compression; none beyond 4 GiB.
+/// A zip without compression; `None` beyond 4 GiB.
 fn stored_zip(entries: &[(&str, Vec<u8>)]) -> Option<Vec<u8>> {
     let (mut out, mut directory) = (Vec::new(), Vec::new());
     for (name, data) in entries {
         let (at, size) = (u32::try_from(out.len()).ok()?, u32::try_from(data.len()).ok()?);
-        // An extra field of zeros pads the header; its own header takes four bytes.
+        // An extra field of zeros pads the header; the field's own header has four bytes.
         let unpadded = out.len() + 30 + name.len() + 4;
         let padding = unpadded.next_multiple_of(ALIGNMENT) - unpadded;
         // Version 1.0, no flags, stored, 1980-01-01.

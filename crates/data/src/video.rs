@@ -1,4 +1,4 @@
-//! Frames of a video through ffmpeg: the sharpest of each stretch of time.
+//! Extracts frames of a video with ffmpeg: the sharpest of each interval.
 
 use crate::error::{DataError, Result};
 use crate::process::{self, Ended};
@@ -6,44 +6,44 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
-/// Size of the small grey frames by which sharpness is judged.
+/// Side of the small gray frames on which sharpness is measured.
 const WIDTH: usize = 320;
 
-/// Frames that one call of ffmpeg writes: systems bound the length of a command.
+/// Most frames per call of ffmpeg; systems limit the length of a command.
 const PER_CALL: usize = 1500;
 
-/// Which frames of a video are taken.
+/// Which frames of a video are extracted.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Choice {
-    /// So many in all, at most.
+    /// At most this many in total.
     Count(usize),
-    /// So many per second.
+    /// This many per second.
     PerSecond(f64),
 }
 
-/// ffmpeg's path.
+/// Path of ffmpeg.
 ///
 /// # Errors
-/// When it is not installed.
+/// If it is not installed.
 pub fn ffmpeg() -> Result<PathBuf> {
     process::find("ffmpeg", "DIORAMA_FFMPEG", "Debian: apt install ffmpeg")
 }
 
-/// What [`extract`] did.
+/// Result of [`extract`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Extracted {
-    /// Frames that the video has.
+    /// Frames in the video.
     pub frames: usize,
     /// Frames that were written.
     pub taken: usize,
-    /// What ffmpeg said where the video could be decoded in part only.
+    /// ffmpeg's messages, if the video could be decoded only in part.
     pub fault: Option<String>,
 }
 
-/// Writes the chosen frames as `frame_00001.jpg` … into `folder`, without metadata; none when interrupted.
+/// Writes the chosen frames as `frame_00001.jpg` … into `folder`, without metadata; `None` when interrupted.
 ///
 /// # Errors
-/// When ffmpeg fails, or the video has no frames that it can decode; ffmpeg's own words are part of it.
+/// If ffmpeg fails, or the video has no frames that it can decode; the error includes ffmpeg's own message.
 pub fn extract(
     ffmpeg: &Path,
     video: &Path,
@@ -60,7 +60,7 @@ pub fn extract(
     };
     let chosen = sharpest(&sharpness, count);
     for (i, part) in chosen.chunks(PER_CALL).enumerate() {
-        // Runs of neighbouring frames keep the expression short.
+        // Runs of consecutive frames keep the expression short.
         let terms: Vec<String> =
             runs(part).iter().map(|(a, b)| if a == b { format!("eq(n,{a})") } else { format!("between(n,{a},{b})") }).collect();
         let mut c = Command::new(ffmpeg);
@@ -72,10 +72,10 @@ pub fn extract(
         let written = (0..part.len()).all(|k| folder.join(format!("frame_{:05}.jpg", i * PER_CALL + k + 1)).is_file());
         match ended {
             Ok(Ended::Interrupted) => return Ok(None),
-            // ffmpeg fails for what comes after the last frame that can be decoded, too.
+            // ffmpeg also fails for frames after the last one that can be decoded.
             Err(e) if !(written && fault.is_some()) => return Err(e),
             Ok(Ended::Done) if !written => {
-                let what = format!("wrote fewer than the {} frames that it was asked for; see {}", part.len(), log.display());
+                let what = format!("wrote fewer than the {} requested frames; see {}", part.len(), log.display());
                 return Err(DataError::failed(ffmpeg, what));
             }
             _ => {}
@@ -84,8 +84,8 @@ pub fn extract(
     Ok(Some(Extracted { frames: sharpness.len(), taken: chosen.len(), fault }))
 }
 
-/// The option by which each decoded frame is written once, whatever its time: `-vsync` was renamed in ffmpeg 5.1, and its old name is gone
-/// from newer versions.
+/// The option that writes each decoded frame once, regardless of its timestamp: `-vsync` was renamed in ffmpeg 5.1, and newer versions
+/// removed the old name.
 fn passthrough(ffmpeg: &Path) -> Result<[&'static str; 2]> {
     let out = Command::new(ffmpeg).arg("-version").output().map_err(DataError::io(ffmpeg, "start"))?;
     let text = String::from_utf8_lossy(&out.stdout).into_owned();
@@ -93,16 +93,16 @@ fn passthrough(ffmpeg: &Path) -> Result<[&'static str; 2]> {
     Ok(if old { ["-vsync", "0"] } else { ["-fps_mode", "passthrough"] })
 }
 
-/// Major and minor number in what `ffmpeg -version` prints; none for builds of no release, which are new.
+/// Major and minor version from the output of `ffmpeg -version`; `None` for development builds, which are recent.
 fn version(text: &str) -> Option<(u32, u32)> {
-    let told = text.lines().next()?.strip_prefix("ffmpeg version ")?.split_whitespace().next()?;
-    let mut parts = told.trim_start_matches('n').split(|c: char| !c.is_ascii_digit());
+    let version = text.lines().next()?.strip_prefix("ffmpeg version ")?.split_whitespace().next()?;
+    let mut parts = version.trim_start_matches('n').split(|c: char| !c.is_ascii_digit());
     let major = parts.next()?.parse().ok()?;
-    // Builds of a day begin with the year.
+    // Names of nightly builds start with the year.
     (major < 1000).then(|| (major, parts.next().and_then(|m| m.parse().ok()).unwrap_or(0)))
 }
 
-/// Variance of the Laplacian of each frame, in small and grey, and ffmpeg's words where it could not decode all.
+/// Variance of the Laplacian of each frame, small and gray; and ffmpeg's messages if it could not decode all frames.
 fn measure(ffmpeg: &Path, passthrough: [&str; 2], video: &Path) -> Result<(Vec<f32>, Option<String>)> {
     let mut c = Command::new(ffmpeg);
     c.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-i"]).arg(video).args(passthrough);
@@ -120,9 +120,9 @@ fn measure(ffmpeg: &Path, passthrough: [&str; 2], video: &Path) -> Result<(Vec<f
         }
     });
     match read {
-        // What could be decoded before a fault is worth having.
+        // Frames decoded before an error are used.
         Err(e) if !out.is_empty() => Ok((out, Some(e.to_string()))),
-        // An ffmpeg that does not know its options has not looked at the video.
+        // If ffmpeg does not know an option, it has not read the video.
         Err(e) if ["Unrecognized option", "Option not found", "No such filter"].iter().any(|w| e.to_string().contains(w)) => Err(e),
         Err(e) => Err(DataError::input(video, format!("holds no frames that can be decoded: {e}; convert it to MP4"))),
         Ok(()) if out.is_empty() => Err(DataError::input(video, "holds no frames; give a video, or a folder of photographs")),
@@ -131,15 +131,15 @@ fn measure(ffmpeg: &Path, passthrough: [&str; 2], video: &Path) -> Result<(Vec<f
 }
 
 fn frames_per_second(ffmpeg: &Path, video: &Path) -> Result<f64> {
-    // Told by ffmpeg itself, so that ffprobe need not be there: "Stream … 29.97 fps".
+    // ffmpeg itself prints the frame rate, so that ffprobe is not needed: "Stream … 29.97 fps".
     let out = Command::new(ffmpeg).args(["-hide_banner", "-nostdin", "-i"]).arg(video).output().map_err(DataError::io(ffmpeg, "start"))?;
     let text = String::from_utf8_lossy(&out.stderr).into_owned();
     let fps =
         text.lines().filter(|l| l.contains("Video:")).find_map(|l| l.split(" fps").next()?.rsplit([' ', ',']).next()?.parse::<f64>().ok());
-    fps.filter(|f| *f > 0.0).ok_or_else(|| DataError::input(video, "does not tell its frame rate; give --frames instead of --fps"))
+    fps.filter(|f| *f > 0.0).ok_or_else(|| DataError::input(video, "does not state its frame rate; give --frames instead of --fps"))
 }
 
-/// Variance of the 4-neighbour Laplacian of a grey image `width` wide.
+/// Variance of the 4-neighbor Laplacian of a gray image that is `width` pixels wide.
 pub fn laplacian_variance(gray: &[u8], width: usize) -> f32 {
     let height = gray.len() / width;
     let (mut sum, mut squares, mut n) = (0.0f64, 0.0f64, 0.0f64);
@@ -154,7 +154,7 @@ pub fn laplacian_variance(gray: &[u8], width: usize) -> f32 {
     if n > 0.0 { (squares / n - (sum / n).powi(2)) as f32 } else { 0.0 }
 }
 
-/// The sharpest frame of each of `count` equal stretches.
+/// The sharpest frame of each of `count` equal intervals.
 fn sharpest(sharpness: &[f32], count: usize) -> Vec<usize> {
     let (n, count) = (sharpness.len(), count.clamp(1, sharpness.len().max(1)));
     (0..count)
@@ -162,7 +162,7 @@ fn sharpest(sharpness: &[f32], count: usize) -> Vec<usize> {
         .collect()
 }
 
-/// First and last of each run of consecutive numbers.
+/// First and last number of each run of consecutive numbers.
 fn runs(sorted: &[usize]) -> Vec<(usize, usize)> {
     let mut out: Vec<(usize, usize)> = Vec::new();
     for &i in sorted {

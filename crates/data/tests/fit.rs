@@ -1,4 +1,4 @@
-//! Photographs that do not fit their poses' file as they are: other sizes, other frames, broken ones, depth maps.
+//! Photographs that differ from the file with their poses: other sizes, other frames, broken photographs, depth maps.
 
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::{DataError, colmap, photo, photo_check, transforms_json};
@@ -15,7 +15,7 @@ fn save(path: &Path, w: usize, h: usize) {
     photo::save_png(path, &ImageU8 { width: w, height: h, channels: 3, data: (0..w * h * 3).map(|i| (i * 7) as u8).collect() }).unwrap();
 }
 
-/// Six photographs of `size` in `folder` with cameras of 200×120 around the origin.
+/// Six photographs of `size` in `folder`, with cameras of 200×120 around the origin.
 fn capture(root: &Path, folder: &str, size: (usize, usize)) -> Capture {
     let frames = (0..6)
         .map(|i| {
@@ -39,7 +39,7 @@ fn read(root: &Path) -> Result<Capture, DataError> {
     import::import(root, &ImportOptions::default())
 }
 
-/// Changes the capture's file.
+/// Edits the capture's file.
 fn edit(root: &Path, change: impl FnOnce(&mut Value)) {
     let file = root.join("transforms.json");
     let mut json = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
@@ -56,7 +56,7 @@ fn refusal(root: &Path) -> String {
 
 #[test]
 fn intrinsics_follow_resized_photographs_and_a_note_says_so() {
-    // Sides may be rounded either way.
+    // Sides may be rounded up or down.
     for size in [(100, 60), (50, 30), (66, 40), (67, 40), (23, 14), (400, 240)] {
         let dir = tempfile::tempdir().unwrap();
         let c = capture(dir.path(), "images_4", size);
@@ -66,7 +66,7 @@ fn intrinsics_follow_resized_photographs_and_a_note_says_so() {
         for (f, want) in got.frames.iter().zip(&c.frames) {
             assert_eq!((f.camera.width as usize, f.camera.height as usize), size);
             for (x, y) in [(0.5, 0.5), (150.5, 20.5), (199.5, 119.5)] {
-                // The middle of a pixel of the large photograph, in the small one.
+                // The center of a pixel of the large photograph, in the small one.
                 let d = f.camera.direction(x * sx, y * sy);
                 assert!((d - want.camera.direction(x, y)).length() < 1e-9);
             }
@@ -125,20 +125,20 @@ fn what_nerfstudio_did_to_the_poses_is_undone_for_meshes() {
     let dir = tempfile::tempdir().unwrap();
     let c = capture(dir.path(), "images", (200, 120));
     write(dir.path(), &c);
-    // As `ns-process-data` turns COLMAP's world, and half its size.
+    // As `ns-process-data` rotates COLMAP's world, at half its size.
     let rows = [[1.0, 0.0, 0.0, 0.5], [0.0, 0.0, 1.0, -2.0], [0.0, -1.0, 0.0, 3.0]];
     edit(dir.path(), |j| {
         j["applied_transform"] = json!(rows);
         j["applied_scale"] = json!(0.5);
     });
     let got = read(dir.path()).unwrap();
-    // The poses stay: they are what was given.
+    // The poses stay as given.
     assert!((got.frames[2].world_from_camera.translation - c.frames[2].world_from_camera.translation).length() < 1e-9);
     let in_colmap = DVec3::new(7.0, -4.0, 2.0);
     let in_file = 0.5 * DVec3::new(7.0 + 0.5, 2.0 - 2.0, 4.0 + 3.0);
     assert!((got.world_from_capture.point(in_colmap) - in_file).length() < 1e-12);
     assert!((got.world_from_capture.inverse().point(in_file) - in_colmap).length() < 1e-12);
-    // Within the matrix, a scale is one, too; a mirror is none.
+    // A scale inside the matrix counts as a scale; a mirror is refused.
     edit(dir.path(), |j| j["applied_transform"] = json!(rows.map(|r| r.map(|v| 3.0 * v))));
     let larger = read(dir.path()).unwrap().world_from_capture;
     assert!((larger.scale - 1.5).abs() < 1e-12 && (larger.point(in_colmap) - 3.0 * in_file).length() < 1e-12);
@@ -202,7 +202,7 @@ fn broken_photographs_are_named_or_left_out() {
         let bytes = std::fs::read(&c.frames[i].image).unwrap();
         std::fs::write(&c.frames[i].image, &bytes[..n]).unwrap();
     };
-    // One without a head, one without an end.
+    // One without a header, one without an end.
     cut(0, 0);
     cut(4, 900);
     let text = refusal(dir.path());
@@ -212,7 +212,7 @@ fn broken_photographs_are_named_or_left_out() {
     photo_check::leave_out_broken(&mut got).unwrap();
     assert_eq!(got.notes[1], "1 broken photograph is left out: a4.png");
     assert_eq!(got.frames.iter().map(|f| f.image.file_stem().unwrap().to_str().unwrap()).collect::<Vec<_>>(), ["a1", "a2", "a3", "a5"]);
-    // Without enough of them nothing can be learned.
+    // With too few photographs nothing can be learned.
     for i in [1, 2, 3] {
         cut(i, 900);
     }
@@ -241,7 +241,7 @@ fn light_is_of_one_kind_and_known_from_the_files() {
 fn a_thousand_photographs_are_looked_at_fast() {
     let dir = tempfile::tempdir().unwrap();
     let mut c = capture(dir.path(), "images", (200, 120));
-    // Large files, most of them a hole: reading them whole would take minutes.
+    // Large sparse files: reading them completely would take minutes.
     let first = c.frames[0].clone();
     std::fs::File::options().write(true).open(&first.image).unwrap().set_len(1 << 30).unwrap();
     c.frames = (0..1000).map(|i| Frame { name: i.to_string(), ..first.clone() }).collect();

@@ -1,4 +1,4 @@
-//! Importers: what was written comes back, formats agree with each other, and the real captures.
+//! Importers: round trips, agreement between formats, and real captures.
 
 use diorama_data::import::{self, Format, ImportOptions};
 use diorama_data::{colmap, photo, transforms_json};
@@ -59,7 +59,7 @@ fn colmap_text_round_trips_up_to_the_turn_of_the_world() {
         let (d, e) = (a.camera.direction(3.0, 14.0), b.camera.direction(3.0, 14.0));
         assert!((d - e).length() < 1e-9);
     }
-    // Up is where the cameras say it is.
+    // Up is the cameras' mean up direction.
     let up: DVec3 = got.frames.iter().map(|f| -f.world_from_camera.rotation.y_axis).sum();
     assert!(up.normalize().z > 0.999);
 }
@@ -106,8 +106,8 @@ fn photographs_that_a_model_does_not_hold_are_told() {
     };
     assert!(!notes(&c).iter().any(|n| n.contains("no pose")));
     c.frames.retain(|f| !["images/a 1", "images/a 3"].contains(&&*f.name));
-    let told = notes(&c);
-    assert!(told.iter().any(|n| n.starts_with("2 photographs ") && n.ends_with("left out (a 1.png, a 3.png)")), "{told:?}");
+    let notes = notes(&c);
+    assert!(notes.iter().any(|n| n.starts_with("2 photographs ") && n.ends_with("left out (a 1.png, a 3.png)")), "{notes:?}");
 }
 
 #[test]
@@ -129,7 +129,7 @@ fn blender_sets_keep_their_split_and_complete_extensions() {
     let c = import::import(dir.path(), &ImportOptions::default()).unwrap();
     assert_eq!((c.indices(Split::Train).len(), c.indices(Split::Test).len()), (3, 2));
     assert!((c.frames[0].camera.fx - 4.0 / (0.345f64).tan()).abs() < 1e-9);
-    // Blender's camera looks along −z with y up: this one looks along +y of the world, right is +x.
+    // Blender's camera looks along −z with y up. This one looks along +y of the world, and its right is +x.
     let r = c.frames[0].world_from_camera.rotation;
     assert!((r.z_axis - DVec3::Y).length() < 1e-9 && (r.x_axis - DVec3::X).length() < 1e-9 && (r.y_axis + DVec3::Z).length() < 1e-9);
 }
@@ -149,7 +149,7 @@ fn a_mask_of_instant_ngp_hides_what_is_not_black() {
     assert_eq!((m.pixel(4, 3)[0], m.pixel(5, 3)[0]), (0, 255));
 }
 
-/// The folder of real captures, or a line that says that the test was skipped.
+/// The folder of real captures; without one, prints that the test was skipped.
 fn data(name: &str) -> Option<PathBuf> {
     let found = std::env::var("DIORAMA_TEST_DATA").ok().map(|d| PathBuf::from(d).join(name)).filter(|d| d.is_dir());
     if found.is_none() {

@@ -1,4 +1,4 @@
-//! Photographs of every format: cut off anywhere they are refused, and none of their range is lost.
+//! Photographs of every format: truncated files are refused, and the full range of values is kept.
 
 use diorama_data::photo::{self, Photo};
 use diorama_geom::Image;
@@ -31,7 +31,7 @@ fn linear() -> DynamicImage {
     DynamicImage::ImageRgb32F(ImageBuffer::from_fn(SIZE.0, SIZE.1, pixel))
 }
 
-/// A file of each kind, by name.
+/// One file of each kind, by name.
 fn files() -> Vec<(&'static str, Vec<u8>)> {
     vec![
         ("baseline.jpg", include_bytes!("photos/baseline.jpg").to_vec()),
@@ -62,7 +62,7 @@ fn what_is_cut_off_anywhere_is_refused_by_name_unless_nothing_is_lost() {
     for (name, bytes) in files() {
         let whole = photo::load_full(&saved(dir.path(), name, &bytes)).unwrap();
         let mut refused = 0;
-        // Every length near the end, where little is lost, and a third of the others.
+        // Every length near the end, where little is lost, and a third of the other lengths.
         for n in (0..bytes.len()).filter(|n| n % 3 == 0 || n + 200 > bytes.len()) {
             match photo::load_full(&saved(dir.path(), name, &bytes[..n])) {
                 Ok(cut) => assert!(cut == whole, "{name} of {n} of {} bytes decodes to something else", bytes.len()),
@@ -103,7 +103,7 @@ fn a_jpeg_without_its_end_marker_is_whole_if_its_data_are() {
     }
 }
 
-/// The folder of real captures, or a line that says that the test was skipped.
+/// The folder of real captures; without one, prints that the test was skipped.
 fn data(name: &str) -> Option<PathBuf> {
     let found = std::env::var("DIORAMA_TEST_DATA").ok().map(|d| PathBuf::from(d).join(name)).filter(|d| d.is_dir());
     if found.is_none() {
@@ -126,7 +126,7 @@ fn real_photographs_are_whole_until_they_are_cut_off() {
             assert!(e.contains("cut.jpg") && e.contains("--skip-broken"), "{e}");
         }
     }
-    // Also without their end marker, for which their data are counted.
+    // The same without end markers, which makes the check count the data.
     let bytes = std::fs::read(&photos[0]).unwrap();
     let end = bytes.windows(2).rposition(|w| w == [0xff, 0xd9]).unwrap();
     assert!(photo::load_full(&saved(dir.path(), "whole.jpg", &bytes[..end])).is_ok());
@@ -150,7 +150,7 @@ fn exr_and_hdr_keep_what_is_brighter_than_white() {
         let Photo::Linear(im) = photo::load_full(&saved(dir.path(), name, &bytes)).unwrap() else { panic!("{name}") };
         let want = linear().into_rgb32f().into_raw();
         assert!(want.iter().any(|v| *v > 100.0));
-        // HDR shares one exponent among a pixel's channels.
+        // HDR shares one exponent among the channels of a pixel.
         for (got, want) in im.data.chunks_exact(3).zip(want.chunks_exact(3)) {
             let most = want.iter().fold(0.0f32, |a, b| a.max(*b));
             assert!(got.iter().zip(want).all(|(a, b)| (a - b).abs() <= most / 128.0), "{name}: {got:?} for {want:?}");

@@ -1,4 +1,4 @@
-//! What is written comes back: every format that is both read and written, with any content.
+//! Round trips of every format that is both read and written, with random content.
 
 use diorama_data::camera_path_json::{self, CameraPath};
 use diorama_data::checkpoint::{self, Entry};
@@ -34,7 +34,7 @@ fn is_near(a: &Pose, b: &Pose) -> bool {
     (a.translation - b.translation).length() < 1e-6 && a.rotation.abs_diff_eq(b.rotation, 1e-6)
 }
 
-/// An image of up to 9 pixels a side.
+/// An image of up to 9 × 9 pixels.
 fn image(channels: usize) -> impl Strategy<Value = ImageU8> {
     (1usize..9, 1usize..9).prop_flat_map(move |(width, height)| {
         prop::collection::vec(any::<u8>(), width * height * channels).prop_map(move |data| ImageU8 { width, height, channels, data })
@@ -88,7 +88,7 @@ proptest! {
             prop_assert_eq!((a.camera.width, a.camera.height, a.camera.lens), (b.camera.width, b.camera.height, b.camera.lens));
             prop_assert!(lens == 2 || (a.camera.fy - b.camera.fy).abs() < 1e-6 * a.camera.fy);
         }
-        // To another frame and back it is the same path; the page moves perspective ones only.
+        // Moving a path to another frame and back gives the same path; `moved` accepts perspective paths only.
         if lens != 0 {
             return Ok(());
         }
@@ -136,7 +136,7 @@ proptest! {
         for (i, data) in frames.iter().enumerate() {
             let read = depth::read_png(&dir.path().join(format!("depth16_{i:04}.png"))).unwrap();
             for (n, d) in read.iter().zip(data) {
-                // Frames that were written before a longer distance came are rounded once more for each of those.
+                // Frames written before a longer distance came are rounded once more for each longer distance.
                 prop_assert!((*n as f64 * step - *d as f64).abs() <= step * frames.len() as f64, "{n} x {step}: {d}");
                 prop_assert_eq!(*n == 0, *d == 0.0);
             }
@@ -202,7 +202,7 @@ proptest! {
     }
 }
 
-/// The lenses that both formats describe, bent a little.
+/// The lenses that both formats describe, with some distortion.
 fn lens() -> impl Strategy<Value = Lens> {
     let k = || prop::array::uniform4(-0.02..0.02f64);
     prop_oneof![
@@ -212,7 +212,7 @@ fn lens() -> impl Strategy<Value = Lens> {
     ]
 }
 
-/// A frame whose photograph is there.
+/// A frame whose photograph exists.
 fn frame(root: &Path, i: usize, is_test: bool, camera: Camera, pose: Pose) -> Frame {
     let image = root.join(format!("images/{i}.png"));
     photo::save_png(&image, &ImageU8 { width: 8, height: 6, channels: 3, data: vec![9; 144] }).unwrap();

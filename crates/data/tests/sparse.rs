@@ -1,4 +1,4 @@
-//! Sparse points come with a capture, and a model whose poses contradict them is told.
+//! Sparse points of a capture, and COLMAP models whose poses contradict their points.
 
 use diorama_data::import::{self, Format, ImportOptions};
 use diorama_data::{colmap, photo, photo_check};
@@ -11,17 +11,17 @@ use std::path::Path;
 const VIEWS: usize = 8;
 const POINTS: u64 = 300;
 
-/// What a model is to look like.
+/// A COLMAP model to generate.
 struct Kind {
-    /// Number of the first point in the file of points, where images number from 0.
+    /// Offset added to the point ids in the points file; the images file counts from 0.
     first: u64,
-    /// Photographs by number whose pose is not the one that took them.
+    /// Indices of photographs that get a wrong pose.
     wrong: Vec<usize>,
-    /// Keypoints are of photographs so many times as large.
+    /// Keypoints refer to photographs larger by this factor.
     keypoints: f64,
     text: bool,
     tracks: bool,
-    /// A photograph that shares no points.
+    /// Index of a photograph that shares no points.
     alone: Option<usize>,
 }
 
@@ -32,7 +32,7 @@ fn pose(i: usize) -> Pose {
     Pose::look_at(DVec3::new(4.0 * a.cos(), 4.0 * a.sin(), 1.0), DVec3::ZERO, DVec3::Z)
 }
 
-/// A model in `sparse/0`, and photographs.
+/// Writes a model to `sparse/0`, and photographs.
 fn write(root: &Path, kind: &Kind) {
     let (model, images) = (root.join("sparse/0"), root.join("images"));
     std::fs::create_dir_all(&model).unwrap();
@@ -46,14 +46,14 @@ fn write(root: &Path, kind: &Kind) {
         let image = ImageU8 { width: 200, height: 150, channels: 3, data: vec![90; 200 * 150 * 3] };
         photo::save_png(&images.join(format!("v{i}.png")), &image).unwrap();
         let inverse = pose(i).inverse();
-        let told = if kind.wrong.contains(&i) { pose(i + 3).inverse() } else { inverse };
+        let written = if kind.wrong.contains(&i) { pose(i + 3).inverse() } else { inverse };
         let shows = |n: u64| kind.alone.is_none_or(|a| (n < 20) == (a == i));
         let seen: Vec<(f64, f64, u64)> = (0..POINTS)
             .filter(|n| shows(*n))
             .filter_map(|n| camera.project(inverse.point(place(n))).map(|p| (p.x * kind.keypoints, p.y * kind.keypoints, n)))
             .collect();
-        let q = DQuat::from_mat3(&told.rotation);
-        let t = told.translation;
+        let q = DQuat::from_mat3(&written.rotation);
+        let t = written.translation;
         binary.extend((i as u32 + 1).to_le_bytes());
         [q.w, q.x, q.y, q.z, t.x, t.y, t.z].iter().for_each(|v| binary.extend(v.to_le_bytes()));
         binary.extend(1u32.to_le_bytes());
@@ -130,31 +130,31 @@ fn poses_that_contradict_the_points_are_refused_and_can_be_looked_at() {
     let broken = Kind { wrong: (0..VIEWS).collect(), ..GOOD };
     let e = read(&broken).unwrap_err();
     assert!(e.contains("sparse/0") && e.contains("contradict") && e.contains("prepare") && e.contains("points3D"), "{e}");
-    assert!(!e.contains("lies beside"), "{e}");
+    assert!(!e.contains("is in the model's folder too"), "{e}");
     let dir = tempfile::tempdir().unwrap();
     write(dir.path(), &broken);
     std::fs::write(dir.path().join("sparse/0/images_0.bin"), b"").unwrap();
     let e = import::import(dir.path(), &ImportOptions::default()).err().unwrap().to_string();
-    assert!(e.contains("images_0.bin lies beside"), "{e}");
+    assert!(e.contains("images_0.bin is in the model's folder too"), "{e}");
     let looked = import::import(dir.path(), &ImportOptions { allow_broken: true, ..ImportOptions::default() }).unwrap();
     assert!(looked.agreement.unwrap().is_broken());
-    // As the message says: without points the poses are taken as they are.
+    // As the message suggests: without points the poses are accepted as they are.
     std::fs::remove_file(dir.path().join("sparse/0/points3D.bin")).unwrap();
     assert_eq!(import::import(dir.path(), &ImportOptions::default()).unwrap().agreement, None);
 }
 
 #[test]
 fn observations_of_absent_points_are_checked_by_tracks() {
-    // Files of two runs: numbers and places are others.
+    // Files of two runs: ids and positions differ.
     let mixed = Kind { first: 100_000, wrong: (0..VIEWS).collect(), ..GOOD };
     let e = read(&mixed).unwrap_err();
     assert!(e.contains("contradict") && e.contains("not in the model"), "{e}");
-    // Numbers alone are others.
+    // Only the ids differ.
     let numbered = read(&Kind { first: 100_000, ..GOOD }).unwrap();
     assert!(numbered.notes.len() == 1 && numbered.notes[0].contains("0.0 pixels apart"), "{:?}", numbered.notes);
     assert!(numbered.points.iter().all(|p| p.frames.len() > 1));
-    let untold = read(&Kind { first: 100_000, tracks: false, ..GOOD }).unwrap();
-    assert!(untold.notes.len() == 1 && untold.notes[0].contains("could not be compared"), "{:?}", untold.notes);
+    let without = read(&Kind { first: 100_000, tracks: false, ..GOOD }).unwrap();
+    assert!(without.notes.len() == 1 && without.notes[0].contains("could not be compared"), "{:?}", without.notes);
 }
 
 #[test]
@@ -214,7 +214,7 @@ fn points_named_by_transforms_json_come_along() {
     let with = import::import(dir.path(), &options).unwrap();
     assert_eq!((with.points.len(), with.points[0].position, with.points[0].color), (2, DVec3::new(1.0, 2.0, 3.0), [255, 0, 10]));
     assert!(with.points[0].frames.is_empty() && with.agreement.is_none());
-    // Points are not kept in a run's folder.
+    // Points are not stored in a run's folder.
     assert!(!serde_json::to_string(&with).unwrap().contains("points"));
 }
 
@@ -236,7 +236,7 @@ fn points_follow_the_photographs_when_broken_ones_are_left_out() {
             assert!(f.camera.project(f.world_from_camera.inverse().point(p.position)).is_some(), "{} sees {}", f.name, p.position);
         }
     }
-    // Each frame's own points are those that the whole model has for it.
+    // Each frame has the points that the whole model has for it.
     write(dir.path(), &GOOD);
     let all = import::import(dir.path(), &ImportOptions::default()).unwrap();
     let seen_by = |c: &Capture, name: &str| {

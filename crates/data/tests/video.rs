@@ -1,4 +1,4 @@
-//! Frames of videos, by the ffmpeg of this machine and by one that knows today's options only.
+//! Frames of videos, extracted by this machine's ffmpeg and by stand-ins that accept only present options.
 #![cfg(unix)]
 
 use diorama_data::video::{self, Choice, Extracted};
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
-/// Frames of the test's video; every fourth is sharp, and how bright a frame is tells its number.
+/// Number of frames of the test video. Every fourth is sharp, and the brightness of a frame encodes its number.
 const FRAMES: usize = 24;
 
 fn extract(program: &Path, file: &Path, folder: &Path, choice: Choice) -> Result<Option<Extracted>, DataError> {
@@ -17,7 +17,7 @@ fn extract(program: &Path, file: &Path, folder: &Path, choice: Choice) -> Result
     video::extract(program, file, folder, choice, &folder.with_extension("log"), &AtomicBool::new(false))
 }
 
-/// The machine's ffmpeg and that of `DIORAMA_NEW_FFMPEG`, or lines that say which is skipped.
+/// The machine's ffmpeg and that of `DIORAMA_NEW_FFMPEG`; prints which of them is skipped.
 fn ffmpegs() -> Vec<PathBuf> {
     let machine = video::ffmpeg().ok();
     let new = std::env::var_os("DIORAMA_NEW_FFMPEG").map(PathBuf::from);
@@ -31,7 +31,7 @@ fn ffmpegs() -> Vec<PathBuf> {
     machine.into_iter().chain(new).collect()
 }
 
-/// A checkered picture, fine where it is sharp; its mean tells its number.
+/// A checkered picture, with fine squares if it is sharp; its mean encodes its number.
 fn picture(number: usize) -> ImageU8 {
     let (w, h, level) = (96, 64, 40 + 7 * number as u8);
     let contrast = if number % 4 == 2 { 30 } else { 3 };
@@ -50,7 +50,7 @@ fn script(path: &Path, text: &str) {
     std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o755)).unwrap();
 }
 
-/// The test's video in FFV1, its frames at times that are not regular.
+/// The test video in FFV1, with irregular timestamps.
 fn video(ffmpeg: &Path, dir: &Path) -> PathBuf {
     for i in 0..FRAMES {
         photo::save_png(&dir.join(format!("{i:03}.png")), &picture(i)).unwrap();
@@ -85,7 +85,7 @@ fn sharp_frames_are_written(ffmpeg: &Path) {
     let made = extract(ffmpeg, &file, &out, Choice::Count(6)).unwrap().unwrap();
     assert_eq!(made, Extracted { frames: FRAMES, taken: 6, fault: None });
     assert_eq!(frames(&out).iter().map(|f| number(f)).collect::<Vec<_>>(), [2, 6, 10, 14, 18, 22]);
-    // All of them are neighbours of each other.
+    // All of them are consecutive.
     let all = dir.path().join("all");
     assert_eq!(extract(ffmpeg, &file, &all, Choice::Count(99)).unwrap().unwrap().taken, FRAMES);
     assert_eq!(frames(&all).iter().map(|f| number(f)).collect::<Vec<_>>(), (0..FRAMES).collect::<Vec<_>>());
@@ -102,7 +102,7 @@ fn failures_are_told(ffmpeg: &Path) {
     std::fs::write(&file, b"this is no video, though it is named like one").unwrap();
     let e = extract(ffmpeg, &file, &dir.path().join("out"), Choice::Count(6)).unwrap_err();
     assert!(e.is_input() && e.to_string().contains("a.mp4") && e.to_string().contains("Invalid data found"), "{e}");
-    // Half a video gives its first frames, and says so.
+    // Half a video gives its first frames and a message.
     let whole = video(ffmpeg, dir.path());
     let bytes = std::fs::read(&whole).unwrap();
     std::fs::write(&file, &bytes[..bytes.len() / 2]).unwrap();
@@ -111,7 +111,7 @@ fn failures_are_told(ffmpeg: &Path) {
     assert!(made.frames < FRAMES && made.taken == 3 && frames(&half).len() == 3, "{made:?}");
 }
 
-/// Answers as ffmpeg 8 does: the options `-vsync` and `-filter_script` are unknown to it. It knows one video, whose third frame is sharp.
+/// A stand-in for ffmpeg 8: it does not accept the options `-vsync` and `-filter_script`. It knows one video, whose third frame is sharp.
 fn ffmpeg_8(dir: &Path, version: &str, known: &str) -> PathBuf {
     let side = 320;
     let flat = vec![90u8; side * side];
@@ -149,7 +149,7 @@ cp {here}/frame.png "$(printf "$last" 1)"
     program
 }
 
-/// Debian's ffmpeg 5 still takes what version 8 dropped.
+/// Debian's ffmpeg 5 still accepts options that version 8 removed.
 #[test]
 fn the_newer_ffmpeg_lacks_the_options_that_are_gone() {
     let Some(new) = ffmpegs().into_iter().nth(1) else { return };
@@ -169,7 +169,7 @@ fn options_suit_the_version() {
         assert_eq!((made.frames, made.taken), (4, 1), "{version}");
         assert_eq!(number(&out.join("frame_00001.jpg")), 3, "{version}");
     }
-    // An ffmpeg that knows neither is to blame, not the video.
+    // If ffmpeg accepts neither option, the error blames ffmpeg, not the video.
     let program = ffmpeg_8(dir.path(), "9.0", "-pass_all");
     let e = extract(&program, Path::new("a.mp4"), &dir.path().join("9"), Choice::Count(1)).unwrap_err().to_string();
     assert!(e.contains("Unrecognized option 'fps_mode'") && e.contains("ffmpeg-9.0") && !e.contains("MP4"), "{e}");

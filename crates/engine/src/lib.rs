@@ -5,8 +5,7 @@
 //! - [`step`]: a [`step::Step`] describes a training step: source of rays, placement of samples, loss and rates. [`step::CpuTrainer`] carries
 //!   it out, `on_gpu::GpuTrainer` on a device.
 //! - [`samplers`]: pixels, the occupancy grid, and [`samplers::placement::Placement`] of samples, for training and rendering alike.
-//! - [`losses`], [`metrics`]: photometric terms; MSE, PSNR, SSIM and LPIPS. Losses of whole batches are
-//!   [`diorama_kernels::ops::field_step::BatchLoss`]es.
+//! - [`metrics`]: MSE, PSNR, SSIM and LPIPS. Losses are ops of `diorama-kernels`: `photometric_loss`, or a `BatchLoss` of one's own.
 //! - [`params`]: groups of parameters, each with a rate, decay and schedule of its own, and sets of them.
 //! - [`renderers`]: [`renderers::volume::Tracer`] renders views of a field.
 //! - [`mod@train`]: the loop of a run, its events, and figures by name.
@@ -15,10 +14,10 @@
 //!
 //! ```
 //! use diorama_engine::fields;
-//! use diorama_engine::losses::{ColorLoss, Terms};
 //! use diorama_engine::samplers::placement::Placement;
 //! use diorama_engine::step::{CpuTrainer, GivenRays, Loss, RaySource, Scene, Step, Trainees};
 //! use diorama_geom::contraction::Space;
+//! use diorama_kernels::ops::photometric_loss::{ColorLoss, Terms};
 //!
 //! // In the cube [0, 1]³.
 //! let mut field = fields::baseline(Space::Cube(1.0), 1e-2, 1);
@@ -44,7 +43,6 @@
 
 pub mod background;
 pub mod fields;
-pub mod losses;
 pub mod metrics;
 #[cfg(feature = "gpu")]
 pub mod on_gpu;

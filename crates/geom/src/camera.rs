@@ -3,7 +3,7 @@
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// How directions become normalised image coordinates.
+/// Lens models: how directions become normalized image coordinates.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "model", rename_all = "snake_case")]
 pub enum Lens {
@@ -17,16 +17,16 @@ pub enum Lens {
     Fisheye { k: [f64; 4], p: [f64; 2], s: [f64; 2] },
     /// Devernay–Faugeras field-of-view model: `rd = atan(2 r tan(ω/2)) / ω`.
     Fov { omega: f64 },
-    /// Longitude and latitude over the whole image; focal lengths and centre are not used.
+    /// Longitude and latitude over the whole image; focal lengths and center are not used.
     Equirectangular,
 }
 
-/// How much smaller than the photographs the images are that are worked on.
+/// How photographs are reduced before they are used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reduction {
-    /// So many times, sizes rounded down, at least one pixel.
+    /// By a factor; sizes are rounded down, to at least one pixel.
     Times(u32),
-    /// Until the shortest side has so many pixels; smaller photographs stay as they are.
+    /// Until the shortest side has this many pixels; smaller photographs are unchanged.
     ShortestSide(u32),
 }
 
@@ -60,13 +60,13 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// A pinhole with a horizontal field of view in radians and a centred principal point.
+    /// A pinhole camera with a horizontal field of view in radians and a centered principal point.
     pub fn pinhole(width: u32, height: u32, fov_x: f64) -> Camera {
         let f = 0.5 * width as f64 / (0.5 * fov_x).tan();
         Camera { width, height, fx: f, fy: f, cx: 0.5 * width as f64, cy: 0.5 * height as f64, lens: Lens::Pinhole }
     }
 
-    /// A camera that sees the full sphere. The focal lengths are pixels per radian at the horizon; nothing depends on them.
+    /// A camera that sees the full sphere. Its focal lengths are pixels per radian at the horizon; nothing depends on them.
     pub fn equirectangular(width: u32, height: u32) -> Camera {
         let (w, h) = (width as f64, height as f64);
         let (fx, fy) = (w / std::f64::consts::TAU, h / std::f64::consts::PI);
@@ -84,7 +84,7 @@ impl Camera {
         self.resized((self.width / factor).max(1), (self.height / factor).max(1))
     }
 
-    /// The same camera for reduced images: each axis is scaled by its own exact share.
+    /// The same camera for reduced images; each axis is scaled by its exact ratio.
     pub fn reduced(&self, by: Reduction) -> Camera {
         let (width, height) = by.size((self.width, self.height));
         self.resized(width, height)
@@ -112,8 +112,8 @@ impl Camera {
         }
     }
 
-    /// Pixel coordinates of a point in the camera; `None` behind a perspective camera, and where a fisheye lens does not reach: its
-    /// polynomial has turned back, or the point is straight behind.
+    /// Pixel coordinates of a point in camera coordinates. `None` behind a perspective camera, and where a fisheye lens does not reach:
+    /// beyond the angle at which its polynomial stops growing, or straight behind.
     pub fn project(&self, x_in_camera: DVec3) -> Option<DVec2> {
         let p = x_in_camera;
         let d = match self.lens {
@@ -141,7 +141,7 @@ impl Camera {
 }
 
 impl Lens {
-    /// Ideal to distorted normalised coordinates. For a fisheye the ideal coordinates are
+    /// Ideal to distorted normalized coordinates. For a fisheye the ideal coordinates are
     /// `θ (cos φ, sin φ)`, for the others `(X/Z, Y/Z)`.
     pub fn distort(&self, u: DVec2) -> DVec2 {
         let r2 = u.length_squared();
@@ -166,7 +166,7 @@ impl Lens {
         }
     }
 
-    /// Whether a fisheye's image radius grows with the angle from the axis all the way to `theta`; beyond, its polynomial says nothing.
+    /// Whether a fisheye's image radius grows with the angle from the axis up to `theta`; beyond that, its polynomial is meaningless.
     fn reaches(&self, theta: f64) -> bool {
         let Lens::Fisheye { k, .. } = self else { return true };
         // d(θ + k1 θ³ + …)/dθ
@@ -243,7 +243,7 @@ mod tests {
     fn a_lens_of_200_degrees_sees_behind_itself() {
         for k in [[0.0; 4], [0.02, -0.005, 0.001, -0.0001], [-0.01, 0.0, 0.0, 0.0]] {
             let lens = Lens::Fisheye { k, p: [0.0; 2], s: [0.0; 2] };
-            // The circle of 100° from the axis touches the image's sides.
+            // The circle at 100° from the axis touches the image borders.
             let theta = 100f64.to_radians();
             let edge = lens.distort(DVec2::new(theta, 0.0)).x;
             let f = 500.0 / edge;
@@ -265,7 +265,7 @@ mod tests {
 
     #[test]
     fn a_fisheye_does_not_see_where_its_polynomial_turns_back() {
-        // θ − 0.1 θ³ grows up to 105° and falls from there: 150° would land within the image.
+        // θ − 0.1 θ³ grows up to 105° and then falls: 150° would land inside the image.
         let lens = Lens::Fisheye { k: [-0.1, 0.0, 0.0, 0.0], p: [0.0; 2], s: [0.0; 2] };
         let c = Camera { width: 1000, height: 1000, fx: 300.0, fy: 300.0, cx: 500.0, cy: 500.0, lens };
         let at = |degrees: f64| c.project(DVec3::new(degrees.to_radians().sin(), 0.0, degrees.to_radians().cos()));
@@ -290,7 +290,7 @@ mod tests {
             assert!((d.length() - 1.0).abs() < 1e-12);
             assert!((c.project(d * 0.3).unwrap() - DVec2::new(x, y)).length() < 1e-6);
         }
-        // Straight behind is the seam of the left and right edge.
+        // The direction straight behind is the seam of the left and right border.
         let x = c.project(-DVec3::Z).unwrap().x;
         assert!(x < 1e-6 || (x - 720.0).abs() < 1e-6);
     }

@@ -3,7 +3,7 @@
 use crate::{Camera, Pose};
 use glam::{DMat3, DQuat, DVec3};
 
-/// One view of a path.
+/// One camera of a path.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PathView {
     pub camera: Camera,
@@ -51,7 +51,7 @@ pub fn spiral(poses: &[Pose], center: DVec3, up: DVec3, frames: usize) -> Vec<Po
         .collect()
 }
 
-/// Visits the given poses in order: centres by Catmull–Rom, rotations by slerp.
+/// Visits the given poses in order: centers by Catmull–Rom splines, rotations by slerp.
 pub fn interpolate(poses: &[Pose], frames: usize) -> Vec<Pose> {
     let n = poses.len();
     if n < 2 || frames < 2 {
@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn orbit_keeps_distance_and_looks_at_the_centre() {
+    fn orbit_keeps_distance_and_looks_at_the_center() {
         for p in orbit(&ring(), DVec3::ZERO, DVec3::Z, 12) {
             assert!((p.translation.length() - 5f64.sqrt()).abs() < 1e-9);
             let c = p.inverse().point(DVec3::ZERO);

@@ -1,11 +1,11 @@
-//! A capture: frames with cameras, and the world they stand in.
+//! A capture: frames with cameras, and the world that contains them.
 
 use crate::{Camera, Pose, Similarity};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
-/// One photograph with all that any application may know about it.
+/// One photograph with its camera and metadata.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Frame {
     /// Short unique name, for reports.
@@ -13,11 +13,11 @@ pub struct Frame {
     pub image: PathBuf,
     pub camera: Camera,
     pub world_from_camera: Pose,
-    /// Tells which pixels are left out; [`Capture::masks`] says how it is read and what that means.
+    /// Mask file; [`Capture::masks`] says how it is read and what it means.
     pub mask: Option<PathBuf>,
     pub depth: Option<PathBuf>,
     pub time: Option<f64>,
-    /// Photographs of one session share their light.
+    /// Photographs of one session have the same lighting.
     pub session: Option<u32>,
     pub labels: Option<PathBuf>,
     /// Network conditioning, for example expression coefficients.
@@ -28,7 +28,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// A training photograph about which no more is known than where it was taken.
+    /// A training frame with a photograph and a pose, without other metadata.
     pub fn new(name: impl Into<String>, image: impl Into<PathBuf>, camera: Camera, world_from_camera: Pose) -> Frame {
         Frame {
             name: name.into(),
@@ -47,6 +47,7 @@ impl Frame {
     }
 }
 
+/// Encoding of a photograph's values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ColorSpace {
@@ -54,6 +55,7 @@ pub enum ColorSpace {
     Linear,
 }
 
+/// Use of a frame: training, or held out for validation or test.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Split {
@@ -62,82 +64,81 @@ pub enum Split {
     Test,
 }
 
-/// Where the scene is: an inner cube and how many times larger the outer cube is.
+/// Position and size of the scene: an inner cube, and how many times larger the outer cube is.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SceneBox {
     pub center: DVec3,
     /// Half the edge of the inner cube, in world units.
     pub half: f64,
-    /// Edge of the outer cube over the edge of the inner one; a power of two.
+    /// Edge of the outer cube divided by the edge of the inner one; a power of two.
     pub aabb_scale: u32,
 }
 
 impl SceneBox {
-    /// Model space, in which the inner cube is `[0, 1]³`.
+    /// Transform to model space, in which the inner cube is `[0, 1]³`.
     pub fn model_from_world(&self) -> Similarity {
         let scale = 0.5 / self.half;
         Similarity { scale, rotation: glam::DMat3::IDENTITY, translation: DVec3::splat(0.5) - self.center * scale }
     }
 }
 
-/// A point that structure from motion found.
+/// A 3D point found by structure from motion.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SparsePoint {
-    /// In the world.
+    /// Position in the world.
     pub position: DVec3,
-    /// sRGB.
+    /// sRGB color.
     pub color: [u8; 3],
-    /// Reprojection error in pixels that the model states; 0 where it states none.
+    /// Reprojection error in pixels, from the model; 0 if the model has none.
     pub error: f32,
-    /// Frames that see it, as indices into the capture's, ascending; empty where nobody says.
+    /// Frames that see it, as ascending indices into the capture's frames; empty if unknown.
     pub frames: Vec<u32>,
 }
 
-/// How well the poses of a structure-from-motion model agree with its own points.
+/// Agreement between the poses of a structure-from-motion model and its points.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Agreement {
-    /// Places in photographs that are said to show a point.
+    /// Number of observations: keypoints that show a point.
     pub observations: usize,
-    /// Those of them whose point the model does not hold.
+    /// Number of observations whose point is not in the model.
     pub absent: usize,
-    /// Mean and median distance in pixels between where photographs show points and where their poses put them; none where nothing
-    /// could be compared.
+    /// Mean and median distance in pixels between observed and projected points; `None` if nothing could be compared.
     pub error_px: Option<(f64, f64)>,
-    /// Diagonal of the photographs in pixels (median), to which errors compare.
+    /// Median diagonal of the photographs in pixels, for comparison with the errors.
     pub diagonal_px: f64,
-    /// Per frame of the capture, in its order.
+    /// One entry per frame, in the capture's order.
     pub frames: Vec<FrameAgreement>,
 }
 
 /// [`Agreement`] of one photograph.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct FrameAgreement {
-    /// Mean distance in pixels; none where nothing could be compared.
+    /// Mean distance in pixels; `None` if nothing could be compared.
     pub error_px: Option<f64>,
-    /// Points that it and at least one other photograph show.
+    /// Points that it shares with at least one other photograph.
     pub shared: usize,
 }
 
 impl Agreement {
-    /// Whether the poses contradict the points, so that training on them can give fog alone: half of the points lie more than 1 % of
-    /// the diagonal from where photographs show them.
+    /// Whether the poses contradict the points, so that training may produce only fog: half of the points lie more than 1 % of the
+    /// diagonal from where photographs show them.
     pub fn is_broken(&self) -> bool {
         self.error_px.is_some_and(|(_, median)| median > 0.01 * self.diagonal_px)
     }
 
-    /// Whether more than half of the observations are of points that the model does not hold.
+    /// Whether more than half of the observations are of points that are not in the model.
     pub fn is_mixed(&self) -> bool {
         self.absent * 2 > self.observations
     }
 }
 
-/// What a mask leaves out.
+/// Meaning of the pixels that a mask leaves out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MaskMeaning {
-    /// Empty space: pixels there are transparent.
+    /// Empty space: these pixels are transparent.
     Object,
-    /// Anything: pixels there are neither trained on nor scored.
+    /// Unknown: these pixels are neither trained on nor scored.
     Unknown,
 }
 
@@ -155,7 +156,7 @@ impl Default for MaskRule {
     }
 }
 
-/// A posed set of photographs. The world is z up; `world_from_capture` undoes what the importer did.
+/// Photographs with poses. The world is z up; `world_from_capture` maps from the coordinates of the input.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Capture {
     pub frames: Vec<Frame>,
@@ -165,19 +166,19 @@ pub struct Capture {
     pub notes: Vec<String>,
     #[serde(default)]
     pub masks: MaskRule,
-    /// Points of structure from motion, where there are any; not kept in a run's folder, for there may be millions.
+    /// Points from structure from motion, if there are any. Not stored in a run's folder, since there may be millions.
     #[serde(skip)]
     pub points: Vec<SparsePoint>,
-    /// Where the poses come from a model that tells; not kept in a run's folder.
+    /// Agreement of poses and points, if the poses come from a COLMAP model. Not stored in a run's folder.
     #[serde(skip)]
     pub agreement: Option<Agreement>,
-    /// Names of photographs that could not be decoded and were left out; not kept in a run's folder.
+    /// Names of photographs that could not be decoded and were left out. Not stored in a run's folder.
     #[serde(skip)]
     pub broken: Vec<String>,
 }
 
 impl Capture {
-    /// Photographs about which no more is known, in their own world.
+    /// A capture of frames without other metadata, in their own world.
     pub fn new(frames: Vec<Frame>, scene: SceneBox) -> Capture {
         Capture {
             frames,
@@ -220,7 +221,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn focus_of_a_ring_is_its_centre() {
+    fn focus_of_a_ring_is_its_center() {
         let target = DVec3::new(0.5, -0.3, 1.0);
         let poses: Vec<Pose> = (0..8)
             .map(|i| {

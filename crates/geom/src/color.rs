@@ -10,7 +10,7 @@ pub fn srgb_from_linear(linear: f32) -> f32 {
     if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// Quantises a colour value in [0, 1] to 8 bits, rounding to nearest and clamping.
+/// Quantizes a color value in [0, 1] to 8 bits, rounding to nearest and clamping.
 pub fn u8_from_unit(value: f32) -> u8 {
     (value * 255.0 + 0.5).clamp(0.0, 255.0) as u8
 }

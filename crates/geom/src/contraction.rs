@@ -1,11 +1,11 @@
 //! Scene contraction for unbounded captures (Barron et al. 2022, mip-NeRF 360, eq. 10).
 
-/// How model space, whose inner cube is `[0, 1]³`, becomes the finite domain of an encoding.
+/// Maps model space, whose inner cube is `[0, 1]³`, to the finite domain of an encoding.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Space {
-    /// A cube of this edge around the inner cube's center; nothing lies outside.
+    /// A cube with this edge around the inner cube's center; outside it the field is empty.
     Cube(f32),
-    /// All of space: as it is within a cube of this edge around the inner cube's center, contracted beyond.
+    /// All of space: unchanged within a cube with this edge around the inner cube's center, contracted outside it.
     Contracted(f32),
 }
 
@@ -19,7 +19,7 @@ impl Space {
         }
     }
 
-    /// Gradient of [`Space::normalize`]'s input at `centered`, given that of its output.
+    /// Gradient of [`Space::normalize`] with respect to its input at `centered`, given the gradient of its output.
     pub fn normalize_backward(self, centered: [f32; 3], d: [f32; 3]) -> [f32; 3] {
         match self {
             Space::Cube(edge) => d.map(|d| d / edge),
@@ -49,7 +49,7 @@ pub fn uncontract(y: [f32; 3]) -> [f32; 3] {
     [y[0] * s, y[1] * s, y[2] * s]
 }
 
-/// Gradient of [`contract`]'s input at `x`, given that of its output.
+/// Gradient of [`contract`] with respect to its input at `x`, given the gradient of its output.
 pub fn contract_backward(x: [f32; 3], d: [f32; 3]) -> [f32; 3] {
     let big = (0..3).max_by(|&a, &b| x[a].abs().total_cmp(&x[b].abs())).unwrap_or(0);
     let m = x[big].abs();

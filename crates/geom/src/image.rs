@@ -2,19 +2,19 @@
 
 use crate::color::u8_from_unit;
 
-/// How the values of stored pixels are written.
+/// Number format of stored pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PixelFormat {
     /// 8 bits for 0 to 1.
     Unorm8,
     /// 16 bits for 0 to 1.
     Unorm16,
-    /// Floats of 16 bits (IEEE 754 binary16).
+    /// 16-bit floats (IEEE 754 binary16).
     Half,
 }
 
 impl PixelFormat {
-    /// Bytes of a pixel of four values.
+    /// Bytes of a pixel with four values.
     pub fn bytes(self) -> usize {
         if self == PixelFormat::Unorm8 { 4 } else { 8 }
     }
@@ -29,7 +29,7 @@ pub struct Image {
     pub data: Vec<f32>,
 }
 
-/// `[H, W, C]` of u8; colour is sRGB-encoded, a fourth channel is straight alpha.
+/// `[H, W, C]` of u8; color is sRGB-encoded, a fourth channel is straight alpha.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ImageU8 {
     pub width: usize,
@@ -39,6 +39,7 @@ pub struct ImageU8 {
 }
 
 impl Image {
+    /// An image of zeros.
     pub fn zeros(width: usize, height: usize, channels: usize) -> Image {
         Image { width, height, channels, data: vec![0.0; width * height * channels] }
     }
@@ -58,6 +59,7 @@ impl Image {
         Image { width, height, channels: self.channels, data }
     }
 
+    /// Rounds values in [0, 1] to 8 bits.
     pub fn to_u8(&self) -> ImageU8 {
         let data = self.data.iter().map(|&v| u8_from_unit(v)).collect();
         ImageU8 { width: self.width, height: self.height, channels: self.channels, data }
@@ -71,12 +73,13 @@ impl ImageU8 {
         &self.data[i..i + self.channels]
     }
 
+    /// Converts 8-bit values to [0, 1].
     pub fn to_f32(&self) -> Image {
         let data = self.data.iter().map(|&v| v as f32 / 255.0).collect();
         Image { width: self.width, height: self.height, channels: self.channels, data }
     }
 
-    /// Area average over the exact pixel footprint; colour is weighted by alpha where there is one.
+    /// Area average over the exact pixel footprint; color is weighted by alpha where there is one.
     pub fn downsampled(&self, width: usize, height: usize) -> ImageU8 {
         if (width, height) == (self.width, self.height) {
             return self.clone();
@@ -86,7 +89,7 @@ impl ImageU8 {
     }
 }
 
-/// Averages over the footprints of a smaller image's pixels, of values that `at` tells.
+/// Averages `at` over the footprints of a smaller image's pixels.
 fn averages(from: (usize, usize), to: (usize, usize), channels: usize, at: impl Fn(usize) -> f32) -> Vec<f32> {
     let (xs, ys) = (footprints(from.0, to.0), footprints(from.1, to.1));
     let mut out = vec![0.0; to.0 * to.1 * channels];
@@ -117,7 +120,7 @@ fn averages(from: (usize, usize), to: (usize, usize), channels: usize, at: impl 
     out
 }
 
-/// For each output pixel the input pixels that it covers and by how much.
+/// For each output pixel, the input pixels that it covers, with their weights.
 fn footprints(from: usize, to: usize) -> Vec<Vec<(usize, f32)>> {
     let step = from as f64 / to as f64;
     (0..to)
@@ -142,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn transparent_pixels_do_not_bleed_colour() {
+    fn transparent_pixels_do_not_bleed_color() {
         let im = ImageU8 { width: 2, height: 1, channels: 4, data: vec![255, 0, 0, 255, 0, 255, 0, 0] };
         assert_eq!(im.downsampled(1, 1).data, vec![255, 0, 0, 128]);
     }

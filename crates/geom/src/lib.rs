@@ -1,7 +1,31 @@
-//! The nouns every other room shares: transforms, cameras, rays, boxes, colour, images, meshes and
-//! captures, plus the small traits that let rooms meet without knowing each other.
+//! Shared types: transforms, cameras, rays, boxes, colors, images, meshes and captures, and the small traits that connect the other crates.
 //!
-//! World: right-handed, z up. Camera: x right, y down, z forward; pixel centres at +0.5.
+//! The world is right-handed with z up. Cameras have x right, y down, z forward; pixel centers are at +0.5. Angles are in radians.
+//!
+//! - [`Pose`] is the rigid transform `world_from_camera`, [`Similarity`] adds a scale.
+//! - [`Camera`] holds intrinsics and a [`Lens`]; [`camera_path`] makes orbits, spirals and interpolated paths.
+//! - [`Capture`] is a set of [`Frame`]s (photographs with cameras and poses) and a [`SceneBox`].
+//! - [`Image`] and [`ImageU8`] are row-major pixels, [`Mesh`] is an indexed triangle mesh.
+//! - [`field_query::FieldQuery`] gives density and color at points; [`view_source::ViewSource`] is what a viewer can show.
+//!
+//! ```
+//! use diorama_geom::glam::{DVec2, DVec3};
+//! use diorama_geom::{Aabb, Camera, Pose, Ray};
+//!
+//! // A camera at (4, 0, 1) looks at the origin; z is up.
+//! let camera = Camera::pinhole(640, 480, 60f64.to_radians());
+//! let eye = DVec3::new(4.0, 0.0, 1.0);
+//! let world_from_camera = Pose::look_at(eye, DVec3::ZERO, DVec3::Z);
+//!
+//! // The origin appears in the center of the image.
+//! let px = camera.project(world_from_camera.inverse().point(DVec3::ZERO)).unwrap();
+//! assert!((px - DVec2::new(320.0, 240.0)).length() < 1e-9);
+//!
+//! // The ray through this pixel enters the cube [-1, 1]³ after 3 / cos(elevation) units.
+//! let ray = Ray { origin: eye, direction: world_from_camera.rotation * camera.direction(px.x, px.y) };
+//! let (enter, leave) = Aabb::cube(DVec3::ZERO, 1.0).intersect(&ray).unwrap();
+//! assert!((enter - 0.75 * eye.length()).abs() < 1e-9 && leave > enter);
+//! ```
 
 pub mod camera;
 pub mod camera_path;

@@ -8,13 +8,13 @@ pub struct Mesh {
     pub positions: Vec<[f32; 3]>,
     /// Unit normals, one per vertex, or empty.
     pub normals: Vec<[f32; 3]>,
-    /// sRGB colours in [0, 1], one per vertex, or empty.
+    /// sRGB colors in [0, 1], one per vertex, or empty.
     pub colors_srgb: Vec<[f32; 3]>,
-    /// Texture coordinates, one per vertex, or empty: u to the right, v down, the texture is `[0, 1]²`.
+    /// Texture coordinates, one per vertex, or empty: u to the right, v down; the texture covers `[0, 1]²`.
     pub uvs: Vec<[f32; 2]>,
-    /// sRGB, `[H, W, 3]`.
+    /// sRGB texture, `[H, W, 3]`.
     pub texture: Option<ImageU8>,
-    /// Unit vectors along u, and the sign that `normal × tangent` needs to point against v, one per vertex, or empty.
+    /// Unit vectors along u, and the sign for which `sign · (normal × tangent)` points against v; one per vertex, or empty.
     pub tangents: Vec<[f32; 4]>,
     /// Normals in tangent space, `(n + 1) / 2`, `[H, W, 3]`: x along u, y against v, z outward.
     pub normal_map: Option<ImageU8>,
@@ -32,7 +32,7 @@ impl Mesh {
         )
     }
 
-    /// Whether every edge is shared by exactly two faces that run it in opposite directions.
+    /// Whether every edge is shared by exactly two faces that traverse it in opposite directions.
     pub fn is_watertight(&self) -> bool {
         let mut edges = std::collections::HashMap::<(u32, u32), i32>::new();
         for f in &self.faces {
@@ -43,7 +43,7 @@ impl Mesh {
         !self.faces.is_empty() && edges.iter().all(|(&(a, b), &n)| n == 1 && edges.get(&(b, a)) == Some(&1))
     }
 
-    /// What a closed mesh encloses; below 0 where its faces look inward.
+    /// Enclosed volume of a closed mesh; negative if its faces point inward.
     pub fn volume(&self) -> f64 {
         let of = |f: &[u32; 3]| {
             let [a, b, c] = f.map(|i| glam::DVec3::from(self.positions[i as usize].map(f64::from)));
@@ -73,7 +73,7 @@ impl Mesh {
             .collect();
     }
 
-    /// Keeps the vertices that faces use, in their order of first use.
+    /// Keeps only vertices that faces use, in the order of their first use.
     pub fn compact(&mut self) {
         let mut new_index = vec![u32::MAX; self.positions.len()];
         let mut kept = Vec::new();
@@ -99,10 +99,12 @@ impl Mesh {
     }
 }
 
+/// `a − b`.
 pub fn sub(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
+/// Cross product `a × b`.
 pub fn cross(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }

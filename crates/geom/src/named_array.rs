@@ -1,6 +1,6 @@
-//! Numbers with a name and a shape: how weights travel between the files of one room and the networks of another.
+//! Named arrays: weights read from files, before they are loaded into networks.
 
-/// A named array, row by row.
+/// A named array in row-major order.
 #[derive(Clone, Debug, PartialEq)]
 pub struct NamedArray {
     pub name: String,
@@ -10,7 +10,7 @@ pub struct NamedArray {
 
 impl NamedArray {
     /// # Panics
-    /// When the shape asks for another count of values.
+    /// If the number of values differs from the product of the shape.
     pub fn new(name: impl Into<String>, shape: &[usize], values: Vec<f32>) -> Self {
         assert_eq!(values.len(), shape.iter().product::<usize>(), "as many values as the shape says");
         NamedArray { name: name.into(), shape: shape.to_vec(), values }

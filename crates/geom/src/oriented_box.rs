@@ -1,24 +1,25 @@
-//! A box that may be turned.
+//! Boxes with any orientation.
 
 use crate::Pose;
 use glam::{DMat3, DVec3};
 
-/// A box by its middle, its axes and its sides.
+/// A box given by its center, axes and side lengths.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OrientedBox {
-    /// Middle, and axes as columns.
+    /// Center, and axes as columns.
     pub place: Pose,
     /// Lengths along the axes.
     pub sides: DVec3,
 }
 
 impl OrientedBox {
+    /// Whether a point lies inside or on the surface.
     pub fn contains(&self, p: DVec3) -> bool {
         let q = self.place.inverse().point(p).abs();
         q.cmple(0.5 * self.sides).all()
     }
 
-    /// The part of the ray `origin + t dir` that lies in the box, as its first and last `t`; none where it misses.
+    /// First and last `t` of the part of the ray `origin + t dir` inside the box; `None` if the ray misses.
     pub fn intersect(&self, origin: DVec3, dir: DVec3) -> Option<(f64, f64)> {
         let to_box: DMat3 = self.place.rotation.transpose();
         let (o, d) = (to_box * (origin - self.place.translation), to_box * dir);
@@ -26,7 +27,7 @@ impl OrientedBox {
         for k in 0..3 {
             let half = 0.5 * self.sides[k];
             let (a, b) = ((-half - o[k]) / d[k], (half - o[k]) / d[k]);
-            // A ray along a side gives ±∞ outside its planes and NaN on them, which min and max ignore.
+            // A ray parallel to a side gives ±∞ outside its planes and NaN on them; min and max ignore NaN.
             (near, far) = (near.max(a.min(b)), far.min(a.max(b)));
         }
         (near < far && far > 0.0).then_some((near, far))

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-/// `x(t) = origin + t * direction`, direction of unit length, so t is metric.
+/// `x(t) = origin + t * direction`. The direction has unit length, so t is a distance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
     pub origin: DVec3,
@@ -17,15 +17,17 @@ pub struct Aabb {
 }
 
 impl Aabb {
+    /// A cube with edges of length `2 half`.
     pub fn cube(center: DVec3, half: f64) -> Aabb {
         Aabb { min: center - DVec3::splat(half), max: center + DVec3::splat(half) }
     }
 
+    /// Whether a point lies inside or on the surface.
     pub fn contains(&self, x: DVec3) -> bool {
         x.cmpge(self.min).all() && x.cmple(self.max).all()
     }
 
-    /// Entry and exit distance (slab method), clipped to t ≥ 0; `None` when the ray misses.
+    /// Entry and exit distance (slab method), clipped to t ≥ 0; `None` if the ray misses.
     pub fn intersect(&self, ray: &Ray) -> Option<(f64, f64)> {
         let inv = ray.direction.recip();
         let a = (self.min - ray.origin) * inv;

@@ -7,7 +7,7 @@ pub struct Rng {
     key: u64,
 }
 
-/// The finaliser of SplitMix64 (Steele, Lea, Flood 2014): a bijection with full avalanche.
+/// The finalizer of SplitMix64 (Steele, Lea, Flood 2014): a bijection with full avalanche.
 fn mix(mut z: u64) -> u64 {
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
@@ -22,7 +22,7 @@ impl Rng {
         Self { key: mix(mix(seed.wrapping_add(GOLDEN)) ^ stream.wrapping_mul(GOLDEN)) }
     }
 
-    /// What the bits at a counter depend on besides it: `mix(key ^ mix(counter · golden + key))`.
+    /// The key that, besides the counter, determines the bits: `mix(key ^ mix(counter · golden + key))`.
     pub fn key(&self) -> u64 {
         self.key
     }

@@ -8,11 +8,12 @@ use serde::{Deserialize, Serialize};
 pub struct Pose {
     /// Columns are the camera's axes (right, down, forward) in the world.
     pub rotation: DMat3,
-    /// The camera centre in the world.
+    /// The camera center in the world.
     pub translation: DVec3,
 }
 
 impl Pose {
+    /// No rotation, no translation.
     pub const IDENTITY: Pose = Pose { rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
 
     /// Maps a point from the camera to the world.
@@ -26,7 +27,7 @@ impl Pose {
         Pose { rotation, translation: -(rotation * self.translation) }
     }
 
-    /// The camera at `eye` that looks at `target`, with the image's up direction close to `up`.
+    /// The pose of a camera at `eye` that looks at `target`, with the image's up direction close to `up`.
     pub fn look_at(eye: DVec3, target: DVec3, up: DVec3) -> Pose {
         let forward = (target - eye).normalize();
         let mut right = forward.cross(up);
@@ -43,7 +44,7 @@ impl Pose {
         Pose { rotation: DMat3::from_cols(r.x_axis, -r.y_axis, -r.z_axis), translation: self.translation }
     }
 
-    /// How far the rotation is from orthonormal and right-handed: `max |RᵀR − I|`, plus 2 if mirrored.
+    /// Deviation of the rotation from orthonormal and right-handed: `max |RᵀR − I|`, plus 2 if mirrored.
     pub fn rigidity_error(&self) -> f64 {
         let d = self.rotation.transpose() * self.rotation - DMat3::IDENTITY;
         let worst = d.to_cols_array().iter().fold(0.0f64, |m, v| m.max(v.abs()));
@@ -60,29 +61,31 @@ pub struct Similarity {
 }
 
 impl Similarity {
+    /// No scale, rotation or translation.
     pub const IDENTITY: Similarity = Similarity { scale: 1.0, rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
-
+    /// Maps a point from the source to the target.
     pub fn point(&self, x: DVec3) -> DVec3 {
         self.scale * (self.rotation * x) + self.translation
     }
 
+    /// The transform `source_from_target`.
     pub fn inverse(&self) -> Similarity {
         let rotation = self.rotation.transpose();
         Similarity { scale: 1.0 / self.scale, rotation, translation: -(rotation * self.translation) / self.scale }
     }
 
-    /// This transform after another one.
+    /// Composition: `first` is applied first, then this transform.
     pub fn after(&self, first: &Similarity) -> Similarity {
         Similarity { scale: self.scale * first.scale, rotation: self.rotation * first.rotation, translation: self.point(first.translation) }
     }
 
-    /// Moves a camera: its centre as a point, its axes by the rotation alone.
+    /// Moves a camera: the center as a point, the axes by the rotation only.
     pub fn pose(&self, pose: &Pose) -> Pose {
         Pose { rotation: self.rotation * pose.rotation, translation: self.point(pose.translation) }
     }
 }
 
-/// Rotation matrix of a unit quaternion (w, x, y, z), normalised first.
+/// Rotation matrix of a unit quaternion (w, x, y, z), normalized first.
 pub fn rotation_from_quaternion(wxyz: [f64; 4]) -> DMat3 {
     let [w, x, y, z] = wxyz;
     DMat3::from_quat(glam::DQuat::from_xyzw(x, y, z, w).normalize())
@@ -94,7 +97,7 @@ pub fn rotation_from_axis_angle(omega: DVec3) -> DMat3 {
     if angle < 1e-12 { DMat3::IDENTITY } else { DMat3::from_axis_angle(omega / angle, angle) }
 }
 
-/// The rotation that turns unit vector `a` into unit vector `b`.
+/// The rotation that maps unit vector `a` to unit vector `b`.
 pub fn rotation_between(a: DVec3, b: DVec3) -> DMat3 {
     DMat3::from_quat(glam::DQuat::from_rotation_arc(a.normalize(), b.normalize()))
 }

@@ -1,62 +1,62 @@
-//! Layers and controls of a viewer: which pictures a source can draw of a view, and which settings change them.
+//! Layers and controls of a viewer: the pictures that a source can render of a view, and the settings that change them.
 //!
 //! A source lists both in its [`ViewScene`](crate::view_source::ViewScene); the page builds its buttons, sliders and legends from the lists.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-/// One of the pictures that a source draws of a view, such as depth.
+/// A kind of picture that a source renders of a view, such as depth.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewLayer {
-    /// Name in requests.
+    /// Identifier in requests.
     pub id: String,
-    /// Name on the page.
+    /// Label on the page.
     pub label: String,
     pub legend: Option<Legend>,
 }
 
 impl ViewLayer {
-    /// A layer without legend.
+    /// A layer without a legend.
     pub fn new(id: &str, label: &str) -> ViewLayer {
         ViewLayer { id: id.into(), label: label.into(), legend: None }
     }
 
-    /// The same layer with a color scale.
+    /// Adds a color scale as legend.
     pub fn with_scale(self, colors: &[[u8; 3]], low: &str, high: &str, unit: &str) -> ViewLayer {
         let legend = Legend::Scale { colors: colors.to_vec(), low: low.into(), high: high.into(), unit: unit.into() };
         ViewLayer { legend: Some(legend), ..self }
     }
 
-    /// The same layer with a list of what its colors stand for.
+    /// Adds a legend that lists what each color means.
     pub fn with_classes(self, classes: &[(&str, [u8; 3])]) -> ViewLayer {
         let legend = Legend::Classes(classes.iter().map(|(label, color)| (label.to_string(), *color)).collect());
         ViewLayer { legend: Some(legend), ..self }
     }
 }
 
-/// What the colors of a layer stand for. Colors are sRGB.
+/// Legend of a layer. Colors are sRGB.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Legend {
-    /// Values from `low` to `high`, in `colors` at even distances.
+    /// Values from `low` to `high`; the `colors` are spaced evenly between them.
     Scale { colors: Vec<[u8; 3]>, low: String, high: String, unit: String },
     /// A name for each color.
     Classes(Vec<(String, [u8; 3])>),
 }
 
-/// A setting of the views that a source draws.
+/// A setting of the views that a source renders.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewControl {
-    /// Name in requests.
+    /// Identifier in requests.
     pub id: String,
-    /// Name on the page.
+    /// Label on the page.
     pub label: String,
-    /// One sentence for who wonders what it does; may be empty.
+    /// One sentence of help; may be empty.
     pub help: String,
-    /// Layers that it changes, by id; empty: all.
+    /// Ids of the layers that it changes; empty: all layers.
     pub layers: Vec<String>,
     pub input: ControlInput,
 }
 
-/// What a control looks like, and which values it takes.
+/// The kind of a control and the values that it accepts.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ControlInput {
     Slider {
@@ -69,7 +69,7 @@ pub enum ControlInput {
     Toggle {
         default: bool,
     },
-    /// One of `options`, each an id and its name on the page.
+    /// One of `options`, each with an id and its label on the page.
     Pick {
         options: Vec<(String, String)>,
         default: String,
@@ -104,7 +104,7 @@ pub enum ControlValue {
     Choice(String),
 }
 
-/// A value for each control of a source, each one that its control takes.
+/// One accepted value for each control of a source.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ControlValues(BTreeMap<String, ControlValue>);
 
@@ -114,10 +114,10 @@ impl ControlValues {
         ControlValues(controls.iter().map(|c| (c.id.clone(), c.input.default_value())).collect())
     }
 
-    /// The given values, and defaults for the controls that are not given.
+    /// The given values, with defaults for controls that are not given.
     ///
     /// # Errors
-    /// One line, when there is no such control or a control does not take its value.
+    /// One line, if there is no such control or a control does not accept its value.
     pub fn checked(controls: &[ViewControl], given: impl IntoIterator<Item = (String, ControlValue)>) -> Result<ControlValues, String> {
         let mut values = ControlValues::defaults(controls);
         for (id, value) in given {
@@ -133,7 +133,7 @@ impl ControlValues {
     /// Value of a slider.
     ///
     /// # Panics
-    /// When the source has listed no slider `id`.
+    /// If the source has no slider `id`.
     pub fn number(&self, id: &str) -> f64 {
         match self.0.get(id) {
             Some(ControlValue::Number(v)) => *v,
@@ -143,7 +143,7 @@ impl ControlValues {
 
     /// State of a toggle.
     ///
-    /// # Panics
+    /// If the source has no toggle `id`.
     /// When the source has listed no toggle `id`.
     pub fn switch(&self, id: &str) -> bool {
         match self.0.get(id) {
@@ -152,10 +152,10 @@ impl ControlValues {
         }
     }
 
-    /// Option that is picked, by its id.
+    /// Id of the chosen option of a pick.
     ///
     /// # Panics
-    /// When the source has listed no pick `id`.
+    /// If the source has no pick `id`.
     pub fn choice(&self, id: &str) -> &str {
         match self.0.get(id) {
             Some(ControlValue::Choice(v)) => v,
@@ -164,15 +164,14 @@ impl ControlValues {
     }
 }
 
-/// Checks that a source's lists make sense: at least one layer, ids that differ, defaults that their controls take, and
-/// controls that name layers which exist.
+/// Checks a source's lists: at least one layer, unique ids, defaults that their controls accept, and controls that name existing layers.
 ///
 /// # Errors
 /// One line that names the layer or control.
 pub fn check_lists(layers: &[ViewLayer], controls: &[ViewControl]) -> Result<(), String> {
     let ids: BTreeSet<&str> = layers.iter().map(|l| &l.id[..]).collect();
     if layers.is_empty() || ids.len() < layers.len() {
-        return Err("layers: need ids that differ, and at least one".into());
+        return Err("layers: there must be at least one, and ids must be unique".into());
     }
     let mut seen = BTreeSet::new();
     for c in controls {
@@ -184,7 +183,7 @@ pub fn check_lists(layers: &[ViewLayer], controls: &[ViewControl]) -> Result<(),
             return Err(format!("control {:?}: does not take its default", c.id));
         }
         if !seen.insert(&c.id) {
-            return Err(format!("control {:?}: is there twice", c.id));
+            return Err(format!("control {:?}: appears twice", c.id));
         }
         if let Some(l) = c.layers.iter().find(|l| !ids.contains(&l[..])) {
             return Err(format!("control {:?}: there is no layer {l:?}", c.id));

@@ -1,23 +1,23 @@
-//! What a viewer needs of a run, without knowing what it is.
+//! The interface between a viewer and the source that it shows, such as a run or a data set.
 
 use crate::view_controls::{ControlValues, ViewControl, ViewLayer};
 use crate::{Camera, ImageU8, Pose, Similarity};
 use std::path::PathBuf;
 
-/// A view to be drawn.
+/// A view to render.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewRequest {
     pub camera: Camera,
     pub world_from_camera: Pose,
-    /// Id of a layer that the scene lists.
+    /// Id of a layer in the scene's list.
     pub layer: String,
-    /// Values of the controls that the scene lists.
+    /// Values of the controls in the scene's list.
     pub values: ControlValues,
-    /// Lowest and highest corner in the world of what is shown.
+    /// Lowest and highest corner, in the world, of the visible region.
     pub clip: Option<([f32; 3], [f32; 3])>,
 }
 
-/// A camera that took a photograph.
+/// The camera of a photograph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewFrame {
     pub name: String,
@@ -33,47 +33,47 @@ impl From<&crate::Frame> for ViewFrame {
     }
 }
 
-/// What there is to look at.
+/// Description of a source: cameras, layers, controls and saved settings.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewScene {
     pub name: String,
     pub frames: Vec<ViewFrame>,
-    /// Pictures that can be drawn of a view; the first is shown first.
+    /// Layers that can be rendered; the first one is shown at first.
     pub layers: Vec<ViewLayer>,
-    /// Settings of these pictures.
+    /// Controls that change the layers.
     pub controls: Vec<ViewControl>,
-    /// One line about what can be seen and what cannot, shown with the picture; may be empty.
+    /// One line about what can be shown and what cannot, displayed with the picture; may be empty.
     pub note: String,
-    /// Whether crop box, scale and camera path can be kept and meshes made: only a run can.
+    /// Whether crop box, scale and camera path can be saved and meshes exported; only runs support this.
     pub is_run: bool,
-    /// What the cameras look at, and how far they stand from it.
+    /// The point that the cameras look at, and their distance from it.
     pub focus: [f64; 3],
     pub distance: f64,
-    /// Meshes are made in the capture's frame.
+    /// Similarity from the capture's frame, in which meshes are written, to the world.
     pub world_from_capture: Similarity,
-    /// Lowest and highest corner in the world of what may be shown.
+    /// Lowest and highest corner, in the world, of the region that can be shown.
     pub bounds: ([f64; 3], [f64; 3]),
-    /// The crop box as it was last saved.
+    /// The crop box that was saved last.
     pub crop: Option<([f32; 3], [f32; 3])>,
-    /// A length that was measured, in the world.
+    /// A measured length, in the world.
     pub measured: Option<MeasuredLength>,
-    /// The camera path as it was last saved, nerfstudio's JSON with cameras in the world.
+    /// The camera path that was saved last: nerfstudio's JSON with cameras in the world.
     pub path: Option<String>,
 }
 
-/// Two points and how far they are apart in truth.
+/// Two points and their true distance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MeasuredLength {
     pub points: [[f64; 3]; 2],
     pub metres: f64,
 }
 
-/// How far training is.
+/// Progress of training.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ViewStatus {
     pub step: u64,
     pub seconds: f64,
-    /// Share of the training that is done, 0 to 1; 0 where nothing trains.
+    /// Completed share of the training, 0 to 1; 0 if nothing is being trained.
     pub progress: f64,
     pub running: bool,
     /// What the source wants shown, in its order.
@@ -83,7 +83,7 @@ pub struct ViewStatus {
 /// A figure of training, such as its loss.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewFigure {
-    /// By which lines of charts refer to it.
+    /// Identifier, by which lines of charts refer to it.
     pub id: String,
     /// Name on the page.
     pub label: String,
@@ -106,7 +106,7 @@ pub struct ViewChart {
 pub struct ViewLine {
     /// Id of the figure whose values follow while training goes on.
     pub figure: String,
-    /// What the line is called beside the others of its chart.
+    /// Name of the line in its chart.
     pub label: String,
     /// Whether it is of data that was held out: few values, each shown as a dot.
     pub held_out: bool,
@@ -114,7 +114,7 @@ pub struct ViewLine {
     pub points: Vec<(u64, f64)>,
 }
 
-/// A mesh to be made.
+/// A request for a mesh.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MeshRequest {
     /// glb, obj, ply, stl, usdz or dae.
@@ -124,7 +124,7 @@ pub struct MeshRequest {
     pub clip: Option<([f32; 3], [f32; 3])>,
 }
 
-/// A run, or a data set, that can be looked at. Errors are one line for the user.
+/// A run or a data set that a viewer can show. Errors are one line of text for the user.
 pub trait ViewSource: Send + Sync {
     fn scene(&self) -> ViewScene;
 
@@ -135,32 +135,32 @@ pub trait ViewSource: Send + Sync {
         Vec::new()
     }
 
-    /// Frames whose views lie behind fog, as far as is known.
+    /// Frames whose views are behind fog, as far as known.
     fn behind_fog(&self) -> Vec<usize> {
         Vec::new()
     }
 
-    /// Draws a view as `[H, W, 3]` sRGB. Its layer and values are those of the scene's lists.
+    /// Renders a view as `[H, W, 3]` sRGB. Its layer and values are from the scene's lists.
     fn view(&self, request: &ViewRequest) -> Result<ImageU8, String>;
 
-    /// The place in the world that a pixel shows; none where nothing is.
+    /// The point in the world that a pixel shows; `None` where there is no surface.
     fn point(&self, request: &ViewRequest, x_px: f64, y_px: f64) -> Option<[f64; 3]>;
 
-    /// A small photograph of a frame.
+    /// A thumbnail of a frame's photograph.
     fn thumbnail(&self, frame: usize) -> Result<ImageU8, String>;
 
-    /// Keeps the crop box for `render` and `export`.
+    /// Saves the crop box for `render` and `export`.
     fn save_crop(&self, crop: Option<([f32; 3], [f32; 3])>) -> Result<(), String>;
 
-    /// Keeps a measured length (in the world) as the scale of exported meshes, or forgets it.
+    /// Saves a measured length (in the world) as the scale of exported meshes, or removes it.
     fn save_measured(&self, measured: Option<MeasuredLength>) -> Result<(), String>;
 
-    /// Keeps a camera path, nerfstudio's JSON with cameras in the world, for `render`; the file's name.
+    /// Saves a camera path (nerfstudio's JSON with cameras in the world) for `render`; returns the file.
     fn save_path(&self, json: &str) -> Result<PathBuf, String>;
 
-    /// The same path, given in the capture's frame as other programs write it, with cameras in the world.
+    /// Converts a camera path from the capture's frame, in which other programs write it, to cameras in the world.
     fn open_path(&self, json: &str) -> Result<String, String>;
 
-    /// Makes a mesh; the file's name, and the metres of the mesh per unit of the capture.
+    /// Exports a mesh; returns the file, and the meters of the mesh per unit of the capture.
     fn export(&self, request: &MeshRequest, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<(PathBuf, f64), String>;
 }

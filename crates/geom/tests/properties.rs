@@ -1,4 +1,4 @@
-//! Properties of cameras, transforms and camera paths: what no rigid motion of the world may change, and what comes back.
+//! Properties of cameras, transforms and camera paths: invariance under rigid motions of the world, and round trips.
 
 use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::transform::rotation_from_axis_angle;
@@ -17,12 +17,12 @@ fn pose() -> impl Strategy<Value = Pose> {
     (rotation(), vector(5.0)).prop_map(|(rotation, translation)| Pose { rotation, translation })
 }
 
-/// A rigid motion with a change of scale.
+/// A rigid motion with a scale.
 fn motion() -> impl Strategy<Value = Similarity> {
     (0.1..10.0f64, rotation(), vector(5.0)).prop_map(|(scale, rotation, translation)| Similarity { scale, rotation, translation })
 }
 
-/// Every kind of lens, bent a little.
+/// Every lens model, with some distortion.
 fn camera() -> impl Strategy<Value = Camera> {
     let lens = prop_oneof![
         Just(Lens::Pinhole),

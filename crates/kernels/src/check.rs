@@ -2,8 +2,8 @@
 
 use crate::gpu::{Gpu, GpuError};
 use crate::ops::{
-    adam, composite, depth_loss, distortion, field_step, frequency, fused_mlp, hash_grid, linear, march, marching_cubes,
-    marching_tetrahedra, pixel_gather, prune, ray_aabb, ray_generation, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
+    adam, composite, depth_loss, distortion, field_step, frequency, fused_mlp, grid_sample, hash_grid, linear, march, marching_cubes,
+    marching_tetrahedra, occupancy_update, photometric_loss, pixel_gather, prune, ray_aabb, ray_generation, resample, sample_pdf, scan, spherical_harmonics, ssim, triangle_wave,
     trilinear_corner_grid,
 };
 
@@ -25,9 +25,11 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         composite::cases::check,
         distortion::cases::check,
         depth_loss::cases::check,
+        photometric_loss::cases::check,
         scan::cases::check,
         ray_aabb::cases::check,
         march::cases::check,
+        occupancy_update::cases::check,
         sample_pdf::cases::check,
         trilinear_corner_grid::cases::check,
         pixel_gather::cases::check,
@@ -38,6 +40,8 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         field_step::cases::check,
         marching_cubes::cases::check,
         marching_tetrahedra::check,
+        resample::cases::check,
+        grid_sample::cases::check,
     ];
     for check in ops {
         check(gpu, &mut table)?;

@@ -15,7 +15,6 @@ pub mod gpu;
 pub mod math;
 pub mod ops;
 pub mod probe;
-pub mod scatter_max;
 pub mod simd;
 mod sums;
 pub mod tasks;

@@ -105,6 +105,12 @@ pub unsafe trait Lane: Copy {
     /// `a * b + c`
     unsafe fn fma(a: Self::V, b: Self::V, c: Self::V) -> Self::V;
     unsafe fn max(a: Self::V, b: Self::V) -> Self::V;
+    unsafe fn add(a: Self::V, b: Self::V) -> Self::V;
+    unsafe fn sub(a: Self::V, b: Self::V) -> Self::V;
+    /// The even and the odd ones of `2 N` floats.
+    unsafe fn load_pairs(p: *const f32) -> (Self::V, Self::V);
+    /// `2 N` floats, of `even` and `odd` in turns.
+    unsafe fn store_pairs(p: *mut f32, even: Self::V, odd: Self::V);
 }
 
 /// Plain arrays.
@@ -137,6 +143,26 @@ unsafe impl Lane for Plain {
     unsafe fn max(a: [f32; 8], b: [f32; 8]) -> [f32; 8] {
         std::array::from_fn(|i| if a[i] > b[i] { a[i] } else { b[i] })
     }
+    #[inline(always)]
+    unsafe fn add(a: [f32; 8], b: [f32; 8]) -> [f32; 8] {
+        std::array::from_fn(|i| a[i] + b[i])
+    }
+    #[inline(always)]
+    unsafe fn sub(a: [f32; 8], b: [f32; 8]) -> [f32; 8] {
+        std::array::from_fn(|i| a[i] - b[i])
+    }
+    #[inline(always)]
+    unsafe fn load_pairs(p: *const f32) -> ([f32; 8], [f32; 8]) {
+        // SAFETY: the caller guarantees sixteen readable floats.
+        let all = unsafe { p.cast::<[[f32; 2]; 8]>().read_unaligned() };
+        (all.map(|v| v[0]), all.map(|v| v[1]))
+    }
+    #[inline(always)]
+    unsafe fn store_pairs(p: *mut f32, even: [f32; 8], odd: [f32; 8]) {
+        let all: [[f32; 2]; 8] = std::array::from_fn(|i| [even[i], odd[i]]);
+        // SAFETY: the caller guarantees sixteen writable floats.
+        unsafe { p.cast::<[[f32; 2]; 8]>().write_unaligned(all) }
+    }
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -147,7 +173,8 @@ pub use arm::Neon;
 
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! lane {
-    ($(#[$doc:meta])* $name:ident, $n:literal, $v:ty, $set:ident, $load:ident, $store:ident, $fma:expr, $max:ident) => {
+    ($(#[$doc:meta])* $name:ident, $n:literal, $v:ty, $set:ident, $load:ident, $store:ident, $fma:expr, $max:ident,
+     $add:ident, $sub:ident, $load_pairs:ident, $store_pairs:ident) => {
         $(#[$doc])*
         #[derive(Clone, Copy)]
         pub struct $name;
@@ -181,6 +208,26 @@ macro_rules! lane {
                 // SAFETY: see the impl.
                 unsafe { $max(a, b) }
             }
+            #[inline(always)]
+            unsafe fn add(a: $v, b: $v) -> $v {
+                // SAFETY: see the impl.
+                unsafe { $add(a, b) }
+            }
+            #[inline(always)]
+            unsafe fn sub(a: $v, b: $v) -> $v {
+                // SAFETY: see the impl.
+                unsafe { $sub(a, b) }
+            }
+            #[inline(always)]
+            unsafe fn load_pairs(p: *const f32) -> ($v, $v) {
+                // SAFETY: see the impl.
+                unsafe { $load_pairs(p) }
+            }
+            #[inline(always)]
+            unsafe fn store_pairs(p: *mut f32, even: $v, odd: $v) {
+                // SAFETY: see the impl.
+                unsafe { $store_pairs(p, even, odd) }
+            }
         }
     };
 }
@@ -192,8 +239,22 @@ mod arm {
 
     lane!(
         /// 128-bit vectors.
-        Neon, 4, float32x4_t, vdupq_n_f32, vld1q_f32, vst1q_f32, |a, b, c| vfmaq_f32(c, a, b), vmaxq_f32
+        Neon, 4, float32x4_t, vdupq_n_f32, vld1q_f32, vst1q_f32, |a, b, c| vfmaq_f32(c, a, b), vmaxq_f32,
+        vaddq_f32, vsubq_f32, load_pairs, store_pairs
     );
+
+    #[inline(always)]
+    unsafe fn load_pairs(p: *const f32) -> (float32x4_t, float32x4_t) {
+        // SAFETY: as `Lane` states.
+        let v = unsafe { vld2q_f32(p) };
+        (v.0, v.1)
+    }
+
+    #[inline(always)]
+    unsafe fn store_pairs(p: *mut f32, even: float32x4_t, odd: float32x4_t) {
+        // SAFETY: as `Lane` states.
+        unsafe { vst2q_f32(p, float32x4x2_t(even, odd)) }
+    }
 }
 
 #[cfg(target_arch = "x86_64")]
@@ -203,12 +264,57 @@ mod x86 {
 
     lane!(
         /// 256-bit vectors.
-        Avx2, 8, __m256, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_max_ps
+        Avx2, 8, __m256, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_max_ps,
+        _mm256_add_ps, _mm256_sub_ps, load_pairs_256, store_pairs_256
     );
     lane!(
         /// 512-bit vectors.
-        Avx512, 16, __m512, _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_max_ps
+        Avx512, 16, __m512, _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_max_ps,
+        _mm512_add_ps, _mm512_sub_ps, load_pairs_512, store_pairs_512
     );
+
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    unsafe fn load_pairs_256(p: *const f32) -> (__m256, __m256) {
+        // SAFETY: as `Lane` states.
+        let (a, b) = unsafe { (_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8))) };
+        // The halves of both come in turns, and are put in order.
+        let order = |v| _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(v)));
+        (order(_mm256_shuffle_ps::<0b10_00_10_00>(a, b)), order(_mm256_shuffle_ps::<0b11_01_11_01>(a, b)))
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    unsafe fn store_pairs_256(p: *mut f32, even: __m256, odd: __m256) {
+        let (low, high) = (_mm256_unpacklo_ps(even, odd), _mm256_unpackhi_ps(even, odd));
+        // SAFETY: as `Lane` states.
+        unsafe {
+            _mm256_storeu_ps(p, _mm256_permute2f128_ps::<0x20>(low, high));
+            _mm256_storeu_ps(p.add(8), _mm256_permute2f128_ps::<0x31>(low, high));
+        }
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx512f")]
+    unsafe fn load_pairs_512(p: *const f32) -> (__m512, __m512) {
+        // SAFETY: as `Lane` states.
+        let (a, b) = unsafe { (_mm512_loadu_ps(p), _mm512_loadu_ps(p.add(16))) };
+        let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+        let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+        (_mm512_permutex2var_ps(a, even, b), _mm512_permutex2var_ps(a, odd, b))
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx512f")]
+    unsafe fn store_pairs_512(p: *mut f32, even: __m512, odd: __m512) {
+        let low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+        let high = _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+        // SAFETY: as `Lane` states.
+        unsafe {
+            _mm512_storeu_ps(p, _mm512_permutex2var_ps(even, low, odd));
+            _mm512_storeu_ps(p.add(16), _mm512_permutex2var_ps(even, high, odd));
+        }
+    }
 }
 
 /// Asks memory for values that are read before long; a hint, which changes no result.

@@ -51,14 +51,17 @@ pub struct Pack<'a> {
     pub exact: bool,
 }
 
-/// One row of outputs of one channel: `c[i] = start + Σ_t weights[t] b[offsets[t] + i]`, whole vectors of it.
-pub struct Row<'a> {
+/// Rows of outputs of one channel: `c[i] = start + Σ_t weights[t] b[offsets[t] + i]`, whole vectors of each.
+pub struct Rows<'a> {
     pub weights: &'a [f32],
     pub offsets: &'a [(u32, u32)],
     pub b: *const f32,
+    pub b_pitch: usize,
+    pub rows: usize,
     pub columns: usize,
     pub start: f32,
     pub c: *mut f32,
+    pub c_pitch: usize,
 }
 
 /// Products of a gradient's rows with shifted rows of an input: `sums[t, i mod lanes] += Σ_rows Σ_i d[i] b[offsets[t] + i]`.
@@ -100,7 +103,7 @@ pub struct Kernel {
     pub vectors: usize,
     tiles: [[TileFn; MOST_VECTORS]; MOST_ROWS],
     pack: unsafe fn(&Pack),
-    row: unsafe fn(&Row),
+    rows_of: unsafe fn(&Rows),
     dots: unsafe fn(&Dots),
 }
 
@@ -133,13 +136,13 @@ impl Kernel {
         unsafe { (self.pack)(pack) }
     }
 
-    /// Computes a row of a depthwise convolution.
+    /// Computes rows of a depthwise convolution.
     ///
     /// # Safety
-    /// Inputs and outputs exist up to the next multiple of the largest tile's width.
-    pub unsafe fn row(&self, row: &Row) {
+    /// Inputs and outputs exist up to the next multiple of four vectors in each row.
+    pub unsafe fn depthwise(&self, rows: &Rows) {
         // SAFETY: as the caller vouches.
-        unsafe { (self.row)(row) }
+        unsafe { (self.rows_of)(rows) }
     }
 
     /// Adds the products of rows to sums per tap.
@@ -242,23 +245,26 @@ unsafe fn pack<L: Lane>(p: &Pack) {
 }
 
 #[inline(always)]
-unsafe fn row<L: Lane>(r: &Row) {
+unsafe fn rows_of<L: Lane>(r: &Rows) {
     const VECTORS: usize = 4;
-    // SAFETY: `Kernel::row` states what must exist.
+    // SAFETY: `Kernel::depthwise` states what must exist.
     unsafe {
-        let mut i = 0;
-        while i < r.columns {
-            let mut acc = [L::splat(r.start); VECTORS];
-            for (w, &(_, offset)) in r.weights.iter().zip(r.offsets) {
-                let (w, b) = (L::splat(*w), r.b.add(offset as usize + i));
-                for (q, v) in acc.iter_mut().enumerate() {
-                    *v = L::fma(w, L::load(b.add(q * L::N)), *v);
+        for y in 0..r.rows {
+            let (from, to) = (r.b.add(y * r.b_pitch), r.c.add(y * r.c_pitch));
+            let mut i = 0;
+            while i < r.columns {
+                let mut acc = [L::splat(r.start); VECTORS];
+                for (w, &(_, offset)) in r.weights.iter().zip(r.offsets) {
+                    let (w, b) = (L::splat(*w), from.add(offset as usize + i));
+                    for (q, v) in acc.iter_mut().enumerate() {
+                        *v = L::fma(w, L::load(b.add(q * L::N)), *v);
+                    }
                 }
+                for (q, v) in acc.iter().enumerate() {
+                    L::store(to.add(i + q * L::N), *v);
+                }
+                i += VECTORS * L::N;
             }
-            for (q, v) in acc.iter().enumerate() {
-                L::store(r.c.add(i + q * L::N), *v);
-            }
-            i += VECTORS * L::N;
         }
     }
 }
@@ -320,9 +326,9 @@ macro_rules! kernel {
             }
 
             $(#[$target])*
-            unsafe fn one_row(r: &Row) {
-                // SAFETY: compiled for the set; the rest as `Kernel::row` states.
-                unsafe { row::<$lane>(r) }
+            unsafe fn rows(r: &Rows) {
+                // SAFETY: compiled for the set; the rest as `Kernel::depthwise` states.
+                unsafe { rows_of::<$lane>(r) }
             }
 
             $(#[$target])*
@@ -337,7 +343,7 @@ macro_rules! kernel {
                 vectors: $vectors,
                 tiles: [$([of::<$m, 1>, of::<$m, 2>, of::<$m, 3>]),*],
                 pack: copy,
-                row: one_row,
+                rows_of: rows,
                 dots: products,
             };
         }

@@ -34,6 +34,45 @@ macro_rules! vectorized {
 }
 pub(crate) use vectorized;
 
+/// Compiles a function that is generic over the [`Lane`](crate::simd::Lane) `$l` once per instruction set and chooses at run time.
+macro_rules! by_lanes {
+    ($(#[$m:meta])* $vis:vis unsafe fn $name:ident<$l:ident>($($arg:ident: $t:ty),* $(,)?) $body:block) => {
+        $(#[$m])*
+        $vis unsafe fn $name($($arg: $t),*) {
+            #[inline(always)]
+            unsafe fn body<$l: $crate::simd::Lane>($($arg: $t),*) {
+                // SAFETY: as the caller of the outer function vouches.
+                unsafe { $body }
+            }
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx512f,avx512dq,avx512bw,avx512vl,avx2,fma")]
+            unsafe fn avx512($($arg: $t),*) {
+                // SAFETY: compiled for the set.
+                unsafe { body::<$crate::simd::Avx512>($($arg),*) }
+            }
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx2,fma")]
+            unsafe fn avx2($($arg: $t),*) {
+                // SAFETY: compiled for the set.
+                unsafe { body::<$crate::simd::Avx2>($($arg),*) }
+            }
+            // SAFETY: `level()` only names sets that this CPU has.
+            unsafe {
+                match $crate::simd::level() {
+                    #[cfg(target_arch = "x86_64")]
+                    $crate::simd::Level::Avx512 => avx512($($arg),*),
+                    #[cfg(target_arch = "x86_64")]
+                    $crate::simd::Level::Avx2 => avx2($($arg),*),
+                    #[cfg(target_arch = "aarch64")]
+                    $crate::simd::Level::Neon => body::<$crate::simd::Neon>($($arg),*),
+                    _ => body::<$crate::simd::Plain>($($arg),*),
+                }
+            }
+        }
+    };
+}
+pub(crate) use by_lanes;
+
 /// `a b + c`
 #[inline(always)]
 pub(crate) fn fma<const F: bool>(a: f32, b: f32, c: f32) -> f32 {

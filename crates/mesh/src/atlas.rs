@@ -1,28 +1,27 @@
-//! Texture coordinates: the surface is cut into charts that a parallel projection flattens without
-//! overlap, and the charts are packed into a square.
+//! Texture coordinates: the surface is cut into charts that a parallel projection flattens without overlap, and the charts are packed into
+//! a square.
 
 use diorama_geom::Mesh;
 use diorama_geom::mesh::{cross, sub};
 use glam::{Vec2, Vec3};
 use std::collections::{BinaryHeap, HashMap};
 
-/// Empty texels around each chart, so that filtering meets no other chart.
+/// Empty texels around each chart, so that texture filtering reaches no other chart.
 const MARGIN: f32 = 2.0;
-/// Largest angle between a face and its chart's axis while charts grow, and where scraps are taken in (cosines).
+/// Cosine of the largest angle between a face and its chart's axis while charts grow; and when tiny charts are merged into neighbors.
 const GROW: f32 = 0.64;
-const TAKE_IN: f32 = 0.25;
-/// Charts with fewer faces are scraps.
-const SCRAP: usize = 12;
+const MERGE_ANGLE: f32 = 0.25;
+/// Charts with fewer faces are tiny and are merged.
+const TINY_CHART: usize = 12;
 
-/// A part of the surface and the plane that it is projected on.
+/// A part of the surface and the plane onto which it is projected.
 struct Chart {
     faces: Vec<u32>,
     u: Vec3,
     v: Vec3,
 }
 
-/// Gives the mesh texture coordinates for a texture of `size × size` texels; vertices on seams are doubled.
-/// Faces without area share one texel.
+/// Computes texture coordinates for a texture of `size × size` texels. Vertices on seams are duplicated. Degenerate faces share one texel.
 pub fn unwrap(mesh: &mut Mesh, size: usize) {
     let surface = Surface::new(mesh);
     let total: f32 = surface.areas.iter().sum();
@@ -30,7 +29,7 @@ pub fn unwrap(mesh: &mut Mesh, size: usize) {
         mesh.uvs = vec![[0.5; 2]; mesh.positions.len()];
         return;
     }
-    // Texels per unit of length at which three quarters of the texture would be in use.
+    // Texels per unit of length at which three quarters of the texture would be used.
     let scale = size as f32 * (0.75 / total).sqrt();
     let charts = surface.charts(scale);
     let flat: Vec<Flat> = charts.iter().map(|c| surface.flatten(c)).collect();
@@ -38,21 +37,21 @@ pub fn unwrap(mesh: &mut Mesh, size: usize) {
     rebuild(mesh, &charts, &flat, &places, scale, size as f32);
 }
 
-/// What charts are cut from.
+/// The surface from which charts are cut.
 struct Surface<'a> {
     mesh: &'a Mesh,
     positions: Vec<Vec3>,
     normals: Vec<Vec3>,
-    /// Normals averaged with those of neighbours that are not across an edge, by which charts grow.
+    /// Normals averaged with those of neighbors that are not across a sharp edge; charts grow by these.
     smooth: Vec<Vec3>,
     areas: Vec<f32>,
-    /// Faces across the three edges.
-    neighbours: Vec<[u32; 3]>,
+    /// Neighbor faces across the three edges.
+    neighbors: Vec<[u32; 3]>,
 }
 
 const NONE: u32 = u32::MAX;
 
-/// A candidate for a chart; the one that lies flattest comes first.
+/// A candidate face for a chart; the face with the smallest angle to the axis comes first.
 #[derive(PartialEq)]
 struct Candidate {
     flatness: f32,
@@ -87,37 +86,37 @@ impl<'a> Surface<'a> {
                 edges.insert((f[k], f[(k + 1) % 3]), i as u32);
             }
         }
-        let neighbours: Vec<[u32; 3]> =
+        let neighbors: Vec<[u32; 3]> =
             mesh.faces.iter().map(|f| std::array::from_fn(|k| edges.get(&(f[(k + 1) % 3], f[k])).copied().unwrap_or(NONE))).collect();
         let mut smooth = normals.clone();
         for _ in 0..3 {
             smooth = (0..smooth.len())
                 .map(|i| {
-                    let around = neighbours[i].iter().filter(|n| **n != NONE && smooth[**n as usize].dot(smooth[i]) > 0.5);
+                    let around = neighbors[i].iter().filter(|n| **n != NONE && smooth[**n as usize].dot(smooth[i]) > 0.5);
                     let sum: Vec3 = around.map(|n| smooth[*n as usize] * areas[*n as usize]).sum();
                     (sum + smooth[i] * areas[i]).normalize_or(normals[i])
                 })
                 .collect();
         }
         let positions = mesh.positions.iter().map(|p| Vec3::from(*p)).collect();
-        Surface { mesh, positions, normals, smooth, areas, neighbours }
+        Surface { mesh, positions, normals, smooth, areas, neighbors }
     }
 
     fn charts(&self, scale: f32) -> Vec<Chart> {
         let mut owner = vec![NONE; self.areas.len()];
         let mut charts = self.grow(&mut owner, scale);
-        self.dissolve_scraps(&mut charts, &mut owner, scale);
+        self.merge_tiny_charts(&mut charts, &mut owner, scale);
         charts
     }
 
-    /// Charts that cover all faces, each grown from the largest face that is left.
+    /// Charts that cover all faces, each grown from the largest remaining face.
     fn grow(&self, owner: &mut [u32], scale: f32) -> Vec<Chart> {
         let mut order: Vec<u32> = (0..self.areas.len() as u32).collect();
         order.sort_by(|a, b| self.areas[*b as usize].total_cmp(&self.areas[*a as usize]).then(a.cmp(b)));
         let mut charts = Vec::new();
         let mut texels = Texels::default();
         for seed in order {
-            // What a chart could not take without overlap is free again.
+            // Faces that a chart could not take without overlap become available again.
             while owner[seed as usize] == NONE {
                 let id = charts.len() as u32;
                 let grown = self.grow_from(seed, owner, id);
@@ -132,7 +131,7 @@ impl<'a> Surface<'a> {
         charts
     }
 
-    /// Connected faces in the order in which they joined.
+    /// Connected faces in the order in which they were added.
     fn grow_from(&self, seed: u32, owner: &mut [u32], id: u32) -> Vec<u32> {
         let mut faces = Vec::new();
         let mut sum = Vec3::ZERO;
@@ -140,7 +139,7 @@ impl<'a> Surface<'a> {
         while let Some(Candidate { face, .. }) = heap.pop() {
             let i = face as usize;
             let axis = sum.normalize_or_zero();
-            let fits = faces.is_empty() || (self.smooth[i].dot(axis) > GROW && self.normals[i].dot(axis) > TAKE_IN);
+            let fits = faces.is_empty() || (self.smooth[i].dot(axis) > GROW && self.normals[i].dot(axis) > MERGE_ANGLE);
             if owner[i] != NONE || !fits {
                 continue;
             }
@@ -148,19 +147,19 @@ impl<'a> Surface<'a> {
             faces.push(face);
             sum += self.smooth[i] * self.areas[i].max(1e-20);
             let axis = sum.normalize_or_zero();
-            for n in self.neighbours[i].into_iter().filter(|n| *n != NONE && owner[*n as usize] == NONE) {
+            for n in self.neighbors[i].into_iter().filter(|n| *n != NONE && owner[*n as usize] == NONE) {
                 heap.push(Candidate { flatness: self.smooth[n as usize].dot(axis), face: n });
             }
         }
         faces
     }
 
-    /// Axes of the plane across the faces' mean normal, turned so that their box is small.
+    /// Axes of the plane perpendicular to the faces' mean normal, rotated so that the bounding box is small.
     fn plane(&self, faces: &[u32]) -> (Vec3, Vec3) {
         let sum: Vec3 = faces.iter().map(|f| self.normals[*f as usize] * self.areas[*f as usize].max(1e-20)).sum();
         let axis = sum.normalize_or(Vec3::Z);
         let (u, v) = axis.any_orthonormal_pair();
-        // (u, v, axis) is right-handed, so faces that look along the axis keep their sense.
+        // (u, v, axis) is right-handed, so faces that look along the axis keep their orientation.
         let (u, v) = if u.cross(v).dot(axis) < 0.0 { (v, u) } else { (u, v) };
         let turned = |k: u32| {
             let (s, c) = (k as f32 * std::f32::consts::FRAC_PI_2 / 9.0).sin_cos();
@@ -185,14 +184,14 @@ impl<'a> Surface<'a> {
         })
     }
 
-    /// Hands the faces of tiny charts to charts next to them, where they fit without overlap.
-    fn dissolve_scraps(&self, charts: &mut Vec<Chart>, owner: &mut [u32], scale: f32) {
+    /// Moves the faces of tiny charts to adjacent charts, if they fit without overlap.
+    fn merge_tiny_charts(&self, charts: &mut Vec<Chart>, owner: &mut [u32], scale: f32) {
         let mut by_size: Vec<usize> = (0..charts.len()).collect();
         by_size.sort_by_key(|c| (std::cmp::Reverse(charts[*c].faces.len()), *c));
-        let scrap: Vec<bool> = charts.iter().map(|c| c.faces.len() < SCRAP).collect();
+        let is_tiny: Vec<bool> = charts.iter().map(|c| c.faces.len() < TINY_CHART).collect();
         let mut texels = Texels::default();
         for c in by_size {
-            if scrap[c] {
+            if is_tiny[c] {
                 continue;
             }
             texels.clear();
@@ -202,9 +201,9 @@ impl<'a> Surface<'a> {
             }
             let mut next = 0;
             while next < charts[c].faces.len() {
-                for n in self.neighbours[charts[c].faces[next] as usize] {
-                    let free = n != NONE && scrap[owner[n as usize] as usize];
-                    if free && self.normals[n as usize].dot(u.cross(v)) > TAKE_IN && texels.take(self.triangle(n, u, v), scale, false) {
+                for n in self.neighbors[charts[c].faces[next] as usize] {
+                    let free = n != NONE && is_tiny[owner[n as usize] as usize];
+                    if free && self.normals[n as usize].dot(u.cross(v)) > MERGE_ANGLE && texels.take(self.triangle(n, u, v), scale, false) {
                         owner[n as usize] = c as u32;
                         charts[c].faces.push(n);
                     }
@@ -237,14 +236,14 @@ impl<'a> Surface<'a> {
 
 /// A chart in its plane.
 struct Flat {
-    /// Places among the points of the mesh's vertices.
+    /// Index in `points` of each vertex of the mesh.
     index: HashMap<u32, u32>,
     points: Vec<(u32, Vec2)>,
     low: Vec2,
     extent: Vec2,
 }
 
-/// Texels of a chart that faces cover.
+/// Texels of a chart that are covered by faces.
 #[derive(Default)]
 struct Texels {
     taken: std::collections::HashSet<(i32, i32)>,
@@ -256,8 +255,8 @@ impl Texels {
         self.taken.clear();
     }
 
-    /// Marks the texels whose centres a triangle covers; not, and no, where one is taken or the triangle is turned
-    /// over, unless `always`.
+    /// Marks the texels whose centers a triangle covers. Fails without marking if one is taken or the triangle is flipped, unless `always`
+    /// is set.
     fn take(&mut self, t: [Vec2; 3], scale: f32, always: bool) -> bool {
         self.wanted.clear();
         let t = t.map(|p| p * scale);
@@ -275,8 +274,8 @@ impl Texels {
     }
 }
 
-/// Calls `f` with each texel whose centre lies in a triangle, and the centre's barycentric coordinates. Of triangles
-/// that share an edge at most one has a centre on it.
+/// Calls `f` with each texel whose center lies in a triangle, and with the center's barycentric coordinates. Of two triangles that share
+/// an edge, at most one contains a center on it.
 pub(crate) fn covered(t: [Vec2; 3], mut f: impl FnMut(i32, i32, [f32; 3])) {
     let area = (t[1] - t[0]).perp_dot(t[2] - t[0]);
     if area == 0.0 || !area.is_finite() {
@@ -287,7 +286,7 @@ pub(crate) fn covered(t: [Vec2; 3], mut f: impl FnMut(i32, i32, [f32; 3])) {
     let area = area.abs();
     let lo = t[0].min(t[1]).min(t[2]);
     let hi = t[0].max(t[1]).max(t[2]);
-    // An edge owns the points on it if it runs upward, or to the left.
+    // An edge owns its points if it runs upward, or to the left.
     let owns = |a: Vec2, b: Vec2| b.y > a.y || (b.y == a.y && b.x < a.x);
     let edges = [(t[1], t[2]), (t[2], t[0]), (t[0], t[1])];
     for y in (lo.y - 0.5).ceil() as i32..=(hi.y - 0.5).floor() as i32 {
@@ -303,7 +302,7 @@ pub(crate) fn covered(t: [Vec2; 3], mut f: impl FnMut(i32, i32, [f32; 3])) {
     }
 }
 
-/// Where charts lie in the texture, in texels, and texels per unit of length: the largest that finds room.
+/// Positions of the charts in the texture, in texels, and texels per unit of length: the largest scale that fits.
 fn pack(charts: &[Flat], size: f32, mut scale: f32) -> (f32, Vec<Vec2>) {
     let mut order: Vec<usize> = (0..charts.len()).collect();
     order.sort_by(|a, b| charts[*b].extent.y.total_cmp(&charts[*a].extent.y).then(a.cmp(b)));
@@ -315,7 +314,7 @@ fn pack(charts: &[Flat], size: f32, mut scale: f32) -> (f32, Vec<Vec2>) {
     }
 }
 
-/// Lowest place first over the skyline of what lies already.
+/// Skyline packing: each chart goes to the lowest free position.
 fn pack_at(charts: &[Flat], order: &[usize], size: f32, scale: f32) -> Option<Vec<Vec2>> {
     let width = size as usize;
     let mut places = vec![Vec2::ZERO; charts.len()];
@@ -323,7 +322,7 @@ fn pack_at(charts: &[Flat], order: &[usize], size: f32, scale: f32) -> Option<Ve
     let mut line: Vec<(usize, usize)> = vec![(0, 0)];
     for &c in order {
         let box_size = (charts[c].extent * scale + 2.0 * MARGIN).ceil();
-        // Tiny charts may shrink to nothing, their margins may not.
+        // Tiny charts may shrink to nothing, but their margins may not.
         let (w, h) = (box_size.x as usize, box_size.y as usize);
         let mut best: Option<(usize, usize, usize)> = None;
         for s in 0..line.len() {
@@ -369,7 +368,7 @@ fn rebuild(mesh: &mut Mesh, charts: &[Chart], flat: &[Flat], places: &[Vec2], sc
 mod tests {
     use super::*;
 
-    /// A sphere of `n` rings.
+    /// A sphere with `n` rings.
     fn sphere(n: u32) -> Mesh {
         let mut m = Mesh::default();
         for i in 0..=n {

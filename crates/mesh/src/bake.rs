@@ -1,12 +1,11 @@
-//! From texture coordinates to texels: where on the surface each lies, which cameras see it, and what stands in
-//! the texels between charts.
+//! Texture baking: positions of texels on the surface, the cameras that see them, and padding between charts.
 
 use crate::atlas::covered;
 use diorama_geom::{Camera, ImageU8, Mesh, Pose};
 use glam::{DVec3, Vec2, Vec3};
 use rayon::prelude::*;
 
-/// Texels that show the surface.
+/// Texels that lie on the surface.
 #[derive(Default)]
 pub struct Texels {
     /// Index in the texture, row by row, `[N]`.
@@ -17,7 +16,7 @@ pub struct Texels {
     pub normals: Vec<[f32; 3]>,
 }
 
-/// Texels of a `size × size` texture whose centres a face covers; the mesh has texture coordinates and normals.
+/// Texels of a `size × size` texture whose centers are covered by a face. The mesh must have texture coordinates and normals.
 pub fn texels(mesh: &Mesh, size: usize) -> Texels {
     let mut out = Texels::default();
     for (i, f) in mesh.faces.iter().enumerate() {
@@ -36,8 +35,8 @@ pub fn texels(mesh: &Mesh, size: usize) -> Texels {
     out
 }
 
-/// A texture of the texels' colours `[N, 3]`; the rest, and texels whose colour is negative, take on the colours nearest to
-/// them, so that no filter brings anything else across a seam.
+/// A texture with the texels' colors `[N, 3]`. All other texels, and those with a negative color, get the nearest color, so that texture
+/// filtering does not blend a background color across seams.
 pub fn texture(texels: &Texels, rgb_srgb: &[[f32; 3]], size: usize) -> ImageU8 {
     let mut color = vec![[0.0f32; 3]; size * size];
     let mut known = vec![false; size * size];
@@ -77,16 +76,16 @@ pub fn texture(texels: &Texels, rgb_srgb: &[[f32; 3]], size: usize) -> ImageU8 {
     ImageU8 { width: size, height: size, channels: 3, data }
 }
 
-/// Distances from a camera to the first surface in each pixel.
+/// Depth map of a camera: distance to the first surface in each pixel.
 pub struct DepthMap {
     camera: Camera,
     camera_from_world: Pose,
-    /// Infinite where nothing is.
+    /// Infinite where there is no surface.
     depth: Vec<f32>,
 }
 
 impl DepthMap {
-    /// Draws a mesh; faces that reach behind the camera are left out.
+    /// Renders a mesh; faces that reach behind the camera are left out.
     pub fn new(mesh: &Mesh, camera: Camera, world_from_camera: &Pose) -> DepthMap {
         let (w, h) = (camera.width as usize, camera.height as usize);
         let mut map = DepthMap { camera, camera_from_world: world_from_camera.inverse(), depth: vec![f32::INFINITY; w * h] };
@@ -104,7 +103,7 @@ impl DepthMap {
             let t = t.map(|p| p.clamp(Vec2::splat(-4.0 * w as f32), Vec2::splat(4.0 * w as f32)));
             covered(t, |x, y, s| {
                 if x >= 0 && y >= 0 && x < w as i32 && y < h as i32 {
-                    // 1/z is linear in the picture.
+                    // 1/z is linear in the image.
                     let d = 1.0 / (s[0] / a.1 + s[1] / b.1 + s[2] / c.1);
                     let at = &mut map.depth[y as usize * w + x as usize];
                     *at = at.min(d);
@@ -114,29 +113,29 @@ impl DepthMap {
         map
     }
 
-    /// Pixel and distance of a point before the camera.
+    /// Pixel and distance of a point in front of the camera.
     fn project(&self, p_in_world: [f32; 3]) -> Option<(Vec2, f32)> {
         let q = self.camera_from_world.point(DVec3::from(p_in_world.map(|v| v as f64)));
         let px = self.camera.project(q).filter(|_| q.z > 0.0)?;
         (px.is_finite()).then(|| (px.as_vec2(), q.length() as f32))
     }
 
-    /// Whether a point is the first thing that the camera sees there, give or take `slack`.
+    /// Whether the camera sees a point, that is, no surface is nearer by more than `slack`.
     pub fn sees(&self, p_in_world: [f32; 3], slack: f32) -> bool {
         let Some((px, d)) = self.project(p_in_world) else { return false };
         let (w, h) = (self.camera.width as i32, self.camera.height as i32);
-        // Before they are numbers of pixels: a lens may throw a point far beside the picture anywhere.
+        // Checked before the conversion to pixel indices: a lens may project a point arbitrarily far outside the image.
         if !((1.0..w as f32 - 1.0).contains(&px.x) && (1.0..h as f32 - 1.0).contains(&px.y)) {
             return false;
         }
         let (x, y) = (px.x as i32, px.y as i32);
-        // The nearest of the pixels around, so that an edge before the point hides it.
+        // The nearest of the neighboring pixels, so that an edge in front of the point occludes it.
         let first = (0..9).map(|k| self.depth[((y + k / 3 - 1) * w + x + k % 3 - 1) as usize]).fold(f32::INFINITY, f32::min);
-        // On a surface at 60 degrees to the view the pixels around lie that much nearer.
+        // On a surface at 60 degrees to the view, the neighboring pixels are nearer by this much.
         d <= first + slack + 2.5 * d / self.camera.fx.min(self.camera.fy) as f32
     }
 
-    /// Centre of the camera in the world.
+    /// Center of the camera in the world.
     pub fn eye(&self) -> DVec3 {
         self.camera_from_world.inverse().translation
     }
@@ -146,7 +145,7 @@ impl DepthMap {
 mod tests {
     use super::*;
 
-    /// Two unit squares across z, the second two units behind the first.
+    /// Two unit squares perpendicular to z, the second two units behind the first.
     fn squares() -> Mesh {
         let mut m = Mesh::default();
         for z in [0.0, -2.0] {
@@ -167,7 +166,7 @@ mod tests {
         let side = Pose::look_at(DVec3::new(5.0, 0.5, 3.0), DVec3::new(0.5, 0.5, -2.0), DVec3::Y);
         assert!(DepthMap::new(&m, Camera::pinhole(100, 100, 0.8), &side).sees([0.9, 0.5, -2.0], 2e-2));
         assert!(!map.sees([0.5, 0.5, 9.0], 1e-3), "behind the camera");
-        // Beside the camera, where pixels are beyond all numbers of pixels.
+        // Beside the camera, where projections exceed the range of pixel indices.
         assert!(!map.sees([1e30, 0.5, 2.9], 1e-3) && !map.sees([0.5, -1e30, 2.9], 1e-3));
     }
 
@@ -179,7 +178,7 @@ mod tests {
         assert!(t.positions.iter().all(|p| p[2].abs() < 1e-5 || (p[2] + 2.0).abs() < 1e-5) && t.index.len() > 64 * 64 / 3);
         let rgb: Vec<[f32; 3]> = t.positions.iter().map(|p| [p[0], p[1], if p[2] < -1.0 { 1.0 } else { 0.0 }]).collect();
         let image = texture(&t, &rgb, 64);
-        // A vertex's texture coordinates lead to its own colour.
+        // A vertex's texture coordinates lead to its own color.
         for (p, uv) in m.positions.iter().zip(&m.uvs) {
             let c = image.pixel((uv[0] * 64.0) as usize, (uv[1] * 64.0) as usize);
             assert!((c[0] as f32 / 255.0 - p[0]).abs() < 0.06 && (c[1] as f32 / 255.0 - p[1]).abs() < 0.06, "{p:?} {c:?}");

@@ -1,10 +1,10 @@
-//! Removing what is not the object: small parts, and parts that the cameras' views speak against.
+//! Removes floaters: small parts, and parts that the cameras' views contradict.
 
-use crate::visibility::Sight;
+use crate::visibility::CameraVisibility;
 use diorama_geom::{Camera, Mesh, Pose};
 use rayon::prelude::*;
 
-/// Keeps connected components that hold at least `share` of the faces of the largest one; returns how many faces went.
+/// Keeps connected components that have at least `share` of the faces of the largest one; returns how many faces were removed.
 pub fn remove_floaters(mesh: &mut Mesh, share: f32) -> usize {
     let parts = components(mesh);
     let largest = parts.iter().map(Vec::len).max().unwrap_or(0);
@@ -12,42 +12,42 @@ pub fn remove_floaters(mesh: &mut Mesh, share: f32) -> usize {
     remove(mesh, parts.iter().filter(|p| p.len() < least))
 }
 
-/// Cameras that must see a part.
-const WITNESSES: usize = 3;
-/// Share of a part's faces that as many cameras must see; of a closed part, some half faces away from all of them.
+/// Number of cameras that must see a part.
+const MIN_CAMERAS: usize = 3;
+/// Share of a part's faces that this many cameras must see. Of a closed part, about half faces away from every camera.
 const SEEN: f64 = 0.05;
-/// Faces of a part that are asked about.
-const ASKED: usize = 500;
-/// A part stands before everything that a camera looks at where its farthest face is nearer than this share of the distance
-/// beyond which nine tenths of the main part in the picture lie.
+/// Most faces per part that are tested.
+const TESTED_FACES: usize = 500;
+/// A part stands in front of everything that a camera looks at if its farthest face is nearer than this share of the distance beyond which
+/// nine tenths of the main part in the image lie.
 const BEFORE: f64 = 0.5;
 
-/// How many faces went, and why.
+/// Number of removed faces, by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Removed {
     /// In parts that fewer than three cameras see.
     pub unseen: usize,
-    /// In parts close before a camera.
+    /// In parts close in front of a camera.
     pub before: usize,
 }
 
-/// Removes connected components that fewer than three of the `cameras` (all, where there are fewer) see past the rest of the
-/// mesh, and those that stand before everything that some camera looks at, unless more than half of the cameras see them
-/// farther away. The part of which most is seen stays in any case, and with it faces that nobody sees, such as its underside.
-/// `slack` is the error of the surface in units of the mesh.
+/// Removes connected components that fewer than three of the `cameras` (or all, if there are fewer) see past the rest of the mesh, and
+/// components that stand in front of everything that some camera looks at, unless more than half of the cameras see them farther away. The
+/// component of which most is seen is always kept, including faces that no camera sees, such as its underside. `slack` is the error of the
+/// surface in units of the mesh.
 pub fn remove_unseen(mesh: &mut Mesh, cameras: &[(Camera, Pose)], slack: f32) -> Removed {
     let parts = components(mesh);
     if parts.len() < 2 || cameras.is_empty() {
         return Removed::default();
     }
-    let centers: Vec<Vec<[f32; 3]>> = parts.iter().map(|p| asked(mesh, p)).collect();
-    // Of each camera and part: which of the faces asked about it sees, and how far away.
-    let views: Vec<View> = cameras.par_iter().map(|(c, pose)| View::new(&Sight::new(mesh, c, pose), &centers, slack)).collect();
-    let witnesses = WITNESSES.min(cameras.len());
+    let centers: Vec<Vec<[f32; 3]>> = parts.iter().map(|p| face_centers(mesh, p)).collect();
+    // For each camera and part: which of the tested faces it sees, and how far away.
+    let views: Vec<View> = cameras.par_iter().map(|(c, pose)| View::new(&CameraVisibility::new(mesh, c, pose), &centers, slack)).collect();
+    let needed = MIN_CAMERAS.min(cameras.len());
     let seen: Vec<f64> = (0..parts.len())
         .map(|p| {
             let by = |i: usize| views.iter().filter(|v| v.seen[p][i].is_some()).count();
-            (0..centers[p].len()).filter(|i| by(*i) >= witnesses).count() as f64 / centers[p].len().max(1) as f64
+            (0..centers[p].len()).filter(|i| by(*i) >= needed).count() as f64 / centers[p].len().max(1) as f64
         })
         .collect();
     let main = (0..parts.len()).max_by(|a, b| (seen[*a] * parts[*a].len() as f64).total_cmp(&(seen[*b] * parts[*b].len() as f64)));
@@ -72,19 +72,19 @@ pub fn remove_unseen(mesh: &mut Mesh, cameras: &[(Camera, Pose)], slack: f32) ->
     removed
 }
 
-/// What one camera sees of the faces that are asked about.
+/// Visibility of the tested faces from one camera.
 struct View {
-    /// Distance of each face of each part, where the camera sees it.
+    /// Distance of each face of each part, if the camera sees it.
     seen: Vec<Vec<Option<f64>>>,
-    /// Distances of each part's faces in the picture, whatever stands before them, from near to far.
+    /// Sorted distances of each part's faces inside the image, including occluded ones.
     in_picture: Vec<Vec<f64>>,
 }
 
 impl View {
-    fn new(sight: &Sight, centers: &[Vec<[f32; 3]>], slack: f32) -> View {
-        let seen = |p: &[f32; 3]| sight.distance(*p).filter(|_| sight.sees(*p, slack));
+    fn new(visibility: &CameraVisibility, centers: &[Vec<[f32; 3]>], slack: f32) -> View {
+        let seen = |p: &[f32; 3]| visibility.distance(*p).filter(|_| visibility.sees(*p, slack));
         let in_picture = |part: &Vec<[f32; 3]>| {
-            let mut d: Vec<f64> = part.iter().filter_map(|p| sight.distance(*p)).collect();
+            let mut d: Vec<f64> = part.iter().filter_map(|p| visibility.distance(*p)).collect();
             d.sort_by(f64::total_cmp);
             d
         };
@@ -94,21 +94,21 @@ impl View {
         }
     }
 
-    /// Distance of the farthest face that is seen of a part, none where nothing is.
+    /// Distance of the farthest visible face of a part; `None` if none is visible.
     fn farthest(&self, part: usize) -> Option<f64> {
         self.seen[part].iter().flatten().copied().max_by(f64::total_cmp)
     }
 
-    /// Distance beyond which nine tenths of a part in the picture lie.
+    /// Distance beyond which nine tenths of a part's faces in the image lie.
     fn subject(&self, part: usize) -> Option<f64> {
         let d = &self.in_picture[part];
         d.get(d.len() / 10).copied()
     }
 }
 
-/// Middles of up to [`ASKED`] faces.
-fn asked(mesh: &Mesh, faces: &[u32]) -> Vec<[f32; 3]> {
-    let n = faces.len().min(ASKED);
+/// Centers of up to [`TESTED_FACES`] faces.
+fn face_centers(mesh: &Mesh, faces: &[u32]) -> Vec<[f32; 3]> {
+    let n = faces.len().min(TESTED_FACES);
     let center = |f: u32| {
         let [a, b, c] = mesh.faces[f as usize].map(|i| mesh.positions[i as usize]);
         std::array::from_fn(|k| (a[k] + b[k] + c[k]) / 3.0)
@@ -116,7 +116,7 @@ fn asked(mesh: &Mesh, faces: &[u32]) -> Vec<[f32; 3]> {
     (0..n).map(|i| center(faces[i * faces.len() / n])).collect()
 }
 
-/// Faces by connected component.
+/// Groups faces by connected component.
 fn components(mesh: &Mesh) -> Vec<Vec<u32>> {
     let mut parent: Vec<u32> = (0..mesh.positions.len() as u32).collect();
     fn root(parent: &mut [u32], mut i: u32) -> u32 {
@@ -163,7 +163,7 @@ mod tests {
 
     #[test]
     fn small_islands_go_and_large_ones_stay() {
-        // A strip of ten triangles, and one apart.
+        // A strip of ten triangles, and a separate one.
         let mut m = Mesh::default();
         for i in 0..12 {
             m.positions.push([i as f32 * 0.5, (i % 2) as f32, 0.0]);
@@ -211,7 +211,7 @@ mod tests {
         (0..12).map(|i| camera(eye(i), DVec3::ZERO)).collect()
     }
 
-    /// Faces of balls, the first the object, that stay.
+    /// Number of remaining faces of each ball; the first ball is the object.
     fn left(balls: &[(DVec3, f64)], cameras: &[(Camera, Pose)]) -> (Vec<bool>, Removed, usize) {
         let mut m = Mesh::default();
         let faces: Vec<usize> = balls.iter().enumerate().map(|(i, (c, r))| ball(&mut m, *c, *r, if i == 0 { 64 } else { 16 })).collect();

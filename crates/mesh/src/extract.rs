@@ -1,18 +1,18 @@
-//! Marching cubes or tetrahedra over a [`FieldQuery`], a few slices at a time: memory is two slices of density plus
-//! the surface, whatever the resolution.
+//! Marching cubes or tetrahedra over a [`FieldQuery`], a few slices at a time. Memory holds two slices of density plus the surface, at any
+//! resolution.
 
 use diorama_geom::Mesh;
 use diorama_geom::field_query::FieldQuery;
 use diorama_kernels::ops::marching_cubes::{self, CaseTable, cpu::Mesher};
 use diorama_kernels::ops::marching_tetrahedra;
 
-/// What a surface is made of.
+/// Extraction algorithm.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Method {
     /// Marching cubes: fewest faces.
     #[default]
     Cubes,
-    /// Marching tetrahedra: some twice the faces, none ambiguous.
+    /// Marching tetrahedra: about twice the faces, no ambiguous cases.
     Tetrahedra,
 }
 
@@ -37,7 +37,7 @@ impl std::str::FromStr for Method {
     }
 }
 
-/// Where and how finely to look.
+/// Region and resolution of an extraction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Grid {
     /// Lowest and highest corner in the world.
@@ -61,11 +61,11 @@ impl Grid {
     }
 }
 
-/// Grid points that are asked for at once.
+/// Grid points per query of the field.
 const BATCH: usize = 1 << 18;
 
-/// The surface where density equals `level`, in world coordinates, faces outward. What lies outside of
-/// the box counts as empty, so the surface is closed where it is cut. `progress` is told slices done of all.
+/// Extracts the surface where the density equals `level`, in world coordinates, with faces outward. Space outside the box counts as empty,
+/// so the surface is closed where the box cuts it. `progress` is called with the slices done and the total.
 pub fn extract(field: &dyn FieldQuery, grid: &Grid, level: f32, method: Method, progress: &mut dyn FnMut(usize, usize)) -> Mesh {
     let [nx, ny, _] = grid.points();
     let cell = grid.cell();
@@ -86,7 +86,7 @@ pub fn extract(field: &dyn FieldQuery, grid: &Grid, level: f32, method: Method, 
         }
     });
     mesher.push(&empty);
-    // The empty layer lies one cell outside: pull what it cut back onto the box.
+    // The empty layer lies one cell outside the box: move the vertices on it back onto the box.
     let world =
         |p: &[f32; 3]| std::array::from_fn(|k| (grid.min[k] + (p[k] - 1.0) * cell).clamp(grid.min[k], grid.max[k].max(grid.min[k] + cell)));
     let positions = mesher.positions.iter().map(world).collect();
@@ -100,7 +100,7 @@ pub fn sample(field: &dyn FieldQuery, grid: &Grid, progress: &mut dyn FnMut(usiz
     sigma
 }
 
-/// Hands over the densities of a few slices at a time, from the lowest up.
+/// Passes the densities on, a few slices at a time, in ascending order.
 fn each_slab(field: &dyn FieldQuery, grid: &Grid, progress: &mut dyn FnMut(usize, usize), take: &mut dyn FnMut(&[f32])) {
     let [nx, ny, nz] = grid.points();
     let cell = grid.cell();
@@ -123,7 +123,7 @@ fn each_slab(field: &dyn FieldQuery, grid: &Grid, progress: &mut dyn FnMut(usize
     }
 }
 
-/// The surface in densities that are at hand, in world coordinates; open where the box cuts it.
+/// Extracts the surface from densities in memory, in world coordinates; it is open where the box cuts it.
 pub fn from_densities(sigma: &[f32], grid: &Grid, level: f32) -> Mesh {
     let cell = grid.cell();
     let (mut positions, faces) = marching_cubes::cpu::surface(&marching_cubes::case_table(), sigma, grid.points(), level);
@@ -201,7 +201,7 @@ mod tests {
             for p in &mesh.positions {
                 assert!(shape.distance(*p).abs() <= 0.5 * cell);
             }
-            // Surface to mesh.
+            // From the surface to the mesh.
             for i in 0..500 {
                 let z = 1.0 - (2.0 * i as f32 + 1.0) / 500.0;
                 let (r, a) = ((1.0 - z * z).sqrt(), i as f32 * 2.399_963);
@@ -225,7 +225,7 @@ mod tests {
             let corner: [f32; 3] = std::array::from_fn(|k| if c >> k & 1 == 1 { half[k] } else { -half[k] });
             assert!(nearest(&mesh, corner) <= 1.2 * cell, "{}", nearest(&mesh, corner) / cell);
         }
-        // Face centres lie on the mesh.
+        // Face centers lie on the mesh.
         for k in 0..6 {
             let mut p = [0.01, 0.02, 0.03];
             p[k / 2] = if k % 2 == 0 { half[k / 2] } else { -half[k / 2] };

@@ -1,19 +1,19 @@
-//! Normals of the field on the texture of a simplified mesh, in the tangent space of glTF: x along u, y against v, z outward.
+//! Normal maps: normals of the field on the texture of a simplified mesh, in the tangent space of glTF: x along u, y against v, z outward.
 
 use crate::bake::{self, Texels};
 use diorama_geom::field_query::FieldQuery;
 use diorama_geom::{ImageU8, Mesh};
 use glam::{Mat3, Vec2, Vec3, Vec4};
 
-/// Cells to either side of the face in which the surface is looked for, and steps on the way.
+/// Cells on either side of a face in which the surface is searched, and steps of the search.
 const REACH: f32 = 2.0;
 const STEPS: usize = 8;
-/// Cells over which the density's slope is taken.
+/// Cells over which the density gradient is taken.
 const SPAN: f32 = 0.75;
-/// Texels that are asked for at once.
+/// Texels per query of the field.
 const BATCH: usize = 1 << 16;
 
-/// Sets tangents of a mesh with normals and texture coordinates: unit vectors along u, and the sign of `normal × tangent` along −v.
+/// Computes tangents of a mesh with normals and texture coordinates: unit vectors along u, and the sign of `normal × tangent` along −v.
 pub fn set_tangents(mesh: &mut Mesh) {
     let n = mesh.positions.len();
     let (mut along_u, mut against_v) = (vec![Vec3::ZERO; n], vec![Vec3::ZERO; n]);
@@ -25,7 +25,7 @@ pub fn set_tangents(mesh: &mut Mesh) {
         if det.abs() < 1e-20 {
             continue;
         }
-        // Weighted by area: large faces know better.
+        // Weighted by area, because the tangents of large faces are more reliable.
         let area = e[0].cross(e[1]).length();
         let u = ((e[0] * d[1].y - e[1] * d[0].y) / det).normalize_or_zero() * area;
         let v = ((e[1] * d[0].x - e[0] * d[1].x) / det).normalize_or_zero() * area;
@@ -43,8 +43,8 @@ pub fn set_tangents(mesh: &mut Mesh) {
     mesh.tangents = (0..n).map(tangent).collect();
 }
 
-/// The normal map, `size × size`, of a mesh whose tangents are set; `cell` is the edge of the cells it was extracted with, `level` the
-/// density of the surface.
+/// Computes the normal map, `size × size`, of a mesh with tangents. `cell` is the edge of the cells that it was extracted with, `level`
+/// the density of the surface.
 pub fn bake(field: &dyn FieldQuery, mesh: &Mesh, size: usize, cell: f32, level: f32, progress: &mut dyn FnMut(usize, usize)) -> ImageU8 {
     let texels = bake::texels(mesh, size);
     let frames = frames(mesh, &texels, size);
@@ -53,7 +53,7 @@ pub fn bake(field: &dyn FieldQuery, mesh: &Mesh, size: usize, cell: f32, level: 
         let last = (first + BATCH).min(texels.index.len());
         let normals = normals(field, &texels, first..last, cell, level);
         rgb.extend(normals.iter().zip(&frames[first..last]).map(|(n, frame)| {
-            // What a renderer makes of the map is this normal: its frame's vectors need not be orthogonal.
+            // A renderer reconstructs the normal from this frame, whose vectors need not be orthogonal.
             let t = (frame.inverse() * *n).try_normalize().filter(|t| t.is_finite() && t.z > 0.0).unwrap_or(Vec3::Z);
             (t * 0.5 + 0.5).to_array()
         }));
@@ -81,7 +81,7 @@ fn frames(mesh: &Mesh, texels: &Texels, size: usize) -> Vec<Mat3> {
     (0..texels.index.len()).map(frame).collect()
 }
 
-/// Outward unit normals of the field where the lines across the faces at some texels meet its surface.
+/// Outward unit normals of the field at the points where lines through some texels, along the mesh normal, meet its surface.
 fn normals(field: &dyn FieldQuery, texels: &Texels, range: std::ops::Range<usize>, cell: f32, level: f32) -> Vec<Vec3> {
     let place = |k: usize| (Vec3::from(texels.positions[k]), Vec3::from(texels.normals[k]));
     let offset = |s: usize| (2.0 * s as f32 / STEPS as f32 - 1.0) * REACH * cell;
@@ -92,7 +92,7 @@ fn normals(field: &dyn FieldQuery, texels: &Texels, range: std::ops::Range<usize
     let points: Vec<[f32; 3]> = range.clone().flat_map(line).collect();
     let mut sigma = vec![0.0; points.len()];
     field.density(&points, &mut sigma);
-    // From outside in: where the level is crossed nearest to the face.
+    // From outside inward: the crossing of the level nearest to the face.
     let on_surface = |(k, s): (usize, &[f32])| {
         let crossing = |i: usize| offset(i) + (offset(i + 1) - offset(i)) * (level - s[i]) / (s[i + 1] - s[i]);
         let all = (0..STEPS).filter(|i| s[*i] <= level && s[*i + 1] > level).map(crossing);
@@ -109,7 +109,7 @@ fn normals(field: &dyn FieldQuery, texels: &Texels, range: std::ops::Range<usize
     let slope = |(k, s): (usize, &[f32])| {
         let n = place(k).1;
         let g = Vec3::new(s[1] - s[0], s[3] - s[2], s[5] - s[4]).normalize_or(n);
-        // A field that turns away from its own surface is noise.
+        // A field normal that points away from the mesh normal is noise.
         if g.dot(n) > 0.2 { g } else { n }
     };
     range.zip(sigma.chunks_exact(6)).map(slope).collect()
@@ -121,7 +121,7 @@ mod tests {
     use crate::extract::{Grid, Method, extract};
     use crate::{atlas, simplify};
 
-    /// A ball with waves on it.
+    /// A ball with a wavy surface.
     struct Waves;
 
     impl Waves {
@@ -155,7 +155,7 @@ mod tests {
         for k in 0..texels.index.len() {
             let p = Vec3::from(texels.positions[k]);
             let e = 1e-3;
-            // The gradient is the same a little deeper, where the density is not cut off.
+            // The gradient is the same slightly deeper, where the density is not clamped.
             let inner = p * (0.69 / p.length());
             let slope_in = |d: Vec3| Waves::density_at(inner + d * e) - Waves::density_at(inner - d * e);
             let truth = -Vec3::new(slope_in(Vec3::X), slope_in(Vec3::Y), slope_in(Vec3::Z)).normalize();

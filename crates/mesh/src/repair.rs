@@ -1,33 +1,33 @@
-//! Closed meshes: vertices at one place become one, edges of four faces are parted, holes are filled.
+//! Closes meshes: merges vertices with equal positions, separates edges with more than two faces, fills holes.
 
 use diorama_geom::Mesh;
 use diorama_geom::mesh::{cross, sub};
 use std::collections::HashMap;
 
-/// Makes one vertex of those at the same place, and drops the faces that lose their area by it. What was closed stays closed.
+/// Merges vertices with equal positions and drops faces that become degenerate. A closed mesh stays closed.
 pub fn weld(mesh: &mut Mesh) {
     let mut first = HashMap::new();
     let at: Vec<u32> = mesh
         .positions
         .iter()
         .enumerate()
-        // Adding zero makes one of both zeros.
+        // Adding zero turns −0 into 0.
         .map(|(i, p)| *first.entry(p.map(|v| (v + 0.0).to_bits())).or_insert(i as u32))
         .collect();
     mesh.faces.iter_mut().flatten().for_each(|i| *i = at[*i as usize]);
     mesh.faces.retain(|f| f[0] != f[1] && f[1] != f[2] && f[0] != f[2]);
-    drop_folds(mesh);
+    remove_folded_faces(mesh);
     mesh.compact();
 }
 
-/// Two faces on the same three vertices that look away from each other enclose nothing.
-fn drop_folds(mesh: &mut Mesh) {
+/// Removes pairs of faces on the same three vertices with opposite orientation; they enclose nothing.
+fn remove_folded_faces(mesh: &mut Mesh) {
     let mut balance: HashMap<[u32; 3], i32> = HashMap::new();
     let key = |f: &[u32; 3]| {
         let mut k = *f;
         k.sort_unstable();
         let least = (0..3).min_by_key(|i| f[*i]).unwrap_or(0);
-        // Which way round the face runs.
+        // Orientation of the face.
         (k, if f[(least + 1) % 3] == k[1] { 1 } else { -1 })
     };
     for f in &mesh.faces {
@@ -46,36 +46,37 @@ fn drop_folds(mesh: &mut Mesh) {
     });
 }
 
-/// Rounds of [`close`].
+/// Most rounds of [`close`].
 const ROUNDS: usize = 8;
-/// Parts that touched are moved into themselves by this share of their edges, so that readers without indices see them apart.
-const NUDGE: f32 = 2e-3;
+/// Separated parts that touch are shrunk by this share of their edge length, so that readers that merge vertices by position keep them
+/// separate.
+const SHRINK: f32 = 2e-3;
 
-/// Closes a mesh; whether it is watertight then. Edges that more than two faces share are parted so that the solid on either side
-/// is its own, and rims are filled by fans around their middle.
+/// Closes a mesh; returns whether it is watertight then. Edges with more than two faces are split so that each solid beside them is
+/// separate, and holes are filled with fans around their center.
 pub fn close(mesh: &mut Mesh) -> bool {
     weld(mesh);
     for _ in 0..ROUNDS {
         if mesh.is_watertight() {
             return true;
         }
-        part(mesh);
-        fill(mesh);
-        divide(mesh);
+        separate_fans(mesh);
+        fill_holes(mesh);
+        split_shared_edges(mesh);
     }
     mesh.is_watertight()
 }
 
-/// Half edges by their ends: three times the face plus the corner where each begins.
+/// Half edges by their end vertices: three times the face index plus the corner where each starts.
 fn half_edges(mesh: &Mesh) -> HashMap<(u32, u32), Vec<u32>> {
-    let mut along: HashMap<(u32, u32), Vec<u32>> = HashMap::new();
+    let mut by_ends: HashMap<(u32, u32), Vec<u32>> = HashMap::new();
     for (i, f) in mesh.faces.iter().enumerate() {
-        (0..3).for_each(|k| along.entry((f[k], f[(k + 1) % 3])).or_default().push((i * 3 + k) as u32));
+        (0..3).for_each(|k| by_ends.entry((f[k], f[(k + 1) % 3])).or_default().push((i * 3 + k) as u32));
     }
-    along
+    by_ends
 }
 
-/// Normal of a face, as long as twice its area.
+/// Face normal with twice the face's area as length.
 fn normal(mesh: &Mesh, face: usize) -> [f32; 3] {
     let [a, b, c] = mesh.faces[face].map(|i| mesh.positions[i as usize]);
     cross(sub(b, a), sub(c, a))
@@ -85,25 +86,25 @@ fn length(v: [f32; 3]) -> f32 {
     (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt()
 }
 
-/// Edges along which several pairs of faces meet although their ends cannot be parted get a vertex of their own for each pair.
-fn divide(mesh: &mut Mesh) {
-    let along = half_edges(mesh);
+/// Some edges with several pairs of faces cannot be separated at their ends. They get one additional vertex per pair.
+fn split_shared_edges(mesh: &mut Mesh) {
+    let by_ends = half_edges(mesh);
     let mut touched = vec![false; mesh.faces.len()];
-    let mut edges: Vec<_> = along.iter().filter(|((a, b), c)| a < b && c.len() > 1).collect();
+    let mut edges: Vec<_> = by_ends.iter().filter(|((a, b), c)| a < b && c.len() > 1).collect();
     edges.sort_unstable();
     let mut added = Vec::new();
     for (&(a, b), forth) in edges {
-        let Some(back) = along.get(&(b, a)) else { continue };
+        let Some(back) = by_ends.get(&(b, a)) else { continue };
         for (x, y) in pairs(mesh, (a, b), forth, back) {
             let (f, g) = (x as usize / 3, y as usize / 3);
-            // What was divided in this round waits for the next.
+            // Edges of faces that were split in this round wait for the next.
             if touched[f] || touched[g] || f == g {
                 continue;
             }
             (touched[f], touched[g]) = (true, true);
             let (p, q) = (mesh.positions[a as usize], mesh.positions[b as usize]);
             let n: [f32; 3] = std::array::from_fn(|k| normal(mesh, f)[k] + normal(mesh, g)[k]);
-            let by = NUDGE * length(sub(q, p)) / length(n).max(1e-20);
+            let by = SHRINK * length(sub(q, p)) / length(n).max(1e-20);
             let middle = mesh.positions.len() as u32;
             mesh.positions.push(std::array::from_fn(|k| 0.5 * (p[k] + q[k]) - by * n[k]));
             for c in [x, y] {
@@ -118,10 +119,10 @@ fn divide(mesh: &mut Mesh) {
     mesh.faces.extend(added);
 }
 
-/// Gives each fan of faces around a vertex a vertex of its own, where fans are joined by edges between two faces.
-fn part(mesh: &mut Mesh) {
-    let along = half_edges(mesh);
-    // Corners that are one: those at both ends of an edge between two faces.
+/// Gives each fan of faces around a vertex its own vertex; fans are connected by edges with two faces.
+fn separate_fans(mesh: &mut Mesh) {
+    let by_ends = half_edges(mesh);
+    // Corners that stay one vertex: those at both ends of an edge between two faces.
     let mut same: Vec<u32> = (0..mesh.faces.len() as u32 * 3).collect();
     fn root(same: &mut [u32], mut i: u32) -> u32 {
         while same[i as usize] != i {
@@ -131,11 +132,11 @@ fn part(mesh: &mut Mesh) {
         i
     }
     let next = |c: u32| c / 3 * 3 + (c + 1) % 3;
-    for (&(a, b), forth) in &along {
-        if a > b && along.contains_key(&(b, a)) {
+    for (&(a, b), forth) in &by_ends {
+        if a > b && by_ends.contains_key(&(b, a)) {
             continue;
         }
-        let Some(back) = along.get(&(b, a)) else { continue };
+        let Some(back) = by_ends.get(&(b, a)) else { continue };
         for (x, y) in pairs(mesh, (a, b), forth, back) {
             for (p, q) in [(x, next(y)), (next(x), y)] {
                 let (p, q) = (root(&mut same, p), root(&mut same, q));
@@ -159,11 +160,11 @@ fn part(mesh: &mut Mesh) {
     vertex.iter().for_each(|((at, _), id)| parted[*id as usize] = copies[*at as usize] > 1);
     let faces = corners.chunks_exact(3).map(|f| [f[0], f[1], f[2]]).collect();
     *mesh = Mesh { positions, faces, ..Mesh::default() };
-    withdraw(mesh, &parted);
+    shrink(mesh, &parted);
 }
 
-/// Moves vertices a little against the normals of their faces.
-fn withdraw(mesh: &mut Mesh, which: &[bool]) {
+/// Moves vertices slightly against the normals of their faces.
+fn shrink(mesh: &mut Mesh, which: &[bool]) {
     let (mut sum, mut shortest) = (vec![[0.0f32; 3]; which.len()], vec![f32::INFINITY; which.len()]);
     for (i, f) in mesh.faces.iter().enumerate().filter(|(_, f)| f.iter().any(|v| which[*v as usize])) {
         let n = normal(mesh, i);
@@ -175,12 +176,12 @@ fn withdraw(mesh: &mut Mesh, which: &[bool]) {
         }
     }
     for v in (0..which.len()).filter(|v| which[*v]) {
-        let by = NUDGE * shortest[v] / length(sum[v]).max(1e-20);
+        let by = SHRINK * shortest[v] / length(sum[v]).max(1e-20);
         (0..3).for_each(|k| mesh.positions[v][k] -= by * sum[v][k]);
     }
 }
 
-/// Which faces (by their corner at the edge's start) belong together across an edge: of more than two, those with the solid between them.
+/// Pairs faces (by their corner at the edge's start) across an edge; with more than two faces, those with the solid between them.
 fn pairs(mesh: &Mesh, (a, b): (u32, u32), forth: &[u32], back: &[u32]) -> Vec<(u32, u32)> {
     if forth.len() == 1 && back.len() == 1 {
         return vec![(forth[0], back[0])];
@@ -201,7 +202,7 @@ fn pairs(mesh: &Mesh, (a, b): (u32, u32), forth: &[u32], back: &[u32]) -> Vec<(u
     let mut free: Vec<(u32, f32)> = back.iter().map(|c| (*c, angle(*c))).collect();
     let mut out = Vec::new();
     for &c in forth {
-        // The solid lies behind the face that runs along the edge: the next one that way round bounds it.
+        // The solid lies behind a face: the next face around the edge in that direction bounds it.
         let own = angle(c);
         let Some(k) = (0..free.len()).min_by(|i, j| turn(free[*i].1, own).total_cmp(&turn(free[*j].1, own))) else { break };
         out.push((c, free.remove(k).0));
@@ -209,17 +210,17 @@ fn pairs(mesh: &Mesh, (a, b): (u32, u32), forth: &[u32], back: &[u32]) -> Vec<(u
     out
 }
 
-/// Fills each rim with a fan around its middle.
-fn fill(mesh: &mut Mesh) {
-    let along = half_edges(mesh);
+/// Fills each hole with a fan around its center.
+fn fill_holes(mesh: &mut Mesh) {
+    let by_ends = half_edges(mesh);
     let mut rim: HashMap<u32, Vec<u32>> = HashMap::new();
     let mut starts: Vec<(u32, u32)> = Vec::new();
-    for (&(a, b), forth) in &along {
-        let alone = forth.len().saturating_sub(along.get(&(b, a)).map_or(0, Vec::len));
+    for (&(a, b), forth) in &by_ends {
+        let alone = forth.len().saturating_sub(by_ends.get(&(b, a)).map_or(0, Vec::len));
         starts.extend(std::iter::repeat_n((a, b), alone));
     }
     starts.sort_unstable();
-    // A rim runs against its faces.
+    // The border of a hole runs against its faces.
     starts.iter().for_each(|(a, b)| rim.entry(*b).or_default().push(*a));
     for (_, start) in starts {
         let mut ring = vec![start];
@@ -247,7 +248,7 @@ fn fill(mesh: &mut Mesh) {
 mod tests {
     use super::*;
 
-    /// A cube of two triangles a side from `lo`, each face with vertices of its own.
+    /// A cube at `lo` with two triangles per side, each face with its own vertices.
     fn cube(lo: [f32; 3], mesh: &mut Mesh) {
         for (axis, side) in (0..3).flat_map(|a| [(a, 0.0), (a, 1.0f32)]) {
             let first = mesh.positions.len() as u32;
@@ -274,7 +275,7 @@ mod tests {
 
     #[test]
     fn holes_are_filled() {
-        // A whole side, a triangle, and both, which meet in a corner or along an edge.
+        // A whole side, a triangle, and two holes that meet in a corner or along an edge.
         for (first, last) in [(2, 0), (0, 1), (2, 1)] {
             let mut m = Mesh::default();
             cube([0.0; 3], &mut m);
@@ -295,7 +296,7 @@ mod tests {
             cube(other, &mut m);
             assert!(close(&mut m), "{other:?}");
             assert!((m.volume() - 2.0).abs() < 2e-2 && m.faces.len() == 24);
-            // Apart for those, too, who know vertices by their place.
+            // The parts are also separate for readers that identify vertices by position.
             weld(&mut m);
             assert!(m.is_watertight());
         }

@@ -1,25 +1,25 @@
-//! Fewer triangles by quadric error (Garland and Heckbert 1997), through meshoptimizer.
+//! Simplifies meshes by quadric error (Garland and Heckbert 1997), through meshoptimizer.
 
 use diorama_geom::Mesh;
 use meshopt::{SimplifyOptions, VertexDataAdapter};
 
-/// How a mesh came to have no more faces than asked.
+/// How a mesh was reduced to the requested number of faces.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reduction {
-    /// It had no more.
+    /// It had no more faces.
     None,
-    /// Edges collapsed; every part is still there.
+    /// Edges were collapsed; all parts remain.
     Collapsed,
-    /// Small parts went, too.
+    /// Small parts were removed too.
     Pruned,
-    /// Vertices were clustered without regard to what is joined to what, because the topology forbids fewer faces.
+    /// Vertices were clustered regardless of connectivity, because the topology allows no fewer faces.
     Clustered,
 }
 
 /// Reduces a mesh to at most `faces` triangles.
 ///
 /// # Errors
-/// The fewest triangles that it can have, where `faces` is below; the mesh stays as it was.
+/// The fewest triangles that the mesh can have, if `faces` is less; the mesh is unchanged then.
 pub fn simplify(mesh: &mut Mesh, faces: usize) -> Result<Reduction, usize> {
     if mesh.faces.len() <= faces {
         return Ok(Reduction::None);
@@ -67,7 +67,7 @@ mod tests {
         m
     }
 
-    /// An octahedron of a size at a place.
+    /// An octahedron with a given size and position.
     fn octahedron(m: &mut Mesh, center: [f32; 3], radius: f32) {
         let first = m.positions.len() as u32;
         for k in 0..3 {
@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn no_more_faces_than_asked_even_where_topology_forbids_collapses() {
-        // A thousand solids apart, which collapsing edges cannot make fewer.
+        // A thousand separate solids, which edge collapses cannot reduce further.
         let mut m = Mesh::default();
         for i in 0..1000 {
             octahedron(&mut m, [(i % 10) as f32, (i / 10 % 10) as f32, (i / 100) as f32], 0.3);
@@ -106,7 +106,7 @@ mod tests {
             assert!(how.is_ok_and(|h| h != Reduction::None), "{faces}: {how:?}");
             assert!((1..=faces).contains(&reduced.faces.len()), "{faces}: {}", reduced.faces.len());
         }
-        // Sheets that share one edge, all fixed by it.
+        // Sheets that share one edge, which fixes all of them.
         let mut fan = Mesh { positions: vec![[0.0; 3], [0.0, 0.0, 1.0]], ..Mesh::default() };
         for i in 0..64 {
             let a = i as f32 * 0.098;

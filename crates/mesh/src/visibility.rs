@@ -1,25 +1,26 @@
-//! Which cameras see a point of a mesh, through their own lenses and past the rest of the mesh.
+//! Which cameras see a point of a mesh, with their lens models and occlusion by the rest of the mesh.
 
 use crate::bake::DepthMap;
 use diorama_geom::{Camera, Mesh, Pose};
 use glam::{DMat3, DVec2, DVec3};
 
-/// Longest side of the pictures of distances, in pixels.
+/// Longest side of the depth maps, in pixels.
 const MAP_PX: f64 = 400.0;
-/// A lens whose picture reaches directions with less than this along the axis is drawn on the six sides of a cube.
+/// If a lens sees directions whose component along the axis is less than this, six depth maps on the sides of a cube are used.
 const NARROW: f64 = 0.25;
 
-/// What one camera sees of a mesh.
-pub struct Sight {
+/// Visibility of a mesh from one camera.
+pub struct CameraVisibility {
     camera: Camera,
     camera_from_world: Pose,
     eye: DVec3,
-    /// Pinhole pictures that hold the camera's own: one, or the six sides of a cube.
+    /// Pinhole depth maps that cover the camera's image: one, or the six sides of a cube.
     maps: Vec<DepthMap>,
 }
 
-impl Sight {
-    pub fn new(mesh: &Mesh, camera: &Camera, world_from_camera: &Pose) -> Sight {
+impl CameraVisibility {
+    /// Renders the depth maps of a camera.
+    pub fn new(mesh: &Mesh, camera: &Camera, world_from_camera: &Pose) -> CameraVisibility {
         let maps = match reach(camera) {
             Some(reach) => {
                 let f = 0.5 * MAP_PX / reach.max_element();
@@ -31,17 +32,17 @@ impl Sight {
             }
             None => sides()
                 .map(|side| {
-                    // A little more than a right angle, for the pixels at the rim.
+                    // Slightly more than a right angle, so that border pixels are covered.
                     let pinhole = Camera::pinhole(MAP_PX as u32, MAP_PX as u32, 1.6);
                     let pose = Pose { rotation: world_from_camera.rotation * side, translation: world_from_camera.translation };
                     DepthMap::new(mesh, pinhole, &pose)
                 })
                 .into(),
         };
-        Sight { camera: *camera, camera_from_world: world_from_camera.inverse(), eye: world_from_camera.translation, maps }
+        CameraVisibility { camera: *camera, camera_from_world: world_from_camera.inverse(), eye: world_from_camera.translation, maps }
     }
 
-    /// Distance of a point that lies in the picture, whatever stands before it.
+    /// Distance of a point that projects into the image, whether or not it is occluded.
     pub fn distance(&self, p_in_world: [f32; 3]) -> Option<f64> {
         let p = DVec3::from(p_in_world.map(f64::from));
         let q = self.camera_from_world.point(p);
@@ -50,18 +51,18 @@ impl Sight {
         if !((0.0..=w).contains(&px.x) && (0.0..=h).contains(&px.y)) {
             return None;
         }
-        // Far beside the axis a lens's polynomial may turn back into the picture.
+        // Far from the axis, a lens polynomial may fold back into the image.
         let d = (p - self.eye).length();
         (self.camera.direction(px.x, px.y).dot(q / q.length().max(1e-300)) > 0.999).then_some(d)
     }
 
-    /// Whether a point is the first thing that the camera sees there, give or take `slack`.
+    /// Whether the camera sees a point, that is, no surface is nearer by more than `slack`.
     pub fn sees(&self, p_in_world: [f32; 3], slack: f32) -> bool {
         self.maps.iter().any(|m| m.sees(p_in_world, slack)) && self.distance(p_in_world).is_some()
     }
 }
 
-/// How far the picture reaches beside the axis at distance 1, with a small margin; none for wide lenses.
+/// Extent of the image beside the axis at distance 1, with a small margin; `None` for wide lenses.
 fn reach(camera: &Camera) -> Option<DVec2> {
     const STEPS: usize = 16;
     let (w, h) = (camera.width as f64, camera.height as f64);
@@ -79,7 +80,7 @@ fn reach(camera: &Camera) -> Option<DVec2> {
     Some(most * 1.03)
 }
 
-/// Turns that bring the axis to each side of a cube.
+/// Rotations that map the axis to each side of a cube.
 fn sides() -> [DMat3; 6] {
     use std::f64::consts::{FRAC_PI_2, PI};
     [
@@ -97,7 +98,7 @@ mod tests {
     use super::*;
     use diorama_geom::Lens;
 
-    /// A square across each of the six axes, at distance 2 from the origin, wound so that it faces the origin or not.
+    /// A square across each of the six axes, at distance 2 from the origin, facing the origin or not.
     fn squares() -> Mesh {
         let mut m = Mesh::default();
         for k in 0..3 {
@@ -116,7 +117,7 @@ mod tests {
 
     fn seen(camera: Camera) -> Vec<[f32; 3]> {
         let pose = Pose { rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
-        let sight = Sight::new(&squares(), &camera, &pose);
+        let sight = CameraVisibility::new(&squares(), &camera, &pose);
         let axes = (0..6).map(|i| {
             let mut p = [0.0; 3];
             p[i / 2] = if i % 2 == 0 { 2.0 } else { -2.0 };
@@ -129,7 +130,7 @@ mod tests {
     fn each_lens_sees_what_its_picture_reaches() {
         let lens = |lens, f: f64| Camera { fx: f, fy: f, lens, ..Camera::pinhole(200, 200, 1.0) };
         assert_eq!(seen(lens(Lens::Pinhole, 100.0)), [[0.0, 0.0, 2.0]]);
-        // 200 degrees: everything but what lies behind.
+        // 200 degrees: everything except what lies behind.
         let fisheye = Lens::Fisheye { k: [0.0; 4], p: [0.0; 2], s: [0.0; 2] };
         assert_eq!(seen(lens(fisheye, 100.0 / 100f64.to_radians())).len(), 5);
         assert_eq!(seen(lens(Lens::Equirectangular, 1.0)).len(), 6);
@@ -137,13 +138,13 @@ mod tests {
 
     #[test]
     fn a_lens_that_folds_back_does_not_see_what_lies_beside_it() {
-        // At 63 degrees from the axis the polynomial is back at the middle of the picture.
+        // At 63 degrees from the axis the polynomial has returned to the center of the image.
         let lens = Lens::Brown { k: [0.058, -0.08, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] };
         let camera = Camera { fx: 150.0, fy: 150.0, lens, ..Camera::pinhole(200, 200, 1.0) };
         let beside = [3.96, 0.0, 2.0];
         let q = DVec3::from(beside.map(f64::from));
-        assert!(camera.project(q).is_some_and(|px| (0.0..200.0).contains(&px.x)), "the case is none");
-        let sight = Sight::new(&squares(), &camera, &Pose { rotation: DMat3::IDENTITY, translation: DVec3::ZERO });
+        assert!(camera.project(q).is_some_and(|px| (0.0..200.0).contains(&px.x)), "the test case is invalid");
+        let sight = CameraVisibility::new(&squares(), &camera, &Pose { rotation: DMat3::IDENTITY, translation: DVec3::ZERO });
         assert!(sight.distance(beside).is_none() && !sight.sees(beside, 0.01));
         assert!(sight.sees([0.1, 0.1, 2.0], 0.01));
     }
@@ -153,7 +154,7 @@ mod tests {
         let mut m = squares();
         m.positions.iter_mut().filter(|p| p[2] == -2.0).for_each(|p| p[2] = 1.0);
         let pose = Pose { rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
-        let sight = Sight::new(&m, &Camera::pinhole(200, 200, 1.0), &pose);
+        let sight = CameraVisibility::new(&m, &Camera::pinhole(200, 200, 1.0), &pose);
         assert!(sight.sees([0.0, 0.0, 1.0], 0.01) && !sight.sees([0.0, 0.0, 2.0], 0.01));
         assert_eq!(sight.distance([0.0, 0.0, 2.0]), Some(2.0));
     }

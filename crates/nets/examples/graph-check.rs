@@ -22,7 +22,8 @@ fn check(name: &str) -> Result<bool, String> {
     if !gpu.shares_memory() {
         return Err(format!("device {name}: burn's own kernels share memory among units, which this device cannot"));
     }
-    let rows = diorama_nets::bridge::check::run(&gpu);
+    let mut rows = diorama_nets::bridge::check::run(&gpu);
+    rows.extend(diorama_nets::ops::check::run(&gpu));
     for row in &rows {
         if let Some(fault) = &row.fault {
             println!("WRONG {} {} ({}): {fault}", row.op, row.result, row.shape);

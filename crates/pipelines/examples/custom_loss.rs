@@ -93,7 +93,7 @@ fn train(photographs: &Photographs, cameras: &[PosedCamera], occupancy: &Occupan
         pixels::draw(photographs, &o, &mut batch);
         let RayBatch { origins, dirs, near_far, jitter, .. } = &batch;
         let rays = MarchRays { origins, dirs, near_far, jitter, resumed: false };
-        field.visible(&occupancy.bits, &rays, &march, pruning, &mut visible, &mut buffers);
+        field.visible(occupancy.bits(), &rays, &march, pruning, &mut visible, &mut buffers);
         let VisibleSamples { samples, positions, encoded } = &mut visible;
         let samples = Packed { offsets: &samples.offsets, t: &samples.t, dt: &samples.dt };
         let rays = Batch { samples, positions, dirs, images: None, given: &[], background, near_scaling: 0.0 };

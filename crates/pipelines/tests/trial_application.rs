@@ -72,11 +72,11 @@ fn field() -> Field {
 
 /// Where blocks are, which is known.
 fn occupancy() -> Occupancy {
-    let mut grid = Occupancy::new(GRID, 1, false);
+    let mut o = Occupancy::new(GRID, 1, false);
     let is_block = |i: usize| material(i % GRID, i / GRID % GRID, i / GRID / GRID).is_some();
-    grid.density.iter_mut().enumerate().for_each(|(i, d)| *d = if is_block(i) { 1e4 } else { 0.0 });
-    grid.refresh();
-    grid
+    o.grid.density.iter_mut().enumerate().for_each(|(i, d)| *d = if is_block(i) { 1e4 } else { 0.0 });
+    o.grid.refresh();
+    o
 }
 
 /// A patch of pixels of a camera that no photograph has.

@@ -12,7 +12,7 @@ pub enum Shape {
         center: DVec3,
         radius: f64,
     },
-    /// Axis-aligned, turned by `angle` about z through its centre.
+    /// Axis-aligned, then rotated by `angle` about z through its center.
     Box {
         center: DVec3,
         half: DVec3,
@@ -26,7 +26,7 @@ pub enum Shape {
     },
 }
 
-/// Procedural colour of a surface point, linear.
+/// Procedural linear color of a surface point.
 #[derive(Clone, Copy, Debug)]
 pub enum Texture {
     Checker {
@@ -64,13 +64,13 @@ pub struct Object {
     pub gloss: f64,
 }
 
-/// Objects under one sun.
+/// Objects lit by one sun.
 #[derive(Clone, Debug)]
 pub struct Scene {
     pub objects: Vec<Object>,
-    /// Unit direction towards the sun.
+    /// Unit direction toward the sun.
     pub sun: DVec3,
-    /// Light from everywhere else.
+    /// Ambient light.
     pub ambient: f64,
 }
 
@@ -143,11 +143,11 @@ impl Shape {
 }
 
 impl Texture {
-    /// Linear colour at a point of the surface.
+    /// Linear color at a point of the surface.
     pub fn color(&self, p: DVec3) -> DVec3 {
         let odd = |v: f64| v.floor() as i64 & 1 == 1;
         let pick = |a: DVec3, b: DVec3, first: bool| if first { a } else { b };
-        // The small shift keeps flat faces off the cells' borders.
+        // A small offset keeps flat faces away from cell borders.
         let p = p + DVec3::new(1.3e-3, 2.1e-3, 3.7e-3);
         match *self {
             Texture::Checker { a, b, size } => {
@@ -173,7 +173,7 @@ impl Scene {
         hits.min_by(|a, b| a.1.t.total_cmp(&b.1.t))
     }
 
-    /// Linear colour along a ray and the distance to what is hit.
+    /// Linear color along a ray, and the distance to the hit.
     pub fn trace(&self, ray: &Ray) -> Option<(DVec3, f64)> {
         let (object, hit) = self.nearest(ray, 1e-6)?;
         let p = ray.origin + ray.direction * hit.t;
@@ -189,7 +189,7 @@ impl Scene {
         Some((c, hit.t))
     }
 
-    /// RGBA as seen by a camera, `samples²` rays per pixel; transparent where nothing is hit.
+    /// RGBA image of a camera, with `samples²` rays per pixel; transparent where no object is hit.
     pub fn render(&self, camera: &Camera, world_from_camera: &Pose, samples: usize) -> ImageU8 {
         let (w, h) = (camera.width as usize, camera.height as usize);
         let mut data = vec![0u8; w * h * 4];
@@ -201,7 +201,7 @@ impl Scene {
                     let d = camera.direction(at(s % samples, x), at(s / samples, y));
                     let ray = Ray { origin: world_from_camera.translation, direction: world_from_camera.rotation * d };
                     if let Some((c, _)) = self.trace(&ray) {
-                        // Averaged as displayed, so that downscaled photographs and renders agree.
+                        // Averaged after the sRGB encoding, so that reduced photographs and renders agree.
                         sum += DVec3::from_array(c.to_array().map(|v| srgb_from_linear(v.clamp(0.0, 1.0) as f32) as f64));
                         hits += 1.0;
                     }

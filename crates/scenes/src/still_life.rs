@@ -1,4 +1,4 @@
-//! The quickstart's capture: a textured still life on a round table, photographed from two rings.
+//! The capture of `diorama quickstart`: a textured still life on a round table, photographed from two rings.
 
 use crate::ray_caster::{Object, Scene, Shape, Texture};
 use diorama_geom::glam::DVec3;
@@ -8,7 +8,7 @@ use rayon::prelude::*;
 /// Edge of the photographs in pixels.
 pub const SIZE: u32 = 160;
 
-/// Views on both rings together; every eighth is held out.
+/// Number of views on both rings together; every eighth is held out.
 pub const VIEWS: usize = 48;
 
 /// A photograph of the capture.
@@ -19,7 +19,7 @@ pub struct Photo {
     pub image: ImageU8,
 }
 
-/// The objects; all lie within the unit ball.
+/// The objects of the scene, all within the unit ball.
 pub fn scene() -> Scene {
     let rgb = DVec3::new;
     let objects = vec![
@@ -57,12 +57,12 @@ pub fn scene() -> Scene {
     Scene { objects, sun: rgb(0.4, -0.5, 0.77).normalize(), ambient: 0.45 }
 }
 
-/// The box that training is told.
+/// The scene box for training.
 pub fn scene_box() -> SceneBox {
     SceneBox { center: DVec3::ZERO, half: 1.0, aabb_scale: 1 }
 }
 
-/// Pose of view `i` of `views`, in turn on the lower and the upper ring.
+/// Pose of view `i` of `views`, alternating between the lower and the upper ring.
 pub fn pose(i: usize, views: usize) -> Pose {
     let (ring, k) = (i % 2, i / 2);
     let angle = (k as f64 + 0.5 * ring as f64) / views.div_ceil(2) as f64 * std::f64::consts::TAU;
@@ -74,7 +74,7 @@ pub fn pose(i: usize, views: usize) -> Pose {
 /// Horizontal field of view in radians.
 pub const FOV: f64 = 0.75;
 
-/// Renders `views` photographs of `size` pixels a side, exactly posed.
+/// Renders `views` photographs of `size × size` pixels with exact poses.
 pub fn photographs(views: usize, size: u32) -> Vec<Photo> {
     let scene = scene();
     let camera = Camera::pinhole(size, size, FOV);

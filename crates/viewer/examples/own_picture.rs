@@ -1,4 +1,4 @@
-//! A viewer for one's own picture: a painted ball with layers, a slider, a toggle and a list of its own.
+//! A viewer for your own pictures: a painted ball with its own layers, slider, toggle and list.
 //!
 //! `cargo run --release -p diorama-viewer --example own_picture` prints the address to open.
 
@@ -126,15 +126,15 @@ impl ViewSource for Ball {
     }
 
     fn save_crop(&self, _: Option<([f32; 3], [f32; 3])>) -> Result<(), String> {
-        Err("a ball keeps nothing".into())
+        Err("this example saves nothing".into())
     }
 
     fn save_measured(&self, _: Option<MeasuredLength>) -> Result<(), String> {
-        Err("a ball keeps nothing".into())
+        Err("this example saves nothing".into())
     }
 
     fn save_path(&self, _: &str) -> Result<PathBuf, String> {
-        Err("a ball keeps nothing".into())
+        Err("this example saves nothing".into())
     }
 
     fn open_path(&self, json: &str) -> Result<String, String> {
@@ -142,7 +142,7 @@ impl ViewSource for Ball {
     }
 
     fn export(&self, _: &MeshRequest, _: &mut dyn FnMut(&str, usize, usize)) -> Result<(PathBuf, f64), String> {
-        Err("a ball has no mesh".into())
+        Err("this example has no mesh".into())
     }
 }
 

@@ -1,14 +1,14 @@
-//! What page and program say to each other, defined here alone: `web/src/messages.ts` is made from this file.
+//! Messages between the page and the program. They are defined here only; `web/src/messages.ts` is generated from this file.
 //!
-//! Poses are `world_from_camera` as three rows of four; cameras look along +z with y down. Boxes are lowest and highest corner
+//! Poses are `world_from_camera` as three rows of four numbers; cameras look along +z with y down. Boxes are the lowest and highest corner
 //! in the world.
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-
+/// Lowest and highest corner of a box in the world.
 pub type Box6 = [f32; 6];
 
-/// A picture that the program can draw of a view.
+/// A kind of picture that the program can render of a view.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[cfg_attr(test, derive(ts_rs::TS))]
 pub struct Layer {
@@ -17,7 +17,7 @@ pub struct Layer {
     pub legend: Option<Legend>,
 }
 
-/// What the colors of a layer stand for. Colors are `#rrggbb`.
+/// Legend of a layer. Colors are `#rrggbb`.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[cfg_attr(test, derive(ts_rs::TS))]
 #[serde(tag = "kind", rename_all = "snake_case")]
@@ -26,7 +26,7 @@ pub enum Legend {
     Classes { classes: Vec<Class> },
 }
 
-/// A color and what it stands for.
+/// A color and its meaning.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[cfg_attr(test, derive(ts_rs::TS))]
 pub struct Class {
@@ -41,12 +41,12 @@ pub struct Control {
     pub id: String,
     pub label: String,
     pub help: String,
-    /// Layers that it changes; empty: all.
+    /// Ids of the layers that it changes; empty: all layers.
     pub layers: Vec<String>,
     pub input: Input,
 }
 
-/// What a control takes.
+/// Kind of a control, and the values that it accepts.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[cfg_attr(test, derive(ts_rs::TS))]
 #[serde(tag = "kind", rename_all = "snake_case")]
@@ -74,7 +74,7 @@ pub enum Value {
     Choice(String),
 }
 
-/// What the camera sees.
+/// A view to render.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(ts_rs::TS), derive(Serialize))]
 #[serde(deny_unknown_fields)]
@@ -84,45 +84,45 @@ pub struct View {
     pub fov_y: f64,
     pub pose: [f64; 12],
     pub layer: String,
-    /// Values of controls by their ids; those that are left out have their defaults.
+    /// Values of controls by id; controls that are left out have their defaults.
     pub values: BTreeMap<String, Value>,
     pub clip: Option<Box6>,
 }
 
-/// From the page.
+/// Messages from the page.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[cfg_attr(test, derive(ts_rs::TS), derive(Serialize))]
 #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
-pub enum Ask {
-    /// Draw a view; only the last one asked for counts. It is answered by a binary message: `id`, then a JPEG.
+pub enum ClientMessage {
+    /// Render a view; only the last request counts. The answer is a binary message: `id`, then a JPEG.
     View {
         id: u32,
         view: View,
     },
-    /// Which point of the world a pixel shows; answered by `Picked`.
+    /// Find the point of the world that a pixel shows; answered by `Picked`.
     Pick {
         x: f64,
         y: f64,
         view: View,
     },
-    /// Keep the true length in metres between two points of the world as the scale of meshes.
+    /// Save the true length in meters between two points of the world as the scale of meshes; `null` removes it.
     Measured {
         points: Option<[f64; 6]>,
         metres: f64,
     },
-    /// Answered by a binary message: 2³¹ plus the frame's number, then a JPEG.
+    /// Send a photograph's thumbnail. The answer is a binary message: 2³¹ plus the frame's index, then a JPEG.
     Thumbnail {
         frame: u32,
     },
-    /// Keep the crop box for `render` and `export`.
+    /// Save the crop box for `render` and `export`.
     Crop {
         clip: Option<Box6>,
     },
-    /// Keep a camera path, nerfstudio's JSON with cameras in the world; it can then be fetched as `camera_path.json`.
+    /// Save a camera path: nerfstudio's JSON with cameras in the world. It can then be fetched as `camera_path.json`.
     Path {
         json: String,
     },
-    /// Take over a camera path, nerfstudio's JSON as other programs write it; answered by `Path`.
+    /// Convert a camera path: nerfstudio's JSON as other programs write it; answered by `Path`.
     OpenPath {
         json: String,
     },
@@ -134,7 +134,7 @@ pub enum Ask {
     },
 }
 
-/// A camera that took a photograph.
+/// The camera of a photograph.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[cfg_attr(test, derive(ts_rs::TS))]
 pub struct Photograph {
@@ -176,32 +176,32 @@ pub struct Line {
     pub points: Vec<(f64, f64)>,
 }
 
-/// From the program.
+/// Messages from the program.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[cfg_attr(test, derive(ts_rs::TS))]
 #[serde(tag = "kind", rename_all = "snake_case")]
 #[allow(clippy::large_enum_variant, reason = "one message at a time")]
-pub enum Tell {
+pub enum ServerMessage {
     Scene {
         name: String,
         photographs: Vec<Photograph>,
         layers: Vec<Layer>,
         controls: Vec<Control>,
-        /// One line about what can be seen and what cannot; may be empty.
+        /// One line about what can be shown and what cannot; may be empty.
         note: String,
-        /// Whether boxes, lengths and paths can be kept and meshes made.
+        /// Whether boxes, lengths and paths can be saved and meshes exported.
         is_run: bool,
         focus: [f64; 3],
         distance: f64,
-        /// Rows of the similarity that takes meshes to the world.
+        /// Rows of the similarity from the capture's frame to the world.
         world_from_capture: Box<[f64; 12]>,
         bounds: [f64; 6],
         crop: Option<Box6>,
-        /// Two points of the world, and the metres between them.
+        /// Two points of the world, and the meters between them.
         measured: Option<Box<[f64; 7]>>,
         path: Option<String>,
     },
-    /// None where nothing is.
+    /// The answer to `Pick`; null if the pixel shows no surface.
     Picked {
         point: Option<[f64; 3]>,
     },
@@ -209,7 +209,7 @@ pub enum Tell {
         #[cfg_attr(test, ts(type = "number"))]
         step: u64,
         seconds: f64,
-        /// 0 to 1.
+        /// Completed share of the training, 0 to 1.
         progress: f64,
         running: bool,
         figures: Vec<Figure>,
@@ -218,7 +218,7 @@ pub enum Tell {
     History {
         charts: Vec<Chart>,
     },
-    /// Photographs, by their number, that the field shows through fog.
+    /// Indices of the photographs whose views are behind fog.
     Fog {
         frames: Vec<u32>,
     },
@@ -226,11 +226,11 @@ pub enum Tell {
         what: String,
         percent: u32,
     },
-    /// A mesh was made; `mesh.glb` can be fetched where it was a GLB.
+    /// A mesh was exported; if it is a GLB, it can be fetched as `mesh.glb`.
     Exported {
         file: String,
         glb: bool,
-        /// Metres of the mesh per unit of the capture.
+        /// Meters of the mesh per unit of the capture.
         scale: f64,
     },
     /// A camera path with cameras in the world.
@@ -243,7 +243,7 @@ pub enum Tell {
     },
     Failed {
         why: String,
-        /// The view that was not drawn, where it was one.
+        /// The id of the view that could not be rendered, if the failure concerns a view.
         view: Option<u32>,
     },
 }
@@ -259,7 +259,7 @@ mod tests {
         let c = Config::default();
         let of_views = [Layer::decl(&c), Legend::decl(&c), Class::decl(&c), Control::decl(&c), Input::decl(&c), Choice::decl(&c)];
         let of_training = [Figure::decl(&c), Line::decl(&c), Chart::decl(&c)];
-        let types = [Value::decl(&c), View::decl(&c), Ask::decl(&c), Photograph::decl(&c), Tell::decl(&c)];
+        let types = [Value::decl(&c), View::decl(&c), ClientMessage::decl(&c), Photograph::decl(&c), ServerMessage::decl(&c)];
         let types = of_views.into_iter().chain(of_training).chain(types);
         let text: String = types.map(|t| format!("export {t}\n")).collect();
         let text = format!("// Made from crates/viewer/src/messages.rs by its test; do not edit.\n\n{text}");
@@ -272,9 +272,9 @@ mod tests {
 
     #[test]
     fn unknown_kinds_and_fields_are_errors() {
-        assert!(serde_json::from_str::<Ask>(r#"{"kind":"thumbnail","frame":3}"#).is_ok());
+        assert!(serde_json::from_str::<ClientMessage>(r#"{"kind":"thumbnail","frame":3}"#).is_ok());
         for bad in [r#"{"kind":"shell"}"#, r#"{"kind":"thumbnail","frame":-1}"#, r#"{"kind":"thumbnail","frame":1,"path":"/etc"}"#, "[]"] {
-            assert!(serde_json::from_str::<Ask>(bad).is_err(), "{bad}");
+            assert!(serde_json::from_str::<ClientMessage>(bad).is_err(), "{bad}");
         }
     }
 }

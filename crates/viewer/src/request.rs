@@ -1,4 +1,4 @@
-//! The head of an HTTP request, and whether it may be answered.
+//! Parses the head of an HTTP request and decides whether to answer it.
 
 use std::io::Read;
 use std::net::TcpStream;
@@ -6,24 +6,24 @@ use std::net::TcpStream;
 /// Longest head that is read.
 const LONGEST: usize = 16 << 10;
 
-/// What is asked, as far as it matters here.
+/// The parts of a request that are used here.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Request {
     pub path: String,
     pub token: Option<String>,
     pub host: Option<String>,
     pub origin: Option<String>,
-    /// Key of a web socket's handshake.
+    /// Key of a WebSocket handshake.
     pub socket_key: Option<String>,
 }
 
-/// Files of the page that hold nothing of a run. Browsers ask for them without the token of the page's address.
+/// Files of the page that contain no data of a run. Browsers request them without the token.
 const WITHOUT_TOKEN: [&str; 3] = ["/app.js", "/app.css", "/favicon.ico"];
 
-/// Why a request is turned away: status and reason.
+/// Why a request is refused: status and reason.
 pub type Refusal = (u16, &'static str);
 
-/// Reads a head.
+/// Reads the head of a request.
 pub fn read(stream: &mut TcpStream) -> Result<Request, Refusal> {
     let mut data = Vec::new();
     let mut part = [0; 1024];
@@ -42,7 +42,7 @@ pub fn read(stream: &mut TcpStream) -> Result<Request, Refusal> {
     }
 }
 
-/// Parses a whole head.
+/// Parses the head of a request.
 pub fn parse(data: &[u8]) -> Result<Request, Refusal> {
     let mut headers = [httparse::EMPTY_HEADER; 64];
     let mut r = httparse::Request::new(&mut headers);
@@ -51,7 +51,7 @@ pub fn parse(data: &[u8]) -> Result<Request, Refusal> {
         _ => return Err((400, "the request cannot be read")),
     }
     if r.method != Some("GET") {
-        return Err((405, "only GET is answered"));
+        return Err((405, "only GET is supported"));
     }
     let target = r.path.unwrap_or("/");
     let (path, query) = target.split_once('?').unwrap_or((target, ""));
@@ -71,9 +71,9 @@ pub fn parse(data: &[u8]) -> Result<Request, Refusal> {
             }
             _ => continue,
         };
-        // Two of these are a trick.
+        // Duplicate headers are an attack.
         if slot.replace(value).is_some() {
-            return Err((400, "a header is there twice"));
+            return Err((400, "a header appears twice"));
         }
     }
     if !wants_socket {
@@ -82,15 +82,15 @@ pub fn parse(data: &[u8]) -> Result<Request, Refusal> {
     Ok(out)
 }
 
-/// Whether a request comes from the page that this server serves.
+/// Whether a request comes from the page of this server.
 pub fn admit(r: &Request, hosts: &[String], token: Option<&str>) -> Result<(), Refusal> {
-    // A name that resolves to this machine is not enough: pages elsewhere can arrange that.
+    // A host name that resolves to this machine is not sufficient (DNS rebinding).
     if !r.host.as_ref().is_some_and(|h| hosts.contains(h)) {
         return Err((403, "wrong Host: open the address that diorama printed"));
     }
     let from_here = |o: &String| o.strip_prefix("http://").is_some_and(|h| hosts.iter().any(|known| known == h));
     if r.origin.as_ref().is_some_and(|o| !from_here(o)) || (r.socket_key.is_some() && r.origin.is_none()) {
-        return Err((403, "wrong Origin: only diorama's own page may ask"));
+        return Err((403, "wrong Origin: only diorama's own page is allowed"));
     }
     match (token, &r.token) {
         (None, _) => Ok(()),
@@ -100,7 +100,7 @@ pub fn admit(r: &Request, hosts: &[String], token: Option<&str>) -> Result<(), R
     }
 }
 
-/// Equality in a time that tells nothing about where the first difference is.
+/// Compares in a time that does not reveal the position of the first difference.
 fn same(a: &[u8], b: &[u8]) -> bool {
     a.len() == b.len() && a.iter().zip(b).fold(0, |d, (a, b)| d | (a ^ b)) == 0
 }

@@ -1,15 +1,15 @@
-//! What a source can show, turned into messages, and values of controls turned back.
+//! Converts a source's scene, controls and history to and from messages.
 
-use crate::messages::{Chart, Choice, Class, Control, Figure, Input, Layer, Legend, Line, Photograph, Tell, Value};
+use crate::messages::{Chart, Choice, Class, Control, Figure, Input, Layer, Legend, Line, Photograph, ServerMessage, Value};
 use diorama_geom::view_controls::{self as geom, ControlInput, ControlValue, ControlValues, ViewControl, ViewLayer};
 use diorama_geom::view_source::{ViewChart, ViewLine, ViewScene, ViewStatus};
 use std::collections::BTreeMap;
 
-/// Values of a line that the page is told, about.
+/// Approximate number of values in a line sent to the page.
 const MOST_POINTS: usize = 400;
 
-/// The scene as the page is told of it.
-pub fn tell(s: &ViewScene) -> Tell {
+/// The message that describes a scene.
+pub fn message(s: &ViewScene) -> ServerMessage {
     let photographs = s.frames.iter().map(|f| {
         let (r, t, c) = (f.world_from_camera.rotation, f.world_from_camera.translation, f.camera);
         let row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]];
@@ -23,7 +23,7 @@ pub fn tell(s: &ViewScene) -> Tell {
     let rows: [f64; 12] = [row(0), row(1), row(2)].concat().try_into().expect("twelve");
     let world_from_capture = Box::new(rows);
     let (lo, hi) = s.bounds;
-    Tell::Scene {
+    ServerMessage::Scene {
         name: s.name.clone(),
         photographs: photographs.collect(),
         layers: s.layers.iter().map(layer).collect(),
@@ -68,32 +68,32 @@ fn control(c: &ViewControl) -> Control {
     Control { id: c.id.clone(), label: c.label.clone(), help: c.help.clone(), layers: c.layers.clone(), input }
 }
 
-/// How far training is, as the page is told of it. JSON has no infinity: figures that are not finite are left out.
-pub fn status(s: &ViewStatus) -> Tell {
+/// The message with the progress of training. JSON has no infinity: figures that are not finite are left out.
+pub fn status(s: &ViewStatus) -> ServerMessage {
     let finite = |v: f64| if v.is_finite() { v } else { 0.0 };
     let figures = s.figures.iter().filter(|f| f.value.is_finite());
     let figures = figures.map(|f| Figure { id: f.id.clone(), label: f.label.clone(), value: f.value, text: f.text.clone() }).collect();
-    Tell::Status { step: s.step, seconds: finite(s.seconds), progress: finite(s.progress), running: s.running, figures }
+    ServerMessage::Status { step: s.step, seconds: finite(s.seconds), progress: finite(s.progress), running: s.running, figures }
 }
 
-/// Charts as the page is told of them.
-pub fn history(charts: &[ViewChart]) -> Tell {
+/// The message with the charts.
+pub fn history(charts: &[ViewChart]) -> ServerMessage {
     let chart = |c: &ViewChart| Chart { label: c.label.clone(), unit: c.unit.clone(), lines: c.lines.iter().map(line).collect() };
-    Tell::History { charts: charts.iter().map(chart).collect() }
+    ServerMessage::History { charts: charts.iter().map(chart).collect() }
 }
 
-/// Of many values every n-th and the last.
+/// Every n-th value and the last, if there are many.
 fn line(l: &ViewLine) -> Line {
     let nth = l.points.len().div_ceil(MOST_POINTS).max(1);
-    let told = l.points.iter().enumerate().filter(|(i, p)| p.1.is_finite() && (i % nth == 0 || i + 1 == l.points.len()));
-    let points = told.map(|(_, p)| (p.0 as f64, p.1)).collect();
+    let sent = l.points.iter().enumerate().filter(|(i, p)| p.1.is_finite() && (i % nth == 0 || i + 1 == l.points.len()));
+    let points = sent.map(|(_, p)| (p.0 as f64, p.1)).collect();
     Line { figure: l.figure.clone(), label: l.label.clone(), held_out: l.held_out, points }
 }
 
-/// Values that a page gives, checked against the source's controls.
+/// Checks control values from a page against the source's controls.
 ///
 /// # Errors
-/// One line, when there is no such control or it does not take its value.
+/// One line, if there is no such control or it does not accept its value.
 pub fn values(controls: &[ViewControl], given: BTreeMap<String, Value>) -> Result<ControlValues, String> {
     let value = |v| match v {
         Value::Number(v) => ControlValue::Number(v),
@@ -103,7 +103,7 @@ pub fn values(controls: &[ViewControl], given: BTreeMap<String, Value>) -> Resul
     ControlValues::checked(controls, given.into_iter().map(|(id, v)| (id, value(v))))
 }
 
-/// A scene of one layer, for tests and fuzzing.
+/// A scene with one layer, for tests and fuzzing.
 pub fn with_layer(id: &str) -> ViewScene {
     ViewScene {
         name: String::new(),
@@ -132,7 +132,7 @@ mod tests {
         let line = |points| ViewLine { figure: "accuracy".into(), label: "training".into(), held_out: false, points };
         let told = |points| {
             let chart = ViewChart { label: "Accuracy".into(), unit: String::new(), lines: vec![line(points)] };
-            let Tell::History { mut charts } = history(&[chart]) else { panic!("no charts") };
+            let ServerMessage::History { mut charts } = history(&[chart]) else { panic!("no charts") };
             charts.remove(0).lines.remove(0).points
         };
         let long = told((0..4000).map(|i| (i, i as f64)).collect());
@@ -140,6 +140,6 @@ mod tests {
         assert_eq!(told(vec![(1, f64::INFINITY), (2, 3.0)]), [(2.0, 3.0)]);
         let figure = |value| ViewFigure { id: "accuracy".into(), label: "Accuracy".into(), value, text: value.to_string() };
         let s = ViewStatus { figures: vec![figure(0.5), figure(f64::NAN)], ..ViewStatus::default() };
-        assert!(matches!(status(&s), Tell::Status { figures, .. } if figures.len() == 1 && figures[0].text == "0.5"));
+        assert!(matches!(status(&s), ServerMessage::Status { figures, .. } if figures.len() == 1 && figures[0].text == "0.5"));
     }
 }

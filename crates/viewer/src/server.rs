@@ -1,4 +1,4 @@
-//! Accepting connections: the page's few files, and the socket.
+//! The HTTP server: accepts connections, serves the page's files and the socket.
 
 use crate::request::{self, Request};
 use crate::session;
@@ -11,20 +11,20 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-/// Connections that are served at a time.
+/// Most connections at a time.
 const MOST: usize = 32;
-/// How long a client may take to send its request or to take an answer.
-const PATIENCE: Duration = Duration::from_secs(10);
+/// Time limit for reading a request and for writing an answer.
+const TIME_LIMIT: Duration = Duration::from_secs(10);
 
 const PAGE: &str = include_str!("../web/dist/index.html");
 const SCRIPT: &str = include_str!("../web/dist/app.js");
 const STYLE: &str = include_str!("../web/dist/app.css");
 
-/// Where to listen.
+/// Address to listen on.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ViewerOptions {
     pub host: IpAddr,
-    /// 0: any that is free.
+    /// 0: any free port.
     pub port: u16,
 }
 
@@ -34,7 +34,7 @@ impl Default for ViewerOptions {
     }
 }
 
-/// Why there is no viewer.
+/// Reasons why the viewer cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum ViewerError {
     #[error("--port {0}: is in use; choose another, or 0 for any")]
@@ -43,17 +43,17 @@ pub enum ViewerError {
     Listen(SocketAddr, std::io::Error),
 }
 
-/// A bound, not yet serving viewer.
+/// A bound viewer that does not serve yet.
 pub struct Server {
     listener: TcpListener,
     shared: Arc<Shared>,
 }
 
 impl Server {
-    /// Binds. Anywhere but on the loopback address a token is needed, which is part of [`Server::address`].
+    /// Binds the address. Except on the loopback address, a token is required, which is part of [`Server::address`].
     ///
     /// # Errors
-    /// When the port is taken or the address is not this machine's.
+    /// If the port is in use or the address does not belong to this machine.
     pub fn bind(options: &ViewerOptions, source: Arc<dyn ViewSource>) -> Result<Server, ViewerError> {
         let wanted = SocketAddr::new(options.host, options.port);
         let listener = TcpListener::bind(wanted).map_err(|e| match e.kind() {
@@ -67,7 +67,7 @@ impl Server {
         if options.host.is_loopback() {
             hosts.push(format!("localhost:{}", at.port()));
         } else if options.host.is_unspecified() {
-            // Whatever address of this machine was typed; the token keeps others out.
+            // Any address of this machine is accepted; the token keeps others out.
             hosts.extend(own_addresses().into_iter().map(|ip| SocketAddr::new(ip, at.port()).to_string()));
         }
         let token = (!options.host.is_loopback()).then(random_token);
@@ -75,7 +75,7 @@ impl Server {
         Ok(Server { listener, shared: Arc::new(shared) })
     }
 
-    /// What to open in a browser.
+    /// The address to open in a browser.
     pub fn address(&self) -> String {
         let host = self.shared.hosts.last().filter(|_| self.shared.token.is_some()).unwrap_or(&self.shared.hosts[0]);
         match &self.shared.token {
@@ -106,10 +106,10 @@ impl Server {
     }
 }
 
-/// Addresses under which this machine is reached: that of the route outward, and the loopback's.
+/// Addresses of this machine: that of its default route, and the loopback addresses.
 fn own_addresses() -> Vec<IpAddr> {
     let outward = std::net::UdpSocket::bind("0.0.0.0:0").and_then(|s| {
-        // Nothing is sent: this asks the routing table.
+        // Nothing is sent: connecting a UDP socket only queries the routing table.
         s.connect("192.0.2.1:9")?;
         s.local_addr()
     });
@@ -125,8 +125,8 @@ fn random_token() -> String {
 
 fn serve(mut stream: TcpStream, shared: &Arc<Shared>) -> std::io::Result<()> {
     stream.set_nonblocking(false)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
-    stream.set_write_timeout(Some(PATIENCE))?;
+    stream.set_read_timeout(Some(TIME_LIMIT))?;
+    stream.set_write_timeout(Some(TIME_LIMIT))?;
     stream.set_nodelay(true)?;
     let admitted = request::read(&mut stream).and_then(|r| {
         request::admit(&r, &shared.hosts, shared.token.as_deref())?;
@@ -155,16 +155,16 @@ fn file(stream: &mut TcpStream, path: &str, shared: &Shared) -> std::io::Result<
         "/favicon.ico" => answer(stream, 204, "image/x-icon", b""),
         "/mesh.glb" => made(stream, &shared.mesh, "model/gltf-binary"),
         "/camera_path.json" => made(stream, &shared.path, "application/json"),
-        _ => answer(stream, 404, "text/plain; charset=utf-8", b"there is no such page"),
+        _ => answer(stream, 404, "text/plain; charset=utf-8", b"no such page"),
     }
 }
 
-/// Answers with a file that a session made.
+/// Answers with a file that a session wrote.
 fn made(stream: &mut TcpStream, file: &Mutex<Option<PathBuf>>, kind: &str) -> std::io::Result<()> {
     let file = file.lock().ok().and_then(|f| f.clone());
     match file.map(std::fs::read) {
         Some(Ok(bytes)) => answer(stream, 200, kind, &bytes),
-        _ => answer(stream, 404, "text/plain; charset=utf-8", b"it has not been made yet"),
+        _ => answer(stream, 404, "text/plain; charset=utf-8", b"the file does not exist yet"),
     }
 }
 

@@ -1,6 +1,6 @@
-//! One browser's socket: the last view asked for is drawn, meshes are made beside it.
+//! One page's socket: renders the last requested view; meshes are exported on another thread.
 
-use crate::messages::{Ask, Box6, Tell, View};
+use crate::messages::{Box6, ClientMessage, ServerMessage, View};
 use crate::scene;
 use crate::shared::Shared;
 use diorama_geom::view_controls::check_lists;
@@ -19,59 +19,59 @@ use tungstenite::{Bytes, Error, Message};
 const LONGEST: usize = 4 << 20;
 /// Largest view, in pixels.
 const LARGEST: u32 = 4096 * 2304;
-/// How long the socket is listened to before there is other work.
-const GLANCE: Duration = Duration::from_millis(4);
-/// How often training is asked how far it is.
-const NEWS: Duration = Duration::from_millis(500);
+/// Time limit for reading from the socket before other work continues.
+const READ_TIMEOUT: Duration = Duration::from_millis(4);
+/// Interval of status messages.
+const STATUS_INTERVAL: Duration = Duration::from_millis(500);
 const THUMBNAIL: u32 = 1 << 31;
 
 struct Session<'a> {
     socket: WebSocket<TcpStream>,
     shared: &'a Arc<Shared>,
-    /// What the page was told that there is.
+    /// The scene that was sent to the page.
     scene: ViewScene,
-    /// What other threads have to tell the page.
-    tell: Sender<Tell>,
-    told: Receiver<Tell>,
+    /// Messages from other threads to the page.
+    outbox: Sender<ServerMessage>,
+    inbox: Receiver<ServerMessage>,
     view: Option<(u32, ViewRequest)>,
     exporting: Arc<AtomicBool>,
 }
 
 /// Serves a socket until it closes.
 pub fn run(stream: TcpStream, shared: &Arc<Shared>) {
-    if stream.set_read_timeout(Some(GLANCE)).is_err() {
+    if stream.set_read_timeout(Some(READ_TIMEOUT)).is_err() {
         return;
     }
     let config = WebSocketConfig::default().max_message_size(Some(LONGEST)).max_frame_size(Some(LONGEST));
     let socket = WebSocket::from_raw_socket(stream, Role::Server, Some(config));
-    let (tell, told) = channel();
-    let mut s = Session { socket, shared, scene: shared.source.scene(), tell, told, view: None, exporting: Arc::default() };
-    // Errors mean that the page is gone or misbehaves: both end the session.
-    let _ = s.talk();
+    let (outbox, inbox) = channel();
+    let mut s = Session { socket, shared, scene: shared.source.scene(), outbox, inbox, view: None, exporting: Arc::default() };
+    // Errors mean that the page is closed or misbehaves; both end the session.
+    let _ = s.serve();
     let _ = s.socket.close(None);
 }
 
 impl Session<'_> {
-    fn talk(&mut self) -> Result<(), Error> {
+    fn serve(&mut self) -> Result<(), Error> {
         if let Err(why) = check_lists(&self.scene.layers, &self.scene.controls) {
             return self.fail(why);
         }
-        self.send(&scene::tell(&self.scene))?;
+        self.send(&scene::message(&self.scene))?;
         let (mut last, mut foggy) = (self.shared.source.status(), Vec::new());
         self.send(&scene::history(&self.shared.source.charts()))?;
         self.send(&scene::status(&last))?;
-        let mut news = Instant::now() - NEWS;
+        let mut last_status = Instant::now() - STATUS_INTERVAL;
         while !self.shared.stop.load(Ordering::Relaxed) {
             self.listen()?;
-            while let Ok(t) = self.told.try_recv() {
+            while let Ok(t) = self.inbox.try_recv() {
                 self.send(&t)?;
             }
-            if news.elapsed() >= NEWS {
-                news = Instant::now();
+            if last_status.elapsed() >= STATUS_INTERVAL {
+                last_status = Instant::now();
                 let s = self.shared.source.status();
                 if last != s {
                     let ids = |s: &ViewStatus| s.figures.iter().map(|f| f.id.clone()).collect::<Vec<_>>();
-                    // What is told of for the first time has a history, too.
+                    // A new figure has a line of its own in the charts.
                     if ids(&last) != ids(&s) {
                         self.send(&scene::history(&self.shared.source.charts()))?;
                     }
@@ -80,34 +80,34 @@ impl Session<'_> {
                 }
                 let fog = self.shared.source.behind_fog();
                 if fog != foggy {
-                    self.send(&Tell::Fog { frames: fog.iter().map(|f| *f as u32).collect() })?;
+                    self.send(&ServerMessage::Fog { frames: fog.iter().map(|f| *f as u32).collect() })?;
                     foggy = fog;
                 }
             }
             if let Some((id, request)) = self.view.take() {
                 match self.shared.source.view(&request) {
                     Ok(image) => self.picture(id, &image, 85)?,
-                    Err(why) => self.send(&Tell::Failed { why, view: Some(id) })?,
+                    Err(why) => self.send(&ServerMessage::Failed { why, view: Some(id) })?,
                 }
             }
         }
         Ok(())
     }
 
-    fn send(&mut self, tell: &Tell) -> Result<(), Error> {
-        self.socket.send(Message::text(serde_json::to_string(tell).expect("plain values")))
+    fn send(&mut self, message: &ServerMessage) -> Result<(), Error> {
+        self.socket.send(Message::text(serde_json::to_string(message).expect("plain values")))
     }
 
     fn fail(&mut self, why: impl Into<String>) -> Result<(), Error> {
-        self.send(&Tell::Failed { why: why.into(), view: None })
+        self.send(&ServerMessage::Failed { why: why.into(), view: None })
     }
 
-    /// Takes all messages that have arrived.
+    /// Handles all messages that have arrived.
     fn listen(&mut self) -> Result<(), Error> {
         loop {
             match self.socket.read() {
                 Ok(Message::Text(text)) => match serde_json::from_str(&text) {
-                    Ok(ask) => self.hear(ask)?,
+                    Ok(message) => self.handle(message)?,
                     Err(e) => self.fail(format!("the page sent a message that cannot be read: {e}"))?,
                 },
                 Ok(Message::Close(_)) => return Err(Error::ConnectionClosed),
@@ -118,53 +118,53 @@ impl Session<'_> {
         }
     }
 
-    fn hear(&mut self, ask: Ask) -> Result<(), Error> {
+    fn handle(&mut self, message: ClientMessage) -> Result<(), Error> {
         let source = self.shared.source.clone();
-        match ask {
-            Ask::View { id, view } => match view_request(&self.scene, view) {
+        match message {
+            ClientMessage::View { id, view } => match view_request(&self.scene, view) {
                 Ok(r) => self.view = Some((id, r)),
-                Err(why) => self.send(&Tell::Failed { why, view: Some(id) })?,
+                Err(why) => self.send(&ServerMessage::Failed { why, view: Some(id) })?,
             },
-            Ask::Pick { x, y, view } => {
+            ClientMessage::Pick { x, y, view } => {
                 let inside = (0.0..view.width as f64).contains(&x) && (0.0..view.height as f64).contains(&y);
                 match view_request(&self.scene, view) {
-                    Ok(r) if inside => self.send(&Tell::Picked { point: source.point(&r, x, y) })?,
-                    Ok(_) => self.fail("the point asked for lies outside the view")?,
+                    Ok(r) if inside => self.send(&ServerMessage::Picked { point: source.point(&r, x, y) })?,
+                    Ok(_) => self.fail("the requested point lies outside the view")?,
                     Err(why) => self.fail(why)?,
                 }
             }
-            Ask::Measured { points, metres } => match measured(points, metres) {
-                Err(()) => self.fail("a measured length needs two points that differ, and a length above 0")?,
+            ClientMessage::Measured { points, metres } => match measured(points, metres) {
+                Err(()) => self.fail("a measured length needs two different points and a length above 0")?,
                 Ok(m) => match source.save_measured(m) {
-                    Ok(()) => self.send(&Tell::Saved { what: "scale".into(), file: "scale.json".into() })?,
+                    Ok(()) => self.send(&ServerMessage::Saved { what: "scale".into(), file: "scale.json".into() })?,
                     Err(e) => self.fail(e)?,
                 },
             },
-            Ask::Thumbnail { frame } => match source.thumbnail(frame as usize) {
+            ClientMessage::Thumbnail { frame } => match source.thumbnail(frame as usize) {
                 Ok(image) => self.picture(THUMBNAIL | frame, &image, 75)?,
                 Err(e) => self.fail(e)?,
             },
-            Ask::Crop { clip } => match corners(clip) {
+            ClientMessage::Crop { clip } => match corners(clip) {
                 Err(()) => self.fail("the crop box is empty")?,
                 Ok(c) => match source.save_crop(c) {
-                    Ok(()) => self.send(&Tell::Saved { what: "crop box".into(), file: "crop.json".into() })?,
+                    Ok(()) => self.send(&ServerMessage::Saved { what: "crop box".into(), file: "crop.json".into() })?,
                     Err(e) => self.fail(e)?,
                 },
             },
-            Ask::Path { json } => match source.save_path(&json) {
+            ClientMessage::Path { json } => match source.save_path(&json) {
                 Ok(f) => {
-                    self.send(&Tell::Saved { what: "camera path".into(), file: f.display().to_string() })?;
+                    self.send(&ServerMessage::Saved { what: "camera path".into(), file: f.display().to_string() })?;
                     if let Ok(mut p) = self.shared.path.lock() {
                         *p = Some(f);
                     }
                 }
                 Err(e) => self.fail(e)?,
             },
-            Ask::OpenPath { json } => match source.open_path(&json) {
-                Ok(json) => self.send(&Tell::Path { json })?,
+            ClientMessage::OpenPath { json } => match source.open_path(&json) {
+                Ok(json) => self.send(&ServerMessage::Path { json })?,
                 Err(e) => self.fail(e)?,
             },
-            Ask::Export { format, faces, resolution, clip } => match corners(clip) {
+            ClientMessage::Export { format, faces, resolution, clip } => match corners(clip) {
                 Ok(clip) => self.export(MeshRequest { format, faces: faces as usize, resolution: resolution as usize, clip })?,
                 Err(()) => self.fail("the crop box is empty")?,
             },
@@ -172,30 +172,30 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Makes a mesh on a thread of its own.
+    /// Exports a mesh on its own thread.
     fn export(&mut self, request: MeshRequest) -> Result<(), Error> {
         if self.exporting.swap(true, Ordering::Relaxed) {
-            return self.fail("a mesh is being made already");
+            return self.fail("another mesh is still being exported");
         }
-        let (shared, tell, busy) = (self.shared.clone(), self.tell.clone(), self.exporting.clone());
+        let (shared, outbox, busy) = (self.shared.clone(), self.outbox.clone(), self.exporting.clone());
         std::thread::spawn(move || {
             let mut last = Instant::now();
             let made = shared.source.export(&request, &mut |what, i, n| {
                 if last.elapsed() > Duration::from_millis(200) {
                     last = Instant::now();
-                    let _ = tell.send(Tell::Working { what: what.into(), percent: (100 * i / n.max(1)) as u32 });
+                    let _ = outbox.send(ServerMessage::Working { what: what.into(), percent: (100 * i / n.max(1)) as u32 });
                 }
             });
             busy.store(false, Ordering::Relaxed);
-            let _ = tell.send(match made {
+            let _ = outbox.send(match made {
                 Ok((file, scale)) => {
                     let glb = file.extension().is_some_and(|e| e == "glb");
                     if glb && let Ok(mut m) = shared.mesh.lock() {
                         *m = Some(file.clone());
                     }
-                    Tell::Exported { file: file.display().to_string(), glb, scale }
+                    ServerMessage::Exported { file: file.display().to_string(), glb, scale }
                 }
-                Err(why) => Tell::Failed { why, view: None },
+                Err(why) => ServerMessage::Failed { why, view: None },
             });
         });
         Ok(())
@@ -217,7 +217,7 @@ impl Session<'_> {
     }
 }
 
-/// A length that can be one, or none to forget.
+/// Validates a measured length; `None` removes it.
 fn measured(points: Option<[f64; 6]>, metres: f64) -> Result<Option<MeasuredLength>, ()> {
     let Some([a, b, c, d, e, f]) = points else { return Ok(None) };
     let points = [[a, b, c], [d, e, f]];
@@ -225,7 +225,7 @@ fn measured(points: Option<[f64; 6]>, metres: f64) -> Result<Option<MeasuredLeng
     if sound { Ok(Some(MeasuredLength { points, metres })) } else { Err(()) }
 }
 
-/// Corners of a box that holds something.
+/// Corners of a nonempty box.
 fn corners(b: Option<Box6>) -> Result<Option<([f32; 3], [f32; 3])>, ()> {
     match b {
         None => Ok(None),
@@ -234,9 +234,9 @@ fn corners(b: Option<Box6>) -> Result<Option<([f32; 3], [f32; 3])>, ()> {
     }
 }
 
-/// The view that a page asks for, if it makes sense and is of a layer and with values that the scene lists.
+/// Validates a requested view against the scene's layers and controls.
 fn view_request(scene: &ViewScene, v: View) -> Result<ViewRequest, String> {
-    let senseless = || "the view asked for makes no sense".to_string();
+    let senseless = || "the requested view is invalid".to_string();
     let View { width, height, fov_y, pose, layer, values, clip } = v;
     let clip = corners(clip).map_err(|()| "the crop box is empty")?;
     if width < 1 || height < 1 || width.checked_mul(height).ok_or_else(senseless)? > LARGEST || !(0.01..3.1).contains(&fov_y) {
@@ -256,9 +256,9 @@ fn view_request(scene: &ViewScene, v: View) -> Result<ViewRequest, String> {
     Ok(ViewRequest { camera, world_from_camera, layer, values, clip })
 }
 
-/// Reads a message as a session would.
+/// Parses a message as a session does.
 pub fn fuzz(text: &[u8]) {
-    if let Ok(Ask::View { view, .. }) = serde_json::from_slice(text)
+    if let Ok(ClientMessage::View { view, .. }) = serde_json::from_slice(text)
         && let Ok(r) = view_request(&scene::with_layer(&view.layer), view)
     {
         assert!(r.camera.width * r.camera.height <= LARGEST && r.camera.fx.is_finite());

@@ -5,14 +5,14 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicUsize};
 use std::sync::{Arc, Mutex};
 
-/// Shared by the server and its sessions.
+/// State shared by the server and its sessions.
 pub struct Shared {
-    /// Values of the Host header that are admitted.
+    /// Accepted values of the Host header.
     pub hosts: Vec<String>,
-    /// Part of the address wherever other machines can reach the server.
+    /// Token in the address; required if other machines can reach the server.
     pub token: Option<String>,
     pub source: Arc<dyn ViewSource>,
-    /// The last mesh made, where it is a GLB.
+    /// The last exported mesh, if it is a GLB.
     pub mesh: Mutex<Option<PathBuf>>,
     /// The last camera path saved.
     pub path: Mutex<Option<PathBuf>>,

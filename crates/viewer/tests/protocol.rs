@@ -1,4 +1,4 @@
-//! The socket of a stand-in source, driven as the page drives it: layers and controls that no other source has are listed, drawn and changed.
+//! Tests the socket as the page uses it, with a source that has its own layers and controls.
 
 #[allow(dead_code)]
 #[path = "../examples/own_picture.rs"]
@@ -82,8 +82,8 @@ impl Page {
         Page(tungstenite::client(request, TcpStream::connect(host).unwrap()).unwrap().0)
     }
 
-    /// The next message of this kind.
-    fn told(&mut self, kind: &str) -> Value {
+    /// The next message of the given kind.
+    fn next(&mut self, kind: &str) -> Value {
         loop {
             if let Message::Text(t) = self.0.read().unwrap() {
                 let v: Value = serde_json::from_str(&t).unwrap();
@@ -94,7 +94,7 @@ impl Page {
         }
     }
 
-    fn ask(&mut self, layer: &str, values: Value) {
+    fn request(&mut self, layer: &str, values: Value) {
         // From (0, -4, 0) along +y: x to the right, y down the picture is -z.
         let pose = [1, 0, 0, 0, 0, 0, 1, -4, 0, -1, 0, 0];
         let view = json!({ "width": 64, "height": 64, "fov_y": 0.7, "pose": pose, "layer": layer, "values": values, "clip": null });
@@ -104,7 +104,7 @@ impl Page {
 
     /// Mean color of a view's middle rows.
     fn view(&mut self, layer: &str, values: Value) -> [f64; 3] {
-        self.ask(layer, values);
+        self.request(layer, values);
         loop {
             match self.0.read().unwrap() {
                 Message::Binary(b) => {
@@ -134,7 +134,7 @@ fn a_source_shows_layers_and_controls_of_its_own() {
     });
     let mut page = Page::open(&address);
 
-    let scene = page.told("scene");
+    let scene = page.next("scene");
     let layers: Vec<&str> = scene["layers"].as_array().unwrap().iter().map(|l| l["id"].as_str().unwrap()).collect();
     assert_eq!(layers, ["shaded", "albedo", "height"]);
     assert_eq!(scene["layers"][1]["legend"]["classes"][0], json!({ "label": "warm paint", "color": "#e07a3f" }));
@@ -148,7 +148,7 @@ fn a_source_shows_layers_and_controls_of_its_own() {
     assert!(differ(striped, page.view("shaded", json!({}))), "another layer is another picture");
     assert_eq!(striped, page.view("albedo", json!({ "pattern": "stripes" })), "values that are left out have their defaults");
     assert!(differ(striped, page.view("albedo", json!({ "pattern": "plain" }))), "a pick changes the picture");
-    assert_eq!(striped, page.view("albedo", json!({ "sun": 80 })), "albedo knows no sun");
+    assert_eq!(striped, page.view("albedo", json!({ "sun": 80 })), "albedo does not depend on the sun");
     assert!(differ(page.view("shaded", json!({ "sun": 80 })), page.view("shaded", json!({ "sun": 10 }))), "a slider changes the picture");
     assert!(differ(striped, page.view("albedo", json!({ "sky": true }))), "a toggle changes the picture");
 
@@ -158,8 +158,8 @@ fn a_source_shows_layers_and_controls_of_its_own() {
         ("shaded", json!({ "sun": 91 }), "control \"sun\" does not take Number(91.0)"),
         ("albedo", json!({ "pattern": "dots" }), "control \"pattern\" does not take Choice(\"dots\")"),
     ] {
-        page.ask(layer, values);
-        let failed = page.told("failed");
+        page.request(layer, values);
+        let failed = page.next("failed");
         assert_eq!((failed["why"].as_str(), failed["view"].as_u64()), (Some(why), Some(7)));
     }
     end.store(true, Ordering::Relaxed);
@@ -177,14 +177,14 @@ fn a_source_shows_figures_and_charts_of_its_own() {
     });
     let mut page = Page::open(&address);
     let training = json!({ "figure": "accuracy", "label": "ACCURACY", "held_out": false, "points": [[1.0, 60.0], [3.0, 71.0]] });
-    assert_eq!(page.told("history")["charts"], json!([{ "label": "Accuracy", "unit": "%", "lines": [training] }]));
+    assert_eq!(page.next("history")["charts"], json!([{ "label": "Accuracy", "unit": "%", "lines": [training] }]));
     let accuracy = json!({ "id": "accuracy", "label": "ACCURACY", "value": 71.0, "text": "71 %" });
-    let status = page.told("status");
+    let status = page.next("status");
     assert_eq!((&status["figures"], &status["step"], &status["running"]), (&json!([accuracy]), &json!(3), &json!(true)));
     // A figure that comes later brings its line with it.
     source.0.store(true, Ordering::Relaxed);
-    assert_eq!(page.told("history")["charts"][0]["lines"][1]["held_out"], json!(true));
-    assert_eq!(page.told("status")["figures"][1]["text"], "64 %");
+    assert_eq!(page.next("history")["charts"][0]["lines"][1]["held_out"], json!(true));
+    assert_eq!(page.next("status")["figures"][1]["text"], "64 %");
     end.store(true, Ordering::Relaxed);
     serving.join().unwrap();
 }

@@ -1,27 +1,27 @@
-//! Arrows between modules: none between applications, none from what they share to one of them, and no circles inside a crate.
+//! Dependencies between modules: none between applications, none from shared code to an application, and no circles inside a crate.
 
 use super::source::{code, paths, without_tests};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// The applications, as modules of `pipelines`.
 const APPLICATIONS: [&str; 5] = ["object", "text", "world", "head", "relight"];
-/// What all of them share, which knows none.
+/// The module that all applications share; it depends on none of them.
 const SHARED: &str = "run";
 
-/// Arrows that close a circle today: (crate, module from, module to). One that is gone leaves the list.
+/// Dependencies that close a circle today: (crate, from module, to module). One that no longer exists must be removed.
 const CIRCLES: [(&str, &str, &str); 0] = [];
 
-/// A source of a crate.
+/// A source file of a crate.
 pub struct Source {
     /// Path of the module from the crate's root; empty for the root itself.
     module: Vec<String>,
-    /// Paths that it names, from the crate's root, with the number of their line.
+    /// Paths that it names, from the crate's root, with their line numbers.
     names: Vec<(usize, Vec<String>)>,
     file: String,
 }
 
 impl Source {
-    /// The module of a file such as `crates/geom/src/a/b.rs`, without its tests; none of files that are no modules.
+    /// The module of a file such as `crates/geom/src/a/b.rs`, without its tests; `None` for files that are not modules.
     pub fn of(file: &str, text: &str) -> Option<(String, Source)> {
         let (krate, inner) = file.strip_prefix("crates/").unwrap_or(file).split_once("/src/")?;
         let module: Vec<String> = inner.strip_suffix(".rs")?.split('/').map(String::from).collect();
@@ -37,7 +37,7 @@ impl Source {
     }
 }
 
-/// A path from the crate's root; none where `super` leads out of the crate.
+/// Resolves a path from the crate's root; `None` if `super` leads out of the crate.
 fn absolute(module: &[String], path: &[String]) -> Option<Vec<String>> {
     let mut at: Vec<String> = if path[0] == "crate" { Vec::new() } else { module.to_vec() };
     for part in path {
@@ -50,7 +50,7 @@ fn absolute(module: &[String], path: &[String]) -> Option<Vec<String>> {
     Some(at)
 }
 
-/// Breaches of a crate by its name.
+/// Violations in a crate, given by its name.
 pub fn check(krate: &str, sources: &[Source], breaches: &mut Vec<String>) {
     if krate == "pipelines" {
         applications(sources, breaches);
@@ -63,16 +63,16 @@ fn applications(sources: &[Source], breaches: &mut Vec<String>) {
         let Some(from) = s.module.first().filter(|m| APPLICATIONS.contains(&m.as_str()) || *m == SHARED) else { continue };
         for (line, to) in s.names.iter().filter_map(|(line, p)| Some((line, p.first()?))) {
             if to != from && APPLICATIONS.contains(&to.as_str()) {
-                breaches.push(format!("{}:{line}: {from} may not know {to}", s.file));
+                breaches.push(format!("{}:{line}: {from} may not import {to}", s.file));
             }
         }
     }
 }
 
-/// Names the modules of every circle among the modules of one folder.
+/// Reports every circle among the modules of one folder.
 fn circles(krate: &str, sources: &[Source], listed: &[(&str, &str, &str)], breaches: &mut Vec<String>) {
     let modules: BTreeSet<&[String]> = sources.iter().flat_map(|s| (0..=s.module.len()).map(|n| &s.module[..n])).collect();
-    // Arrows between modules that stand beside each other, and a place where each is.
+    // Dependencies between sibling modules, and one source location of each.
     let mut arrows: BTreeMap<(String, String), String> = BTreeMap::new();
     for s in sources {
         for (line, name) in &s.names {
@@ -87,7 +87,7 @@ fn circles(krate: &str, sources: &[Source], listed: &[(&str, &str, &str)], breac
     }
     for (_, from, to) in listed.iter().filter(|c| c.0 == krate) {
         if arrows.remove(&(from.to_string(), to.to_string())).is_none() {
-            breaches.push(format!("{krate}: {from} does not know {to} any more: take it off the list in tidy/arrows.rs"));
+            breaches.push(format!("{krate}: {from} no longer imports {to}: remove it from the list in tidy/arrows.rs"));
         }
     }
     while let Some(circle) = circle(&arrows) {
@@ -98,13 +98,13 @@ fn circles(krate: &str, sources: &[Source], listed: &[(&str, &str, &str)], breac
     }
 }
 
-/// A shortest circle, its first module again at its end.
+/// A shortest circle; its first module is repeated at the end.
 fn circle(arrows: &BTreeMap<(String, String), String>) -> Option<Vec<String>> {
     let begins: BTreeSet<&String> = arrows.keys().map(|(from, _)| from).collect();
     begins.into_iter().filter_map(|b| way_back(arrows, b)).min_by_key(Vec::len)
 }
 
-/// The shortest way from a module back to it.
+/// The shortest path from a module back to itself.
 fn way_back(arrows: &BTreeMap<(String, String), String>, from: &String) -> Option<Vec<String>> {
     let mut came: BTreeMap<&String, &String> = BTreeMap::new();
     let mut edge = vec![from];
@@ -159,7 +159,7 @@ mod tests {
         assert_eq!(of(&[("a.rs", "use crate::b;\n"), ("b.rs", "use crate::a;\n")]), Vec::<String>::new());
         assert_eq!(
             of(&[("a.rs", "use crate::b;\n"), ("b.rs", "")]),
-            ["geom: b does not know a any more: take it off the list in tidy/arrows.rs"]
+            ["geom: b no longer imports a: remove it from the list in tidy/arrows.rs"]
         );
     }
 
@@ -167,9 +167,9 @@ mod tests {
     fn applications_do_not_know_each_other_and_what_they_share_knows_none() {
         let sideways = [("text/mod.rs", ""), ("head/mod.rs", "use crate::run;\nuse crate::text::recipe;\n"), ("run/mod.rs", "")];
         let b = breaches("pipelines", &sideways);
-        assert_eq!(b, ["crates/pipelines/src/head/mod.rs:2: head may not know text"]);
+        assert_eq!(b, ["crates/pipelines/src/head/mod.rs:2: head may not import text"]);
         let upward = [("object/mod.rs", ""), ("run/folder.rs", "fn f() { crate::object::config::new() }\n")];
-        assert_eq!(breaches("pipelines", &upward), ["crates/pipelines/src/run/folder.rs:1: run may not know object"]);
+        assert_eq!(breaches("pipelines", &upward), ["crates/pipelines/src/run/folder.rs:1: run may not import object"]);
         let good = [("object/mod.rs", "use crate::run::folder;\n"), ("run/folder.rs", ""), ("bench.rs", "use crate::object;\n")];
         assert_eq!(breaches("pipelines", &good), Vec::<String>::new());
     }

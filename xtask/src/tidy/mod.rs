@@ -1,5 +1,5 @@
-//! The rules of the house that a script can check: the import table, arrows and circles between modules, sizes, names, where
-//! `unsafe` may stand, and that the paths named in ARCHITECTURE.md exist.
+//! The rules of the code base that a script can check: the import table, dependencies and circles between modules, sizes, names, where
+//! `unsafe` is allowed, and that the paths named in ARCHITECTURE.md exist.
 
 mod arrows;
 mod sizes;
@@ -26,12 +26,12 @@ const IMPORTS: [(&str, &[&str]); 11] = [
 const MAX_BYTES: u64 = 2 << 20;
 const BANNED: [&str; 6] = ["utils", "common", "helpers", "misc", "manager", "legacy"];
 const UNSAFE: [&str; 2] = ["crates/kernels/", "crates/data/"];
-/// The room that burn is for: no other names it, so that the others build beside it.
+/// The only crate that may use burn, so that the others build in parallel with it.
 const BURN: &str = "nets";
-/// Dependencies under another name in the sources, and those that are listed for their features alone.
+/// Dependencies with another name in the sources, and those that are listed only for their features.
 const NAMED_ELSE: [(&str, &str); 2] = [("kamadak-exif", "exif"), ("cubecl-native", "")];
 
-/// Prints every breach; true when there are none.
+/// Prints every violation; returns whether there are none.
 pub fn run() -> bool {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the workspace");
     let mut breaches = Vec::new();
@@ -62,12 +62,12 @@ fn collect(folder: &Path, out: &mut Vec<PathBuf>) {
     }
 }
 
-/// A file's name from the workspace's root.
+/// A file's path from the workspace's root.
 fn name_of(root: &Path, path: &Path) -> String {
     path.strip_prefix(root).unwrap_or(path).to_string_lossy().replace('\\', "/")
 }
 
-/// Arrows between the modules of each crate.
+/// Dependencies between the modules of each crate.
 fn check_arrows(root: &Path, files: &[PathBuf], breaches: &mut Vec<String>) {
     let mut crates: BTreeMap<String, Vec<arrows::Source>> = BTreeMap::new();
     for file in files.iter().filter(|f| f.extension().is_some_and(|e| e == "rs")) {
@@ -88,7 +88,7 @@ fn check_file(root: &Path, path: &Path, breaches: &mut Vec<String>) {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let extension = path.extension().unwrap_or_default().to_string_lossy().into_owned();
     if ["rs", "ts"].contains(&&*extension) && BANNED.contains(&&*stem) {
-        breaches.push(format!("{name}: a name that says nothing"));
+        breaches.push(format!("{name}: the file name says nothing about its content"));
     }
     if extension != "rs" {
         return;
@@ -96,7 +96,7 @@ fn check_file(root: &Path, path: &Path, breaches: &mut Vec<String>) {
     let Ok(text) = std::fs::read_to_string(path) else { return };
     sizes::check(&name, &text, breaches);
     if !text.trim_start().starts_with("//!") && !name.ends_with("tests.rs") {
-        breaches.push(format!("{name}: does not begin with what the file is (//!)"));
+        breaches.push(format!("{name}: must begin with a description (//!)"));
     }
     let this = name.split('/').nth(1).unwrap_or_default().to_string();
     let is_tidy = name.starts_with("xtask/src/tidy/");
@@ -119,11 +119,11 @@ fn check_file(root: &Path, path: &Path, breaches: &mut Vec<String>) {
             continue;
         }
         if (code.contains("use burn::") || code.contains(" burn::")) && this != BURN {
-            breaches.push(format!("{at}: burn is not for {this}"));
+            breaches.push(format!("{at}: {this} may not use burn"));
         }
         let Some((_, allowed)) = IMPORTS.iter().find(|(c, _)| *c == this) else { continue };
         for (other, _) in IMPORTS {
-            // The testkit may be used by any crate's tests.
+            // Tests of any crate may use the testkit.
             let free = other == this || other == "testkit" || allowed.contains(&other);
             if !free && code.contains(&format!("diorama_{other}::")) {
                 breaches.push(format!("{at}: {this} may not import {other}"));
@@ -132,7 +132,7 @@ fn check_file(root: &Path, path: &Path, breaches: &mut Vec<String>) {
     }
 }
 
-/// Every dependency must be used by its crate, and burn stays in its room.
+/// Every dependency must be used by its crate, and only one crate may use burn.
 fn check_manifests(root: &Path, files: &[PathBuf], breaches: &mut Vec<String>) {
     for manifest in files.iter().filter(|f| f.ends_with("Cargo.toml")) {
         let folder = manifest.parent().unwrap_or(root);
@@ -145,7 +145,7 @@ fn check_manifests(root: &Path, files: &[PathBuf], breaches: &mut Vec<String>) {
         let code: String = sources.filter_map(|f| std::fs::read_to_string(f).ok()).collect();
         for dependency in dependencies(&text) {
             if ["burn", "burn-cubecl"].contains(&dependency) && !name.starts_with(&format!("crates/{BURN}/")) {
-                breaches.push(format!("{name}: {dependency} is for {BURN} only"));
+                breaches.push(format!("{name}: only {BURN} may use {dependency}"));
             }
             let known = NAMED_ELSE.iter().find(|(d, _)| *d == dependency).map(|(_, n)| n.to_string());
             let used = known.unwrap_or_else(|| dependency.replace('-', "_"));
@@ -156,7 +156,7 @@ fn check_manifests(root: &Path, files: &[PathBuf], breaches: &mut Vec<String>) {
     }
 }
 
-/// Names in a manifest's tables of dependencies.
+/// Names in a manifest's dependency tables.
 fn dependencies(manifest: &str) -> impl Iterator<Item = &str> {
     let mut within = false;
     manifest.lines().filter_map(move |line| {
@@ -168,7 +168,7 @@ fn dependencies(manifest: &str) -> impl Iterator<Item = &str> {
     })
 }
 
-/// Whether code names a crate as a whole word, outside of comments.
+/// Whether code names a crate as a whole word, outside comments.
 fn mentions(code: &str, name: &str) -> bool {
     let part = |c: char| c.is_alphanumeric() || c == '_';
     code.lines().map(|l| l.split("//").next().unwrap_or_default()).any(|line| {
@@ -212,9 +212,9 @@ mod tests {
         for what in [
             "says nothing",
             "more than 500",
-            "does not begin",
+            "must begin",
             "may not import engine",
-            "burn is not for geom",
+            "geom may not use burn",
             "unsafe outside",
             "SAFETY",
             "ARCHITECTURE.md is missing",
@@ -234,7 +234,7 @@ mod tests {
         let mut b = Vec::new();
         check_manifests(&dir, &[manifest, source], &mut b);
         std::fs::remove_dir_all(&dir).unwrap();
-        assert_eq!(b, ["crates/mesh/Cargo.toml: burn is for nets only", "crates/mesh/Cargo.toml: serde is not used"]);
+        assert_eq!(b, ["crates/mesh/Cargo.toml: only nets may use burn", "crates/mesh/Cargo.toml: serde is not used"]);
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Sizes: lines of a file, lines of a function.
+//! Size limits: lines per file, lines per function.
 
 use super::source::{code, functions};
 
@@ -7,18 +7,13 @@ pub const MAX_LINES: usize = 500;
 /// Most lines of a function.
 pub const MAX_FUNCTION: usize = 80;
 
-/// Files that are longer, and how long they may be: none may grow, none may be added, and one that is short enough leaves the list.
+/// Longer files, and how long they may be: none may grow, none may be added, and one that is short enough must be removed.
 const LONGER: [(&str, usize); 0] = [];
 
-/// The same of functions.
-const LONGER_FUNCTIONS: [(&str, &str, usize); 4] = [
-    ("crates/kernels/src/ops/march/cpu.rs", "march_ray", 93),
-    ("crates/kernels/src/ops/march/gpu.rs", "walk", 117),
-    ("crates/kernels/src/ops/photometric_loss/gpu.rs", "blend_and_compare", 123),
-    ("crates/kernels/src/ops/pixel_gather/gpu.rs", "choose", 114),
-];
+/// The same for functions.
+const LONGER_FUNCTIONS: [(&str, &str, usize); 0] = [];
 
-/// Breaches of a source by its name.
+/// Violations in a source file.
 pub fn check(name: &str, text: &str, breaches: &mut Vec<String>) {
     let lines = text.lines().count();
     let allowed = LONGER.iter().find(|l| l.0 == name).map(|l| l.1);
@@ -28,21 +23,25 @@ pub fn check(name: &str, text: &str, breaches: &mut Vec<String>) {
         let allowed = listed.iter().position(|l| l.1 == f.name && f.lines > MAX_FUNCTION).map(|i| listed.remove(i).2);
         breaches.extend(too_long(format!("{name}:{}: {}", f.line, f.name), f.lines, MAX_FUNCTION, allowed));
     }
-    breaches.extend(listed.iter().map(|l| format!("{name}: {} is listed as long in tidy/sizes.rs and is not: take it off the list", l.1)));
+    breaches
+        .extend(listed.iter().map(|l| format!("{name}: {} is listed as long in tidy/sizes.rs but is not: remove it from the list", l.1)));
 }
 
-/// Files of the lists that are not there.
+/// Listed files that do not exist.
 pub fn check_lists(exists: impl Fn(&str) -> bool, breaches: &mut Vec<String>) {
     let names = LONGER.iter().map(|l| l.0).chain(LONGER_FUNCTIONS.iter().map(|l| l.0));
-    breaches
-        .extend(names.filter(|n| !exists(n)).map(|n| format!("{n}: is listed as long in tidy/sizes.rs and is gone: take it off the list")));
+    breaches.extend(
+        names
+            .filter(|n| !exists(n))
+            .map(|n| format!("{n}: is listed as long in tidy/sizes.rs but does not exist: remove it from the list")),
+    );
 }
 
 fn too_long(what: String, lines: usize, most: usize, allowed: Option<usize>) -> Option<String> {
     match allowed {
         None if lines > most => Some(format!("{what}: {lines} lines, more than {most}")),
         Some(n) if lines > n => Some(format!("{what}: {lines} lines, more than the {n} that its exception allows")),
-        Some(_) if lines <= most => Some(format!("{what}: {lines} lines; take its exception off the list in tidy/sizes.rs")),
+        Some(_) if lines <= most => Some(format!("{what}: {lines} lines; remove its exception from the list in tidy/sizes.rs")),
         _ => None,
     }
 }
@@ -71,7 +70,7 @@ mod tests {
         let of = |lines: usize, allowed| too_long("a".into(), lines, 500, allowed).unwrap_or_default();
         assert_eq!(of(600, Some(600)), "");
         assert!(of(601, Some(600)).contains("more than the 600"));
-        assert!(of(500, Some(600)).contains("take its exception off"));
+        assert!(of(500, Some(600)).contains("remove its exception"));
         let mut b = Vec::new();
         check_lists(|_| false, &mut b);
         assert_eq!(b.len(), LONGER.len() + LONGER_FUNCTIONS.len());

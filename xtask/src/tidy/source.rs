@@ -1,16 +1,16 @@
-//! Rust sources without what is no code, and what stands in them: functions, and the paths that they name.
+//! Parses Rust sources: strips comments and literals, and finds functions and the paths that they name.
 
 /// A function with a body.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Function {
     pub name: String,
-    /// Number of its first line, from 1.
+    /// Number of its first line, starting at 1.
     pub line: usize,
-    /// Lines from `fn` to the closing brace.
+    /// Number of lines from `fn` to the closing brace.
     pub lines: usize,
 }
 
-/// The source with spaces in place of comments and of what strings and characters hold; its lines keep their numbers.
+/// The source with comments and the contents of strings and characters replaced by spaces; line numbers are unchanged.
 pub fn code(text: &str) -> String {
     let t: Vec<char> = text.chars().collect();
     let mut out = String::with_capacity(text.len());
@@ -28,7 +28,7 @@ pub fn code(text: &str) -> String {
     out
 }
 
-/// Where the comment or literal that begins at `i` ends; `i` where none begins.
+/// End of the comment or literal that starts at `i`; `i` if none starts there.
 fn no_code(t: &[char], i: usize) -> usize {
     let at = |k: usize| t.get(k).copied().unwrap_or('\0');
     match (at(i), at(i + 1)) {
@@ -54,7 +54,7 @@ fn no_code(t: &[char], i: usize) -> usize {
         }
         ('r', '"' | '#') if i == 0 || !is_word(t[i - 1]) || at(i - 1) == 'b' => raw_string(t, i),
         ('\'', '\\') => (i + 3..t.len()).find(|k| t[*k] == '\'').map_or(t.len(), |k| k + 1),
-        // Otherwise a lifetime.
+        // Otherwise it is a lifetime.
         ('\'', _) if at(i + 2) == '\'' => i + 3,
         _ => i,
     }
@@ -75,7 +75,7 @@ fn is_word(c: char) -> bool {
     c.is_alphanumeric() || c == '_'
 }
 
-/// All functions with a body in code without comments and literals.
+/// All functions with a body, in code without comments and literals.
 pub fn functions(code: &str) -> Vec<Function> {
     let mut found = Vec::new();
     for (at, _) in code.match_indices("fn ") {
@@ -90,7 +90,7 @@ pub fn functions(code: &str) -> Vec<Function> {
     found
 }
 
-/// Where the body ends whose signature `rest` begins with; none of a declaration.
+/// End of the body of a function whose signature starts `rest`; `None` for a declaration.
 fn body_end(rest: &str) -> Option<usize> {
     let mut depth = 0;
     for (i, c) in rest.char_indices() {
@@ -105,7 +105,7 @@ fn body_end(rest: &str) -> Option<usize> {
     None
 }
 
-/// Where the block ends that opens at `from`.
+/// End of the block that opens at `from`.
 fn block_end(code: &str, from: usize) -> Option<usize> {
     let mut depth = 0;
     for (i, c) in code[from..].char_indices() {
@@ -119,7 +119,7 @@ fn block_end(code: &str, from: usize) -> Option<usize> {
     None
 }
 
-/// Code without items that are there for tests alone.
+/// Code without items that exist only for tests.
 pub fn without_tests(code: &str) -> String {
     let mut out = code.to_string();
     let marks = ["#[cfg(test)]", "#[cfg(all(test,"];
@@ -136,8 +136,8 @@ pub fn without_tests(code: &str) -> String {
     out
 }
 
-/// All paths that begin with `crate`, `self` or `super`, in `use` items (whose braces are spread out) and elsewhere, with the number of
-/// their line.
+/// All paths that start with `crate`, `self` or `super`, in `use` items (with their braces expanded) and elsewhere, with their line
+/// numbers.
 pub fn paths(code: &str) -> Vec<(usize, Vec<String>)> {
     let mut found = Vec::new();
     let mut rest = 0;
@@ -151,7 +151,7 @@ pub fn paths(code: &str) -> Vec<(usize, Vec<String>)> {
     found
 }
 
-/// Where the next path begins, and the length of its first word.
+/// Start of the next path, and the length of its first word.
 fn next_root(code: &str, from: usize) -> Option<(usize, usize)> {
     let roots = ["crate::", "self::", "super::"];
     let begins = |at: usize| !code[..at].ends_with(|c: char| is_word(c) || c == ':' || c == '$');
@@ -159,7 +159,7 @@ fn next_root(code: &str, from: usize) -> Option<(usize, usize)> {
     roots.iter().filter_map(|r| next(r)).min()
 }
 
-/// Reads one tree of paths at the beginning of `text`; returns how long it is.
+/// Parses one tree of paths at the start of `text`; returns its length.
 fn spread(text: &str, prefix: &mut Vec<String>, out: &mut Vec<Vec<String>>) -> usize {
     let depth = prefix.len();
     let mut i = 0;

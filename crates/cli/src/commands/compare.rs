@@ -7,7 +7,7 @@ use diorama_pipelines::object::memory::size;
 use diorama_pipelines::{Application, Result};
 use std::path::PathBuf;
 
-/// Runs side by side: curves, held-out images, cost
+/// Compare runs side by side: curves, held-out images, cost
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  diorama compare runs/a runs/b -o runs/compare")]
 pub struct Compare {
@@ -20,6 +20,7 @@ pub struct Compare {
     /// Folder for curves.svg, curves.png, views.png and compare.json
     #[arg(short, long, default_value = "runs/compare")]
     out: PathBuf,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }

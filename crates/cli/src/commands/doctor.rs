@@ -11,17 +11,18 @@ use diorama_pipelines::{PipelineError, Result};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-/// What this machine offers, and what each missing part disables; of a capture, what will likely go wrong
+/// Show what this machine supports, and what each missing part disables; or, for a capture, likely problems
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:\n  diorama doctor\n  diorama doctor data/chair")]
 pub struct Doctor {
-    /// A capture's folder; without it, this machine
+    /// Folder of a capture; without it, the machine is checked
     data: Option<PathBuf>,
-    /// Format of a capture, where a folder holds several
+    /// Format of the capture, if its folder contains several
     #[arg(long, requires = "data")]
     format: Option<String>,
     #[command(flatten)]
     masks: MaskFlags,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }
@@ -35,14 +36,14 @@ impl Verb for Doctor {
         match &self.data {
             Some(data) => capture(data, self),
             None if self.masks.mask.is_some() || self.masks.mask_meaning.is_some() => {
-                Err(PipelineError::Usage("--mask and --mask-meaning: give the capture's folder as well".into()))
+                Err(PipelineError::Usage("--mask and --mask-meaning: need the folder of a capture too".into()))
             }
             None => machine(self),
         }
     }
 }
 
-/// What a capture is, and what will likely go wrong.
+/// Checks a capture and prints likely problems.
 fn capture(data: &Path, a: &Doctor) -> Result<Outcome> {
     let format = a.format.as_deref().map(str::parse).transpose().map_err(PipelineError::Usage)?;
     let masks = a.masks.options()?;
@@ -65,7 +66,7 @@ fn capture(data: &Path, a: &Doctor) -> Result<Outcome> {
         }
     }
     let count = |g: Grade| found.iter().filter(|f| f.grade == g).count();
-    println!("{} troubles, {} notes", count(Grade::Trouble), count(Grade::Note));
+    println!("{} problems, {} notes", count(Grade::Trouble), count(Grade::Note));
     Ok(Outcome::Done)
 }
 

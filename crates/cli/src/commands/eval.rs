@@ -34,20 +34,23 @@ pub struct Eval {
     /// train, val or test
     #[arg(long, default_value = "test")]
     on: String,
-    /// full, or fast as for previews
+    /// full, or fast as used for previews
     #[arg(long, default_value = "full")]
     quality: String,
-    /// Also judge by LPIPS with these weights: AlexNet or VGG16 and the linear heads, safetensors or PyTorch's .pth, in one file or two
+    /// Also compute LPIPS with these weights: AlexNet or VGG16 and the linear heads, as safetensors or PyTorch's .pth, in one file or two
     #[arg(long, value_name = "FILE[,FILE]", value_delimiter = ',')]
     lpips: Vec<PathBuf>,
     /// Write each render beside its photograph into RUN/eval
     #[arg(long)]
     save_images: bool,
-    /// Tell how many training views see what each view shows, and the PSNR where two or more do; maps in RUN/eval: purple none, red 1, orange 2, yellow 3, green more, gray nothing
+    /// Also report how many training views see what each view shows, and the PSNR where two or more do; maps in RUN/eval: purple none, red
+    /// 1, orange 2, yellow 3, green 4 or more, gray no surface
     #[arg(long)]
     explain: bool,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }
@@ -65,21 +68,21 @@ impl Verb for Eval {
     }
 }
 
-/// What judging a run of the object application came to.
+/// Result of evaluating a run of the object application.
 struct Judgement {
     model: ObjectModel,
     report: Report,
     lpips: Option<Lpips>,
-    /// Who sees what each view shows; empty where that was not asked.
+    /// How many training views see what each view shows; empty unless requested.
     seen_by: Vec<SeenBy>,
-    /// How many training views were asked what they see.
+    /// Number of training views that were tested for this.
     asked: usize,
-    /// Where pictures and maps lie.
+    /// Folder of the pictures and maps.
     folder: PathBuf,
 }
 
 impl Eval {
-    /// Judges a run of the object application.
+    /// Evaluates a run of the object application.
     fn object(&self) -> Result<Outcome> {
         let split = match &self.on[..] {
             "train" => Split::Train,
@@ -94,7 +97,7 @@ impl Eval {
         if self.save_images || self.explain {
             std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
         }
-        // Before the training views are drawn.
+        // Printed before the training views are rendered.
         evaluate::judged(&model, split)?;
         let sights = self.explain.then(|| sights(&model));
         let shown = RefCell::new(ShareShown::new());
@@ -128,7 +131,7 @@ impl Eval {
         Ok(Outcome::Done)
     }
 
-    /// The model with the capture's points, on the device.
+    /// Loads the model with the capture's points, on the device.
     fn open(&self) -> Result<ObjectModel> {
         let (mut model, notes) = run_folder::load_model_of(&self.run, self.data.as_deref())?;
         let no_points = run_folder::add_points(&mut model, &self.run, self.data.as_deref())?;
@@ -139,23 +142,23 @@ impl Eval {
     }
 }
 
-/// Where the rays of the training views end.
+/// Traces where the rays of the training views end.
 fn sights(model: &ObjectModel) -> Sights {
     let mut shown = ShareShown::new();
     let mut progress = |done: usize, all: usize| {
-        shown.show(done as f64 / all as f64, &format!("training view {} of {all}: where its rays end", done + 1));
+        shown.show(done as f64 / all as f64, &format!("training view {} of {all}: tracing where its rays end", done + 1));
     };
     let sights = Sights::of(model, &mut progress);
     shown.finish();
     sights
 }
 
-/// The file of a view's picture.
+/// File of a view's picture.
 fn file(folder: &Path, name: &str, what: &str) -> PathBuf {
     folder.join(format!("{}{what}.png", name.replace(['/', '\\'], "_")))
 }
 
-/// A render, and its photograph to the right of it.
+/// A render with its photograph to the right of it.
 fn beside(v: &ScoredView) -> ImageU8 {
     let (r, p) = (v.view.rgb.to_u8(), v.photo.to_u8());
     let rows = r.data.chunks_exact(r.width * 3).zip(p.data.chunks_exact(p.width * 3));
@@ -202,12 +205,13 @@ impl Judgement {
             println!("scored in {}: the photographs hold linear light", report.scored_in);
         }
         if let Some(p) = report.psnr_mean_image {
-            println!("the mean training image in place of renders: {p:.2} dB");
+            println!("for comparison, the mean training image scores {p:.2} dB");
         }
     }
 }
 
-/// Which share of each view's light comes from places that so many training views see, and who sees what few see.
+/// Prints which share of each view's light comes from surfaces that given numbers of training views see, and which views see those that
+/// few see.
 fn print_seen_by(views: &[SeenBy], asked: usize, all: usize, folder: &Path) {
     let of = if asked < all { format!("of {asked} of the {all} training views, those") } else { "training views".into() };
     println!("{of} that see what a view shows, in percent of its light (maps in {}):", folder.display());
@@ -215,7 +219,8 @@ fn print_seen_by(views: &[SeenBy], asked: usize, all: usize, folder: &Path) {
     for v in views {
         let shares: String = v.shares.iter().map(|s| format!("{:>6.1}", 100.0 * s)).collect();
         let sources: Vec<String> = v.sources.iter().map(|s| format!("{} {:.1}", s.name, 100.0 * s.share)).collect();
-        let of_few = if sources.is_empty() { String::new() } else { format!("; what one or two see is of {}", sources.join(", ")) };
+        let of_few =
+            if sources.is_empty() { String::new() } else { format!("; parts that one or two see come from {}", sources.join(", ")) };
         let psnr = v.psnr_where_seen.map_or("-".into(), |p| format!("{p:.2}"));
         println!("{shares}  {psnr:>5}  {}{of_few}", v.name);
     }

@@ -29,13 +29,13 @@ pub struct Export {
     /// glb, obj, ply, stl, usdz or dae; points (a point cloud: ply, las or e57) [default: the extension of --out]
     #[arg(long)]
     format: Option<String>,
-    /// How many points a point cloud gets [default: 1000000]
+    /// Number of points of a point cloud [default: 1000000]
     #[arg(long, value_name = "N")]
     points: Option<usize>,
     /// The file to write
     #[arg(short, long)]
     out: PathBuf,
-    /// mc: marching cubes; mt: marching tetrahedra, some twice the faces before they are reduced
+    /// mc: marching cubes; mt: marching tetrahedra, about twice the faces before simplification
     #[arg(long, default_value = "mc")]
     extract: String,
     /// Cells along the longest side
@@ -44,28 +44,28 @@ pub struct Export {
     /// auto, or the density of the surface in inverse units of the input
     #[arg(long, default_value = "auto")]
     level: String,
-    /// Most faces; 0 keeps all [default: 60000 with a texture, 200000 without]
+    /// Largest number of faces; 0 keeps all [default: 60000 with a texture, 200000 without]
     #[arg(long)]
     faces: Option<usize>,
-    /// Edge of the texture in texels; 0 colours the vertices instead [default: 2048 where the format has textures]
+    /// Edge of the texture in texels; 0 colors the vertices instead [default: 2048 if the format has textures]
     #[arg(long)]
     texture: Option<usize>,
-    /// Bake the field's normals too, for a material that is lit; glb and obj
+    /// Also bake the field's normals and make the material lit; glb and obj
     #[arg(long)]
     normal_map: bool,
-    /// Close the mesh, as printing needs it, or fail
+    /// Close the mesh, as printing requires, or fail
     #[arg(long)]
     watertight: bool,
-    /// Metres per unit of the capture [default: by the length measured in the viewer, else 1]
+    /// Meters per unit of the capture [default: from the length measured in the viewer, else 1]
     #[arg(long, conflicts_with_all = ["scale_to", "measured"])]
     scale: Option<f64>,
-    /// Make the longest side so long, for example 80cm, 0.8m, 800mm or 31.5in
+    /// Scale the mesh so that its longest side has this length, for example 80cm, 0.8m, 800mm or 31.5in
     #[arg(long, value_name = "LENGTH", conflicts_with = "measured")]
     scale_to: Option<String>,
     /// Two points of the capture and their true distance: x0,y0,z0,x1,y1,z1=45cm
     #[arg(long, value_name = "POINTS=LENGTH", allow_hyphen_values = true)]
     measured: Option<String>,
-    /// Unit of the coordinates in obj, ply, stl and las: m, cm, mm or in; the others are in metres by their standards
+    /// Unit of the coordinates in obj, ply, stl and las: m, cm, mm or in; the other formats are always in meters
     #[arg(long, default_value = "m")]
     units: String,
     /// Extract only x0,y0,z0,x1,y1,z1 (the input's frame), or auto, or all (points only) [default: the crop box saved in the viewer, else auto: what most cameras look at]
@@ -74,14 +74,16 @@ pub struct Export {
     /// Remove parts with fewer faces than this share of the largest part's
     #[arg(long, default_value_t = 0.01)]
     floaters: f32,
-    /// Keep parts that fewer than three training cameras see, and parts that stand close before one
+    /// Keep parts that fewer than three training cameras see, and parts close in front of a camera
     #[arg(long)]
     keep_unseen: bool,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
     /// Replace an existing file
     #[arg(long)]
     force: bool,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }
@@ -123,7 +125,7 @@ impl Export {
     }
 
     /// # Errors
-    /// When the file is there already, or its folder is not.
+    /// If the file already exists, or its folder does not.
     fn check_out(&self) -> Result<()> {
         let written = [self.out.clone()].into_iter().chain(mesh_text::companions(&self.out));
         if let Some(file) = written.filter(|_| !self.force).find(|f| f.exists()) {
@@ -135,18 +137,18 @@ impl Export {
         Ok(())
     }
 
-    /// `--level` in inverse units of the world; none: from the field.
+    /// `--level` in inverse units of the world; `None`: chosen from the field.
     fn level(&self, model: &ObjectModel) -> Result<Option<f32>> {
         if self.level == "auto" {
             return Ok(None);
         }
         let given = self.level.parse::<f32>().ok().filter(|v| v.is_finite() && *v > 0.0);
         let given = given.ok_or_else(|| usage(format!("level {}: expected auto or a number above 0", self.level)))?;
-        // Densities per unit of the input become densities per unit of the world.
+        // Densities per unit of the input are converted to densities per unit of the world.
         Ok(Some(given / model.capture.world_from_capture.scale as f32))
     }
 
-    /// What the flags ask of a mesh, but for what depends on the model.
+    /// The mesh options that do not depend on the model.
     fn mesh_options(&self, format: export::Format) -> Result<ExportOptions> {
         Ok(ExportOptions {
             format,
@@ -192,7 +194,7 @@ fn print_mesh(made: &Exported, size: Size) {
     );
     let r = made.removed;
     println!(
-        "removed: {} faces of small parts, {} of parts that fewer than three cameras see, {} of parts close before a camera{}",
+        "removed: {} faces of small parts, {} of parts that fewer than three cameras see, {} of parts close in front of a camera{}",
         r.small,
         r.unseen,
         r.before_cameras,
@@ -201,7 +203,7 @@ fn print_mesh(made: &Exported, size: Size) {
     made.notes.iter().for_each(|n| println!("note: {n}"));
 }
 
-/// Where points are taken.
+/// Options for extracting points.
 fn region(clip: Option<Crop>, everything: bool) -> Region {
     match clip {
         Some((lo, hi)) => Region::Box(lo, hi),
@@ -210,7 +212,7 @@ fn region(clip: Option<Crop>, everything: bool) -> Region {
     }
 }
 
-/// What the file will hold.
+/// Output format.
 #[derive(Clone, Copy)]
 enum Format {
     Mesh(export::Format),
@@ -218,7 +220,7 @@ enum Format {
 }
 
 impl Format {
-    /// Of `--format`, else of the file's extension; flags that do not go with it are refused.
+    /// From `--format`, else from the file's extension; options that do not apply to the format are refused.
     fn of(a: &Export) -> Result<Format> {
         let usage = |e: String| PipelineError::Usage(format!("--{e}"));
         let extension = a.out.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
@@ -237,10 +239,10 @@ impl Format {
                 Err(PipelineError::Usage("--clip all: a mesh needs a box; give its corners, or --clip auto".into()))
             }
             Format::Mesh(_) if a.points.is_some() => {
-                Err(PipelineError::Usage("--points: only a point cloud has them; add --format points, or name a .las or .e57 file".into()))
+                Err(PipelineError::Usage("--points: only for point clouds; add --format points, or write a .las or .e57 file".into()))
             }
             Format::Points(_) if a.texture.is_some() || a.faces.is_some() || a.normal_map || a.watertight => Err(PipelineError::Usage(
-                "--faces, --texture, --normal-map and --watertight: only a mesh has them; leave them out for points".into(),
+                "--faces, --texture, --normal-map and --watertight: only for meshes; leave them out for points".into(),
             )),
             _ => Ok(format),
         }
@@ -267,16 +269,16 @@ fn export_points(a: &Export, model: &ObjectModel, options: &PointOptions) -> Res
     Ok(Outcome::Done)
 }
 
-/// Lengths of the sides, and in what.
+/// Lengths of the sides, with their unit.
 fn extent([x, y, z]: [f32; 3], size: Size) -> String {
     let unit = match size {
-        Size::Unknown => " units of the capture, taken as meters (--measured or --scale-to says how large it is)",
+        Size::Unknown => " units of the capture, taken as meters (give the true size with --measured or --scale-to)",
         _ => " m",
     };
     format!("{x:.3} x {y:.3} x {z:.3}{unit}")
 }
 
-/// Says every few seconds how far a stage is.
+/// Prints the progress of a stage every few seconds.
 fn progress() -> impl FnMut(&str, usize, usize) {
     let mut last = Instant::now();
     move |stage, i, n| {
@@ -287,7 +289,7 @@ fn progress() -> impl FnMut(&str, usize, usize) {
     }
 }
 
-/// Metres of a unit's name.
+/// Meters per unit, by the unit's name.
 fn unit(name: &str) -> Option<f64> {
     match name {
         "m" => Some(1.0),
@@ -298,7 +300,7 @@ fn unit(name: &str) -> Option<f64> {
     }
 }
 
-/// Metres of a number with a unit, such as 80cm.
+/// Parses a length with a unit, such as 80cm, to meters.
 fn length(text: &str) -> Option<f64> {
     let text = text.trim();
     let split = text.find(|c: char| c.is_ascii_alphabetic() && c != 'e' && c != 'E')?;
@@ -318,16 +320,13 @@ fn size(a: &Export) -> Result<Size> {
             let points: [[f64; 3]; 2] = [v.get(..3)?.try_into().ok()?, v.get(3..)?.try_into().ok()?];
             (points[0] != points[1]).then_some(Size::Measured { points, metres: length(distance)? })
         };
-        return read().ok_or_else(|| usage("--measured", text, "x0,y0,z0,x1,y1,z1=45cm with two points that differ"));
+        return read().ok_or_else(|| usage("--measured", text, "x0,y0,z0,x1,y1,z1=45cm with two different points"));
     }
     let Some(scale) = a.scale else {
         let measured = viewing::read_scale(&a.run)?;
         if let Some(Size::Measured { metres, .. }) = measured {
             let file = a.run.join("scale.json");
-            eprintln!(
-                "note: scaled by the length of {metres} m that was measured in the viewer ({}); --scale 1 leaves it out",
-                file.display()
-            );
+            eprintln!("note: scaled by the length of {metres} m measured in the viewer ({}); --scale 1 ignores it", file.display());
         }
         return Ok(measured.unwrap_or(Size::Unknown));
     };

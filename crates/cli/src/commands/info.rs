@@ -8,15 +8,16 @@ use diorama_pipelines::run::description;
 use diorama_pipelines::{Application, PipelineError, Result};
 use std::path::PathBuf;
 
-/// What a capture or a run is
+/// Describe a capture or a run
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Examples:\n  diorama info data/chair\n  diorama info runs/chair --json")]
 pub struct Info {
-    /// A capture's folder or a run's
+    /// Folder of a capture or of a run
     path: PathBuf,
-    /// Format of a capture, where a folder holds several
+    /// Format of the capture, if its folder contains several
     #[arg(long)]
     format: Option<String>,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }
@@ -41,7 +42,7 @@ impl Verb for Info {
 }
 
 impl Info {
-    /// What a capture is.
+    /// Description of a capture.
     fn capture(&self) -> Result<serde_json::Value> {
         let format = self.format.as_deref().map(str::parse).transpose().map_err(PipelineError::Usage)?;
         let c = import::import(&self.path, &ImportOptions { format, min_views: 1, allow_broken: true, ..ImportOptions::default() })?;
@@ -69,7 +70,7 @@ impl Info {
     }
 }
 
-/// A value for people: four digits, lists without brackets.
+/// Formats a value for people: four digits, lists without brackets.
 fn shown(v: &serde_json::Value) -> String {
     use serde_json::Value;
     match v {

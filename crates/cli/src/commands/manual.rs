@@ -6,12 +6,13 @@ use diorama_data::{DataError, atomic};
 use diorama_pipelines::Result;
 use std::path::{Path, PathBuf};
 
-/// Completions for a shell, to be put where it looks for them
+/// Print completions for a shell
 #[derive(Args, Clone, Debug)]
 #[command(
     after_help = "Examples:\n  diorama completions bash > ~/.local/share/bash-completion/completions/diorama\n  diorama completions zsh > ~/.zfunc/_diorama\n  diorama completions fish > ~/.config/fish/completions/diorama.fish"
 )]
 pub struct Completions {
+    /// Shell whose completions are printed
     shell: clap_complete::Shell,
 }
 
@@ -24,11 +25,11 @@ impl Verb for Completions {
     }
 }
 
-/// Manual pages, one per verb
+/// Write manual pages, one per command
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  diorama man ~/.local/share/man/man1 && man diorama-train")]
 pub struct Man {
-    /// Folder for the pages, which are named after their verbs
+    /// Folder for the pages, which are named after the commands
     folder: PathBuf,
 }
 
@@ -44,11 +45,11 @@ impl Verb for Man {
     }
 }
 
-/// Writes a page for the program and for each verb, `diorama-train.1` and so on.
+/// Writes a page for the program and for each command: `diorama-train.1` and so on.
 fn write(command: &clap::Command, name: &str, folder: &Path, names: &mut Vec<String>) -> Result<()> {
     let file = folder.join(format!("{name}.1"));
     let mut text = Vec::new();
-    // Pages name themselves as they are called from a shell: `diorama train`.
+    // Pages show the name as typed in a shell: `diorama train`.
     let page = clap_mangen::Man::new(command.clone().display_name(name));
     page.render(&mut text).map_err(DataError::io(&file, "write"))?;
     atomic::write(&file, &text)?;

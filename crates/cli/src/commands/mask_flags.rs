@@ -5,22 +5,22 @@ use clap::Args;
 use diorama_data::masks::{self, MaskOptions, MaskUse};
 use diorama_pipelines::Result;
 
-/// Flags of verbs that read a capture with masks.
+/// Options of commands that read a capture with masks.
 #[derive(Args, Clone, Debug)]
 pub struct MaskFlags {
     /// Masks beside the photographs: use (black is left out), invert or ignore [default: use]
     #[arg(long, value_name = "use|invert|ignore")]
     pub mask: Option<String>,
-    /// What masks leave out: object (empty space), unknown (anything), or auto, told by what they cover [default: auto]
+    /// Meaning of masked-out pixels: object (empty space), unknown (anything), or auto, chosen from what the masks cover [default: auto]
     #[arg(long, value_name = "auto|object|unknown")]
     pub mask_meaning: Option<String>,
 }
 
 impl MaskFlags {
-    /// What the flags say.
+    /// The options' values.
     ///
     /// # Errors
-    /// When a value is unknown.
+    /// If a value is unknown.
     pub fn options(&self) -> Result<MaskOptions> {
         Ok(MaskOptions {
             usage: self.mask.as_deref().map_or(Ok(MaskUse::Use), str::parse).map_err(usage)?,

@@ -1,7 +1,7 @@
-//! The verbs: one file each, which holds the verb's flags and what it does with them.
+//! The commands: one file each, with the command's options and its implementation.
 //!
-//! A verb of the program is a variant of [`Command`]. Verbs of an application other than the main one stand behind a noun, as those of
-//! `bench` do: a file of its own with an enum of verbs.
+//! A command of the program is a variant of [`Command`]. Commands of applications other than the main one form a group, as those of
+//! `bench` do: a file of its own with an enum of commands.
 
 mod bench;
 mod clip;
@@ -22,28 +22,28 @@ mod view;
 use clap::{Parser, Subcommand};
 use diorama_pipelines::Result;
 
-/// A verb: a struct of flags, which clap parses, and what is done with them.
+/// A command: a struct of options parsed by clap, and what it does.
 pub trait Verb {
     /// Whether results and errors are JSON objects on stdout.
     fn json(&self) -> bool {
         false
     }
 
-    /// Does the work and prints its results.
+    /// Runs the command and prints its results.
     ///
     /// # Errors
-    /// When the request is wrong or the work failed.
+    /// If the request is wrong or the work failed.
     fn run(&self) -> Result<Outcome>;
 }
 
-/// How a verb ended, errors apart.
+/// How a command ended, other than by an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
     Done,
     Interrupted,
 }
 
-/// Photographs to radiance fields, novel views and meshes.
+/// Train radiance fields from photographs; render novel views, export meshes.
 #[derive(Parser)]
 #[command(
     name = "diorama",
@@ -56,7 +56,7 @@ pub struct Program {
     pub command: Command,
 }
 
-/// The verbs and nouns, in the order in which the help lists them.
+/// The commands and groups, in the order of the help.
 #[derive(Subcommand)]
 pub enum Command {
     Prepare(prepare::Prepare),
@@ -76,7 +76,7 @@ pub enum Command {
 }
 
 impl Command {
-    /// The verb that was called.
+    /// The chosen command.
     pub fn verb(&self) -> &dyn Verb {
         match self {
             Command::Prepare(v) => v,

@@ -11,26 +11,26 @@ use diorama_pipelines::object::prepare::{self, Finish, PrepareOptions, Prepared,
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-/// Photographs or a video to a data set, through COLMAP or with the poses that they have
+/// Turn photographs or a video into a data set, with poses from COLMAP or from the capture
 #[derive(Args, Clone, Debug)]
 #[command(
-    after_help = "Examples:\n  diorama prepare photos/ -o data/chair\n  diorama prepare chair.mp4 -o data/chair --frames 120\n  diorama prepare photos/ -o data/chair --resume --remove-background auto\n  diorama prepare posed/ -o data/chair --sfm none --remove-background auto\n\nCOLMAP (and ffmpeg for videos) must be installed; DIORAMA_COLMAP and DIORAMA_FFMPEG name other programs than those in PATH."
+    after_help = "Examples:\n  diorama prepare photos/ -o data/chair\n  diorama prepare chair.mp4 -o data/chair --frames 120\n  diorama prepare photos/ -o data/chair --resume --remove-background auto\n  diorama prepare posed/ -o data/chair --sfm none --remove-background auto\n\nCOLMAP (and ffmpeg for videos) must be installed; set DIORAMA_COLMAP or DIORAMA_FFMPEG to use programs outside PATH."
 )]
 pub struct Prepare {
-    /// Folder of photographs, or a video; with --sfm none a capture that has poses
+    /// Folder of photographs, or a video; with --sfm none, a capture that has poses
     input: PathBuf,
     /// Folder of the data set
     #[arg(short, long)]
     out: PathBuf,
-    /// Where poses come from: colmap, or none for a capture that has them (transforms.json, COLMAP model, poses_bounds.npy)
+    /// Source of the poses: colmap, or none for a capture that has them (transforms.json, COLMAP model, poses_bounds.npy)
     #[arg(long, default_value = "colmap")]
     sfm: String,
-    /// With --sfm none: transforms, blender, colmap or llff, where a folder holds several
+    /// With --sfm none: transforms, blender, colmap or llff, if the folder contains several
     #[arg(long)]
     format: Option<String>,
     #[command(flatten)]
     masks: MaskFlags,
-    /// Most frames of a video; the sharpest of each stretch is taken
+    /// Largest number of frames from a video; the sharpest of each interval is taken
     #[arg(long, default_value_t = 150, conflicts_with = "fps")]
     frames: usize,
     /// Frames per second of a video, instead of --frames
@@ -42,49 +42,52 @@ pub struct Prepare {
     /// Reduce photographs whose longest side is larger
     #[arg(long, value_name = "PIXELS")]
     max_side: Option<u32>,
-    /// Pairs that are compared: auto, exhaustive or sequential
+    /// Pairs to compare: auto, exhaustive or sequential
     #[arg(long, default_value = "auto")]
     matcher: String,
-    /// Most features per photograph; matching takes time with the square of it
+    /// Largest number of features per photograph; matching time grows with its square
     #[arg(long, default_value_t = 8192)]
     features: usize,
     /// COLMAP's camera model: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or OPENCV_FISHEYE
     #[arg(long, default_value = "OPENCV")]
     lens: String,
-    /// Keep only some photographs: diverse:N, the N that differ most in place, direction and looks
+    /// Keep only some photographs: diverse:N keeps the N that differ most in position, direction and appearance
     #[arg(long, value_name = "diverse:N")]
     select: Option<String>,
-    /// Cut the photographs once their poses are known: square, or x,y,width,height in pixels
+    /// Crop the photographs once their poses are known: square, or x,y,width,height in pixels
     #[arg(long)]
     crop: Option<String>,
-    /// Remove noise (non-local means, as strong as the noise that is measured)
+    /// Remove noise (non-local means; the strength follows the measured noise)
     #[arg(long)]
     denoise: bool,
-    /// Make exposure and white balance equal, by the points that several photographs show
+    /// Equalize exposure and white balance, by points that several photographs show
     #[arg(long)]
     normalize_exposure: bool,
-    /// off, auto (by the points of what the cameras look at), or a segmentation network: NETWORK.onnx
+    /// off, auto (by the points on what the cameras look at), or a segmentation network: NETWORK.onnx
     #[arg(long, default_value = "off")]
     remove_background: String,
-    /// every:N, A:B:C (percent), all, or file: as the capture says [default: every:8; with --sfm none file]
+    /// every:N, A:B:C (percent), all, or file: as in the capture's files [default: every:8; with --sfm none file]
     #[arg(long)]
     split: Option<String>,
+    /// Seed of all random numbers
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Leave out photographs that cannot be decoded, for example because they were cut off, and list them
+    /// Leave out photographs that cannot be decoded, for example because they are truncated, and list them
     #[arg(long)]
     skip_broken: bool,
-    /// Fail where fewer photographs than this percentage find a pose
+    /// Fail if fewer than this percentage of the photographs find a pose
     #[arg(long, default_value_t = 80.0)]
     min_registered: f64,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
-    /// Go on from what an interrupted call left
+    /// Continue where an interrupted call stopped
     #[arg(long)]
     resume: bool,
     /// Replace an earlier data set
     #[arg(long, conflicts_with = "resume")]
     force: bool,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }
@@ -101,7 +104,7 @@ impl Verb for Prepare {
         watch_interrupts();
         let (mut last, mut stage) = (Instant::now(), String::new());
         let mut note = |text: &str| {
-            // Each stage at once, counts within it every two seconds.
+            // New stages are printed at once, counts within a stage every two seconds.
             let begins = text.split(':').next().unwrap_or(text);
             if begins != stage || last.elapsed() > Duration::from_secs(2) {
                 (last, stage) = (Instant::now(), begins.to_string());
@@ -110,7 +113,7 @@ impl Verb for Prepare {
         };
         let Some(made) = prepare::prepare(&options, &INTERRUPT, &mut note)? else {
             let sfm = if options.sfm == Sfm::None { " --sfm none" } else { "" };
-            eprintln!("interrupted; go on with: diorama prepare {} -o {}{sfm} --resume", self.input.display(), self.out.display());
+            eprintln!("interrupted; continue with: diorama prepare {} -o {}{sfm} --resume", self.input.display(), self.out.display());
             return Ok(Outcome::Interrupted);
         };
         if self.json {
@@ -124,7 +127,7 @@ impl Verb for Prepare {
 
 impl Prepare {
     /// # Errors
-    /// When a number is outside of its range.
+    /// If a number is outside its range.
     fn check_numbers(&self) -> Result<()> {
         let least = |flag: &str, ok: bool, what: &str| if ok { Ok(()) } else { Err(usage(format!("{flag}: must be {what}"))) };
         least("frames", self.frames >= 3, "at least 3")?;
@@ -135,7 +138,7 @@ impl Prepare {
         least("min-registered", (0.0..=100.0).contains(&self.min_registered), "0 to 100")
     }
 
-    /// What the flags ask for.
+    /// The requested options.
     fn options(&self) -> Result<PrepareOptions> {
         let sfm: Sfm = self.sfm.parse().map_err(usage)?;
         if sfm == Sfm::Colmap
@@ -143,7 +146,7 @@ impl Prepare {
                 .iter()
                 .find(|f| f.1.is_some())
         {
-            return Err(usage(format!("{}: is for captures that have poses; give --sfm none as well", flag.0)));
+            return Err(usage(format!("{}: is only for captures that have poses; give --sfm none too", flag.0)));
         }
         let split: Option<SplitRule> = self.split.as_deref().map(str::parse).transpose().map_err(usage)?;
         let diverse = |text: &String| {
@@ -190,7 +193,7 @@ fn print(made: &Prepared) {
         made.points,
         made.held_out,
         made.aabb_scale,
-        if made.floor { ", floor level" } else { "" }
+        if made.floor { ", leveled by the floor" } else { "" }
     );
     if !made.lost.is_empty() {
         println!("without a pose: {}", made.lost.join(", "));
@@ -200,13 +203,13 @@ fn print(made: &Prepared) {
     }
     let f = &made.finished;
     if f.left_out > 0 {
-        println!("left out: {} photographs that differ little from others", f.left_out);
+        println!("left out: {} photographs that are similar to others", f.left_out);
     }
     if let Some([dark, bright]) = f.exposure_stops {
-        println!("exposures made equal: they were {dark:+.2} to {bright:+.2} stops apart from the middle");
+        println!("exposures equalized: they were {dark:+.2} to {bright:+.2} stops from the median");
     }
     if let Some(sigma) = f.noise {
-        println!("noise removed: {sigma:.1} of 255 in the middle photograph");
+        println!("noise removed: {sigma:.1} of 255 in the median photograph");
     }
     if let Some(share) = f.foreground {
         println!("background removed: {:.0} % of the pixels are left", 100.0 * share);

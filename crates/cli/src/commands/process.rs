@@ -1,4 +1,4 @@
-//! What verbs do to the process: interrupts, threads, notes.
+//! Process-wide settings of commands: interrupts, threads, notes.
 
 use diorama_pipelines::{PipelineError, Result};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -6,9 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// Set by the first Ctrl-C; the second ends the program at once.
 pub static INTERRUPT: AtomicBool = AtomicBool::new(false);
 
-/// Lets Ctrl-C end long work cleanly.
+/// Makes Ctrl-C end long work cleanly.
 pub fn watch_interrupts() {
-    // A handler may already be there when verbs call verbs.
+    // A handler may exist already when commands call commands.
     let _ = ctrlc::set_handler(|| {
         if INTERRUPT.swap(true, Ordering::Relaxed) {
             std::process::exit(130);
@@ -17,10 +17,10 @@ pub fn watch_interrupts() {
     });
 }
 
-/// Bounds the threads of all kernels.
+/// Limits the threads of all kernels.
 ///
 /// # Errors
-/// When there would be none.
+/// If the number is zero.
 pub fn use_threads(threads: Option<usize>) -> Result<()> {
     if threads == Some(0) {
         return Err(PipelineError::Usage("--threads 0: must be at least 1".into()));
@@ -31,12 +31,12 @@ pub fn use_threads(threads: Option<usize>) -> Result<()> {
     Ok(())
 }
 
-/// Tells what the user should know.
+/// Prints a note for the user.
 pub fn note(text: &str) {
     eprintln!("note: {text}");
 }
 
-/// What a flag's value is refused with; `text` begins with the flag's name.
+/// Error for an option's value; `text` begins with the option's name.
 pub fn usage(text: String) -> PipelineError {
     PipelineError::Usage(format!("--{text}"))
 }

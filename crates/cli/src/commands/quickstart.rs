@@ -8,21 +8,23 @@ use diorama_pipelines::object::quickstart;
 use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
 
-/// Everything at once on a capture that the program generates itself
+/// Run every step on a capture that the program generates itself
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  diorama quickstart --seconds 30 -o runs/first")]
 pub struct Quickstart {
-    /// Folder for everything that is made
+    /// Folder for all results
     #[arg(short, long, default_value = "runs/quickstart")]
     out: PathBuf,
     /// Seconds of training
     #[arg(long, default_value_t = 90.0)]
     seconds: f64,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
     /// Replace an earlier quickstart
     #[arg(long)]
     force: bool,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }
@@ -38,7 +40,7 @@ impl Verb for Quickstart {
             return Err(PipelineError::Usage(format!("--seconds {}: must be greater than 0", self.seconds)));
         }
         watch_interrupts();
-        // The default folder is the program's own: a second quickstart replaces the first.
+        // The default folder belongs to the program: a second quickstart replaces the first.
         let force = self.force || self.out == std::path::Path::new("runs/quickstart");
         let mut progress = Progress::new();
         let made =
@@ -51,7 +53,7 @@ impl Verb for Quickstart {
             made.video.iter().for_each(|v| println!("video      {}", v.display()));
             println!("mesh       {}", made.mesh.file.display());
             println!("curves     {}", made.folder.join("curves.svg").display());
-            println!("the same with your photographs: diorama train FOLDER -o runs/mine");
+            println!("with your own photographs: diorama train FOLDER -o runs/mine");
         }
         Ok(if made.interrupted { Outcome::Interrupted } else { Outcome::Done })
     }

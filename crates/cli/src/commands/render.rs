@@ -26,7 +26,7 @@ pub struct Render {
     /// orbit, spiral, interpolate, held-out, or a camera_path.json
     #[arg(long, default_value = "orbit")]
     path: String,
-    /// How many frames [default: 90, or all held-out views]
+    /// Number of frames [default: 90, or all held-out views]
     #[arg(long)]
     frames: Option<usize>,
     /// WIDTHxHEIGHT [default: that of the run, or of the path's file]
@@ -41,26 +41,29 @@ pub struct Render {
     /// Folder for PNG sequences [default: RUN/render unless --video is given]
     #[arg(long)]
     images: Option<PathBuf>,
-    /// Film of the first layer: .mp4, or .gif with up to 50 frames per second
+    /// Video of the first layer: .mp4, or .gif with up to 50 frames per second
     #[arg(long)]
     video: Option<PathBuf>,
     /// [default: 30, or that of the path's file]
     #[arg(long)]
     fps: Option<u32>,
-    /// How the layer depth keeps distances, beside its pictures: png (16 bit, one step for the sequence, in depth.json), exr or npy (floats)
+    /// File format of distances in the layer depth, besides its pictures: png (16 bit, one step for the sequence, in depth.json), exr or
+    /// npy (floats)
     #[arg(long, default_value = "png")]
     depth: String,
-    /// Meters per unit of the capture, for distances [default: by the length measured in the viewer, else unknown]
+    /// Meters per unit of the capture, for distances [default: from the length measured in the viewer, else unknown]
     #[arg(long)]
     scale: Option<f64>,
-    /// Show only what lies in x0,y0,z0,x1,y1,z1 (the input's frame), or all [default: the crop box saved in the viewer, else all]
+    /// Show only the inside of x0,y0,z0,x1,y1,z1 (the input's frame), or all [default: the crop box saved in the viewer, else all]
     #[arg(long, allow_hyphen_values = true)]
     clip: Option<String>,
     /// full, or fast for previews
     #[arg(long, default_value = "full")]
     quality: String,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }
@@ -96,12 +99,12 @@ impl Render {
             }
         })?;
         let seconds = start.elapsed().as_secs_f64();
-        // Of a film that was interrupted there are the frames so far; before the first there is none.
+        // An interrupted video keeps the frames so far; before the first frame nothing is written.
         let (images, video) = (options.images.filter(|_| frames > 0), options.video.filter(|_| frames > 0));
         if interrupted {
             match frames {
                 0 => eprintln!("interrupted before the first frame: nothing was written"),
-                n => eprintln!("interrupted: what was written ends with frame {n}"),
+                n => eprintln!("interrupted: the output ends with frame {n}"),
             }
         }
         if self.json {
@@ -116,7 +119,7 @@ impl Render {
         Ok(if interrupted { Outcome::Interrupted } else { Outcome::Done })
     }
 
-    /// What the flags ask for, but for the box, which depends on the model.
+    /// The requested options, except the box, which depends on the model.
     fn options(&self) -> Result<RenderOptions> {
         let size = self.size.as_deref().map(parse_size).transpose()?;
         if self.frames == Some(0) || self.fps == Some(0) {

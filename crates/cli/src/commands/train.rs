@@ -21,7 +21,7 @@ use diorama_viewer::Server;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Fit a field to photographs with poses
+/// Train a field on photographs with poses
 #[derive(Args, Clone, Debug)]
 #[command(
     after_help = "Examples:\n  diorama train capture/ -o runs/chair --seconds 120\n  diorama train lego/ -o runs/lego --method mlp --downscale 8 --background white\n  diorama train capture/ -o runs/chair --resume"
@@ -38,10 +38,10 @@ pub struct Train {
     /// ngp, nerf, mlp or baseline [default: ngp]
     #[arg(long)]
     method: Option<String>,
-    /// transforms, blender, colmap or llff, where a folder holds several
+    /// transforms, blender, colmap or llff, if the folder contains several
     #[arg(long)]
     format: Option<String>,
-    /// Reduce the photographs N times
+    /// Reduce the photographs by this factor
     #[arg(long)]
     downscale: Option<u32>,
     /// Stop after N steps
@@ -58,23 +58,25 @@ pub struct Train {
     /// auto, white, black, random or learned
     #[arg(long)]
     background: Option<String>,
-    /// auto, cpu, cuda, vulkan, metal or webgpu; auto is the best GPU that the build reaches, else the CPU
+    /// auto, cpu, cuda, vulkan, metal or webgpu; auto is the best GPU that the build supports, else the CPU
     #[arg(long)]
     device: Option<String>,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
+    /// Seed of all random numbers
     #[arg(long)]
     seed: Option<u64>,
-    /// Leave out photographs that cannot be decoded, for example because they were cut off, and list them
+    /// Leave out photographs that cannot be decoded, for example because they are truncated, and list them
     #[arg(long)]
     skip_broken: bool,
-    /// `report`: the shortest side of each photograph becomes 100 pixels
+    /// report: reduce each photograph so that its shortest side has 100 pixels
     #[arg(long, conflicts_with = "downscale")]
     preset: Option<String>,
-    /// Override a configuration value, for example loss.distortion=0.01; may be repeated
+    /// Set a configuration value, for example loss.distortion=0.01; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
-    /// Start from a config.toml
+    /// Read the configuration from a config.toml
     #[arg(long)]
     config: Option<PathBuf>,
     /// Show the run in the browser while it trains
@@ -82,10 +84,10 @@ pub struct Train {
     view: bool,
     #[command(flatten)]
     listen: ListenFlags,
-    /// Go on from the last checkpoint
+    /// Continue from the last checkpoint
     #[arg(long)]
     resume: bool,
-    /// Replace what the run folder holds
+    /// Replace the content of the run folder
     #[arg(long)]
     force: bool,
     /// Print one JSON object on stdout
@@ -100,7 +102,7 @@ impl Verb for Train {
 
     fn run(&self) -> Result<Outcome> {
         use_threads(self.threads)?;
-        // Runs of other applications begin with the application's own verb, and may go on with this one.
+        // Runs of other applications are started by the application's own command, but this one can resume them.
         match if self.resume { Application::of_run(&self.out)? } else { Application::Object } {
             Application::Object => self.object(),
         }
@@ -112,7 +114,7 @@ impl Train {
     fn object(&self) -> Result<Outcome> {
         let mut config = configuration(self)?;
         if !self.resume {
-            // Read the capture before anything is written.
+            // The capture is read before anything is written.
             memory::check_training(&config, &recipe::load_capture(&config)?)?;
         }
         let device = recipe::device(&config)?;
@@ -121,7 +123,7 @@ impl Train {
         if let (Some(folder), Some(data)) = (&opened, &self.moved) {
             config.data.path = folder.move_capture::<Config>(data)?.data.path;
         }
-        // The port is asked for before there is a folder.
+        // The port is opened before the run folder is created.
         let viewing = if self.view { Some(watch(self, &config, opened.as_ref())?) } else { None };
         let mut folder = opened.map_or_else(|| RunFolder::create(&self.out, self.force), Ok)?;
         watch_interrupts();
@@ -131,7 +133,7 @@ impl Train {
         let view = viewing.as_ref().map(|v| &*v.0);
         let trained = recipe::train(&config, &mut folder, self.resume, view, &INTERRUPT, &mut |e| progress.event(e));
         if trained.is_err() && !existed && !folder.checkpoints().exists() {
-            // A run that never began leaves nothing behind, and what was there before stays.
+            // A run that never started leaves nothing behind, and earlier files stay.
             drop(folder);
             let _ = std::fs::remove_dir_all(&self.out);
         }
@@ -142,7 +144,7 @@ impl Train {
             self.print(&trained);
         }
         if let Some((_, server)) = viewing {
-            eprintln!("the viewer goes on until Ctrl-C");
+            eprintln!("the viewer keeps running until Ctrl-C");
             let _ = server.join();
         }
         Ok(if trained.summary.interrupted { Outcome::Interrupted } else { Outcome::Done })
@@ -184,7 +186,7 @@ impl Train {
     }
 }
 
-/// The run as the viewer sees it while it trains, and a server that is bound and does not serve yet.
+/// The view source of a run in training, and a bound server that does not serve yet.
 fn watch(a: &Train, config: &Config, resumed: Option<&RunFolder>) -> Result<(Arc<RunView>, Server)> {
     let capture = resumed.map_or_else(|| recipe::load_capture(config), RunFolder::capture)?;
     let view = viewing::open(&a.out, ObjectModel::new(config.clone(), capture, false)?, true)?;
@@ -202,12 +204,12 @@ fn finite(v: f64) -> Option<f64> {
     v.is_finite().then_some(v)
 }
 
-/// The run's configuration: defaults, then a file, then flags; a resumed run keeps its own but for the budget.
+/// The run's configuration: defaults, then a file, then options. A resumed run keeps its own, except for the budget.
 fn configuration(a: &Train) -> Result<Config> {
     let mut c = if a.resume { resumed(a)? } else { begun(a)? };
     let before = a.resume.then(|| c.clone());
     let mut set = |key: &str, value: Option<String>| value.map_or(Ok(()), |v| c.set(key, &v));
-    // A method that was named on top of a file keeps the file's other values.
+    // A method given in addition to a file keeps the file's other values.
     set("method", a.method.clone())?;
     set("data.format", a.format.clone())?;
     set("data.downscale", a.downscale.map(|v| v.to_string()))?;
@@ -221,7 +223,7 @@ fn configuration(a: &Train) -> Result<Config> {
     set_budget(a, &mut c)?;
     for o in &a.overrides {
         let (key, value) = key_and_value(o)?;
-        // What a run has settled stays so.
+        // Values that the run has determined stay.
         if !(a.resume && is_settled_later(key, value)) {
             c.set(key, value)?;
         }
@@ -239,7 +241,7 @@ fn configuration(a: &Train) -> Result<Config> {
     Ok(c)
 }
 
-/// The configuration of the run that goes on.
+/// The configuration of the resumed run.
 fn resumed(a: &Train) -> Result<Config> {
     let c = read_config(&a.out)?;
     if let Some(d) = &a.data
@@ -265,7 +267,7 @@ fn begun(a: &Train) -> Result<Config> {
     Ok(c)
 }
 
-/// The configuration that `--config` names.
+/// The configuration file of `--config`.
 fn read_file(file: &Path) -> Result<Config> {
     let text = std::fs::read_to_string(file).map_err(DataError::io(file, "read"))?;
     Config::from_toml(&text).map_err(|e| DataError::input(file, e).into())
@@ -294,31 +296,31 @@ fn set_budget(a: &Train, c: &mut Config) -> Result<()> {
     Ok(())
 }
 
-/// A value that a resumed run cannot take.
-fn changed(flag: &str, run: &str, said: &str) -> Result<()> {
-    let what = format!("{flag} cannot change on --resume: the run has {run}, not {said}; start a new run with another --out");
+/// Error for a value that a resumed run cannot accept.
+fn changed(flag: &str, run: &str, requested: &str) -> Result<()> {
+    let what = format!("{flag} cannot change on --resume: the run has {run}, not {requested}; start a new run with another --out");
     Err(PipelineError::Usage(what))
 }
 
-/// What a resumed run keeps: the same value may be said again, another one is named with the run's.
+/// Checks values that a resumed run keeps: the same value may be given again; for another, the error names both.
 fn same(a: &Train, before: &Config, now: &Config) -> Result<()> {
-    let (run, said) = (before.values(), now.values());
+    let (run, requested) = (before.values(), now.values());
     let kept = |key: &str| key == "method" || key == "background" || key == "seed" || key.starts_with("field.") || key.starts_with("data.");
-    for ((key, run), (_, said)) in run.iter().zip(&said).filter(|((key, run), (_, said))| kept(key) && run != said) {
+    for ((key, run), (_, requested)) in run.iter().zip(&requested).filter(|((key, run), (_, requested))| kept(key) && run != requested) {
         let flag = FLAGS.iter().find(|f| f.1 == key).map_or(&key[..], |f| f.0);
-        // Pixels of a run may be kept more sparsely than before.
+        // The pixels of a run may be stored more sparsely than before.
         if key != "data.memory_budget" {
-            return changed(flag, run, said);
+            return changed(flag, run, requested);
         }
     }
     same_file(a, before)
 }
 
-/// The same of the file of `--config`, where there is one.
+/// The same check for the file of `--config`, if there is one.
 fn same_file(a: &Train, before: &Config) -> Result<()> {
     let Some(file) = &a.config else { return Ok(()) };
     let (run, given) = (before.values(), read_file(file)?.values());
-    // Flags of the same command stand above the file, as they did when the run began.
+    // Options of the same command take precedence over the file, as when the run was started.
     let flagged = |key: &str| {
         let set = a.overrides.iter().any(|o| o.split('=').next().is_some_and(|k| k.trim() == key));
         set || FLAGS.iter().any(|f| f.1 == key && is_given(a, f.0)) || key.starts_with("run.") || ["device", "data.path"].contains(&key)
@@ -329,7 +331,7 @@ fn same_file(a: &Train, before: &Config) -> Result<()> {
     }
 }
 
-/// Whether a value leaves open what the photographs say, which a run then keeps.
+/// Whether a value is determined from the photographs; the run then keeps the result.
 fn is_settled_later(key: &str, value: &str) -> bool {
     match key {
         "data.white" | "sampling.near" => value.parse::<f64>() == Ok(0.0),
@@ -338,7 +340,7 @@ fn is_settled_later(key: &str, value: &str) -> bool {
     }
 }
 
-/// Flags and the values that they set.
+/// Options and the keys that they set.
 const FLAGS: [(&str, &str); 10] = [
     ("--method", "method"),
     ("--downscale", "data.downscale"),

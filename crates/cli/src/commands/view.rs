@@ -17,28 +17,28 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-/// Where the viewer listens: flags of `view`, and of `train --view`.
+/// Address of the viewer: options of `view`, and of `train --view`.
 #[derive(Args, Clone, Debug)]
 pub struct ListenFlags {
-    /// Address to listen on; any but 127.0.0.1 asks for a token, which is part of the printed address
+    /// Address to listen on; except for 127.0.0.1, a token is required, which is part of the printed address
     #[arg(long, default_value = "127.0.0.1")]
     pub host: IpAddr,
-    /// 0: any that is free
+    /// 0: any free port
     #[arg(long, default_value_t = 7007)]
     pub port: u16,
 }
 
 impl ListenFlags {
-    /// A server that is bound and does not serve yet.
+    /// Binds a server that does not serve yet.
     ///
     /// # Errors
-    /// When the address cannot be bound.
+    /// If the address cannot be bound.
     pub fn bind(&self, source: Arc<dyn ViewSource>) -> Result<Server> {
         Server::bind(&ViewerOptions { host: self.host, port: self.port }, source).map_err(|e| PipelineError::Usage(e.to_string()))
     }
 }
 
-/// Look at a run in the browser: views, cameras, crop box, scale, camera paths, meshes; or at a data set's cameras and points
+/// Show a run in the browser: views, cameras, crop box, scale, camera paths, meshes; or a data set's cameras and points
 #[derive(Args, Clone, Debug)]
 #[command(
     after_help = "Examples:\n  diorama view runs/chair\n  diorama view data/chair\n  diorama view splats.ply\n  diorama view runs/chair --host 0.0.0.0 --port 8080"
@@ -46,7 +46,7 @@ impl ListenFlags {
 pub struct View {
     /// Folder of a run or of a data set, or a PLY file of points or Gaussian splats
     path: PathBuf,
-    /// Of a run: where its photographs are now, if they moved
+    /// For a run: where its photographs are now, if they moved
     #[arg(long, value_name = "FOLDER")]
     data: Option<PathBuf>,
     /// auto, cpu, cuda, vulkan, metal or webgpu
@@ -54,6 +54,7 @@ pub struct View {
     device: String,
     #[command(flatten)]
     listen: ListenFlags,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
     /// Print the address as a JSON object on stdout
@@ -76,12 +77,12 @@ impl Verb for View {
         } else {
             println!("{}", server.address());
         }
-        eprintln!("open this address in a browser; Ctrl-C ends");
+        eprintln!("open this address in a browser; press Ctrl-C to end");
         let Source::Run(run) = source else {
             server.run(&INTERRUPT);
             return Ok(Outcome::Done);
         };
-        // A device that was named and fails ends the viewer.
+        // If a device given by name fails, the viewer ends.
         std::thread::scope(|s| {
             s.spawn(|| {
                 while !INTERRUPT.load(Ordering::Relaxed) {
@@ -111,11 +112,11 @@ impl Source {
     }
 }
 
-/// What there is to look at: a run, a file of points or splats, or a data set.
+/// The view source: a run, a file of points or splats, or a data set.
 fn source(a: &View) -> Result<Source> {
     let is_run = a.path.join(description::NAME).exists() || folder::checkpoints(&a.path).exists();
     if a.data.is_some() && !is_run {
-        return Err(PipelineError::Usage(format!("--data: {} is no run, so it has no photographs elsewhere", a.path.display())));
+        return Err(PipelineError::Usage(format!("--data: {} is not a run; give --data only for runs", a.path.display())));
     }
     if a.path.is_file() && a.path.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply")) {
         let view = PointsView::of_file(&a.path)?;
@@ -130,11 +131,11 @@ fn source(a: &View) -> Result<Source> {
     let capture = import::import(&a.path, &ImportOptions { min_views: 1, allow_broken: true, ..ImportOptions::default() })?;
     capture.notes.iter().for_each(|n| note(n));
     let view = PointsView::of_capture(&a.path, &capture)?;
-    eprintln!("a data set of {} views with {} points; train it to see more", capture.frames.len(), view.points());
+    eprintln!("a data set of {} views with {} points; train a field to see more", capture.frames.len(), view.points());
     Ok(Source::Points(Arc::new(view)))
 }
 
-/// A run of the object application.
+/// The view source of a run of the object application.
 fn object(a: &View) -> Result<Source> {
     let (mut model, notes) = run_folder::load_model_of(&a.path, a.data.as_deref())?;
     notes.iter().for_each(|n| note(n));

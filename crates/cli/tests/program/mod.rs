@@ -1,4 +1,4 @@
-//! The real program on a small capture with a short run, for tests of it. Each test uses a part of this.
+//! Runs the real program on a small capture with a short run. Each test file uses a part of this module.
 
 #![allow(dead_code, reason = "each test program uses a part")]
 
@@ -33,14 +33,14 @@ pub fn s(p: &Path) -> &str {
     p.to_str().unwrap()
 }
 
-/// How long a call may take: `view` would serve for ever.
+/// Time limit of a call: `view` would serve forever.
 pub const LIMIT: Duration = Duration::from_secs(300);
 
 pub fn call(folder: &Path, arguments: &[&str]) -> Output {
     call_in(folder, &[], arguments)
 }
 
-/// A call with variables of its environment.
+/// A call with environment variables.
 pub fn call_in(folder: &Path, variables: &[(&str, &str)], arguments: &[&str]) -> Output {
     let said = tempfile::tempdir().unwrap();
     let file = |name: &str| std::fs::File::create(said.path().join(name)).unwrap();
@@ -63,7 +63,7 @@ pub fn call_in(folder: &Path, variables: &[(&str, &str)], arguments: &[&str]) ->
     Output { status, stdout: read("out"), stderr: read("err") }
 }
 
-/// What a call from `folder` prints, which succeeds.
+/// The output of a call from `folder` that succeeds.
 #[track_caller]
 pub fn works(folder: &Path, arguments: &[&str]) -> String {
     let o = call(folder, arguments);
@@ -71,7 +71,7 @@ pub fn works(folder: &Path, arguments: &[&str]) -> String {
     String::from_utf8(o.stdout).unwrap()
 }
 
-/// A call fails with one line that holds all of `parts`; all that it says.
+/// Expects that a call fails with one line that contains all of `parts`; returns its output.
 #[track_caller]
 pub fn fails(folder: &Path, arguments: &[&str], code: i32, parts: &[&str]) -> String {
     let o = call(folder, arguments);
@@ -95,7 +95,7 @@ pub fn copy_all(from: &Path, to: &Path) {
     }
 }
 
-/// A copy of a folder that a case may spoil.
+/// A copy of a folder for a test to damage.
 pub fn copy_of(from: &Path) -> (tempfile::TempDir, PathBuf) {
     let dir = tempfile::tempdir().unwrap();
     let to = dir.path().join("copy");
@@ -103,12 +103,12 @@ pub fn copy_of(from: &Path) -> (tempfile::TempDir, PathBuf) {
     (dir, to)
 }
 
-/// A copy of the good run that a case may spoil.
+/// A copy of the valid run for a test to damage.
 pub fn copy() -> (tempfile::TempDir, PathBuf) {
     copy_of(&good().run)
 }
 
-/// A file system of a mebibyte, or none where this user may not mount one.
+/// A file system of one mebibyte; `None` if this user may not mount one.
 pub struct Small(pub PathBuf);
 
 impl Small {

@@ -1,5 +1,5 @@
-//! Weights of networks from the user's files: safetensors, and what PyTorch's `torch.save` writes of a state_dict (`.pth`, `.pt`),
-//! in its present format (a ZIP archive) and the one before 1.6.
+//! Network weights from files: safetensors, and state_dicts written by PyTorch's `torch.save` (`.pth`, `.pt`), in the present format (a
+//! zip archive) and the one before PyTorch 1.6.
 
 mod number;
 #[cfg(test)]
@@ -16,18 +16,18 @@ use std::fs::File;
 use std::io::{BufReader, Read, Seek, Write};
 use std::path::Path;
 
-/// Most bytes of a file.
+/// Largest file that is read, in bytes.
 const LIMIT: u64 = 8 << 30;
 
-/// The tensors of floating-point numbers whose names `wanted` admits, in the file's order, as f32.
+/// Reads the floating-point tensors whose names `wanted` accepts, in the file's order, as f32.
 ///
 /// # Errors
-/// When the file is neither safetensors nor `torch.save`'s, is not whole, or holds more than names and tensors.
+/// If the file is neither safetensors nor from `torch.save`, is incomplete, or contains more than names and tensors.
 pub fn read(path: &Path, wanted: &dyn Fn(&str) -> bool) -> Result<Vec<NamedArray>> {
     let file = File::open(path).map_err(DataError::io(path, "read"))?;
     let size = file.metadata().map_err(DataError::io(path, "read"))?.len();
     if size > LIMIT {
-        return Err(DataError::input(path, format!("{size} bytes, more than the {LIMIT} that a file of weights may have")));
+        return Err(DataError::input(path, format!("{size} bytes, more than the limit of {LIMIT} for a file of weights")));
     }
     let mut file = BufReader::new(file);
     let mut head = [0; 4];
@@ -35,8 +35,8 @@ pub fn read(path: &Path, wanted: &dyn Fn(&str) -> bool) -> Result<Vec<NamedArray
     let read = match head {
         _ if !known => Err("it is empty or can hardly be read".to_string()),
         [b'P', b'K', 3, 4] => torch::from_zip(file, size, wanted),
-        // Pickles of the magic number begin so, from protocol 4 on in a frame; in a safetensors file this would be the length of a
-        // header, which the magic number tells apart.
+        // Old files start with a pickled magic number, from protocol 4 on inside a frame. In a safetensors file these bytes would be the
+        // length of a header; the magic number distinguishes the two.
         [0x80, 2 | 3, 0x8a, 0x0a] | [0x80, 4 | 5, 0x95, _] => torch::from_legacy(file, size, wanted),
         _ => from_safetensors(path, wanted),
     };
@@ -63,10 +63,10 @@ fn from_safetensors(path: &Path, wanted: &dyn Fn(&str) -> bool) -> std::result::
     Ok(out)
 }
 
-/// Writes arrays as safetensors, with text in its metadata. The file appears whole or not at all.
+/// Writes arrays as safetensors, with text in its metadata. The file appears complete or not at all.
 ///
 /// # Errors
-/// When two arrays have the same name, or the file cannot be written.
+/// If two arrays have the same name, or the file cannot be written.
 pub fn save(path: &Path, arrays: &[NamedArray], metadata: HashMap<String, String>) -> Result<()> {
     let mut views = Vec::new();
     let bytes: Vec<Vec<u8>> = arrays.iter().map(|a| a.values.iter().flat_map(|v| v.to_le_bytes()).collect()).collect();

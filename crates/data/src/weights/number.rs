@@ -1,13 +1,13 @@
-//! Formats of numbers in files of weights.
+//! Number formats in files of weights.
 
-/// Formats of numbers.
+/// Number format of a storage.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Kind {
     Half,
     Brain,
     Single,
     Double,
-    /// Numbers of so many bytes that are no weights.
+    /// Numbers of this many bytes that are not floating point.
     Other(usize),
 }
 
@@ -35,7 +35,7 @@ impl Kind {
         }
     }
 
-    /// Little-endian numbers as f32.
+    /// Decodes little-endian numbers to f32.
     pub(super) fn values(self, data: &[u8]) -> Vec<f32> {
         match self {
             Kind::Half => data.as_chunks::<2>().0.iter().map(|b| half(u16::from_le_bytes(*b))).collect(),
@@ -47,7 +47,7 @@ impl Kind {
     }
 }
 
-/// IEEE 754's 16 bits.
+/// Converts an IEEE 754 half float.
 pub(super) fn half(bits: u16) -> f32 {
     let (sign, exponent, fraction) = (bits >> 15, (bits >> 10 & 31) as i32, (bits & 1023) as f32);
     let magnitude = match exponent {

@@ -1,10 +1,10 @@
-//! Files that PyTorch wrote, files that end early, and hostile ones.
+//! Reads files that PyTorch wrote, truncated files, and hostile ones.
 
 use super::number::half;
 use super::*;
 use std::path::PathBuf;
 
-/// Made by benches/peers/lpips_reference.py, by PyTorch 2.
+/// Made with PyTorch 2 by benches/peers/lpips_reference.py.
 fn sample(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
 }
@@ -14,7 +14,7 @@ fn both_formats_of_torch_save_are_read() {
     for name in ["small.pth", "small_legacy.pth"] {
         let tensors = read(&sample(name), &|_| true).unwrap();
         let names: Vec<&str> = tensors.iter().map(|t| &t.name[..]).collect();
-        // Integers are no weights.
+        // Integer tensors are not weights.
         let expected = ["0.weight", "0.bias", "1.weight", "1.bias", "1.running_mean", "1.running_var", "half", "brain", "double", "part"];
         assert_eq!(names, expected, "{name}");
         let by = |n: &str| tensors.iter().find(|t| t.name == n).unwrap();
@@ -60,7 +60,7 @@ fn tensors_beyond_their_storage_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.pth");
     let whole = std::fs::read(sample("small_legacy.pth")).unwrap();
-    // The tensor `part` begins at its storage's number 4 and has three of ten.
+    // The tensor `part` has three of its storage's ten numbers, starting at number 4.
     let at = whole.windows(6).position(|w| w == b"K\x04K\x03\x85q").unwrap();
     for (i, v) in [(1, 200u8), (3, 9)] {
         let mut bad = whole.clone();
@@ -91,7 +91,7 @@ fn what_is_saved_is_read() {
     assert!(save(&path, &twice, HashMap::new()).unwrap_err().to_string().contains("two arrays are named a.weight"));
 }
 
-/// A file as PyTorch before 1.6 wrote it, with one storage of floats named `0`.
+/// A file in the format of PyTorch before 1.6, with one storage of floats named `0`.
 fn legacy(tensors: &[u8], floats: &[f32]) -> Vec<u8> {
     let mut out = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.\x80\x02M\xe9\x03.\x80\x02}.\x80\x02}".to_vec();
     out.extend(tensors);
@@ -101,7 +101,7 @@ fn legacy(tensors: &[u8], floats: &[f32]) -> Vec<u8> {
     out
 }
 
-/// The entry of a tensor named `name` in that storage of `stored` numbers.
+/// A dictionary entry for a tensor named `name` in that storage, which has `stored` numbers.
 fn entry(name: u8, stored: u8, first: u8, shape: [u8; 2], strides: [u8; 2]) -> Vec<u8> {
     let mut out = vec![b'X', 1, 0, 0, 0, name];
     out.extend(
@@ -144,7 +144,7 @@ fn hostile_files_get_one_line_and_no_memory() {
         (call("os\nsystem\n"), "would run os.system"),
         (call("builtins\neval\n"), "would run builtins.eval"),
         (call("subprocess\nPopen\n"), "would run subprocess.Popen"),
-        // A tensor of 65,025 numbers of a storage of one, and one that begins behind its storage.
+        // A tensor of 65,025 numbers from a storage of one, and one that starts beyond its storage.
         (entry(b'w', 1, 0, [255, 255], [0, 0]), "more numbers than the file has bytes"),
         (entry(b'w', 1, 0, [2, 3], [1, 2]), "beyond its storage"),
         (entry(b'w', 1, 9, [1, 1], [1, 1]), "beyond its storage"),
@@ -156,7 +156,7 @@ fn hostile_files_get_one_line_and_no_memory() {
         let line = e.to_string();
         assert!(e.is_input() && line.contains(what) && line.lines().count() == 1, "{what}: {line}");
     }
-    // A list in itself, and a storage that claims to have 2⁶³ numbers.
+    // A list that contains itself, and a storage that claims 2⁶³ numbers.
     let mut claims = legacy(&entry(b'w', 1, 0, [1, 1], [1, 1]), &[1.0]);
     let n = claims.len();
     claims[n - 12..n - 4].copy_from_slice(&(1u64 << 63).to_le_bytes());

@@ -1,4 +1,4 @@
-//! What `torch.save` writes: a pickle of names and tensors' descriptions, and the numbers beside it.
+//! Files of `torch.save`: a pickle with names and descriptions of tensors, and the numbers beside it.
 
 use super::number::Kind;
 use crate::pickle::{self, Id, Node, Pickle};
@@ -7,7 +7,7 @@ use std::collections::HashMap;
 use std::fs::File;
 use std::io::{BufReader, Read, Seek};
 
-/// Modules that run programs, reach files or load code: a file of weights that calls into them is hostile.
+/// Modules that run programs, access files or load code: a file of weights that calls them is hostile.
 const HOSTILE: [&str; 18] = [
     "os",
     "posix",
@@ -28,7 +28,7 @@ const HOSTILE: [&str; 18] = [
     "marshal",
     "operator",
 ];
-/// Functions of those modules that merely build values.
+/// Functions of those modules that only build values.
 const HARMLESS: [&str; 8] = [
     "builtins set",
     "builtins frozenset",
@@ -45,17 +45,17 @@ struct Described {
     name: String,
     shape: Vec<usize>,
     kind: Kind,
-    /// Name of the storage and how many numbers it has.
+    /// Name of the storage, and how many numbers it has.
     storage: String,
     stored: usize,
-    /// The first number of the tensor, and how many there are.
+    /// Index of the tensor's first number, and how many it has.
     first: usize,
     count: usize,
-    /// Steps between neighbours of each axis, where the numbers do not lie row by row.
+    /// Strides of the axes, if the numbers are not stored row by row.
     strides: Option<Vec<usize>>,
 }
 
-/// The tensors that a state_dict names, or that one under a key such as `state_dict` does.
+/// The tensors of a state_dict, at the top or under a key such as `state_dict`.
 fn described(p: &Pickle, file_bytes: u64, wanted: &dyn Fn(&str) -> bool) -> std::result::Result<Vec<Described>, String> {
     refuse_hostile(p)?;
     let Node::Dict(entries) = p.root() else {
@@ -72,21 +72,21 @@ fn described(p: &Pickle, file_bytes: u64, wanted: &dyn Fn(&str) -> bool) -> std:
             _ => describe(p, *key, *value, wanted, &mut out)?,
         }
     }
-    // Tensors may share storage, but not so often that a small file fills the memory.
+    // Tensors may share storage, but a small file must not fill the memory.
     if out.iter().map(|d| d.count as u64).try_fold(0, u64::checked_add).is_none_or(|n| n > file_bytes) {
         return Err("its tensors have more numbers than the file has bytes".into());
     }
     Ok(out)
 }
 
-/// Refuses a pickle that would have run something. Nothing is ever called here; the line tells the user what the file is.
+/// Refuses a pickle that would have executed something. Nothing is ever called here; the message tells the user what kind of file it is.
 fn refuse_hostile(p: &Pickle) -> std::result::Result<(), String> {
     for node in p.nodes() {
         let Node::Call(f, _) = node else { continue };
         let Node::Global(name) = p.get(*f) else { continue };
         let module = name.split([' ', '.']).next().unwrap_or_default();
         if HOSTILE.contains(&module) && !HARMLESS.contains(&&name[..]) {
-            return Err(format!("it would run {:.80}, as no file of weights does; do not load it elsewhere", name.replace(' ', ".")));
+            return Err(format!("it would run {:.80}, which no file of weights needs; do not load it elsewhere", name.replace(' ', ".")));
         }
     }
     Ok(())
@@ -95,7 +95,7 @@ fn refuse_hostile(p: &Pickle) -> std::result::Result<(), String> {
 fn describe(p: &Pickle, key: Id, value: Id, wanted: &dyn Fn(&str) -> bool, out: &mut Vec<Described>) -> std::result::Result<(), String> {
     let Some(name) = p.text(key).filter(|n| wanted(n)) else { return Ok(()) };
     let mut value = value;
-    // A parameter is a tensor with the wish for a gradient.
+    // A parameter is a tensor with a flag for its gradient.
     if let Node::Call(f, arguments) = p.get(value)
         && matches!(p.get(*f), Node::Global(g) if g == "torch._utils _rebuild_parameter")
         && let Some([tensor, ..]) = p.list(*arguments)
@@ -145,7 +145,7 @@ fn describe(p: &Pickle, key: Id, value: Id, wanted: &dyn Fn(&str) -> bool, out: 
 }
 
 impl Described {
-    /// How many of the storage's numbers it takes to have the tensor's.
+    /// How many of the storage's numbers must be read to get all numbers of the tensor.
     fn end(&self) -> Option<usize> {
         match &self.strides {
             None => self.first.checked_add(self.count),
@@ -153,7 +153,7 @@ impl Described {
         }
     }
 
-    /// The tensor, of its storage's bytes.
+    /// Decodes the tensor from the bytes of its storage.
     fn of(self, storage: &[u8]) -> std::result::Result<NamedArray, String> {
         let n = self.kind.bytes();
         let range = self.first.checked_mul(n).zip(self.end().and_then(|e| e.checked_mul(n)));
@@ -167,7 +167,7 @@ impl Described {
     }
 }
 
-/// Numbers with strides, row by row.
+/// Copies numbers with strides into row-major order.
 fn in_rows(shape: &[usize], strides: &[usize], from: &[f32]) -> Vec<f32> {
     let mut index = vec![0; shape.len()];
     let mut out = Vec::new();
@@ -187,7 +187,7 @@ fn in_rows(shape: &[usize], strides: &[usize], from: &[f32]) -> Vec<f32> {
 pub(super) fn from_zip(file: BufReader<File>, size: u64, wanted: &dyn Fn(&str) -> bool) -> std::result::Result<Vec<NamedArray>, String> {
     let mut zip = zip::ZipArchive::new(file).map_err(|e| format!("not a whole archive ({e}); copy the file again"))?;
     let named = |name: std::result::Result<std::borrow::Cow<str>, _>| Some(name.ok()?.strip_suffix("data.pkl")?.to_string());
-    let root = zip.file_names().find_map(named).ok_or("an archive without data.pkl, so none of torch.save")?;
+    let root = zip.file_names().find_map(named).ok_or("an archive without data.pkl, so it was not written by torch.save")?;
     if let Ok(mut order) = zip.by_name(&format!("{root}byteorder")) {
         let mut text = Vec::new();
         order.by_ref().take(16).read_to_end(&mut text).map_err(|e| e.to_string())?;
@@ -214,7 +214,7 @@ pub(super) fn from_zip(file: BufReader<File>, size: u64, wanted: &dyn Fn(&str) -
     Ok(out)
 }
 
-/// The number that opens files of PyTorch before 1.6.
+/// Magic number of files from PyTorch before 1.6.
 const MAGIC: [u8; 10] = [0x6c, 0xfc, 0x9c, 0x46, 0xf9, 0x20, 0x6a, 0xa8, 0x50, 0x19];
 
 pub(super) fn from_legacy(
@@ -223,7 +223,7 @@ pub(super) fn from_legacy(
     wanted: &dyn Fn(&str) -> bool,
 ) -> std::result::Result<Vec<NamedArray>, String> {
     if pickle::read(&mut file)?.root() != &Node::Bytes(MAGIC.into()) {
-        return Err("a pickle, but none of torch.save; save model.state_dict() by torch.save".into());
+        return Err("a pickle, but not one of torch.save; save model.state_dict() with torch.save".into());
     }
     let version = pickle::read(&mut file)?;
     if version.root() != &Node::Int(1001) {
@@ -274,7 +274,7 @@ pub(super) fn from_legacy(
     Ok(out.into_iter().map(|(_, t)| t).collect())
 }
 
-/// Names and kinds of all storages, those of tensors that nobody wants among them.
+/// Names and number formats of all storages, including those of tensors that are not wanted.
 fn storages(p: &Pickle) -> std::result::Result<HashMap<String, Kind>, String> {
     let mut out = HashMap::new();
     for node in p.nodes() {

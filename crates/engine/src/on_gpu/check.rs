@@ -1,12 +1,10 @@
 //! Checks of a device: the parts of a training step compared with the CPU's.
 
 mod draws;
-mod losses;
 mod views;
 
 use super::GpuTracer;
 use crate::fields::{self, DensityQuery, FieldBuffers};
-use crate::losses::{ColorLoss, Photometric};
 use crate::renderers::supervised::Supervised;
 use crate::renderers::volume::{self, Accelerator, Quality, Tracer};
 use crate::samplers::RayBatch;
@@ -19,17 +17,13 @@ use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, PixelFormat, Pose};
 use diorama_kernels::check::{Row, Table};
-use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
-use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
-use diorama_kernels::ops::composite::{Composited, Packed, cpu as composite, reference};
-use diorama_kernels::ops::distortion;
+use diorama_kernels::gpu::{Gpu, GpuError};
+use diorama_kernels::ops::composite::Packed;
+use diorama_kernels::ops::composite::gpu::GpuPacked;
 use diorama_kernels::ops::field_step::gpu as field;
-use diorama_kernels::ops::field_step::{RayGradient, RayLoss, RayOutput};
 use diorama_kernels::ops::hash_grid::HashGridConfig;
-use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::{self as march, GpuRays, Space};
 use diorama_kernels::ops::march::{MarchRays, Marched};
-use diorama_kernels::ops::photometric_loss::gpu::{self as loss, Figures, SUMS, Target, Terms};
 use diorama_kernels::ops::pixel_gather;
 use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, CELLS, GpuPhotographs};
@@ -44,7 +38,7 @@ use diorama_testkit::{random, random_unit, wide};
 /// When the device is lost; wrong results are rows with a fault.
 pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
     let mut table = Table::new(gpu);
-    for case in [draws::draws, strata_cases, corrections, spaces, grids, losses::losses, look_ups, views::views, views::other_views] {
+    for case in [draws::draws, strata_cases, corrections, spaces, look_ups, views::views, views::other_views] {
         case(gpu, &mut table)?;
     }
     Ok(table.rows)
@@ -150,7 +144,6 @@ struct Ragged {
     offsets: Vec<u32>,
     t: Vec<f32>,
     dt: Vec<f32>,
-    sigma: Vec<f32>,
 }
 
 impl Ragged {
@@ -160,8 +153,7 @@ impl Ragged {
         let s = offsets[rays] as usize;
         let t = (0..rays).flat_map(|r| (0..offsets[r + 1] - offsets[r]).map(|i| 0.1 + 0.05 * i as f32)).collect();
         let dt = random_unit(s, 1).iter().map(|u| 0.01 + 0.03 * u).collect();
-        let sigma = random_unit(s, 2).iter().map(|u| if *u < 0.3 { 0.05 * u } else { 40.0 * u * u }).collect();
-        Ragged { offsets, t, dt, sigma }
+        Ragged { offsets, t, dt }
     }
 
     fn packed(&self) -> Packed<'_> {
@@ -200,41 +192,6 @@ fn spaces(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let shape = format!("R={rays} {space:?}");
             table.close("positions", "forward", &shape, &march::positions(gpu, &on_gpu, &p, space), &want)?;
             table.close("positions", "points", &shape, &march::to_space(gpu, &gpu.upload(&model), space), &want)?;
-        }
-    }
-    Ok(())
-}
-
-fn grids(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
-    let rng = Rng::new(5, 6);
-    for (cascades, unbounded) in [(1, false), (3, false), (3, true)] {
-        let mut grid = Occupancy::new(16, cascades, unbounded);
-        // A corner that no camera sees.
-        grid.density[..40].fill(-1.0);
-        grid.refresh();
-        let g = &grid;
-        let thresholds: Vec<f32> = (0..cascades).map(|c| g.most(c)).collect();
-        let on_gpu = GpuOccupancyGrid::upload(gpu, &g.bits, &g.density, &g.fresh, &g.live, g.decay, &thresholds);
-        for (step, block) in [(0u64, 2), (16, 2), (1 << 30, 1)] {
-            let shape = format!("cascades={cascades} unbounded={unbounded} step {step} block {block}");
-            let (points, cells) = grid.probe(&rng, step, 3000, block);
-            let (points_gpu, cells_gpu) = on_gpu.probe(gpu, &rng, step, 3000, block, Space::Model);
-            table.close("occupancy", "points", &shape, &points_gpu, &wide(&points))?;
-            table.equal("occupancy", "cells", &shape, &cells_gpu, &cells)?;
-            let sigma: Vec<f32> = random_unit(3000, step + 1).iter().map(|u| u * u * 20.0).collect();
-            let met: Vec<u32> = cells.iter().rev().copied().collect();
-            let met_sigma: Vec<f32> = random(3000, step + 2).iter().map(|s| s * 9.0).collect();
-            grid.record(&met, &met_sigma);
-            on_gpu.record(gpu, &Rows::all(gpu, 3000), &gpu.upload(&met), &gpu.upload(&met_sigma));
-            grid.fold(&cells, &sigma, block);
-            on_gpu.update(gpu, &cells_gpu, &gpu.upload(&sigma), block);
-            let (density, _) = on_gpu.read(gpu)?;
-            // The greatest number stands for "not sampled yet" and would swamp all errors.
-            let known = |v: &[f32]| v.iter().map(|d| if *d == f32::MAX { -2.0 } else { *d }).collect::<Vec<f32>>();
-            table.close("occupancy", "densities", &shape, &gpu.upload(&known(&density)), &wide(&known(&grid.density)))?;
-            let wrong = on_gpu.bits.differences(gpu, &grid.bits)?;
-            let outcome = if wrong == 0 { Ok(0.0) } else { Err(format!("{wrong} words differ")) };
-            table.row("occupancy", "bits", shape, outcome);
         }
     }
     Ok(())

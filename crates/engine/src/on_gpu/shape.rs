@@ -1,7 +1,7 @@
 //! Device-side description of a field: encoding, network, space and precision. Parameters are kept apart.
 
 use crate::fields::{DirectionCode, Encoder as FieldEncoder, Field};
-use crate::step::relative;
+use crate::step::measure;
 use diorama_geom::contraction as geom;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::gpu::{Buffer, Gpu, Rows};
@@ -9,6 +9,7 @@ use diorama_kernels::ops::field_step::gpu::{Arithmetic, GpuNet};
 use diorama_kernels::ops::frequency::Frequency;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::march::gpu::Space;
+use diorama_kernels::ops::photometric_loss::Measure;
 use diorama_kernels::ops::trilinear_corner_grid::gpu::{GpuVoxels, keep_empty};
 use diorama_kernels::ops::{frequency, spherical_harmonics, triangle_wave};
 
@@ -26,10 +27,8 @@ pub struct Shape {
     pub net: GpuNet,
     /// Space in which positions are encoded.
     pub space: Space,
-    /// Whether space has no bound.
-    pub is_unbounded: bool,
-    /// [`crate::losses::Photometric::relative`] of this field.
-    pub relative: f32,
+    /// How a loss measures colors and distances.
+    pub measure: Measure,
 }
 
 impl Shape {
@@ -56,8 +55,7 @@ impl Shape {
             (true, geom::Space::Cube(edge)) => Space::Centred(edge),
         };
         let net = GpuNet::new(gpu, &field.net, &field.density_net(Precision::F32), per_level, &wanted, arithmetic);
-        let is_unbounded = field.is_unbounded();
-        Shape { encoder, directions: field.codes.direction, net, space, is_unbounded, relative: relative(field) }
+        Shape { encoder, directions: field.codes.direction, net, space, measure: measure(field) }
     }
 
     /// Encoded points `[S, 3]` of the field's space.

@@ -73,7 +73,7 @@ impl GpuTracer {
         let all = if gpu.software { SOFTWARE_ROOM } else { ROOM };
         GpuTracer {
             coarse: coarse.map(|f| ViewField::upload(&gpu, f)),
-            occupancy: occupancy.map(|o| GpuOccupancy::upload(&gpu, &o.bits)),
+            occupancy: occupancy.map(|o| GpuOccupancy::upload(&gpu, o.bits())),
             room: if field.shape.net.element().is_some() || occupancy.is_some() { all } else { LAYERED_ROOM },
             field,
             gpu,

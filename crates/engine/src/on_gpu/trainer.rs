@@ -4,7 +4,6 @@ use super::place::{self, FieldRef, GpuSamples, PlaceOn};
 use super::shape::Shape;
 use crate::fields::Field;
 use crate::params::{ParamGroup, Schedule};
-use crate::samplers::occupancy::Occupancy;
 use crate::step::{self, Figures, GivenRays, Loss, Probes, RaySource, Scene, Step, Trainees};
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
@@ -12,9 +11,9 @@ use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
 use diorama_kernels::ops::linear::{self, Activation, Dense};
-use diorama_kernels::ops::march::gpu::occupancy::GpuOccupancyGrid;
 use diorama_kernels::ops::march::gpu::{self as march, GpuRays};
-use diorama_kernels::ops::photometric_loss::gpu::{self as loss, SUMS, Target, Terms};
+use diorama_kernels::ops::occupancy_update::gpu::GpuOccupancyGrid;
+use diorama_kernels::ops::photometric_loss::gpu::{self as loss, SUMS, Target};
 use diorama_kernels::ops::pixel_gather::gpu::error_map::GpuErrorMap;
 use diorama_kernels::ops::pixel_gather::gpu::{Backdrop, Drawn, GpuPhotographs};
 use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
@@ -175,7 +174,7 @@ impl GpuField {
             }
             Loss::Photometric(terms) => {
                 assert_eq!(net.net.channels(), 3, "a photometric loss compares colors alone");
-                let terms = self.terms(&terms);
+                let terms = (terms, self.shape.measure);
                 let (rgba, distance) = (&r.drawn.target, &r.drawn.distance);
                 let target = Target { rgba, background, left_out: pass.left_out, distance };
                 let figures = loss::Figures { sums, marched: &on.marched, is_main: pass.is_main };
@@ -212,12 +211,6 @@ impl GpuField {
             group.step(gpu, s, &d);
         }
         Ok(Learned { errors, background: g.background, weights: composited, points, codes: d_given, loss })
-    }
-
-    /// The loss terms in the form that the kernels take.
-    fn terms(&self, t: &crate::losses::Terms) -> Terms {
-        let normalized = self.shape.is_unbounded;
-        Terms { color: t.color, relative: self.shape.relative, distortion: t.distortion, normalized, alpha: t.alpha, depth: t.depth }
     }
 }
 
@@ -264,10 +257,6 @@ pub struct GpuTrainer {
 impl GpuTrainer {
     /// Uploads parameters, grid, photographs and cameras.
     pub fn new(gpu: Gpu, scene: Scene, of: &Trainees, photographs: Option<GpuPhotographs>) -> Self {
-        let occupancy = |o: &Occupancy| {
-            let thresholds: Vec<f32> = (0..o.bits.cascades).map(|c| o.most(c)).collect();
-            GpuOccupancyGrid::upload(&gpu, &o.bits, &o.density, &o.fresh, &o.live, o.decay, &thresholds)
-        };
         let cameras = GpuCameras::upload(&gpu, &scene.cameras);
         let corrections = of.corrections.as_ref().map(|(g, focal)| (GpuGroup::upload(&gpu, g), *focal));
         corrections.iter().for_each(|(g, focal)| cameras.correct(&gpu, &g.values, *focal));
@@ -276,7 +265,7 @@ impl GpuTrainer {
             coarse: of.coarse.as_ref().map(|f| GpuField::upload(&gpu, f, false)),
             scene,
             learned: of.learned.as_ref().map(|l| (GpuGroup::upload(&gpu, &l.group), l.activation)),
-            occupancy: of.occupancy.as_deref().map(occupancy),
+            occupancy: of.occupancy.as_deref().map(|o| GpuOccupancyGrid::upload(&gpu, &o.grid)),
             photographs,
             cameras,
             corrections,
@@ -461,8 +450,8 @@ impl GpuTrainer {
             m.rebuild();
         }
         if let (Some(own), Some(o)) = (&self.occupancy, &mut to.occupancy) {
-            (o.density, o.fresh) = own.read(gpu)?;
-            o.refresh();
+            (o.grid.density, o.grid.fresh) = own.read(gpu)?;
+            o.grid.refresh();
         }
         Ok(())
     }

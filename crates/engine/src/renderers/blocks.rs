@@ -317,7 +317,7 @@ mod tests {
                 let f = field(space, images, precision);
                 let mut occupancy = Occupancy::new(16, 2, unbounded);
                 let rng = Rng::new(5, 5);
-                occupancy.bits.fill_with(|i| rng.uniform(i as u64) > 0.4);
+                occupancy.grid.bits.fill_with(|i| rng.uniform(i as u64) > 0.4);
                 let own = traced(&f, &occupancy, 1e-4, 0.0, None);
                 assert!(
                     own.opacity.iter().any(|o| *o > 0.999) && own.opacity.iter().filter(|o| **o > 0.1 && **o < 0.9).count() > 10,

@@ -187,7 +187,7 @@ impl Tracer<'_> {
             return self.before_backdrop(batch, out);
         }
         let mut samples = PlacedSamples::default();
-        let on = PlaceOn { field: self.field, occupancy: self.occupancy.map(|o| &o.bits), batch, first: 0 };
+        let on = PlaceOn { field: self.field, occupancy: self.occupancy.map(Occupancy::bits), batch, first: 0 };
         self.placement.place(&on, &mut samples, buf, &mut |samples, buf| {
             let coarse = self.coarse.expect("a coarse field");
             placement::encode(coarse, batch, samples);
@@ -210,7 +210,7 @@ impl Tracer<'_> {
         }
         let RayBatch { origins, dirs, near_far, jitter, .. } = batch;
         let images = self.appearance.map(|i| vec![i; batch.len()]);
-        let grid = &self.occupancy.expect("an occupancy grid").bits;
+        let grid = self.occupancy.expect("an occupancy grid").bits();
         let blocks = Blocks { field: self.field, grid, march, pruning, shared_weight: self.shared_weight };
         blocks.trace(&MarchRays { origins, dirs, near_far, jitter, resumed: false }, images.as_deref())
     }
@@ -285,7 +285,7 @@ mod tests {
         let rays =
             MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
         let mut long = VisibleSamples::default();
-        march::cpu::march(&occupancy.bits, &rays, &occupancy.march_config(4096), &mut Default::default(), &mut long.samples);
+        march::cpu::march(occupancy.bits(), &rays, &occupancy.march_config(4096), &mut Default::default(), &mut long.samples);
         let mut buf = FieldBuffers::default();
         placement::encode(&field, &batch, &mut long);
         tracer.composite(&field, &batch, &mut long, &mut buf);

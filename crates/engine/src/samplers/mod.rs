@@ -6,6 +6,8 @@ pub mod placement;
 pub mod stereo;
 pub mod stratified;
 
+use diorama_kernels::ops::photometric_loss::Targets;
+
 /// A batch of rays in model space with what they are to match.
 #[derive(Clone, Debug, Default)]
 pub struct RayBatch {
@@ -36,6 +38,11 @@ impl RayBatch {
 
     pub fn is_empty(&self) -> bool {
         self.images.is_empty()
+    }
+
+    /// What the rays are compared with, over a background `[R, 3]`.
+    pub fn targets<'a>(&'a self, background: &'a [f32]) -> Targets<'a> {
+        Targets { rgba: &self.target, background, counts: &self.counts, distance: &self.distance }
     }
 
     /// Makes room for `n` rays.

@@ -1,14 +1,13 @@
-//! The occupancy grid (instant-ngp, section E.2): decayed maxima of sampled densities per cell, and the
-//! bits that marching reads.
+//! The occupancy grid of a field ([`occupancy_update`](diorama_kernels::ops::occupancy_update)): which cells cameras see, and how rays march
+//! through it.
 
 use crate::fields::DensityQuery;
 use diorama_geom::Lens;
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::march::{MarchConfig, OccupancyBits};
+use diorama_kernels::ops::occupancy_update::{OccupancyGrid, UNSEEN};
 use diorama_kernels::ops::ray_generation::PosedCamera;
-use diorama_kernels::scatter_max::scatter_max;
-use rayon::prelude::*;
 use std::f64::consts::PI;
 
 /// Smallest step of marching: the diagonal of the model cube in 1024 steps.
@@ -17,17 +16,8 @@ pub const MIN_STEP: f32 = 1.732_050_8 / 1024.0;
 /// Optical thickness of a smallest step above which a cell is occupied.
 const THRESHOLD: f32 = 0.01;
 
-/// Density above which a cell of the innermost cascade is occupied, unless the mean of all is lower.
+/// Density above which a cell of the innermost cascade is occupied.
 const OCCUPIED: f32 = THRESHOLD / MIN_STEP;
-
-/// Density that stands for "no camera sees this": never sampled, never occupied.
-const UNSEEN: f32 = -1.0;
-
-/// Density that stands for "not sampled yet": occupied until it is.
-const UNKNOWN: f32 = f32::MAX;
-
-/// Cells or points per task.
-const TASK: usize = 1 << 12;
 
 /// Longest step in unbounded space, in inner cubes.
 const LONGEST_STEP: f32 = 1e6;
@@ -41,35 +31,32 @@ const RIM: usize = 8;
 /// Cells per axis of the blocks in which visibility is decided.
 const SEEN_BLOCK: usize = 8;
 
-/// Which cells of nested cubes may hold matter, learned from densities that the field gives.
+/// Where a field's matter may be, within its space.
 #[derive(Clone, Debug)]
 pub struct Occupancy {
-    pub bits: OccupancyBits,
+    /// Cells that no camera sees are never sampled and never occupied.
+    pub grid: OccupancyGrid,
     /// Whether there is space beyond the outermost cascade.
     pub unbounded: bool,
-    /// Decayed maximum density per cell.
-    pub density: Vec<f32>,
-    /// Highest density sampled in each cell since the last update; 0 where none was sampled.
-    pub fresh: Vec<f32>,
-    /// Cells that some camera sees.
-    pub live: Vec<u32>,
-    /// Factor of a stored density at each update of its cell.
-    pub decay: f32,
 }
 
 impl Occupancy {
     pub fn new(resolution: usize, cascades: usize, unbounded: bool) -> Self {
-        let bits = OccupancyBits::full(resolution, cascades);
-        let density = vec![UNKNOWN; bits.cells()];
-        let live = (0..bits.cells() as u32).collect();
-        Occupancy { fresh: vec![0.0; bits.cells()], bits, unbounded, density, live, decay: 0.8 }
+        // Steps of a march grow with the cascades, so that thinner matter counts in the outer ones.
+        let threshold = |cascade: usize| OCCUPIED / if unbounded { (1u32 << cascade) as f32 } else { 1.0 };
+        Occupancy { grid: OccupancyGrid::new(resolution, (0..cascades).map(threshold).collect()), unbounded }
+    }
+
+    /// What marching reads.
+    pub fn bits(&self) -> &OccupancyBits {
+        &self.grid.bits
     }
 
     /// Step lengths of marching through this grid; `max_samples` bounds the samples of a ray.
     pub fn march_config(&self, max_samples: usize) -> MarchConfig {
-        let cascades = self.bits.cascades;
+        let (cascades, resolution) = (self.grid.bits.cascades, self.grid.bits.resolution);
         let cone = if cascades > 1 { 1.0 / 256.0 } else { 0.0 };
-        let dt_max = MIN_STEP * 1024.0 / self.bits.resolution as f32 * (1u32 << (cascades - 1)) as f32;
+        let dt_max = MIN_STEP * 1024.0 / resolution as f32 * (1u32 << (cascades - 1)) as f32;
         if self.unbounded {
             let (disparity_from, dt_max) = (DISPARITY_FROM, LONGEST_STEP);
             return MarchConfig { cone, dt_min: MIN_STEP, dt_max, disparity_from, unbounded: true, max_samples };
@@ -79,10 +66,10 @@ impl Occupancy {
 
     /// Rules out cells that fewer than `min_views` cameras see, and cells of a coarser cascade that a finer one covers.
     pub fn keep_visible(&mut self, cameras: &[PosedCamera], min_views: usize) {
-        let n = self.bits.resolution;
+        let n = self.grid.bits.resolution;
         let blocks = n / SEEN_BLOCK;
         let sights: Vec<Sight> = cameras.iter().map(Sight::new).collect();
-        for c in 0..self.bits.cascades {
+        for c in 0..self.grid.bits.cascades {
             let (low, size) = OccupancyBits::cube(c);
             let edge = (size / blocks as f32) as f64;
             let radius = edge * 0.5 * 3f64.sqrt();
@@ -95,104 +82,25 @@ impl Occupancy {
                     for k in 0..SEEN_BLOCK.pow(3) {
                         let q = [k % SEEN_BLOCK, k / SEEN_BLOCK % SEEN_BLOCK, k / SEEN_BLOCK / SEEN_BLOCK];
                         let at = [0, 1, 2].map(|a: usize| p[a] * SEEN_BLOCK + q[a]);
-                        self.density[((c * n + at[2]) * n + at[1]) * n + at[0]] = UNSEEN;
+                        self.grid.density[((c * n + at[2]) * n + at[1]) * n + at[0]] = UNSEEN;
                     }
                 }
             }
         }
-        self.refresh();
+        self.grid.refresh();
     }
 
-    /// Density above which cells of a cascade are occupied, unless the mean of its known ones is lower.
-    pub fn most(&self, cascade: usize) -> f32 {
-        // Steps of a march grow with the cascades, so that thinner matter counts in the outer ones.
-        OCCUPIED / if self.unbounded { (1u32 << cascade) as f32 } else { 1.0 }
-    }
-
-    /// Recomputes the bits, and which cells are live, from the densities.
-    pub fn refresh(&mut self) {
-        self.live = (0..self.density.len() as u32).filter(|&i| self.density[i as usize] >= 0.0).collect();
-        self.refresh_bits();
-    }
-
-    fn refresh_bits(&mut self) {
-        let cells = self.bits.resolution.pow(3);
-        let thresholds: Vec<f32> = (0..self.bits.cascades)
-            .map(|c| {
-                let own = &self.density[c * cells..(c + 1) * cells];
-                let parts: Vec<(f64, usize)> = own.par_chunks(TASK).map(known_sum).collect();
-                let (sum, known) = parts.iter().fold((0.0, 0), |a, p| (a.0 + p.0, a.1 + p.1));
-                self.most(c).min((sum / known.max(1) as f64) as f32)
-            })
-            .collect();
-        let density = &self.density;
-        self.bits.fill_with(|cell| density[cell] > thresholds[cell / cells]);
-    }
-
-    /// Records densities `[N]` sampled in `cells` `[N]` for the next update; negative ones are ignored.
-    pub fn record(&mut self, cells: &[u32], sigma: &[f32]) {
-        scatter_max(cells, sigma, &mut self.fresh);
-    }
-
-    /// Samples the field at `count` random points of the cells that a camera sees, folds in what was
-    /// recorded and refreshes the bits. Blocks of `block³` cells share one point (1 once the field has settled).
+    /// Samples the field at `count` random points of the cells that a camera sees, and updates the grid with their densities and those
+    /// that were recorded. Blocks of `block³` cells share one point (1 once the field has settled).
     pub fn update(&mut self, field: &dyn DensityQuery, rng: &Rng, counter: u64, count: usize, block: usize) {
-        if self.live.is_empty() {
+        if self.grid.live.is_empty() {
             return;
         }
-        let (points, cells) = self.probe(rng, counter, count, block);
+        let (points, cells) = self.grid.probe(rng, counter, count, block);
         let mut sigma = vec![0.0; count];
         field.density(&points, &mut sigma);
-        self.fold(&cells, &sigma, block);
+        self.grid.update(&cells, &sigma, block);
     }
-
-    /// Random points `[count, 3]` of live cells, and the first cells `[count]` of the blocks that they stand for.
-    pub fn probe(&self, rng: &Rng, counter: u64, count: usize, block: usize) -> (Vec<f32>, Vec<u32>) {
-        let n = self.bits.resolution;
-        let mut points = vec![0.0; count * 3];
-        let mut cells = vec![0u32; count];
-        let live = &self.live;
-        points.par_chunks_mut(TASK * 3).zip(cells.par_chunks_mut(TASK)).enumerate().for_each(|(task, (points, cells))| {
-            for (i, (point, cell)) in points.chunks_exact_mut(3).zip(cells).enumerate() {
-                let base = (counter * count as u64 + (task * TASK + i) as u64) * 4;
-                let at = live[rng.below(base, live.len() as u64) as usize] as usize;
-                let c = at / n.pow(3);
-                let (low, size) = OccupancyBits::cube(c);
-                let corner = [at % n, at / n % n, at / n / n % n].map(|v| v / block * block);
-                for k in 0..3 {
-                    let u = rng.uniform(base + 1 + k as u64);
-                    point[k] = low + (corner[k] as f32 + u * block as f32) * size / n as f32;
-                }
-                *cell = (((c * n + corner[2]) * n + corner[1]) * n + corner[0]) as u32;
-            }
-        });
-        (points, cells)
-    }
-
-    /// Folds in the densities of probed blocks and what was recorded, and refreshes the bits.
-    pub fn fold(&mut self, cells: &[u32], sigma: &[f32], block: usize) {
-        for k in 0..block.pow(3) as u32 {
-            let (n, b) = (self.bits.resolution as u32, block as u32);
-            let offset = k % b + n * (k / b % b) + n * n * (k / b / b);
-            let of_block: Vec<u32> = cells.iter().map(|c| c + offset).collect();
-            scatter_max(&of_block, sigma, &mut self.fresh);
-        }
-        let decay = self.decay;
-        self.density.par_chunks_mut(TASK).zip(self.fresh.par_chunks_mut(TASK)).for_each(|(density, fresh)| {
-            for (d, f) in density.iter_mut().zip(fresh) {
-                let looked = *f > 0.0 && *d >= 0.0;
-                let folded = if *d == UNKNOWN { *f } else { (*d * decay).max(*f) };
-                *d = if looked { folded } else { *d };
-                *f = 0.0;
-            }
-        });
-        self.refresh_bits();
-    }
-}
-
-/// Sum and number of the densities that were ever sampled.
-fn known_sum(density: &[f32]) -> (f64, usize) {
-    density.iter().filter(|d| **d >= 0.0 && **d != UNKNOWN).fold((0.0, 0), |(s, n), d| (s + *d as f64, n + 1))
 }
 
 /// A camera, and how far from its axis its image reaches.
@@ -263,12 +171,12 @@ mod tests {
         for i in 0..60 {
             o.update(&f, &Rng::new(1, 1), i, 4096, 1);
         }
-        assert!(o.density.iter().all(|d| *d < 1.0));
+        assert!(o.grid.density.iter().all(|d| *d < 1.0));
         f.net.density.shift = 5.0;
         for i in 0..10 {
             o.update(&f, &Rng::new(1, 1), i, 4096, 1);
         }
-        assert!(o.bits.fill() > 0.4, "{}", o.bits.fill());
+        assert!(o.grid.bits.fill() > 0.4, "{}", o.grid.bits.fill());
     }
 
     #[test]
@@ -278,8 +186,8 @@ mod tests {
         o.keep_visible(&[PosedCamera { camera: Camera::pinhole(64, 64, 0.6), pose }], 1);
         let n = 32;
         let cell = |c: usize, x: usize, y: usize, z: usize| ((c * n + z) * n + y) * n + x;
-        assert!(o.bits.get(cell(0, 16, 16, 16)), "the middle is in view");
-        assert!(!o.bits.get(cell(1, 1, 1, 1)), "a corner beside the camera is not");
+        assert!(o.grid.bits.get(cell(0, 16, 16, 16)), "the middle is in view");
+        assert!(!o.grid.bits.get(cell(1, 1, 1, 1)), "a corner beside the camera is not");
     }
     /// Whether the ball of this radius at `distance` and `degrees` from the axis of a camera at the origin is seen.
     fn seen(camera: Camera, degrees: f64, distance: f64, radius: f64) -> bool {

@@ -2,16 +2,16 @@
 
 use super::{Backdrop, Figures, GivenRays, Loss, Photographs, RaySource, Scene, Step, Trainees, corrected};
 use crate::fields::{self, Batch, Field, FieldBuffers, VisibleSamples};
-use crate::losses::{self, Photometric, RELATIVE, Terms};
 use crate::params::ParamGroup;
 use crate::samplers::RayBatch;
+use crate::samplers::occupancy::Occupancy;
 use crate::samplers::pixels::{self, DrawOptions, ErrorMap, PixelSource};
 use crate::samplers::placement::{self, PlaceOn, PlacedSamples, Placement};
 use crate::stages::Stages;
 use diorama_kernels::ops::composite::Packed;
-use diorama_kernels::ops::distortion;
 use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::march;
+use diorama_kernels::ops::photometric_loss::{Measure, Photometric, RELATIVE, squared_error};
 use diorama_kernels::ops::ray_aabb;
 use diorama_kernels::ops::ray_generation::{self, CORRECTION, PosedCamera};
 
@@ -175,7 +175,7 @@ impl CpuTrainer {
     fn place_and_train(&mut self, of: &mut Trainees, s: &Step) -> (f64, usize, usize) {
         let moves = of.moves_cameras(s);
         let drawn = Drawn { batch: &self.batch, background: &self.background, step: s };
-        let on = PlaceOn { field: &*of.field, occupancy: of.occupancy.as_ref().map(|o| &o.bits), batch: &self.batch, first: s.first };
+        let on = PlaceOn { field: &*of.field, occupancy: of.occupancy.as_deref().map(Occupancy::bits), batch: &self.batch, first: s.first };
         let (coarse, mut coarse_loss, mut trained) = (&mut of.coarse, 0.0, 0);
         let train_coarse = &mut |samples: &mut VisibleSamples, buffers: &mut FieldBuffers| {
             let field = &mut **coarse.as_mut().expect("a coarse field");
@@ -188,7 +188,7 @@ impl CpuTrainer {
         trained += main.samples.t.len();
         let mut marched = trained;
         if let (Placement::Occupancy { .. }, Some(grid)) = (s.placement, &mut of.occupancy) {
-            self.field.visible.densities().for_each(|(cells, sigma)| grid.record(cells, sigma));
+            self.field.visible.densities().for_each(|(cells, sigma)| grid.grid.record(cells, sigma));
             marched = self.field.visible.marched();
         }
         drawn.train(of.field, main, &mut self.field, moves.then_some(&mut self.d_positions));
@@ -197,13 +197,13 @@ impl CpuTrainer {
 
     /// Squared error of the step's colors, and what the error map learns from it.
     fn score(&self, field: &Field, mut error_map: Option<&mut ErrorMap>, photographs: Option<&dyn PixelSource>) -> f64 {
-        let (b, is_linear) = (&self.batch, relative(field) > 0.0);
+        let (b, is_linear) = (&self.batch, measure(field).relative > 0.0);
         let (mut sum, mut n) = (0.0f64, 0usize);
         for r in (0..b.len()).filter(|r| b.counts[*r]) {
             let t = &b.target[r * 4..r * 4 + 4];
             let want = [0, 1, 2].map(|k| t[k] * t[3] + self.background[r * 3 + k] * (1.0 - t[3]));
             let got = [0, 1, 2].map(|k| self.field.out.values[r * 3 + k]);
-            let e = losses::squared_error(got, want, is_linear);
+            let e = squared_error(got, want, is_linear);
             sum += e as f64;
             n += 1;
             if let (Some(map), Some(photographs)) = (&mut error_map, photographs) {
@@ -250,26 +250,17 @@ impl Drawn<'_> {
             Loss::Batch(loss) => field.train(&b, &mut on.encoded, fields::Loss::Batch(loss), buffers, d_positions),
             Loss::Photometric(terms) => {
                 assert_eq!(field.net.channels(), 3, "a photometric loss compares colors alone");
-                let (mut starts, mut lengths) = (Vec::new(), Vec::new());
-                let spread = if terms.distortion > 0.0 && field.is_unbounded() {
-                    distortion::cpu::normalize(&samples, &mut starts, &mut lengths);
-                    Packed { offsets: &marched.offsets, t: &starts, dt: &lengths }
-                } else {
-                    samples
-                };
-                let Terms { color, distortion, depth, alpha } = terms;
-                let relative = relative(field);
-                let loss = Photometric { batch, samples: spread, background, color, relative, distortion, alpha, depth, along: samples };
+                let loss = Photometric::new(terms, measure(field), batch.targets(background), samples);
                 field.train(&b, &mut on.encoded, fields::Loss::Rays(&loss), buffers, d_positions);
             }
         }
     }
 }
 
-/// [`Photometric::relative`] of a field: 0 unless its colors are linear light, which a color head of its own says.
-pub(crate) fn relative(field: &Field) -> f32 {
+/// How a loss measures a field's colors and distances. Linear light has a color head of its own.
+pub(crate) fn measure(field: &Field) -> Measure {
     let is_linear = field.net.outputs.first().is_some_and(|o| o.head.activation == Activation::TruncatedExp);
-    if is_linear { RELATIVE } else { 0.0 }
+    Measure { relative: if is_linear { RELATIVE } else { 0.0 }, normalized: field.is_unbounded() }
 }
 
 /// One optimizer step for every group; cameras only follow rays of their own, and focal lengths that are not refined stay as they were

@@ -5,17 +5,17 @@ mod cpu;
 
 pub use cpu::CpuTrainer;
 #[cfg(feature = "gpu")]
-pub(crate) use cpu::relative;
+pub(crate) use cpu::measure;
 
 use crate::background::LearnedBackground;
 use crate::fields::Field;
-use crate::losses::Terms;
 use crate::params::{ParamGroup, ParamSet};
 use crate::samplers::occupancy::Occupancy;
 use crate::samplers::pixels::{ErrorMap, Observation, PixelSource};
 use crate::samplers::placement::Placement;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::field_step::BatchLoss;
+use diorama_kernels::ops::photometric_loss::Terms;
 use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
 
 /// Description of a training step.

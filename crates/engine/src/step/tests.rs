@@ -1,6 +1,5 @@
 use super::*;
 use crate::fields::{self, DirectionCode, Encoder, RayCodes, VoxelGrid};
-use crate::losses::ColorLoss;
 use diorama_geom::contraction::Space;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, Pose};
@@ -10,6 +9,7 @@ use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
 use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::march::MarchConfig;
+use diorama_kernels::ops::photometric_loss::ColorLoss;
 use diorama_kernels::ops::pixel_gather::OBSERVED_EVERY;
 use diorama_testkit::random_unit;
 

@@ -1,9 +1,9 @@
-//! A table of comparisons: what a device gives against what is wanted.
+//! Table of comparisons between a device's results and references.
 
 use super::{Buffer, Gpu, GpuError};
 use crate::api::Api;
 use cubecl::prelude::CubeElement;
-use diorama_testkit::compare;
+use diorama_testkit::compare_proven;
 
 /// Largest error allowed, relative to the value plus the root mean square of all.
 pub const TOLERANCE: f64 = 1e-3;
@@ -17,7 +17,7 @@ pub struct Row {
     pub shape: String,
     /// Largest relative error.
     pub error: f64,
-    /// What is wrong; none: it passed.
+    /// Reason of a failure; `None` if the comparison passed.
     pub fault: Option<String>,
 }
 
@@ -32,7 +32,7 @@ impl<'a> Table<'a> {
         Table { gpu, rows: Vec::new() }
     }
 
-    /// Adds a line of a known outcome: the largest relative error, or what is wrong.
+    /// Adds a line with its outcome: the largest relative error, or the reason of a failure.
     pub fn row(&mut self, op: &'static str, result: &'static str, shape: String, outcome: Result<f64, String>) {
         let (error, fault) = match outcome {
             Ok(e) => (e, None),
@@ -41,7 +41,7 @@ impl<'a> Table<'a> {
         self.rows.push(Row { op, result, shape, error, fault });
     }
 
-    /// Compares numbers within [`TOLERANCE`].
+    /// Compares numbers within [`TOLERANCE`], and shows that a wrong one would be noticed.
     ///
     /// # Errors
     /// When the device is lost.
@@ -54,7 +54,7 @@ impl<'a> Table<'a> {
         want: &[f64],
     ) -> Result<(), GpuError> {
         let got = self.gpu.read(got)?;
-        self.row(op, result, shape.to_string(), compare(&got, want, TOLERANCE));
+        self.row(op, result, shape.to_string(), compare_proven(&got, want, TOLERANCE));
         Ok(())
     }
 
@@ -71,19 +71,22 @@ impl<'a> Table<'a> {
         want: &[u32],
     ) -> Result<(), GpuError> {
         let got = self.gpu.read(&got.cast::<u32>())?;
-        let differs = got.iter().zip(want).position(|(a, b)| a != b);
-        let outcome = match differs {
-            _ if got.len() != want.len() => Err(format!("lengths differ: {} and {}", got.len(), want.len())),
-            Some(i) => Err(format!("element {i}: {} is not {}", got[i], want[i])),
-            None => Ok(0.0),
-        };
-        self.row(op, result, shape.to_string(), outcome);
+        self.row(op, result, shape.to_string(), compare_bits(&got, want));
         Ok(())
     }
 }
 
-/// The ways in which the device may have to add: its own, or exchanges where it has none; WebGPU needs both,
-/// because browsers have none.
+/// No error, or the first difference.
+fn compare_bits(got: &[u32], want: &[u32]) -> Result<f64, String> {
+    match got.iter().zip(want).position(|(a, b)| a != b) {
+        _ if got.len() != want.len() => Err(format!("lengths differ: {} and {}", got.len(), want.len())),
+        Some(i) => Err(format!("element {i}: {} is not {}", got[i], want[i])),
+        None => Ok(0.0),
+    }
+}
+
+/// The ways of adding f32 to be checked on a device: native atomics where it has them, exchanges where it has none. WebGPU is checked
+/// with both, because browsers have no f32 atomics.
 pub(crate) fn adders(gpu: &Gpu) -> Vec<(&'static str, Gpu)> {
     let mut all = Vec::new();
     if gpu.has_native_atomics() {
@@ -93,4 +96,16 @@ pub(crate) fn adders(gpu: &Gpu) -> Vec<(&'static str, Gpu)> {
         all.push(("d table, exchanged", gpu.without_native_atomics()));
     }
     all
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn other_bits_are_refused() {
+        assert_eq!(compare_bits(&[1, 2], &[1, 2]), Ok(0.0));
+        assert!(compare_bits(&[1, 2], &[1, 3]).unwrap_err().contains("element 1"));
+        assert!(compare_bits(&[1, 2], &[1]).is_err() && compare_bits(&[], &[1]).is_err());
+    }
 }

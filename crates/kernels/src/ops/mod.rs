@@ -22,6 +22,7 @@ pub mod marching_tetrahedra;
 pub mod matmul;
 pub mod mean_error;
 pub mod norm;
+pub mod occupancy_update;
 pub mod photometric_loss;
 pub mod pixel_gather;
 pub mod pool;

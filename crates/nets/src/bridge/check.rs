@@ -12,7 +12,7 @@ use diorama_kernels::ops::fused_mlp::Mlp;
 use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
 use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::trilinear_corner_grid::Corners;
-use diorama_testkit::{compare, random, random_unit, wide};
+use diorama_testkit::{compare_proven, random, random_unit, wide};
 
 /// Why no case is refused.
 const RIGHT: &str = "shapes are right";
@@ -32,7 +32,7 @@ pub fn run(gpu: &Gpu) -> Vec<Row> {
         ("linear", "67x9x5", layers),
         ("network", "N=67", networks),
         ("composite", "R=4", composited),
-        ("composite, colour alone", "R=4", coloured),
+        ("composite, color alone", "R=4", colored),
         ("distortion", "R=4", distortions),
         ("scan", "R=4", sums),
         ("corner grid", "S=67", corners),
@@ -41,7 +41,7 @@ pub fn run(gpu: &Gpu) -> Vec<Row> {
     ];
     for (op, shape, case) in cases {
         for ((result, want), (_, got)) in case(&here).into_iter().zip(case(&there)) {
-            table.row("in burn's graph", result, format!("{op} {shape}"), compare(&got, &wide(&want), TOLERANCE));
+            table.row("in burn's graph", result, format!("{op} {shape}"), compare_proven(&got, &wide(&want), TOLERANCE));
         }
     }
     table.rows
@@ -125,7 +125,7 @@ fn networks(device: &Device) -> Results {
 /// Four rays, one of them empty.
 const OFFSETS: [u32; 5] = [0, 7, 7, 30, 67];
 
-fn composite_with(device: &Device, colour_alone: bool) -> Results {
+fn composite_with(device: &Device, color_alone: bool) -> Results {
     let (t, dt) = (random_unit(67, 12), random_unit(67, 13));
     let samples = Packed { offsets: &OFFSETS, t: &t, dt: &dt };
     let sigma = given(device, [67], random_unit(67, 14));
@@ -133,12 +133,12 @@ fn composite_with(device: &Device, colour_alone: bool) -> Results {
     let Composited { color, depth, opacity, weights } =
         composite(samples, sigma.clone(), features.clone(), background.clone()).expect(RIGHT);
     let mut loss = weighed(&color, 54);
-    if !colour_alone {
+    if !color_alone {
         loss = loss + weighed(&depth, 55) + weighed(&opacity, 56) + weighed(&weights, 57);
     }
     let g = loss.backward();
     vec![
-        ("colour", read_values(color)),
+        ("color", read_values(color)),
         ("depth", read_values(depth)),
         ("opacity", read_values(opacity)),
         ("weights", read_values(weights)),
@@ -152,7 +152,7 @@ fn composited(device: &Device) -> Results {
     composite_with(device, false)
 }
 
-fn coloured(device: &Device) -> Results {
+fn colored(device: &Device) -> Results {
     composite_with(device, true)
 }
 
@@ -204,7 +204,7 @@ fn mixed(device: &Device) -> Results {
     let color = out.color;
     let g = (color.clone() - 0.5).powf_scalar(2.0).mean().backward();
     vec![
-        ("colour", read_values(color)),
+        ("color", read_values(color)),
         ("d points", read_values(points.grad(&g).expect("it reaches the points"))),
         ("d table", read_values(table.grad(&g).expect("it reaches the table"))),
         ("d weight", read_values(weight.grad(&g).expect("it reaches the weight"))),

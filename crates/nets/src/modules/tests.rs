@@ -8,7 +8,7 @@ use crate::param::{Mode, Module, Visitor};
 use crate::weights::{KeyMap, Rule, Strictness, load};
 use burn::tensor::{Device, Tensor, TensorData};
 use diorama_geom::NamedArray;
-use diorama_testkit::{compare, wide};
+use diorama_testkit::{compare_proven, wide};
 
 /// Of the root mean square, as everywhere.
 const TOLERANCE: f64 = 1e-4;
@@ -47,7 +47,7 @@ impl Fixture {
     }
 
     fn check_values(&self, name: &str, got: &[f32]) {
-        if let Err(e) = compare(got, &wide(&self.get(name).values), TOLERANCE) {
+        if let Err(e) = compare_proven(got, &wide(&self.get(name).values), TOLERANCE) {
             panic!("{name}: {e}");
         }
     }

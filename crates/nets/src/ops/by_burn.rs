@@ -66,14 +66,14 @@ pub(super) fn modulate(x: &[DispatchTensor]) -> Tensors {
     one(of::<4>(&x[0]) * (of::<2>(&x[1]).reshape([n, c, 1, 1]) + 1.0) + of::<2>(&x[2]).reshape([n, c, 1, 1]))
 }
 
-pub(super) fn conv2d(x: &[DispatchTensor], s: &Conv, f: Activation) -> Tensors {
+pub(super) fn conv2d(x: &[DispatchTensor], s: &Conv) -> Tensors {
     let options = ConvOptions::new(s.stride, s.padding, s.dilation, s.groups);
-    one(activated(module::conv2d(of(&x[0]), of(&x[1]), x.get(2).map(of), options), f))
+    one(activated(module::conv2d(of(&x[0]), of(&x[1]), x.get(2).map(of), options), s.activation))
 }
 
-pub(super) fn conv_transpose2d(x: &[DispatchTensor], s: &Conv, f: Activation) -> Tensors {
+pub(super) fn conv_transpose2d(x: &[DispatchTensor], s: &Conv) -> Tensors {
     let options = ConvTransposeOptions::new(s.stride, s.padding, s.output_padding, s.dilation, s.groups);
-    one(activated(module::conv_transpose2d(of(&x[0]), of(&x[1]), x.get(2).map(of), options), f))
+    one(activated(module::conv_transpose2d(of(&x[0]), of(&x[1]), x.get(2).map(of), options), s.activation))
 }
 
 /// By moments of the axes after the first two of `[sets, count]`.

@@ -42,40 +42,12 @@ impl Conv {
     }
 }
 
-/// The kernel's own activation, where it has the one that is wanted.
-pub(super) fn fused(activation: Activation) -> Option<conv2d::Activation> {
-    Some(match activation {
-        Activation::None => conv2d::Activation::None,
-        Activation::Relu => conv2d::Activation::Relu,
-        Activation::LeakyRelu(slope) if slope >= 0.0 => conv2d::Activation::LeakyRelu(slope),
-        Activation::Sigmoid => conv2d::Activation::Sigmoid,
-        Activation::Tanh => conv2d::Activation::Tanh,
-        Activation::Silu => conv2d::Activation::Silu,
-        _ => return None,
-    })
-}
-
-/// The same activation by its general name.
-pub(super) fn unfused(activation: conv2d::Activation) -> Activation {
-    match activation {
-        conv2d::Activation::None => Activation::None,
-        conv2d::Activation::Relu => Activation::Relu,
-        conv2d::Activation::LeakyRelu(slope) => Activation::LeakyRelu(slope),
-        conv2d::Activation::Sigmoid => Activation::Sigmoid,
-        conv2d::Activation::Tanh => Activation::Tanh,
-        conv2d::Activation::Silu => Activation::Silu,
-    }
-}
-
 #[derive(Clone, Debug)]
-pub(super) struct ConvOp {
-    pub(super) settings: Conv,
-    pub(super) activation: conv2d::Activation,
-}
+pub(super) struct ConvOp(pub(super) Conv);
 
 impl ConvOp {
     fn conv(&self, x: &[usize], w: &[usize]) -> (Conv2d, Images) {
-        let s = &self.settings;
+        let s = &self.0;
         let conv = Conv2d {
             channels_in: x[1],
             channels_out: w[0],
@@ -84,7 +56,7 @@ impl ConvOp {
             padding: s.padding,
             dilation: s.dilation,
             groups: s.groups,
-            activation: self.activation,
+            activation: s.activation,
         };
         (conv, Images { batch: x[0], height: x[2], width: x[3] })
     }
@@ -151,7 +123,7 @@ impl SliceOp for ConvOp {
     }
 
     fn check(&self, shapes: &[&[usize]]) -> Result<(), OpError> {
-        check_conv(self.name(), &self.settings, shapes, false)
+        check_conv(self.name(), &self.0, shapes, false)
     }
 
     fn forward(&self, x: &[Values], wanted: &[bool]) -> Forward {
@@ -160,14 +132,14 @@ impl SliceOp for ConvOp {
         work::book(o.batch * o.pixels() * conv.weights_len());
         let shape = [o.batch, conv.channels_out, o.height, o.width];
         let mut out = ValuesMut::any(&shape);
-        let mut before = (wanted.contains(&true) && self.activation.needs_input()).then(|| ValuesMut::any(&shape));
+        let mut before = (wanted.contains(&true) && self.0.activation.needs_input()).then(|| ValuesMut::any(&shape));
         conv2d::cpu::forward(&conv, &images, &x[0], &x[1], bias(x), &mut out, before.as_deref_mut());
         let out = out.freeze();
         if !wanted.contains(&true) {
             return Forward::one(out, Kept::default());
         }
         let mut kept = vec![x[0].clone(), x[1].clone()];
-        if self.activation != conv2d::Activation::None {
+        if self.0.activation != Activation::None {
             kept.push(before.map_or_else(|| out.clone(), ValuesMut::freeze));
         }
         Forward::one(out, Kept::of(&kept))
@@ -184,19 +156,16 @@ impl SliceOp for ConvOp {
     }
 
     fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
-        Some(by_burn::conv2d(x, &self.settings, unfused(self.activation)))
+        Some(by_burn::conv2d(x, &self.0))
     }
 }
 
-/// `act(w ∗ x + b)`; activations that the kernel lacks are a layer of their own.
+/// `act(w ∗ x + b)`
 ///
 /// # Shapes
 /// x `[N, C, H, W]`; weight `[C', C / groups, h, w]`; bias `[C']`.
 pub fn conv2d(x: Tensor<4>, weight: Tensor<4>, bias: Option<Tensor<1>>, settings: Conv) -> Result<Tensor<4>, OpError> {
-    let activation = fused(settings.activation);
-    let op = ConvOp { settings, activation: activation.unwrap_or_default() };
     let mut inputs = vec![x.into_dispatch(), weight.into_dispatch()];
     inputs.extend(bias.map(|b| b.into_dispatch()));
-    let out = apply_one(op, inputs)?;
-    if activation.is_some() { Ok(out) } else { super::activation(out, settings.activation) }
+    apply_one(ConvOp(settings), inputs)
 }

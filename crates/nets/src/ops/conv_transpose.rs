@@ -1,24 +1,21 @@
 //! Transposed convolution of images, with bias and activation.
 
-use super::Conv;
 use super::by_burn;
-use super::conv::{Wanted, bias, check_conv, fused, unfused};
+use super::conv::{Wanted, bias, check_conv};
+use super::{Activation, Conv};
 use crate::bridge::work;
 use crate::bridge::{Forward, Kept, OpError, SliceOp, Values, ValuesMut, apply_one};
 use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
 use diorama_kernels::ops::conv_transpose2d::{self, ConvTranspose2d};
-use diorama_kernels::ops::conv2d::{self, Images};
+use diorama_kernels::ops::conv2d::Images;
 
 #[derive(Clone, Debug)]
-pub(super) struct ConvTransposeOp {
-    pub(super) settings: Conv,
-    pub(super) activation: conv2d::Activation,
-}
+pub(super) struct ConvTransposeOp(pub(super) Conv);
 
 impl ConvTransposeOp {
     fn conv(&self, x: &[usize], w: &[usize]) -> (ConvTranspose2d, Images) {
-        let s = &self.settings;
+        let s = &self.0;
         let conv = ConvTranspose2d {
             channels_in: x[1],
             channels_out: w[1] * s.groups,
@@ -28,7 +25,7 @@ impl ConvTransposeOp {
             output_padding: s.output_padding,
             dilation: s.dilation,
             groups: s.groups,
-            activation: self.activation,
+            activation: s.activation,
         };
         (conv, Images { batch: x[0], height: x[2], width: x[3] })
     }
@@ -40,7 +37,7 @@ impl SliceOp for ConvTransposeOp {
     }
 
     fn check(&self, shapes: &[&[usize]]) -> Result<(), OpError> {
-        let s = &self.settings;
+        let s = &self.0;
         check_conv(self.name(), s, shapes, true)?;
         for axis in 0..2 {
             if s.output_padding[axis] >= s.stride[axis].max(s.dilation[axis]) {
@@ -60,11 +57,11 @@ impl SliceOp for ConvTransposeOp {
         work::book(images.batch * images.pixels() * conv.weights_len());
         let shape = [o.batch, conv.channels_out, o.height, o.width];
         let mut out = ValuesMut::any(&shape);
-        let mut before = (wanted.contains(&true) && self.activation.needs_input()).then(|| ValuesMut::any(&shape));
+        let mut before = (wanted.contains(&true) && self.0.activation.needs_input()).then(|| ValuesMut::any(&shape));
         conv_transpose2d::cpu::forward(&conv, &images, &x[0], &x[1], bias(x), &mut out, before.as_deref_mut());
         let out = out.freeze();
         let mut kept = vec![x[0].clone(), x[1].clone()];
-        if self.activation != conv2d::Activation::None {
+        if self.0.activation != Activation::None {
             kept.push(before.map_or_else(|| out.clone(), ValuesMut::freeze));
         }
         Forward::one(out, if wanted.contains(&true) { Kept::of(&kept) } else { Kept::default() })
@@ -81,7 +78,7 @@ impl SliceOp for ConvTransposeOp {
     }
 
     fn by_burn(&self, x: &[DispatchTensor]) -> Option<Vec<DispatchTensor>> {
-        Some(by_burn::conv_transpose2d(x, &self.settings, unfused(self.activation)))
+        Some(by_burn::conv_transpose2d(x, &self.0))
     }
 }
 
@@ -90,10 +87,7 @@ impl SliceOp for ConvTransposeOp {
 /// # Shapes
 /// x `[N, C, H, W]`; weight `[C, C' / groups, h, w]`; bias `[C']`.
 pub fn conv_transpose2d(x: Tensor<4>, weight: Tensor<4>, bias: Option<Tensor<1>>, settings: Conv) -> Result<Tensor<4>, OpError> {
-    let activation = fused(settings.activation);
-    let op = ConvTransposeOp { settings, activation: activation.unwrap_or_default() };
     let mut inputs = vec![x.into_dispatch(), weight.into_dispatch()];
     inputs.extend(bias.map(|b| b.into_dispatch()));
-    let out = apply_one(op, inputs)?;
-    if activation.is_some() { Ok(out) } else { super::activation(out, settings.activation) }
+    apply_one(ConvTransposeOp(settings), inputs)
 }

@@ -5,6 +5,8 @@
 
 mod attention;
 mod by_burn;
+#[cfg(feature = "gpu")]
+pub mod check;
 mod conv;
 mod conv_transpose;
 mod elementwise;

@@ -1,11 +1,17 @@
 //! Changes of images' sizes: pooling, resampling, pixel shuffle, sampling at a grid.
 
 use super::by_burn;
+#[cfg(feature = "gpu")]
+use crate::bridge::{DeviceKernels, DeviceOutputs, OnDevice};
 use crate::bridge::{Forward, IndicesMut, Kept, OpError, SliceOp, Values, ValuesMut, apply_one, expect_inputs, expect_shape};
 use burn::backend::DispatchTensor;
 use burn::tensor::Tensor;
+#[cfg(feature = "gpu")]
+use diorama_kernels::gpu::{Buffer, Gpu};
 use diorama_kernels::ops::grid_sample::{self, GridSample, Mode, Outside};
 use diorama_kernels::ops::pool::{Pool, cpu as pools};
+#[cfg(feature = "gpu")]
+use diorama_kernels::ops::resample;
 use diorama_kernels::ops::resample::{Filter, Resample, cpu as resampling, shuffle};
 use std::collections::HashMap;
 use std::sync::{Arc, LazyLock, Mutex};
@@ -162,6 +168,25 @@ impl SliceOp for ResampleOp {
             dx.freeze()
         })]
     }
+
+    #[cfg(feature = "gpu")]
+    fn on_device(&self) -> Option<&dyn DeviceKernels> {
+        Some(self)
+    }
+}
+
+#[cfg(feature = "gpu")]
+impl DeviceKernels for ResampleOp {
+    fn forward_on(&self, gpu: &Gpu, x: &[OnDevice]) -> DeviceOutputs {
+        let (s, to) = (&x[0].shape, self.table.to());
+        let out = resample::gpu::forward(gpu, &self.table, s[0] * s[1], &x[0].data);
+        DeviceOutputs { outputs: vec![(out, vec![s[0], s[1], to[0], to[1]])], kept: Vec::new() }
+    }
+
+    fn backward_on(&self, gpu: &Gpu, x: &[OnDevice], _: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
+        let planes = x[0].shape[0] * x[0].shape[1];
+        vec![d[0].as_ref().map(|d| resample::gpu::backward(gpu, &self.table, planes, d))]
+    }
 }
 
 /// Images of another size.
@@ -296,6 +321,27 @@ impl SliceOp for GridOp {
             out.freeze()
         });
         vec![dx, d_grid]
+    }
+
+    #[cfg(feature = "gpu")]
+    fn on_device(&self) -> Option<&dyn DeviceKernels> {
+        Some(self)
+    }
+}
+
+#[cfg(feature = "gpu")]
+impl DeviceKernels for GridOp {
+    fn forward_on(&self, gpu: &Gpu, x: &[OnDevice]) -> DeviceOutputs {
+        let (s, g) = (&x[0].shape, &x[1].shape);
+        let out = grid_sample::gpu::forward(gpu, &self.description(s, g), &x[0].data, &x[1].data);
+        DeviceOutputs { outputs: vec![(out, vec![s[0], s[1], g[1], g[2]])], kept: Vec::new() }
+    }
+
+    fn backward_on(&self, gpu: &Gpu, x: &[OnDevice], _: &[Buffer], d: &[Option<Buffer>]) -> Vec<Option<Buffer>> {
+        let Some(d) = &d[0] else { return vec![None, None] };
+        let (s, grid) = (self.description(&x[0].shape, &x[1].shape), &x[1].data);
+        let dx = grid_sample::gpu::backward_input(gpu, &s, grid, d);
+        vec![Some(dx), Some(grid_sample::gpu::backward_grid(gpu, &s, &x[0].data, grid, d))]
     }
 }
 

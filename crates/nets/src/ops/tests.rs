@@ -137,7 +137,7 @@ fn convolutions_refuse_what_does_not_fit() {
     assert_eq!(e([8, 3, 3, 3], Conv::same(3)), "conv2d: weight has shape [8, 3, 3, 3], expected [any, 4, any, any]");
     assert!(e([8, 4, 7, 7], Conv::default()).contains("room for a kernel that covers 7 pixels"));
     assert!(e([8, 4, 3, 3], Conv { groups: 3, ..Conv::same(3) }).contains("do not divide into 3 groups"));
-    let c = conv_kernel::Conv2d { padding: [1; 2], activation: conv_kernel::Activation::Relu, ..conv_kernel::Conv2d::new(4, 8, 3) };
+    let c = conv_kernel::Conv2d { padding: [1; 2], activation: Activation::Relu, ..conv_kernel::Conv2d::new(4, 8, 3) };
     let got = conv2d(x.clone(), leaf([8, 4, 3, 3], 2), None, Conv::same(3).activation(Activation::Relu)).unwrap();
     let images = conv_kernel::Images { batch: 1, height: 5, width: 5 };
     let want = conv_kernel::reference::forward(&c, &images, &wide(&read_values(x)), &wide(&random(288, 2)), &[]);
@@ -182,12 +182,10 @@ fn burns_own_ops_give_the_same() {
     let image: &[usize] = &[2, 4, 6, 5];
     let f = Activation::Silu;
     for groups in [1, 2] {
-        let settings = Conv { groups, ..Conv::same(3).stride(2) };
-        let op = conv::ConvOp { settings, activation: conv_kernel::Activation::Silu };
-        assert_by_burn(op, &[image, &[6, 4 / groups, 3, 3], &[6]]);
-        let settings = Conv { output_padding: [1; 2], ..settings };
-        let op = conv_transpose::ConvTransposeOp { settings, activation: conv_kernel::Activation::Sigmoid };
-        assert_by_burn(op, &[image, &[4, 6 / groups, 3, 3], &[6]]);
+        let settings = Conv { groups, ..Conv::same(3).stride(2) }.activation(Activation::Silu);
+        assert_by_burn(conv::ConvOp(settings), &[image, &[6, 4 / groups, 3, 3], &[6]]);
+        let settings = Conv { output_padding: [1; 2], ..settings }.activation(Activation::Gelu);
+        assert_by_burn(conv_transpose::ConvTransposeOp(settings), &[image, &[4, 6 / groups, 3, 3], &[6]]);
     }
     assert_by_burn(elementwise::ActivationOp(Activation::Gelu), &[image]);
     assert_by_burn(elementwise::SumOp { relu: true }, &[image, image]);

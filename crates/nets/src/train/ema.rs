@@ -1,5 +1,6 @@
 //! An exponential moving average of a network's weights, which is often better than the weights themselves.
 
+use super::StateError;
 use crate::param::{self, Kind, Module};
 use diorama_geom::NamedArray;
 use rayon::prelude::*;
@@ -59,14 +60,16 @@ impl Ema {
         named.chain([NamedArray::new("ema_updates", &[2], count.to_vec())]).collect()
     }
 
-    /// Takes a saved state over; false, and nothing changed, where it does not fit.
-    pub fn restore(&mut self, arrays: &[NamedArray]) -> bool {
-        let find = |name: &str, len: usize| arrays.iter().find(|a| a.name == name && a.values.len() == len);
-        let Some(count) = find("ema_updates", 2) else { return false };
-        let found: Option<Vec<_>> = self.averages.iter().map(|a| find(&format!("ema.{}", a.name), a.values.len())).collect();
-        let Some(found) = found else { return false };
-        self.averages.iter_mut().zip(found).for_each(|(a, f)| a.values.copy_from_slice(&f.values));
-        self.updates = count.values[0] as u64 | (count.values[1] as u64) << 24;
-        true
+    /// Takes a saved state over.
+    ///
+    /// # Errors
+    /// When an array is missing or has another length; nothing is changed then.
+    pub fn restore(&mut self, arrays: &[NamedArray]) -> Result<(), StateError> {
+        let count = StateError::find(arrays, "ema_updates", 2)?;
+        let found: Result<Vec<_>, _> =
+            self.averages.iter().map(|a| StateError::find(arrays, &format!("ema.{}", a.name), a.values.len())).collect();
+        self.averages.iter_mut().zip(found?).for_each(|(a, f)| a.values.copy_from_slice(f));
+        self.updates = count[0] as u64 | (count[1] as u64) << 24;
+        Ok(())
     }
 }

@@ -1,7 +1,7 @@
 //! Training of networks: gradients by parameter, optimizers, schedules, averages, loading and augmentation of data.
 //!
-//! One step: `loss.backward()` → [`Gradients::take`] → clipping → [`Optimizer::step`]. What a run needs to go on bit by bit is in
-//! [`Optimizer::state`], [`Ema::state`] and the network's [`crate::param::arrays`].
+//! One step: [`Loader::next_batch`] → [`stack`] → `loss.backward()` → [`Gradients::take`] → clipping → [`Optimizer::step`]. [`saved`]
+//! is what a checkpoint must hold, [`resume`] goes on from it bit by bit.
 
 pub mod augment;
 mod ema;
@@ -9,7 +9,9 @@ mod gradients;
 pub mod loader;
 mod on_device;
 mod optimizer;
+mod saved;
 mod schedule;
+mod stack;
 #[cfg(test)]
 mod tests;
 
@@ -17,4 +19,6 @@ pub use ema::Ema;
 pub use gradients::Gradients;
 pub use loader::{Loader, LoaderSettings, SampleKey};
 pub use optimizer::{Group, Optimizer, Rule, StateError};
-pub use schedule::Schedule;
+pub use saved::{ResumeError, resume, saved};
+pub use schedule::{Schedule, Shape};
+pub use stack::stack;

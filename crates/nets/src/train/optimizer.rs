@@ -40,8 +40,19 @@ impl Group {
 
 /// Why a saved state does not fit.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error("the optimizer's state does not fit the network: {0}")]
+#[error("the saved state of the training does not fit the network: {0}")]
 pub struct StateError(String);
+
+impl StateError {
+    /// The numbers of an array, where it is there and has as many.
+    pub(super) fn find<'a>(arrays: &'a [NamedArray], name: &str, len: usize) -> Result<&'a [f32], StateError> {
+        match arrays.iter().find(|a| a.name == name) {
+            None => Err(StateError(format!("{name} is missing"))),
+            Some(a) if a.values.len() != len => Err(StateError(format!("{name} has {} numbers, expected {len}", a.values.len()))),
+            Some(a) => Ok(&a.values),
+        }
+    }
+}
 
 /// Moments of one weight.
 #[derive(Debug, Default)]
@@ -151,11 +162,7 @@ impl Optimizer {
     /// # Errors
     /// When an array is missing or has another length; nothing is changed then.
     pub fn restore(&mut self, module: &dyn Module, arrays: &[NamedArray]) -> Result<(), StateError> {
-        let find = |name: &str, len: usize| match arrays.iter().find(|a| a.name == name) {
-            None => Err(StateError(format!("{name} is missing"))),
-            Some(a) if a.values.len() != len => Err(StateError(format!("{name} has {} numbers, expected {len}", a.values.len()))),
-            Some(a) => Ok(&a.values),
-        };
+        let find = |name: &str, len: usize| StateError::find(arrays, name, len);
         let count = find("optimizer.steps", 2)?;
         let steps = count[0] as u64 | (count[1] as u64) << 24;
         // Before the first step there are no moments on devices.
@@ -175,7 +182,7 @@ impl Optimizer {
             let on_device = [&mut m.device.first, &mut m.device.second];
             for (cpu, device) in on_cpu.into_iter().zip(on_device).take(moments) {
                 let values = found.next().expect("found above");
-                if p.is_on_cpu() { cpu.copy_from_slice(values) } else { *device = Some(p.beside(values.clone())) }
+                if p.is_on_cpu() { cpu.copy_from_slice(values) } else { *device = Some(p.beside(values.to_vec())) }
             }
         });
         Ok(())

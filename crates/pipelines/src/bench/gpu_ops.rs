@@ -16,8 +16,8 @@ use diorama_kernels::ops::fused_mlp::gpu::fused::Element;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
 use diorama_kernels::ops::linear::{self, Activation};
-use diorama_kernels::ops::photometric_loss::ColorLoss;
-use diorama_kernels::ops::photometric_loss::gpu::{self as loss, Figures, SUMS, Target, Terms};
+use diorama_kernels::ops::photometric_loss::gpu::{self as loss, Figures, SUMS, Target};
+use diorama_kernels::ops::photometric_loss::{ColorLoss, Measure, Terms};
 use diorama_kernels::ops::spherical_harmonics;
 
 /// Samples per ray.
@@ -181,16 +181,9 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let (target, left_out, sums) = (random(gpu, p.rays() * 4, 8), gpu.upload(&vec![0u32; p.rays()]), gpu.zeros(SUMS));
     let distance = gpu.empty(0);
     let target = Target { rgba: &target, background: &background, left_out: &left_out, distance: &distance };
+    let terms = Terms { color: ColorLoss::Mse, distortion: 0.0, depth: 0.0, alpha: 0.0 };
     t.row("composite, loss and backward", "3 channels, 32 samples per ray", ("sample", s), 0.0, 64.0, || {
         let figures = Figures { sums: &sums, marched: &p.offsets, is_main: true };
-        loss::composite_and_loss(
-            gpu,
-            Terms { color: ColorLoss::Mse, relative: 0.0, distortion: 0.0, normalized: false, alpha: 0.0, depth: 0.0 },
-            &p,
-            (&sigma, &rgb),
-            target,
-            0.0,
-            figures,
-        );
+        loss::composite_and_loss(gpu, (terms, Measure::default()), &p, (&sigma, &rgb), target, 0.0, figures);
     })
 }

@@ -6,7 +6,6 @@ use crate::error::Result;
 use crate::run::photographs::StoredPhotographs;
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_engine::fields::FieldBuffers;
-use diorama_engine::losses;
 use diorama_engine::metrics::psnr;
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::samplers::RayBatch;
@@ -15,6 +14,7 @@ use diorama_engine::train::{Scalar, Scores};
 use diorama_geom::Capture;
 use diorama_geom::capture::Split;
 use diorama_geom::rng::Rng;
+use diorama_kernels::ops::photometric_loss::squared_error;
 
 /// Stream of the random numbers by which held-out pixels are drawn.
 const PIXELS: u64 = 20;
@@ -123,7 +123,7 @@ impl HeldOutPixels {
             let got = [0, 1, 2].map(|k| if is_linear { seen.rgb[r * 3 + k] } else { seen.rgb[r * 3 + k].clamp(0.0, 1.0) });
             let want = [0, 1, 2].map(|k| t[k] * t[3] + back[k] * (1.0 - t[3]));
             let sum = &mut sums[batch.images[r] as usize];
-            *sum = (sum.0 + losses::squared_error(got, want, is_linear) as f64, sum.1 + 1);
+            *sum = (sum.0 + squared_error(got, want, is_linear) as f64, sum.1 + 1);
         }
         let (error, n) = sums.iter().fold((0.0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         let mse = error / n as f64;

@@ -208,7 +208,7 @@ mod tests {
         let table = m.field.encoder.table().unwrap().values.len() as f64 * 28.0;
         let counted = needs.of("parameters") as f64;
         assert!((0.9..1.1).contains(&(counted / table)), "{counted} for {table}");
-        let cells = m.occupancy.as_ref().unwrap().density.len() as u64;
+        let cells = m.occupancy.as_ref().unwrap().grid.density.len() as u64;
         assert!((8 * cells..=12 * cells).contains(&needs.of("occupancy grid")));
     }
 

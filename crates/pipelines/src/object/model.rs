@@ -5,7 +5,6 @@ use super::field_shape::{cascades, hash_grid, space, viewing_distance};
 use crate::error::{PipelineError, Result};
 use diorama_engine::background::LearnedBackground;
 use diorama_engine::fields::{self, DensityQuery, Field, FieldBuffers, Pruning};
-use diorama_engine::losses::{ColorLoss, Terms};
 use diorama_engine::params::{ParamGroup, Schedule};
 use diorama_engine::renderers::supervised::{Supervised, Unserved};
 use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Tracer};
@@ -23,6 +22,7 @@ use diorama_geom::{Capture, Pose, Similarity};
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::linear::Activation;
+use diorama_kernels::ops::photometric_loss::{ColorLoss, Terms};
 use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
 
 /// Where rays end in space without a bound, in inner cubes: a camera that moves by one sees it move by 0.001 radians.

@@ -24,7 +24,7 @@ impl ObjectModel {
         let (params, occupancy, error_map) = self.trainees().into_params();
         let mut entries = param_state::entries(params);
         if let Some(o) = occupancy {
-            entries.extend([entry("occupancy", &o.density), entry("occupancy.fresh", &o.fresh)]);
+            entries.extend([entry("occupancy", &o.grid.density), entry("occupancy.fresh", &o.grid.fresh)]);
         }
         if let Some(m) = error_map {
             entries.extend([entry("error_map", &m.errors), entry("error_map.drawn", &m.drawn)]);
@@ -55,9 +55,9 @@ impl ObjectModel {
         let (mut params, occupancy, error_map) = self.trainees().into_params();
         param_state::restore(&mut params, &mut c, file)?;
         if let Some(o) = occupancy {
-            param_state::take(&mut o.density, "occupancy", &mut c, file)?;
-            param_state::take(&mut o.fresh, "occupancy.fresh", &mut c, file)?;
-            o.refresh();
+            param_state::take(&mut o.grid.density, "occupancy", &mut c, file)?;
+            param_state::take(&mut o.grid.fresh, "occupancy.fresh", &mut c, file)?;
+            o.grid.refresh();
         }
         if let Some(m) = error_map {
             param_state::take(&mut m.errors, "error_map", &mut c, file)?;

@@ -206,7 +206,7 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
         trained_per_s: trained / seconds,
         marched_per_ray: marched as f64 / rays,
         trained_per_ray: trained / rays,
-        occupied: trainer.model.occupancy.as_ref().map(|o| o.bits.fill()),
+        occupied: trainer.model.occupancy.as_ref().map(|o| o.bits().fill()),
         stages: stages.iter().map(|s| StageFigure { stage: s.0, share: s.1 / total, ms: s.1 * 1e3 / steps as f64 }).collect(),
     })
 }

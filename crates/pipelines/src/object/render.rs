@@ -300,7 +300,7 @@ fn occupied(model: &ObjectModel, camera: &PosedCamera) -> Vec<f32> {
     let config =
         MarchConfig { cone: 0.0, dt_min: 1.0 / STEPS, dt_max: 1.0 / STEPS, max_samples: 4 * STEPS as usize, ..MarchConfig::default() };
     let mut marched = Marched::default();
-    march::cpu::march(&grid.bits, &rays, &config, &mut march::cpu::MarchScratch::default(), &mut marched);
+    march::cpu::march(grid.bits(), &rays, &config, &mut march::cpu::MarchScratch::default(), &mut marched);
     let counts: Vec<u32> = marched.offsets.windows(2).map(|o| o[1] - o[0]).collect();
     let most = counts.iter().max().copied().unwrap_or(0).max(1) as f32;
     counts.iter().map(|n| *n as f32 / most).collect()

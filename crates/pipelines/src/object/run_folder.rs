@@ -101,7 +101,7 @@ pub fn describe(run: &Path) -> Result<serde_json::Value> {
         "parameters": model.field.groups().iter().map(|g| g.values.len()).sum::<usize>(),
         "training_views": model.train.len(),
         "held_out_views": model.capture.indices(Split::Test).len(),
-        "occupied": model.occupancy.as_ref().map(|g| g.bits.fill()),
+        "occupied": model.occupancy.as_ref().map(|o| o.bits().fill()),
         "notes": notes,
     }))
 }

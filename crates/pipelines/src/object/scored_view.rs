@@ -4,10 +4,10 @@ use super::model::ObjectModel;
 use crate::error::Result;
 use diorama_data::masks;
 use diorama_data::photo::Photo;
-use diorama_engine::losses;
 use diorama_engine::metrics::{self, ImageScores};
 use diorama_engine::renderers::volume::{Quality, View};
 use diorama_geom::{Image, ImageU8};
+use diorama_kernels::ops::photometric_loss::shown;
 
 /// One view's render and scores.
 pub struct ScoredView {
@@ -57,7 +57,7 @@ fn reference_photo(model: &ObjectModel, full: &Photo) -> Image {
         let a = if small.channels == 4 { p[3] } else { 1.0 };
         for k in 0..3 {
             let v = p[k.min(small.channels - 1)] * a + back[k] * (1.0 - a);
-            o[k] = if is_linear { losses::shown(v) } else { v.clamp(0.0, 1.0) };
+            o[k] = if is_linear { shown(v) } else { v.clamp(0.0, 1.0) };
         }
     }
     out

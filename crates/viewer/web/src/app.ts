@@ -1,6 +1,6 @@
-// The page: makes its parts, connects them, and keeps the clock.
+// The page: creates its parts, connects them, and runs the animation loop.
 
-import { Connection, type Told } from "./connection";
+import { Connection, type Received } from "./connection";
 import { ControlList } from "./controls";
 import { CropBox } from "./crop";
 import { element, input, onClick } from "./dom";
@@ -37,7 +37,7 @@ class App {
   private readonly exporter = new Exporter(this.connection, this.stage, this.notices, () => this.crop.clip);
   private readonly gizmo = new Gizmo((axis) => this.navigation.lookAlong(axis));
   private readonly layout = new Layout(() => this.resized());
-  /** Name of the scene that is shown; null before the first. */
+  /** Name of the scene that is shown; null before the first scene arrives. */
   private scene: string | null = null;
 
   constructor() {
@@ -76,8 +76,8 @@ class App {
     requestAnimationFrame(tick);
   }
 
-  private take(t: Told<"scene">): void {
-    // After a lost connection the same scene comes again: the camera and what was chosen stay.
+  private take(t: Received<"scene">): void {
+    // After a lost connection the same scene arrives again: camera and settings stay.
     const again = this.scene === t.name;
     this.scene = t.name;
     element("name").textContent = element("name").title = t.name;
@@ -96,7 +96,7 @@ class App {
       this.crop.set(t.bounds, t.crop, t.focus, t.distance);
       this.ruler.set(t.measured, Math.hypot(w[0], w[4], w[8]), t.distance);
       if (t.path) this.path.open(t.path);
-      if (this.views.canvas.width < 2 || document.body.dataset.views === undefined) this.notices.showEmpty("Drawing the first view", "", true);
+      if (this.views.canvas.width < 2 || document.body.dataset.views === undefined) this.notices.showEmpty("Rendering the first view", "", true);
     }
     this.viewChanged();
   }
@@ -109,11 +109,11 @@ class App {
 
   private drawn(why: string | null): void {
     if (why === null) this.notices.showEmpty(null);
-    else this.notices.showEmpty("This view cannot be drawn", why);
+    else this.notices.showEmpty("This view could not be rendered", why);
   }
 
   private touch(): void {
-    // Parts call this while they are made.
+    // Parts call this during construction.
     this.views?.touch();
     this.stage.touch();
   }
@@ -165,12 +165,12 @@ class App {
     return [
       { keys: ["drag"], label: "Turn", group: "Mouse and touch" },
       { keys: ["right drag"], label: "Move; also Shift and drag, or two fingers", group: "Mouse and touch" },
-      { keys: ["wheel"], label: "Nearer and farther; also pinch", group: "Mouse and touch" },
-      { keys: ["double click"], label: "Turn about the middle of the scene", group: "Mouse and touch" },
+      { keys: ["wheel"], label: "Zoom; also pinch", group: "Mouse and touch" },
+      { keys: ["double click"], label: "Turn about the center of the scene", group: "Mouse and touch" },
       { keys: ["w", "a", "s", "d"], label: "Fly", group: view },
-      { keys: ["q", "e"], label: "Sink and rise", group: view },
+      { keys: ["q", "e"], label: "Fly down and up", group: view },
       { keys: ["h"], label: "Home: the first view", group: view, act: () => this.navigation.goHome() },
-      { keys: ["[", "arrowleft"], label: "Photograph before", group: view, act: () => this.frames.step(-1) },
+      { keys: ["[", "arrowleft"], label: "Previous photograph", group: view, act: () => this.frames.step(-1) },
       { keys: ["]", "arrowright"], label: "Next photograph", group: view, act: () => this.frames.step(1) },
       { keys: ["1", "…", "9"], label: "Choose a layer", group: view },
       { keys: ["c"], label: "Show cameras", group: tools, act: () => this.showFrusta(!input("frusta").checked) },

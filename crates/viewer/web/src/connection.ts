@@ -1,21 +1,21 @@
-// The socket to the program: asks go out, what is told comes in, and a lost connection is tried again.
+// The socket to the program: sends and receives messages, and reconnects when the connection is lost.
 
-import type { Ask, Tell } from "./messages";
+import type { ClientMessage, ServerMessage } from "./messages";
 
-export type Told<K extends Tell["kind"]> = Extract<Tell, { kind: K }>;
+export type Received<K extends ServerMessage["kind"]> = Extract<ServerMessage, { kind: K }>;
 export type ConnectionState = { kind: "connecting" } | { kind: "open" } | { kind: "lost"; retryAt: number };
 
-/** Milliseconds before the first try, and the most between two. */
+/** Milliseconds before the first retry, and the longest time between two retries. */
 const FIRST_WAIT = 1000;
 const LONGEST_WAIT = 8000;
 
 export class Connection {
-  /** What stands behind the page's address: the token, where there is one. */
+  /** Query part of the page's address: the token, if there is one. */
   readonly query: string;
   private socket: WebSocket | null = null;
   private wait = FIRST_WAIT;
   private timer = 0;
-  private readonly listeners = new Map<string, ((tell: never) => void)[]>();
+  private readonly listeners = new Map<string, ((message: never) => void)[]>();
   private readonly binary: ((id: number, blob: Blob) => void)[] = [];
   private readonly states: ((state: ConnectionState) => void)[] = [];
 
@@ -28,53 +28,53 @@ export class Connection {
     return this.socket?.readyState === WebSocket.OPEN;
   }
 
-  on<K extends Tell["kind"]>(kind: K, hear: (tell: Told<K>) => void): void {
+  on<K extends ServerMessage["kind"]>(kind: K, hear: (message: Received<K>) => void): void {
     this.listeners.set(kind, [...(this.listeners.get(kind) ?? []), hear]);
   }
 
-  /** Pictures: the id that they were asked with, and a JPEG. */
-  onPicture(see: (id: number, blob: Blob) => void): void {
-    this.binary.push(see);
+  /** Calls `hear` with each picture: the id of its request, and a JPEG. */
+  onPicture(hear: (id: number, blob: Blob) => void): void {
+    this.binary.push(hear);
   }
 
   onState(hear: (state: ConnectionState) => void): void {
     this.states.push(hear);
   }
 
-  /** Whether the message went out. */
-  send(ask: Ask): boolean {
+  /** Returns whether the message was sent. */
+  send(message: ClientMessage): boolean {
     if (!this.isOpen) return false;
-    this.socket?.send(JSON.stringify(ask));
+    this.socket?.send(JSON.stringify(message));
     return true;
   }
 
   connect(): void {
     clearTimeout(this.timer);
     if (this.socket && this.socket.readyState <= WebSocket.OPEN) return;
-    this.tell({ kind: "connecting" });
+    this.report({ kind: "connecting" });
     const socket = new WebSocket(`ws://${location.host}/socket${this.query}`);
     this.socket = socket;
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       this.wait = FIRST_WAIT;
-      this.tell({ kind: "open" });
+      this.report({ kind: "open" });
     };
-    socket.onmessage = (e) => this.hear(e.data as string | ArrayBuffer);
+    socket.onmessage = (e) => this.receive(e.data as string | ArrayBuffer);
     socket.onclose = () => {
-      this.tell({ kind: "lost", retryAt: Date.now() + this.wait });
+      this.report({ kind: "lost", retryAt: Date.now() + this.wait });
       this.timer = window.setTimeout(() => this.connect(), this.wait);
       this.wait = Math.min(this.wait * 2, LONGEST_WAIT);
     };
   }
 
-  private tell(state: ConnectionState): void {
+  private report(state: ConnectionState): void {
     this.states.forEach((f) => f(state));
   }
 
-  private hear(data: string | ArrayBuffer): void {
+  private receive(data: string | ArrayBuffer): void {
     if (typeof data === "string") {
-      const tell = JSON.parse(data) as Tell;
-      this.listeners.get(tell.kind)?.forEach((f) => f(tell as never));
+      const message = JSON.parse(data) as ServerMessage;
+      this.listeners.get(message.kind)?.forEach((f) => f(message as never));
       return;
     }
     const id = new DataView(data).getUint32(0, true);

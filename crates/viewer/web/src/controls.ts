@@ -10,7 +10,7 @@ export class ControlList {
   private controls: Control[] = [];
   private readonly given = new Map<string, Value>();
 
-  /** `changed` is called when a value is another. */
+  /** `changed` is called when a value changes. */
   constructor(private readonly changed: () => void) {}
 
   /** Values that are not the defaults. */
@@ -18,7 +18,7 @@ export class ControlList {
     return Object.fromEntries(this.given);
   }
 
-  /** Takes the program's list; values stay where their control is still there. */
+  /** Sets the program's list; values of controls that still exist stay. */
   set(controls: Control[]): void {
     this.controls = controls;
     for (const id of [...this.given.keys()]) if (!controls.some((c) => c.id === id)) this.given.delete(id);

@@ -1,4 +1,4 @@
-// The crop box: six sides, drawn over the picture and kept in the run.
+// The crop box: six sides, drawn over the picture and saved in the run.
 
 import type { Connection } from "./connection";
 import type { Box6 } from "./stage";
@@ -10,7 +10,7 @@ export class CropBox {
   private box: Box6 = [-1, -1, -1, 1, 1, 1];
   private bounds: Box6 = [-1, -1, -1, 1, 1, 1];
 
-  /** `changed` gets the box, or null where nothing is cropped. */
+  /** `changed` is called with the box, or null if nothing is cropped. */
   constructor(connection: Connection, private readonly changed: (clip: Box6 | null) => void) {
     input("crop").addEventListener("change", () => this.show());
     onClick("crop-save", () => connection.send({ kind: "crop", clip: this.clip }));
@@ -21,12 +21,12 @@ export class CropBox {
     });
   }
 
-  /** What is left of the scene; null: all of it. */
+  /** The visible box; null: the whole scene. */
   get clip(): Box6 | null {
     return input("crop").checked ? this.box : null;
   }
 
-  /** The box's middle, about which to turn. */
+  /** The box's center, about which the camera turns. */
   get middle(): [number, number, number] {
     const half = (k: number) => (this.box[k]! + this.box[k + 3]!) / 2;
     return [half(0), half(1), half(2)];
@@ -91,7 +91,7 @@ export class CropBox {
   }
 }
 
-/** The middle of what may be shown, no larger than the cameras' distance. */
+/** The middle part of the region that can be shown, at most as wide as the cameras' distance. */
 function inner(bounds: Box6, focus: [number, number, number], distance: number): Box6 {
   const low = (k: 0 | 1 | 2) => Math.max(bounds[k], focus[k] - distance / 2);
   const high = (k: 0 | 1 | 2) => Math.min(bounds[k + 3]!, focus[k] + distance / 2);

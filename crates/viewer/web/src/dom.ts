@@ -1,6 +1,6 @@
-// Elements of the page by their ids, made elements, and what the browser remembers.
+// Helpers for elements of the page, new elements, and settings stored in the browser.
 
-/** The element of an id that `index.html` has. */
+/** The element with an id of `index.html`. */
 export function element<T extends Element = HTMLElement>(id: string): T {
   const found = document.getElementById(id);
   if (!found) throw new Error(`index.html has no #${id}`);
@@ -41,7 +41,7 @@ export function icon(name: string): SVGElement {
   return made;
 }
 
-/** A button that shows an icon alone; `label` is its tooltip and its name for screen readers. */
+/** A button with only an icon; `label` is its tooltip and its name for screen readers. */
 export function iconButton(name: string, label: string, act: () => void): HTMLButtonElement {
   const b = make("button", { className: "quiet", title: label, type: "button" }, icon(name));
   b.setAttribute("aria-label", label);
@@ -53,7 +53,7 @@ export function download(name: string, href: string): void {
   make("a", { href, download: name }).click();
 }
 
-/** What the browser keeps between visits; nothing where it may not. */
+/** Settings that the browser stores between visits, if it is allowed to. */
 export const memory = {
   get(key: string): string | null {
     try {
@@ -66,7 +66,7 @@ export const memory = {
     try {
       localStorage.setItem(`diorama.${key}`, value);
     } catch {
-      // Private windows may refuse; the page works without.
+      // Private windows may refuse; the page works without stored settings.
     }
   },
 };

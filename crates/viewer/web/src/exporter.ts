@@ -1,4 +1,4 @@
-// Meshes: asked for, waited for, shown over the picture and downloaded; and screenshots.
+// Meshes: export, progress, display over the picture, download; and screenshots.
 
 import type { Connection } from "./connection";
 import type { Notices } from "./notices";
@@ -21,7 +21,7 @@ export class Exporter {
     connection.on("working", (t) => this.show(t.what, t.percent));
     connection.on("exported", (t) => {
       this.show(null);
-      notices.say(`Made ${t.file}`, "good");
+      notices.say(`Exported ${t.file}`, "good");
       if (t.glb) void this.load(t.scale);
     });
     connection.on("failed", (t) => t.view === null && this.show(null));
@@ -38,7 +38,7 @@ export class Exporter {
     this.stage.showMesh(input("mesh").checked);
   }
 
-  /** The picture with what lies over it, as PNG. */
+  /** Saves the picture with its overlay as PNG. */
   screenshot(): void {
     const picture = element<HTMLCanvasElement>("picture");
     const both = document.createElement("canvas");
@@ -57,7 +57,7 @@ export class Exporter {
     if (this.connection.send(ask)) this.show("Starting", 0);
   }
 
-  /** Shows how far the mesh is; null: none is being made. */
+  /** Shows the progress of an export; null: no export is running. */
   private show(what: string | null, percent = 0): void {
     this.making = what !== null;
     element<HTMLButtonElement>("export").disabled = this.making;
@@ -78,7 +78,7 @@ export class Exporter {
       this.stage.showMesh(true);
       document.body.dataset.mesh = "shown";
     } catch (e) {
-      this.notices.say(`The mesh cannot be shown: ${e}`, "error");
+      this.notices.say(`The mesh could not be shown: ${e}`, "error");
     }
   }
 }

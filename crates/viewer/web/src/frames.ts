@@ -1,11 +1,11 @@
-// The photographs: a strip of small pictures, each a place to look from.
+// The photographs: a strip of thumbnails; a click moves the camera to the pose of a photograph.
 
 import type { Photograph } from "./messages";
 import type { Connection } from "./connection";
 import { THUMBNAIL } from "./views";
 import { element, make } from "./dom";
 
-/** Pictures in the strip, at most: of more photographs, every second or third is shown. */
+/** Most thumbnails in the strip; with more photographs, every second or third is shown. */
 const MOST = 200;
 
 export class Frames {
@@ -23,7 +23,7 @@ export class Frames {
       img.addEventListener("load", () => URL.revokeObjectURL(img.src), { once: true });
       img.src = URL.createObjectURL(blob);
     });
-    // A wheel without a second axis moves the strip sideways.
+    // A mouse wheel without a horizontal axis scrolls the strip sideways.
     element("photographs").addEventListener("wheel", (e) => {
       if (e.deltaX === 0 && element("photographs").scrollWidth > element("photographs").clientWidth) {
         e.preventDefault();
@@ -36,7 +36,7 @@ export class Frames {
     });
   }
 
-  /** Takes a scene's photographs; `home`: the camera stands where the first was taken. */
+  /** Sets a scene's photographs; `home`: the camera is at the first one's pose. */
   set(photographs: Photograph[], home: boolean): void {
     this.photographs = photographs;
     if (home || this.current >= photographs.length) this.current = photographs.length > 0 ? 0 : -1;
@@ -60,13 +60,13 @@ export class Frames {
     this.fetchInSight(place);
   }
 
-  /** Goes to the next photograph, or with -1 to the one before. */
+  /** Moves to the next photograph, or with -1 to the previous one. */
   step(by: number): void {
     const n = this.photographs.length;
     if (n > 0) this.choose((this.current + by + n) % n);
   }
 
-  /** The camera stands where no photograph was taken. */
+  /** Removes the mark after the camera has left the photograph. */
   leave(): void {
     if (this.away) return;
     this.away = true;
@@ -82,7 +82,7 @@ export class Frames {
     this.lookFrom(p);
   }
 
-  /** Marks the chosen photograph, and those that the field shows through fog. */
+  /** Marks the chosen photograph, and those whose views are behind fog. */
   private mark(): void {
     for (const b of element("photographs").querySelectorAll<HTMLElement>("button")) {
       const frame = Number(b.dataset.frame);
@@ -95,7 +95,7 @@ export class Frames {
     document.body.dataset.fog = String(this.foggy.size);
   }
 
-  /** Small pictures are fetched when they come into sight. */
+  /** Requests thumbnails when they scroll into view. */
   private fetchInSight(place: HTMLElement): void {
     this.sight?.disconnect();
     const sight = new IntersectionObserver((entries) => {

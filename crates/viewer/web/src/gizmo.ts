@@ -1,4 +1,4 @@
-// The axes in the corner: they show how the camera is turned, and a click looks along one.
+// The axes in the corner: they show the orientation of the camera, and a click looks along an axis.
 
 import * as THREE from "three";
 import { element, svg } from "./dom";
@@ -43,7 +43,7 @@ export class Gizmo {
     }
   }
 
-  /** Turns the axes as the camera has them, the nearest last and so on top. */
+  /** Rotates the axes with the camera; the nearest is drawn last, on top. */
   turn(camera: THREE.Camera): void {
     const turned = camera.quaternion.clone().invert();
     const now = turned.toArray().map((v) => v.toFixed(3)).join();

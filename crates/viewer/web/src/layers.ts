@@ -1,4 +1,4 @@
-// The layers that the program lists: buttons to choose one, and the legend of what its colors stand for.
+// The layers that the program lists: buttons to choose one, and its legend.
 
 import type { Layer } from "./messages";
 import { element, make } from "./dom";
@@ -19,12 +19,12 @@ export class LayerList {
     });
   }
 
-  /** Id of the layer that is shown. */
+  /** Id of the chosen layer. */
   get id(): string {
     return this.chosen;
   }
 
-  /** Takes the program's list; the chosen layer stays where it is still there. */
+  /** Sets the program's list; the chosen layer stays if it still exists. */
   set(layers: Layer[]): void {
     this.layers = layers;
     if (!layers.some((l) => l.id === this.chosen)) this.chosen = layers[0]?.id ?? "";
@@ -45,7 +45,7 @@ export class LayerList {
     this.changed();
   }
 
-  /** Chooses the layer at a place of the list, if there is one. */
+  /** Chooses the layer with an index of the list, if it exists. */
   chooseNumber(i: number): void {
     const layer = this.layers[i];
     if (layer) this.choose(layer.id);

@@ -1,11 +1,11 @@
-// Panels: cards that fold, a dock that hides, and on a small screen a sheet with tabs that is drawn up and down.
+// Panels: cards that fold, a dock that can be hidden, and on small screens a sheet with tabs that can be dragged up and down.
 
 import { element, memory, onClick } from "./dom";
 
 const PHONE = "(max-width: 720px)";
-/** Share of the window that an opened sheet takes, and that a whole one takes. */
+/** Share of the window covered by an open sheet, and by a fully extended one. */
 const [HALF, WHOLE] = [0.5, 0.85];
-/** Pixels that a finger may stray and still tap. */
+/** Pixels that a finger may move during a tap. */
 const TAP = 6;
 
 export class Layout {
@@ -16,7 +16,7 @@ export class Layout {
   private height = 0;
   private open: Set<string>;
 
-  /** `changed` is called when the stage has another size. */
+  /** `changed` is called when the size of the stage changes. */
   constructor(private readonly changed: () => void) {
     this.open = new Set((memory.get("cards") ?? "training view").split(" "));
     for (const c of this.cards) {
@@ -70,7 +70,7 @@ export class Layout {
     this.arrange();
   }
 
-  /** A tab is chosen; the chosen one again folds the sheet. */
+  /** Chooses a tab; choosing the current one again folds the sheet. */
   private choose(tab: string): void {
     if (this.tab === tab && this.height > 40) this.height = 0;
     else if (this.height < 40) this.height = innerHeight * HALF;
@@ -97,7 +97,7 @@ export class Layout {
     this.changed();
   }
 
-  /** The grip draws the sheet up and down; a tap opens or folds it. */
+  /** The grip drags the sheet up and down; a tap opens or folds it. */
   private drag(): void {
     const grip = element("grip");
     let from: { y: number; height: number } | null = null;

@@ -6,7 +6,7 @@ import type { Notices } from "./notices";
 import { Stage } from "./stage";
 import { element, input, onClick, select } from "./dom";
 
-/** Pixels that a pointer may stray and still click. */
+/** Pixels that the pointer may move during a click. */
 const CLICK = 4;
 
 export class Ruler {
@@ -16,7 +16,7 @@ export class Ruler {
   private size = 0.02;
   private pressed: [number, number] = [0, 0];
 
-  /** `describe` gives the view at a size, in which a pixel is picked. */
+  /** `describe` returns the view at a given size, in which a pixel is picked. */
   constructor(
     private readonly connection: Connection,
     private readonly stage: Stage,
@@ -37,13 +37,13 @@ export class Ruler {
       if (this.picking && Math.hypot(e.clientX - this.pressed[0], e.clientY - this.pressed[1]) < CLICK) this.pick(e);
     });
     connection.on("picked", (t) => {
-      if (!t.point) notices.say("Nothing is there: click on the thing", "error");
+      if (!t.point) notices.say("There is no surface here: click on the object", "error");
       else if (this.points.push(t.point) === 2) this.picking = false;
       this.show();
     });
   }
 
-  /** `unit`: length of a unit of the capture in the world. */
+  /** `unit`: length of one unit of the capture in the world. */
   set(measured: number[] | null, unit: number, distance: number): void {
     [this.unit, this.size] = [unit, distance * 0.006];
     if (measured) {
@@ -54,7 +54,7 @@ export class Ruler {
     this.show();
   }
 
-  /** Begins to pick two new points, or stops. */
+  /** Starts or stops picking two points. */
   toggle(): void {
     if (this.picking) return this.stop();
     this.points = [];

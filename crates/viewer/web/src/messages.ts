@@ -5,7 +5,7 @@ export type Legend = { "kind": "scale", colors: Array<string>, low: string, high
 export type Class = { label: string, color: string, };
 export type Control = { id: string, label: string, help: string, 
 /**
- * Layers that it changes; empty: all.
+ * Ids of the layers that it changes; empty: all layers.
  */
 layers: Array<string>, input: Input, };
 export type Input = { "kind": "slider", min: number, max: number, step: number, unit: string, default: number, } | { "kind": "toggle", default: boolean, } | { "kind": "pick", options: Array<Choice>, default: string, };
@@ -24,37 +24,37 @@ export type Chart = { label: string, unit: string, lines: Array<Line>, };
 export type Value = number | boolean | string;
 export type View = { width: number, height: number, fov_y: number, pose: [number, number, number, number, number, number, number, number, number, number, number, number], layer: string, 
 /**
- * Values of controls by their ids; those that are left out have their defaults.
+ * Values of controls by id; controls that are left out have their defaults.
  */
 values: { [key in string]: Value }, clip: [number, number, number, number, number, number] | null, };
-export type Ask = { "kind": "view", id: number, view: View, } | { "kind": "pick", x: number, y: number, view: View, } | { "kind": "measured", points: [number, number, number, number, number, number] | null, metres: number, } | { "kind": "thumbnail", frame: number, } | { "kind": "crop", clip: [number, number, number, number, number, number] | null, } | { "kind": "path", json: string, } | { "kind": "open_path", json: string, } | { "kind": "export", format: string, faces: number, resolution: number, clip: [number, number, number, number, number, number] | null, };
+export type ClientMessage = { "kind": "view", id: number, view: View, } | { "kind": "pick", x: number, y: number, view: View, } | { "kind": "measured", points: [number, number, number, number, number, number] | null, metres: number, } | { "kind": "thumbnail", frame: number, } | { "kind": "crop", clip: [number, number, number, number, number, number] | null, } | { "kind": "path", json: string, } | { "kind": "open_path", json: string, } | { "kind": "export", format: string, faces: number, resolution: number, clip: [number, number, number, number, number, number] | null, };
 export type Photograph = { name: string, pose: [number, number, number, number, number, number, number, number, number, number, number, number], fov_y: number, aspect: number, held_out: boolean, };
-export type Tell = { "kind": "scene", name: string, photographs: Array<Photograph>, layers: Array<Layer>, controls: Array<Control>, 
+export type ServerMessage = { "kind": "scene", name: string, photographs: Array<Photograph>, layers: Array<Layer>, controls: Array<Control>, 
 /**
- * One line about what can be seen and what cannot; may be empty.
+ * One line about what can be shown and what cannot; may be empty.
  */
 note: string, 
 /**
- * Whether boxes, lengths and paths can be kept and meshes made.
+ * Whether boxes, lengths and paths can be saved and meshes exported.
  */
 is_run: boolean, focus: [number, number, number], distance: number, 
 /**
- * Rows of the similarity that takes meshes to the world.
+ * Rows of the similarity from the capture's frame to the world.
  */
 world_from_capture: [number, number, number, number, number, number, number, number, number, number, number, number], bounds: [number, number, number, number, number, number], crop: [number, number, number, number, number, number] | null, 
 /**
- * Two points of the world, and the metres between them.
+ * Two points of the world, and the meters between them.
  */
 measured: [number, number, number, number, number, number, number] | null, path: string | null, } | { "kind": "picked", point: [number, number, number] | null, } | { "kind": "status", step: number, seconds: number, 
 /**
- * 0 to 1.
+ * Completed share of the training, 0 to 1.
  */
 progress: number, running: boolean, figures: Array<Figure>, } | { "kind": "history", charts: Array<Chart>, } | { "kind": "fog", frames: Array<number>, } | { "kind": "working", what: string, percent: number, } | { "kind": "exported", file: string, glb: boolean, 
 /**
- * Metres of the mesh per unit of the capture.
+ * Meters of the mesh per unit of the capture.
  */
 scale: number, } | { "kind": "path", json: string, } | { "kind": "saved", what: string, file: string, } | { "kind": "failed", why: string, 
 /**
- * The view that was not drawn, where it was one.
+ * The id of the view that could not be rendered, if the failure concerns a view.
  */
 view: number | null, };

@@ -1,4 +1,4 @@
-// Where the camera stands: photographs' places, flying by keys, field of view, and smooth ways between.
+// Camera movement: poses of photographs, flying with keys, field of view, and smooth transitions.
 
 import * as THREE from "three";
 import type { Photograph } from "./messages";
@@ -7,23 +7,23 @@ import { Stage, matrixOf } from "./stage";
 import { element, input } from "./dom";
 import { writes } from "./shortcuts";
 
-/** Milliseconds of a smooth way. */
-const WAY = 450;
-/** Largest field of view in degrees, as the slider has it. */
+/** Milliseconds of a smooth transition. */
+const TRANSITION = 450;
+/** Largest field of view in degrees, as on the slider. */
 const WIDEST = 110;
 const FLYING = "wasdqe";
 
 export class Navigation {
-  /** How far the cameras stand from what they look at. */
+  /** Distance of the cameras from the point that they look at. */
   distance = 4;
   private focus: [number, number, number] = [0, 0, 0];
   private home: Key | null = null;
   private flown = 0;
   private way: { from: Key; to: Key; begun: number } | null = null;
-  /** Keys that are held: w a s d fly, q and e sink and rise. */
+  /** Keys that are held: w a s d fly, q and e move down and up. */
   private readonly held = new Set<string>();
 
-  /** `moved` is called whenever the camera stands elsewhere. */
+  /** `moved` is called whenever the camera has moved. */
   constructor(private readonly stage: Stage, private readonly moved: () => void) {
     stage.controls.addEventListener("change", () => this.moved());
     stage.controls.addEventListener("start", () => (this.way = null));
@@ -39,10 +39,10 @@ export class Navigation {
     });
   }
 
-  /** Takes a scene's focus; the camera goes home where it is the first. */
+  /** Sets a scene's focus; for the first scene the camera moves to its home pose. */
   set(focus: [number, number, number], distance: number, first: Photograph | undefined, goHome: boolean): void {
     [this.focus, this.distance] = [focus, distance];
-    // Cameras right before the eye would hide everything.
+    // Camera outlines close to the viewpoint would hide everything.
     this.stage.camera.near = distance * 0.1;
     this.stage.camera.far = distance * 50;
     if (first) this.home = this.keyOf(first);
@@ -57,7 +57,7 @@ export class Navigation {
     }
   }
 
-  /** The camera as a key of a path. */
+  /** The camera as a keyframe of a path. */
   get key(): Key {
     this.stage.camera.updateMatrixWorld();
     return { matrix: this.stage.camera.matrixWorld.clone(), fov: this.stage.camera.fov };
@@ -71,7 +71,7 @@ export class Navigation {
     this.goTo(this.keyOf(p));
   }
 
-  /** Looks at the middle of the scene, from where the camera is. */
+  /** Turns the camera toward the center of the scene. */
   lookAtFocus(focus = this.focus): void {
     this.stage.controls.target.set(...focus);
     this.moved();
@@ -87,7 +87,7 @@ export class Navigation {
     this.goTo({ matrix: turn.setPosition(eye), fov: this.stage.camera.fov });
   }
 
-  /** Goes to a key smoothly, or at once where motion is not wanted. */
+  /** Moves to a keyframe smoothly, or at once if the user prefers reduced motion. */
   goTo(to: Key): void {
     if (matchMedia("(prefers-reduced-motion: reduce)").matches) this.standAt(to);
     else this.way = { from: this.key, to, begun: performance.now() };
@@ -105,28 +105,28 @@ export class Navigation {
     this.flown = now;
     if (this.way) {
       const { from, to, begun } = this.way;
-      const t = Math.min(1, (now - begun) / WAY);
+      const t = Math.min(1, (now - begun) / TRANSITION);
       const way = this.way;
       this.standAt(t < 1 ? at([from, to], t * t * (3 - 2 * t), false) : to);
       if (t < 1) this.way = way;
     }
     if (this.held.size === 0) return;
-    const along = (plus: string, minus: string) => Number(this.held.has(plus)) - Number(this.held.has(minus));
-    const by = [along("d", "a"), along("e", "q"), along("w", "s")] as const;
+    const axis = (plus: string, minus: string) => Number(this.held.has(plus)) - Number(this.held.has(minus));
+    const by = [axis("d", "a"), axis("e", "q"), axis("w", "s")] as const;
     if (by.every((v) => v === 0)) return;
     this.way = null;
     this.stage.fly(...by, (this.distance / 3) * seconds);
     this.moved();
   }
 
-  /** After the window has another shape: what its shorter side showed is shown still. `aspect`: as it was. */
+  /** Adjusts the field of view after the window was resized, so that its shorter side shows the same angle. `aspect`: the former aspect ratio. */
   keepShown(aspect: number): void {
     const { camera } = this.stage;
     const half = Math.tan((camera.fov * Math.PI) / 360) * (Math.min(1, aspect) / Math.min(1, camera.aspect));
     this.setFov(Math.min(WIDEST, degrees(2 * Math.atan(half))));
   }
 
-  /** Where a photograph was taken, with a field of view that shows all of it in a window of any shape. */
+  /** The pose of a photograph, with a field of view that shows all of it in any window. */
   private keyOf(p: Photograph): Key {
     const wider = Math.max(1, p.aspect / this.stage.camera.aspect);
     return { matrix: matrixOf(p.pose), fov: Math.min(WIDEST, degrees(2 * Math.atan(Math.tan(p.fov_y / 2) * wider))) };

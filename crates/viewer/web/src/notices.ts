@@ -1,4 +1,4 @@
-// What the page says: short notices, the banner of a lost connection, and the state where no picture is.
+// Notices: short messages, the banner for a lost connection, and the message shown when there is no picture.
 
 import type { Connection, ConnectionState } from "./connection";
 import { element, icon, make, onClick } from "./dom";
@@ -6,7 +6,7 @@ import { element, icon, make, onClick } from "./dom";
 export type Level = "info" | "good" | "error";
 
 const ICONS: Record<Level, string> = { info: "info", good: "check", error: "warn" };
-/** Milliseconds that a notice stays. */
+/** Milliseconds for which a notice is shown. */
 const STAY = { info: 4000, good: 4000, error: 9000 };
 
 export class Notices {
@@ -19,7 +19,7 @@ export class Notices {
     connection.onState((s) => this.showState(s));
   }
 
-  /** Shows a line for some seconds; the same line again only renews it. */
+  /** Shows a line for some seconds; repeating the same line only restarts the time. */
   say(text: string, level: Level = "info"): void {
     const place = element("toasts");
     for (const old of place.querySelectorAll<HTMLElement>(".toast")) if (old.dataset.text === text) old.remove();
@@ -33,7 +33,7 @@ export class Notices {
     setTimeout(() => toast.remove(), STAY[level]);
   }
 
-  /** Says over the stage why there is no picture; null: there is one. */
+  /** Shows why there is no picture; null: there is one. */
   showEmpty(title: string | null, detail = "", busy = false): void {
     const place = element("empty");
     place.hidden = title === null;
@@ -53,16 +53,16 @@ export class Notices {
       this.everOpen = true;
     } else if (state.kind === "lost") {
       this.lostOnce = true;
-      if (!this.everOpen) this.showEmpty("No connection", "Is diorama still running? Open the address that it printed, with its token where it has one.");
+      if (!this.everOpen) this.showEmpty("No connection", "Is diorama still running? Open the address that it printed, including its token.");
       element("banner").hidden = false;
       const tick = () => {
         const left = Math.max(0, Math.ceil((state.retryAt - Date.now()) / 1000));
-        element("banner-text").textContent = `The program has gone or does not answer. Next try in ${left} s.`;
+        element("banner-text").textContent = `The program has ended or does not respond. Retrying in ${left} s.`;
       };
       tick();
       this.countdown = window.setInterval(tick, 500);
     } else if (this.lostOnce) {
-      element("banner-text").textContent = "The program has gone or does not answer. Trying again…";
+      element("banner-text").textContent = "The program has ended or does not respond. Retrying…";
     } else {
       this.showEmpty("Connecting", "", true);
     }

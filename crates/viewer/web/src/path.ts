@@ -1,4 +1,4 @@
-// Keyframes and the smooth path through them, in and out as nerfstudio's camera_path.json.
+// Keyframes and the smooth path through them; reads and writes nerfstudio's camera_path.json.
 
 import * as THREE from "three";
 
@@ -15,7 +15,7 @@ export interface PathSettings {
   cycle: boolean;
 }
 
-/** The camera at `t` of 0..1 along the keys: Catmull-Rom for places, spherical interpolation for directions. */
+/** The camera at `t` in 0..1 along the keyframes: Catmull-Rom for positions, spherical interpolation for rotations. */
 export function at(keys: Key[], t: number, cycle: boolean): Key {
   const first = keys[0];
   if (!first || keys.length === 1) return first ?? { matrix: new THREE.Matrix4(), fov: 50 };
@@ -63,7 +63,7 @@ export function fromJson(text: string): { keys: Key[]; settings: PathSettings } 
   }));
   const views: { camera_to_world: number[]; fov?: number }[] = j.camera_path ?? [];
   if (keys.length === 0) {
-    // A path without keys: about a dozen of its cameras serve.
+    // A path without keyframes: about a dozen of its cameras are used instead.
     const step = Math.max(1, Math.floor(views.length / 12));
     keys = views.filter((_, i) => i % step === 0).map((v) => ({
       matrix: new THREE.Matrix4().fromArray(v.camera_to_world).transpose(),

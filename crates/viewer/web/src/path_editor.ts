@@ -1,4 +1,4 @@
-// The camera path: a list of views, played on the page, kept in the run, opened and downloaded.
+// The camera path: a list of views that can be played, saved in the run, opened and downloaded.
 
 import * as THREE from "three";
 import type { Connection } from "./connection";
@@ -26,7 +26,7 @@ export class PathEditor {
       this.show();
     });
     onClick("path-save", () => this.save());
-    // Saved first: the file has the cameras in the capture's own frame.
+    // Saved first, because the program writes the file with cameras in the capture's frame.
     onClick("path-download", () => (this.wantsDownload = this.save()));
     onClick("path-open-button", () => input("path-open").click());
     input("path-open").addEventListener("change", async () => {
@@ -85,7 +85,7 @@ export class PathEditor {
       input("key-cycle").checked = settings.cycle;
       this.show();
     } catch (e) {
-      this.notices.say(`The camera path cannot be read: ${e}`, "error");
+      this.notices.say(`The camera path could not be read: ${e}`, "error");
     }
   }
 
@@ -126,7 +126,7 @@ export class PathEditor {
     const go = make("button", { className: "quiet grow", type: "button", title: "Look from here" }, `View ${i + 1}`);
     go.append(make("small", { textContent: `${Math.round(k.fov)}°` }));
     go.addEventListener("click", () => this.navigation.goTo(k));
-    const renew = iconButton("target", `Set view ${i + 1} to where the camera is`, () => {
+    const renew = iconButton("target", `Set view ${i + 1} to the current camera`, () => {
       this.keys[i] = this.navigation.key;
       this.show();
     });

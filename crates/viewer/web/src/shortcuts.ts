@@ -1,14 +1,14 @@
-// Keyboard shortcuts: one list that is both obeyed and shown by the help overlay.
+// Keyboard shortcuts: one list that defines both the actions and the help overlay.
 
 import { element, make, onClick } from "./dom";
 
 export interface Shortcut {
-  /** As `KeyboardEvent.key`, lower case; several for a row that is shown only. */
+  /** As in `KeyboardEvent.key`, lower case; several for a row that is only shown. */
   keys: string[];
   label: string;
-  /** Empty: obeyed, not described. */
+  /** Empty: active but not shown in the help. */
   group: string;
-  /** None: described here, obeyed elsewhere. */
+  /** Absent: shown in the help, handled elsewhere. */
   act?: () => void;
 }
 
@@ -20,7 +20,7 @@ export class Shortcuts {
   constructor(private readonly list: Shortcut[]) {
     onClick("help-open", () => this.toggleHelp());
     onClick("help-close", () => this.dialog.close());
-    // A click beside the overlay closes it.
+    // A click outside the overlay closes it.
     this.dialog.addEventListener("click", (e) => e.target === this.dialog && this.dialog.close());
     this.fill();
     window.addEventListener("keydown", (e) => this.press(e));
@@ -40,9 +40,9 @@ export class Shortcuts {
       return;
     }
     if (this.dialog.open) return;
-    // A focused button takes Space for itself.
+    // A focused button uses Space itself.
     if (key === " " && e.target instanceof HTMLElement && e.target.closest("button, summary, a")) return;
-    // Arrows move a slider or the choice of a layer.
+    // Arrow keys move a slider or the choice of a layer.
     if (key.startsWith("arrow") && e.target instanceof HTMLElement && e.target.matches("input, [role=radio]")) return;
     const found = this.list.find((s) => s.act && s.keys.includes(key));
     if (!found) return;
@@ -64,7 +64,7 @@ export class Shortcuts {
   }
 }
 
-/** Whether keys mean text or a value there. */
+/** Whether keys enter text or a value in this element. */
 export function writes(target: EventTarget | null): boolean {
   if (target instanceof HTMLInputElement) return target.type !== "checkbox" && target.type !== "radio" && target.type !== "range";
   return target instanceof HTMLSelectElement || target instanceof HTMLTextAreaElement;

@@ -1,4 +1,4 @@
-// What lies over the picture: cameras, crop box, path and mesh, in the picture's own perspective.
+// The overlay: cameras, crop box, path and mesh, drawn over the picture in its perspective.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
@@ -33,7 +33,7 @@ export class Stage {
   private changed = true;
 
   constructor(canvas: HTMLCanvasElement) {
-    // Without WebGL the picture alone is shown; it comes from the program.
+    // Without WebGL only the picture is shown, which the program renders.
     try {
       this.renderer = new THREE.WebGLRenderer({ canvas, alpha: true, antialias: true, preserveDrawingBuffer: true });
       this.renderer.setClearColor(0, 0);
@@ -54,7 +54,7 @@ export class Stage {
     return this.renderer !== null;
   }
 
-  /** Whether anything lies over the picture. */
+  /** Whether there is an overlay. */
   get hasSomething(): boolean {
     const filled = (g: THREE.Group) => g.visible && g.children.length > 0;
     return this.box.visible || Boolean(this.mesh?.visible) || [this.frusta, this.path, this.rule].some(filled);
@@ -67,7 +67,7 @@ export class Stage {
     this.camera.updateProjectionMatrix();
   }
 
-  /** Draws where anything has changed. */
+  /** Draws if anything has changed. */
   draw(): void {
     if (this.changed) this.renderer?.render(this.scene, this.camera);
     this.changed = false;
@@ -77,11 +77,11 @@ export class Stage {
     this.changed = true;
   }
 
-  /** Stands the camera where a pose says, turning about a point `distance` before it. */
+  /** Sets the camera pose; the camera then turns about a point at `distance` in front of it. */
   lookFrom(matrix: THREE.Matrix4, distance: number): void {
     const position = new THREE.Vector3().setFromMatrixPosition(matrix);
     const forward = new THREE.Vector3(0, 0, -1).transformDirection(matrix);
-    // Takes up what a drag has left to turn: it would move the camera from where it is put.
+    // Cancels the damped rest of a drag, which would move the camera away from its new pose.
     const { enableDamping } = this.controls;
     this.controls.enableDamping = false;
     this.controls.update();
@@ -91,7 +91,7 @@ export class Stage {
     this.controls.update();
   }
 
-  /** Moves the camera to its right, up and forward. */
+  /** Moves the camera right, up and forward. */
   fly(right: number, up: number, forward: number, step: number): void {
     const by = new THREE.Vector3(right, 0, -forward).applyQuaternion(this.camera.quaternion);
     by.z += up;
@@ -161,7 +161,7 @@ export class Stage {
     this.changed = true;
   }
 
-  /** Shows a mesh of `scale` metres per unit of the capture; `rows` take the capture to the world. */
+  /** Shows a mesh with `scale` meters per unit of the capture; `rows` map the capture's frame to the world. */
   async loadMesh(url: string, rows: number[], scale: number): Promise<void> {
     const made = await new GLTFLoader().loadAsync(url);
     if (this.mesh) this.scene.remove(this.mesh);

@@ -1,4 +1,4 @@
-// Dark and light: as the system has it until somebody chooses.
+// Dark and light theme: the system's setting until the user chooses.
 
 import { element, memory, onClick } from "./dom";
 
@@ -16,7 +16,7 @@ export class Theme {
     this.show();
   }
 
-  /** Goes from system to light to dark and around. */
+  /** Cycles through system, light and dark. */
   next(): void {
     this.choice = CHOICES[(CHOICES.indexOf(this.choice) + 1) % CHOICES.length] ?? "system";
     memory.set("theme", this.choice);
@@ -27,7 +27,7 @@ export class Theme {
     document.documentElement.dataset.theme = this.choice;
     const b = element("theme");
     b.querySelector("use")?.setAttribute("href", `#i-${{ system: "contrast", light: "sun", dark: "moon" }[this.choice]}`);
-    const label = { system: "Theme: as the system", light: "Theme: light", dark: "Theme: dark" }[this.choice];
+    const label = { system: "Theme: system", light: "Theme: light", dark: "Theme: dark" }[this.choice];
     b.title = `${label} (T)`;
     b.setAttribute("aria-label", label);
   }

@@ -1,17 +1,17 @@
-// How far training is: figures, a bar, and small charts. Which figures and charts there are, the program says.
+// Progress of training: figures, a bar, and small charts. The program chooses figures and charts.
 
-import type { Connection, Told } from "./connection";
+import type { Connection, Received } from "./connection";
 import { element, make, svg } from "./dom";
 import type { Chart, Figure, Line } from "./messages";
 
-/** Points of a line; of more, every second is dropped. */
+/** Most points of a line; when there are more, every second one is dropped. */
 const MOST = 400;
 const [WIDTH, HEIGHT] = [272, 64];
 
 export class Training {
   private charts: Chart[] = [];
 
-  /** `running` tells whether the field changes. */
+  /** `running` is called with whether training is running. */
   constructor(connection: Connection, private readonly running: (on: boolean) => void) {
     connection.on("status", (t) => this.show(t));
     connection.on("history", (t) => {
@@ -20,7 +20,7 @@ export class Training {
     });
   }
 
-  private show(t: Told<"status">): void {
+  private show(t: Received<"status">): void {
     document.body.dataset.step = String(t.step);
     document.body.dataset.running = String(t.running);
     this.running(t.running);
@@ -44,7 +44,7 @@ export class Training {
 
   private add(step: number, figures: Figure[]): void {
     const lines = this.charts.flatMap((c) => c.lines);
-    // Another run begins anew.
+    // Another run starts with empty lines.
     if (lines.some((l) => (l.points.at(-1)?.[0] ?? 0) > step)) lines.forEach((l) => (l.points = []));
     let grew = false;
     for (const l of lines) {

@@ -1,12 +1,12 @@
-// The picture: asks for views as fast as they come, coarser while the camera moves, and draws them.
+// The picture: requests views as fast as they arrive, at lower resolution while the camera moves, and draws them.
 
 import type { View } from "./messages";
 import type { Connection } from "./connection";
 import { element } from "./dom";
 
-/** Milliseconds that a view may take while the camera moves. */
+/** Target time of a view in milliseconds while the camera moves. */
 const TARGET = 50;
-/** Milliseconds of rest after which a view is drawn in full. */
+/** Milliseconds without motion after which a view is requested at full resolution. */
 const REST = 180;
 /** Milliseconds between views of a field in training. */
 const REFRESH = 2000;
@@ -21,7 +21,7 @@ interface Asked {
 
 export class Views {
   readonly canvas = element<HTMLCanvasElement>("picture");
-  /** Whether the field changes by itself. */
+  /** Whether the field is being trained. */
   training = false;
   private nextId = 0;
   private asked: Asked | null = null;
@@ -34,7 +34,7 @@ export class Views {
   private failed = false;
   private count = 0;
 
-  /** `describe` gives the view at a size; `drawn` is called after each, with null or why there is none. */
+  /** `describe` returns the view at a given size; `drawn` is called after each view, with null or the reason of its failure. */
   constructor(
     private readonly connection: Connection,
     private readonly describe: (width: number, height: number) => View,
@@ -49,21 +49,21 @@ export class Views {
     connection.on("failed", (t) => {
       if (t.view === null) return;
       if (this.asked?.id === t.view) this.asked = null;
-      // The same view would fail again: it is asked for when something changes.
+      // The same view would fail again; it is requested when something changes.
       this.failed = true;
       this.shown = 1;
       this.drawn(t.why);
     });
   }
 
-  /** The view is no longer the one that is shown. */
+  /** Marks the displayed view as outdated. */
   touch(): void {
     this.dirty = true;
     this.failed = false;
     this.moved = performance.now();
   }
 
-  /** Asks for what is missing. */
+  /** Requests a view if one is needed. */
   tick(now: number): void {
     document.body.dataset.settled = String(!this.dirty && !this.asked && this.shown === 1);
     if (this.asked || !this.connection.isOpen) return;
@@ -77,7 +77,7 @@ export class Views {
   }
 
   private ask(scale: number): void {
-    // Panels over the stage take nothing from it: the picture fills the window.
+    // Panels lie over the stage: the picture fills the window.
     const width = Math.max(16, Math.round(this.canvas.clientWidth * scale));
     const height = Math.max(16, Math.round(this.canvas.clientHeight * scale));
     this.asked = { id: this.nextId++ % THUMBNAIL, when: performance.now(), scale };
@@ -102,12 +102,12 @@ export class Views {
     element("figures").textContent = `${width} × ${height} · ${Math.round(this.took)} ms`;
   }
 
-  /** Chooses the scale of coming views by how long this one took. */
+  /** Chooses the scale of the next views from the time that this one took. */
   private measure(asked: Asked): void {
     this.took = performance.now() - asked.when;
     this.shown = asked.scale;
     if (asked.scale >= 1) return;
-    // The time goes with the number of pixels, the square of the scale.
+    // The time is proportional to the number of pixels, the square of the scale.
     const wanted = asked.scale * Math.sqrt(TARGET / Math.max(this.took, 1));
     this.scale = Math.min(1, Math.max(0.1, 0.6 * this.scale + 0.4 * wanted));
   }

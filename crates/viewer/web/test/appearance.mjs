@@ -1,8 +1,8 @@
-// Checks of what the page looks like and how it is worked: shortcuts, themes, lists told by a source, lost programs, small screens.
+// Checks of the page's appearance and use: shortcuts, themes, lists of a source, a lost connection, small screens.
 
 import { Page, check, difference, run, standIn, until, viewer } from "./driver.mjs";
 
-/** Keys, the help that lists them, and what is remembered. */
+/** Shortcuts, the help that lists them, and stored settings. */
 export async function shortcuts(browser, address) {
   const p = await Page.open(browser, address);
   const { page } = p;
@@ -53,7 +53,7 @@ export async function shortcuts(browser, address) {
   await p.close();
 }
 
-/** Dark and light, names for screen readers, and nothing that jumps. */
+/** Dark and light theme, names for screen readers, and no layout shift. */
 export async function themes(browser, address) {
   const p = await Page.open(browser, address);
   const { page } = p;
@@ -88,7 +88,7 @@ export async function themes(browser, address) {
   await p.close();
 }
 
-/** Layers and controls of a source that no other has. */
+/** Layers and controls that only one source has. */
 export async function ownLists(browser) {
   const { address, end } = await standIn();
   const p = await Page.open(browser, address);
@@ -120,7 +120,7 @@ export async function ownLists(browser) {
   await end();
 }
 
-/** A program that goes and comes back, and views that cannot be drawn. */
+/** A program that ends and starts again, and views that cannot be rendered. */
 export async function lostAndFailed(browser) {
   const first = await viewer(run);
   const port = new URL(first.address).port;
@@ -130,7 +130,7 @@ export async function lostAndFailed(browser) {
   const before = await p.picture();
   await first.end();
   await until("the banner", () => p.shown("#banner"));
-  check("a program that has gone is told of", /gone|answer/.test(await p.text("#banner")), `(${await p.text("#banner-text")})`);
+  check("a program that has ended is reported", /ended|respond/.test(await p.text("#banner")), `(${await p.text("#banner-text")})`);
   await p.shot("gone");
   const views = await p.views();
   const second = await viewer(run, port);
@@ -165,7 +165,7 @@ export async function lostAndFailed(browser) {
   await second.end();
 }
 
-/** A phone upright: the sheet, its tabs, and fingers. */
+/** A phone in portrait orientation: the sheet, its tabs, and touch. */
 export async function phone(browser, address) {
   const options = { viewport: { width: 390, height: 844 }, isMobile: true, hasTouch: true };
   const p = await Page.open(browser, address, { options });

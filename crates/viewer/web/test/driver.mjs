@@ -1,4 +1,4 @@
-// What the checks of the page stand on: programs to look at, pages of a browser, and pictures to compare.
+// Helpers for the checks of the page: programs to view, browser pages, and comparison of pictures.
 
 import { spawn } from "node:child_process";
 import net from "node:net";
@@ -23,7 +23,7 @@ export const check = (what, ok, detail = "") => {
   console.log(`ok  ${what} ${detail}`);
 };
 
-/** Programs that run still. */
+/** Functions that end the programs that are still running. */
 const ends = new Set();
 export const endAll = () => Promise.all([...ends].map((e) => e()));
 
@@ -37,13 +37,13 @@ async function listening(program, args) {
   return { address: await until("the viewer's address", () => out.match(/http:\/\/[^"\s]+/)?.[0]), end };
 }
 
-/** Starts a viewer; its address and how to end it. */
+/** Starts a viewer; returns its address and a function that ends it. */
 export const viewer = (what, port = 0, ...flags) => listening(diorama, ["view", what, "--port", String(port), "--json", "--device", "cpu", ...flags]);
 
-/** Starts the stand-in source of `crates/viewer/examples`. */
+/** Starts the example source of `crates/viewer/examples`. */
 export const standIn = () => listening(ownPicture, []);
 
-/** Starts training with a viewer on the capture of the run; its address, what it says, and how it ends. */
+/** Starts training with a viewer on the capture of the run; returns its address and a function that stops it. */
 export async function training(out) {
   const flags = ["--seconds", "60", "--view", "--port", "0", "--device", "cpu", "--set", "field.log2_size=15"];
   const child = spawn(diorama, ["train", path.join(run, "capture"), "-o", out, ...flags], { stdio: ["ignore", "ignore", "pipe"] });
@@ -55,7 +55,7 @@ export async function training(out) {
   return { address: await until("the address", () => said.match(/view: (http\S+)/)?.[1]), stop };
 }
 
-/** Sends a request as it stands; the answer's status. */
+/** Sends a raw request; returns the status of the answer. */
 export function raw(port, lines, host = "127.0.0.1") {
   return new Promise((resolve, reject) => {
     const s = net.connect(port, host, () => s.write(lines.join("\r\n") + "\r\n\r\n"));
@@ -70,7 +70,7 @@ export function raw(port, lines, host = "127.0.0.1") {
   });
 }
 
-/** Errors that any page's console had, and what pages fetched. */
+/** Console errors of all pages, and the requests that pages made. */
 export const complaints = [];
 export const requests = [];
 
@@ -103,7 +103,7 @@ export class Page {
   card = (name) => this.page.evaluate((n) => (document.getElementById(`card-${n}`).open = true), name);
   shot = async (name) => pictures && (await this.page.screenshot({ path: path.join(pictures, `${name}.png`) }));
 
-  /** Waits until a whole view is shown and nothing moves. */
+  /** Waits until a view at full resolution is shown and nothing moves. */
   async settled() {
     for (let before = -1, now = 0; before !== now; ) {
       await this.page.waitForTimeout(150);
@@ -112,7 +112,7 @@ export class Page {
     }
   }
 
-  /** The picture, made small. */
+  /** The picture, reduced. */
   async picture() {
     await this.settled();
     return this.page.evaluate(() => {
@@ -127,7 +127,7 @@ export class Page {
   /** Chooses a layer by its button. */
   layer = (id) => this.page.click(`#layers [data-layer=${id}]`);
 
-  /** Drags with the mouse from the middle of the stage. */
+  /** Drags with the mouse from the center of the stage. */
   async drag(dx, dy, steps, wait = 0) {
     const [x, y] = await this.middle();
     await this.page.mouse.move(x, y);
@@ -144,7 +144,7 @@ export class Page {
     return [box.x + box.width / 2, box.y + box.height / 2];
   }
 
-  /** Waits until more than `some` small photographs are loaded. */
+  /** Waits until more than `some` thumbnails are loaded. */
   thumbnails = (some) => until("thumbnails", () => this.page.evaluate((n) => [...document.querySelectorAll("#photographs img")].filter((i) => i.naturalWidth > 0).length > n, some));
 }
 

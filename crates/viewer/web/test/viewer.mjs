@@ -1,5 +1,5 @@
 // Drives the viewer of a run in headless Chromium: node test/viewer.mjs DIORAMA RUN [PICTURES]
-// Prints a line per check and fails with the first that does not hold.
+// Prints a line per check and ends at the first one that fails.
 
 import { execFileSync } from "node:child_process";
 import { existsSync, mkdtempSync, readFileSync, rmSync, writeFileSync } from "node:fs";
@@ -11,7 +11,7 @@ import { Page, check, checked, complaints, difference, diorama, endAll, raw, req
 
 const scratch = mkdtempSync(path.join(os.tmpdir(), "viewer-"));
 
-/** Who else may not ask. */
+/** Requests that must be refused. */
 async function guarded(browser, address) {
   const { port, host } = new URL(address);
   const upgrade = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="];
@@ -44,7 +44,7 @@ async function guarded(browser, address) {
   await page.close();
 }
 
-/** Views from elsewhere and of every layer. */
+/** Views from other poses and of every layer. */
 async function looking(p) {
   const { page } = p;
   const first = await p.picture();
@@ -87,7 +87,7 @@ async function looking(p) {
     await p.shot(layer);
   }
   await p.layer("rgb");
-  // An axis of the corner.
+  // An axis of the gizmo.
   const shown = await p.picture();
   await page.focus("#gizmo g.z:not(.minus)");
   await page.keyboard.press("Enter");
@@ -142,12 +142,12 @@ async function filming(p) {
   check("a saved path is opened again", true);
 }
 
-/** Two points a known length apart; the units between them. */
+/** Picks two points with a known distance; returns their distance in units of the capture. */
 async function measuring(p) {
   const { page } = p;
   await p.card("measure");
   await p.settled();
-  // Where something dark stands before the white: the page's places of two such pixels far apart, beside what floats.
+  // Positions of two dark pixels far apart on the page: the object before the white background, not below floating panels.
   const [one, two] = await page.evaluate(() => {
     const c = document.getElementById("picture");
     const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
@@ -201,7 +201,7 @@ async function exporting(p, apart) {
   check("a screenshot is saved", readFileSync(path.join(scratch, "s.png")).subarray(1, 4).toString() === "PNG");
 }
 
-/** Training shows itself. */
+/** The page during training. */
 async function live(browser) {
   const out = path.join(scratch, "live");
   const { address, stop } = await training(out);
@@ -224,7 +224,7 @@ async function live(browser) {
   check("Ctrl-C ends training and viewer with a checkpoint", code === 130 && existsSync(path.join(out, "checkpoints")), `(exit code ${code})`);
 }
 
-/** A data set and a file of splats, before there is any run. */
+/** A data set and a file of splats, without a run. */
 async function withoutRun(browser) {
   const cloud = path.join(scratch, "ball.ply");
   const names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];

@@ -6,7 +6,7 @@ use diorama_pipelines::bench;
 use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
 
-/// Every op on a GPU against its f64 reference; exit code 1 if one is wrong
+/// Compare every op on a GPU with its f64 reference; exit code 1 if one differs
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  diorama bench check --device vulkan")]
 pub struct Check {
@@ -16,6 +16,7 @@ pub struct Check {
     /// cuda, vulkan, metal or webgpu
     #[arg(long)]
     device: String,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }
@@ -35,10 +36,10 @@ impl Verb for Check {
                 let error = l.error.map_or("FAILED ".into(), |e| format!("{e:.1e}"));
                 println!("{error}  {:<20} {:<18} {:<28} {}", l.op, l.result, l.shape, l.fault.as_deref().unwrap_or(""));
             }
-            let atomics = if r.native_atomics { "native f32 atomics" } else { "exchanged f32 atomics" };
+            let atomics = if r.native_atomics { "native f32 atomics" } else { "f32 atomics by exchange" };
             let kind = if r.software { "software" } else { "hardware" };
             println!(
-                "{} ({}, {kind}, {atomics}): {} of {} right in {:.1} s",
+                "{} ({}, {kind}, {atomics}): {} of {} pass in {:.1} s",
                 r.device,
                 r.name,
                 r.lines.len() - wrong,

@@ -8,7 +8,7 @@ use diorama_pipelines::object::run_folder;
 use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
 
-/// A surface from a grid of densities, with normals, to a file
+/// Extract a surface from a run's densities, with normals, and write it to a file
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  diorama bench mesh runs/chair --resolution 512 --save-grid grid.npy")]
 pub struct Mesh {
@@ -17,14 +17,16 @@ pub struct Mesh {
     /// Cells along the longest side
     #[arg(long, default_value_t = 512)]
     resolution: usize,
-    /// Keep the densities as .npy, for other programs
+    /// Save the densities as .npy, for other programs
     #[arg(long)]
     save_grid: Option<PathBuf>,
-    /// Calls; the median counts
+    /// Number of runs; the median is reported
     #[arg(long, default_value_t = 5)]
     repeats: usize,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }

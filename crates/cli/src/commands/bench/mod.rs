@@ -1,4 +1,4 @@
-//! `diorama bench`: a noun with its verbs.
+//! `diorama bench`: a group of commands.
 
 mod check;
 mod mesh;
@@ -22,7 +22,7 @@ pub enum Bench {
 }
 
 impl Bench {
-    /// The verb that was called.
+    /// The chosen command.
     pub fn verb(&self) -> &dyn Verb {
         match self {
             Bench::Ops(v) => v,

@@ -6,22 +6,24 @@ use clap::Args;
 use diorama_pipelines::bench::nets::{self, Figures, Wanted};
 use diorama_pipelines::{PipelineError, Result};
 
-/// Layers and whole networks on the CPU, forward and training
+/// Time layers and whole networks on the CPU, forward and training
 #[derive(Args, Clone, Debug)]
 #[command(
-    after_help = "Example:\n  diorama bench nets conv3x3_64_128 vgg16 --threads 2 --json\n\nPeak memory compares where a network is alone in the process."
+    after_help = "Example:\n  diorama bench nets conv3x3_64_128 vgg16 --threads 2 --json\n\nPeak memory is comparable only if one network is measured per call."
 )]
 pub struct Nets {
-    /// Parts of names of layers, as NAME_bBATCH, and networks; all where there are none
+    /// Parts of the names of layers (NAME_bBATCH) and networks; all if none is given
     names: Vec<String>,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
-    /// Fewest calls per figure; the median counts
+    /// Fewest runs per figure; the median is reported
     #[arg(long, default_value_t = 5)]
     repeats: usize,
-    /// Calls go on for so many seconds per figure
+    /// Repeat each figure for this many seconds
     #[arg(long, default_value_t = 0.5)]
     seconds: f64,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }
@@ -45,7 +47,7 @@ impl Verb for Nets {
         if self.json {
             println!("{}", serde_json::json!(report));
         } else {
-            println!("{} thread(s); one core's limit: {:.0} GFLOP/s multiply-add", report.threads, report.peak_gflops);
+            println!("{} thread(s); limit of one core: {:.0} GFLOP/s multiply-add", report.threads, report.peak_gflops);
         }
         Ok(Outcome::Done)
     }

@@ -5,18 +5,20 @@ use clap::Args;
 use diorama_pipelines::bench;
 use diorama_pipelines::{PipelineError, Result};
 
-/// Each op against the machine's own measured limits
+/// Time each op and compare it with the machine's measured limits
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  diorama bench ops --threads 2 --json")]
 pub struct Ops {
+    /// Number of CPU threads [default: 1]
     #[arg(long)]
     threads: Option<usize>,
     /// cpu, cuda, vulkan, metal or webgpu
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Calls per figure; the median counts
+    /// Runs per figure; the median is reported
     #[arg(long, default_value_t = 9)]
     repeats: usize,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }
@@ -38,7 +40,7 @@ impl Verb for Ops {
         };
         if self.device != "cpu" {
             if self.threads.is_some() {
-                return Err(PipelineError::Usage(format!("--threads is the CPU's; leave it out with --device {}", self.device)));
+                return Err(PipelineError::Usage(format!("--threads applies to the CPU only; leave it out with --device {}", self.device)));
             }
             return gpu_ops(self, &print);
         }
@@ -52,7 +54,7 @@ impl Verb for Ops {
         } else {
             let l = report.limits;
             println!(
-                "{} thread(s), {}; one thread's limits: {:.0} GFLOP/s multiply-add, {:.1} GB/s read",
+                "{} thread(s), {}; limits of one thread: {:.0} GFLOP/s multiply-add, {:.1} GB/s read",
                 report.threads, report.simd, l.fma_gflops, l.read_gb_per_s
             );
         }

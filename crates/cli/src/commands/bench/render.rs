@@ -8,7 +8,7 @@ use diorama_pipelines::bench;
 use diorama_pipelines::object::{device, run_folder};
 use std::path::PathBuf;
 
-/// Frames per second of a run's held-out views, and what the fast quality costs
+/// Measure frames per second of a run's held-out views, and the error of the fast quality
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  diorama bench render runs/chair --json")]
 pub struct Render {
@@ -17,11 +17,13 @@ pub struct Render {
     /// auto, cpu, cuda, vulkan, metal or webgpu
     #[arg(long, default_value = "auto")]
     device: String,
-    /// Calls per view; the median counts
+    /// Runs per view; the median is reported
     #[arg(long, default_value_t = 5)]
     repeats: usize,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }

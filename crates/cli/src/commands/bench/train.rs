@@ -9,31 +9,37 @@ use diorama_pipelines::run::config::set_all;
 use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
 
-/// Where the time of a training step goes; nothing is written
+/// Show how long each stage of a training step takes; writes nothing
 #[derive(Args, Clone, Debug)]
 #[command(after_help = "Example:\n  diorama bench train capture/ --downscale 4 --steps 200")]
 pub struct Train {
     /// Folder of the capture
     data: PathBuf,
+    /// ngp, nerf, mlp or baseline
     #[arg(long, default_value = "ngp")]
     method: String,
+    /// Reduce the photographs by this factor
     #[arg(long, default_value_t = 1)]
     downscale: u32,
+    /// every:N, A:B:C (percent), file or all
     #[arg(long, default_value = "file")]
     split: String,
+    /// auto, cpu, cuda, vulkan, metal or webgpu
     #[arg(long, default_value = "auto")]
     device: String,
-    /// Steps before the measured ones
+    /// Steps before the measured steps
     #[arg(long, default_value_t = 300)]
     warmup: u64,
-    /// Measured steps
+    /// Number of measured steps
     #[arg(long, default_value_t = 200)]
     steps: u64,
+    /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
-    /// Override a configuration value; may be repeated
+    /// Set a configuration value; may be repeated
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
+    /// Print one JSON object on stdout
     #[arg(long)]
     json: bool,
 }

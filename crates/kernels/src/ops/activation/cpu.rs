@@ -36,6 +36,28 @@ vectorized! {
     }
 }
 
+vectorized! {
+    fn sigmoid_backward<const F>(y: &[f32], d: &[f32], dx: &mut [f32]) {
+        dx.iter_mut().zip(y).zip(d).for_each(|((o, y), d)| *o = d * y * (1.0 - y));
+    }
+}
+
+vectorized! {
+    fn tanh_backward<const F>(y: &[f32], d: &[f32], dx: &mut [f32]) {
+        dx.iter_mut().zip(y).zip(d).for_each(|((o, y), d)| *o = d * (1.0 - y * y));
+    }
+}
+
+/// `dx = d · f′(x)` on this thread, with `kept` the function's input where it [needs that](Activation::needs_input), else its output.
+pub(crate) fn backward_of_kept(a: Activation, kept: &[f32], d: &[f32], dx: &mut [f32]) {
+    match a {
+        Activation::Sigmoid => sigmoid_backward(kept, d, dx),
+        Activation::Tanh => tanh_backward(kept, d, dx),
+        // Output and input have one sign where the output is kept.
+        _ => backward_block(a, kept, d, dx),
+    }
+}
+
 /// `out = f(x)`; slices of one length.
 pub fn forward(a: Activation, x: &[f32], out: &mut [f32]) {
     assert_eq!(x.len(), out.len(), "activation: shapes");

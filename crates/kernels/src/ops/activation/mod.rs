@@ -4,11 +4,12 @@ pub mod cpu;
 pub(crate) mod functions;
 pub mod reference;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 /// `y = f(x)`, element by element.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Activation {
+    #[default]
     None,
     /// `max(x, 0)`
     Relu,
@@ -25,4 +26,15 @@ pub enum Activation {
     Gelu,
     /// [`Activation::Gelu`] with `Φ(x) ≈ (1 + tanh(√(2/π) (x + 0.044715 x³))) / 2`.
     GeluTanh,
+}
+
+impl Activation {
+    /// Whether the slope needs the function's input; else the output tells it, too.
+    pub fn needs_input(self) -> bool {
+        match self {
+            Activation::None | Activation::Relu | Activation::Sigmoid | Activation::Tanh => false,
+            Activation::LeakyRelu(slope) => slope < 0.0,
+            Activation::Softplus | Activation::Silu | Activation::Gelu | Activation::GeluTanh => true,
+        }
+    }
 }

@@ -36,6 +36,20 @@ fn matches_the_reference_both_ways_at_every_level() {
 }
 
 #[test]
+fn slopes_of_what_is_kept_match_the_reference() {
+    for a in ALL {
+        let (x, d) = (random(999, 1), random(999, 2));
+        let (mut kept, mut dx) = (x.clone(), vec![9.0; 999]);
+        if !a.needs_input() {
+            cpu::forward(a, &x, &mut kept);
+        }
+        cpu::backward_of_kept(a, &kept, &d, &mut dx);
+        let want: Vec<f64> = x.iter().zip(&d).map(|(x, d)| *d as f64 * reference::slope(a, *x as f64)).collect();
+        assert_close(&format!("{a:?}"), &dx, &want, 1e-5);
+    }
+}
+
+#[test]
 fn reference_slopes_match_central_differences() {
     let x: Vec<f64> = wide(&random(50, 3)).iter().map(|x| x * 5.0).collect();
     for a in ALL {

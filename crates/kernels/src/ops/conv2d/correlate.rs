@@ -1,10 +1,12 @@
 //! Sums over channels and taps for every pixel of the output, vectors along pixels: forward passes and gradients of inputs.
 
-use super::Activation;
+use super::activate;
 use super::bands::{Bands, Scratch, aligned, with_scratch};
 use super::depthwise;
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Phase, Tensors, offset};
+use crate::ops::activation::Activation;
+use super::winograd;
 use crate::simd;
 use crate::tile::{Kernel, Pack, Segment, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
@@ -72,6 +74,7 @@ impl Correlation {
         if self.channels == 1 && self.features <= 2 {
             return depthwise::run(self, t);
         }
+        let Err(t) = winograd::run(self, t) else { return };
         let level = simd::level();
         let job = self.job(t, kernel(level));
         let parts = self.features.div_ceil(job.features);
@@ -343,7 +346,7 @@ impl Job<'_> {
         if let Some(before) = self.before {
             self.store(segments, channel, rows, sums, before);
         }
-        self.activation.apply(sums);
+        activate(self.activation, sums);
         self.store(segments, channel, rows, sums, self.out);
     }
 

@@ -1,8 +1,10 @@
 //! Forward and backward passes: correlations of the input and of the output's gradient, depthwise layers on their own.
 
 use super::shapes::{Correlation, Phase, Tap, Tensors, WeightSums};
-use super::{Activation, Conv2d, Gradients, Images};
+use super::{Conv2d, Gradients, Images};
 use crate::math::multiversion;
+use crate::ops::activation::Activation;
+use crate::ops::activation::cpu::backward_of_kept;
 use crate::simd;
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -157,7 +159,7 @@ pub(crate) fn with_slopes(activation: Activation, kept: &[f32], d_out: &[f32], w
     d.resize(d_out.len(), 0.0);
     let level = simd::level();
     d.par_chunks_mut(CHUNK).zip(kept.par_chunks(CHUNK)).zip(d_out.par_chunks(CHUNK)).for_each(|((d, kept), d_out)| {
-        simd::with_level(level, || activation.backward(kept, d_out, d));
+        simd::with_level(level, || backward_of_kept(activation, kept, d_out, d));
     });
     work(&d);
     SLOPES.set(d);

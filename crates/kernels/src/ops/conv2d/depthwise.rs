@@ -1,10 +1,11 @@
 //! Layers whose outputs have one input channel each: whole rows at a time, vectors along pixels.
 
+use super::activate;
 use super::bands::{aligned, with_scratch};
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Tensors, WeightSums, offset};
 use crate::simd;
-use crate::tile::{Dots, MOST_DOTS, Row, Shared, kernel};
+use crate::tile::{Dots, MOST_DOTS, Rows, Shared, kernel};
 use rayon::prelude::*;
 
 /// Floats of a band's copy.
@@ -33,6 +34,10 @@ pub fn run(c: &Correlation, t: Tensors) {
             for (first, feature) in (0..most(0)).step_by(band).flat_map(|first| (0..c.features).map(move |f| (first, f))) {
                 if feature == 0 {
                     planes.fill(source, 0..1, image..image + 1, first, copy);
+                    // What follows in memory is the next band or the next plane.
+                    let read = planes.rows_of(first..(first + band).min(most(0)));
+                    let end = ((image * c.groups + group) * c.input[0] + read.end) * c.input[1];
+                    simd::fetch(&x[end..(end + read.len() * c.input[1]).min(x.len())]);
                 }
                 let channel = group * c.features + feature;
                 let weights = &t.weights[group * c.weight_group + feature * c.weight_feature..];
@@ -41,29 +46,35 @@ pub fn run(c: &Correlation, t: Tensors) {
                     taps.extend(offsets.iter().map(|o| weights[o.0 as usize]));
                     let columns = phase.size[1];
                     // Whole tiles are written where they belong.
-                    let in_place = before.is_none() && c.spread[1] == 1 && columns.is_multiple_of(4 * kernel.lanes);
-                    for y in first..(first + band).min(phase.size[0]) {
-                        let at = feature * pixels + (phase.start[0] + y * c.spread[0]) * c.output[1] + phase.start[1];
-                        let target = if in_place { &mut out[at..at + columns] } else { &mut row[..] };
-                        let r = Row {
-                            weights: taps,
-                            offsets,
-                            b: copy[(y - first) * planes.pitch..].as_ptr(),
-                            columns,
-                            start: bias.get(channel).copied().unwrap_or(0.0),
-                            c: target.as_mut_ptr(),
-                        };
-                        // SAFETY: the copy goes on for a row more, and so does the target unless it is a whole number of tiles.
-                        unsafe { kernel.row(&r) };
+                    let in_place = before.is_none() && c.spread == [1; 2] && columns.is_multiple_of(4 * kernel.lanes);
+                    let rows = first..(first + band).min(phase.size[0]);
+                    let place = |y: usize| feature * pixels + (phase.start[0] + y * c.spread[0]) * c.output[1] + phase.start[1];
+                    let of = |y: usize, rows: usize, to: *mut f32| Rows {
+                        weights: taps,
+                        offsets,
+                        b: copy[(y - first) * planes.pitch..].as_ptr(),
+                        b_pitch: planes.pitch,
+                        rows,
+                        columns,
+                        start: bias.get(channel).copied().unwrap_or(0.0),
+                        c: to,
+                        c_pitch: c.spread[0] * c.output[1],
+                    };
+                    if in_place {
+                        let out = &mut out[place(rows.start)..];
+                        // SAFETY: the copy goes on for a row more; the rows are whole tiles of the output.
+                        unsafe { kernel.depthwise(&of(rows.start, rows.len(), out.as_mut_ptr())) };
+                        activate(t.activation, &mut out[..rows.len() * columns]);
+                        continue;
+                    }
+                    for y in rows {
+                        // SAFETY: the copy and the row go on for a row more.
+                        unsafe { kernel.depthwise(&of(y, 1, row.as_mut_ptr())) };
                         if let Some(before) = &mut before {
-                            spread(&row[..columns], c.spread[1], &mut before[at..]);
+                            spread(&row[..columns], c.spread[1], &mut before[place(y)..]);
                         }
-                        if in_place {
-                            t.activation.apply(&mut out[at..at + columns]);
-                        } else {
-                            t.activation.apply(&mut row[..columns]);
-                            spread(&row[..columns], c.spread[1], &mut out[at..]);
-                        }
+                        activate(t.activation, &mut row[..columns]);
+                        spread(&row[..columns], c.spread[1], &mut out[place(y)..]);
                     }
                 }
             }

@@ -1,6 +1,5 @@
 //! Convolution of images, `y = act(w ∗ x + b)`, with stride, padding, dilation and groups.
 
-mod activation;
 pub(crate) mod bands;
 pub(crate) mod correlate;
 pub mod cpu;
@@ -11,8 +10,9 @@ pub(crate) mod shapes;
 #[cfg(test)]
 mod tests;
 pub(crate) mod weights;
+mod winograd;
 
-pub use activation::Activation;
+use super::activation::Activation;
 
 /// What a convolution is besides its weights; pairs are (vertical, horizontal).
 ///
@@ -104,5 +104,12 @@ impl Conv2d {
         );
         let positive = [self.kernel, self.stride, self.dilation].iter().flatten().all(|&v| v > 0);
         assert!(positive, "conv2d: kernel, stride and dilation are at least 1");
+    }
+}
+
+/// `values ← act(values)` on this thread.
+fn activate(activation: Activation, values: &mut [f32]) {
+    if activation != Activation::None {
+        crate::ops::activation::cpu::forward_in_place(activation, values);
     }
 }

@@ -1,6 +1,7 @@
 //! Padded copies of input channels, split by stride, in which every tap of a kernel stands at a fixed offset.
 
-use crate::vector::vectorized;
+use crate::simd::Lane;
+use crate::vector::by_lanes;
 use std::ops::Range;
 
 /// Where the padded channels of a band stand: `[channel, image, residue, row, column]`.
@@ -111,7 +112,8 @@ impl Planes {
                 let to = &mut out[at..at + self.image];
                 if self.plane > 0 {
                     for (plane, residue) in to.chunks_exact_mut(self.plane).zip(&self.residues) {
-                        fill_plane(self, from, *residue, first_row, plane);
+                        // SAFETY: the slices have the sizes that `self` says.
+                        unsafe { fill_plane(self, from, *residue, first_row, plane) };
                     }
                 }
             }
@@ -119,9 +121,12 @@ impl Planes {
     }
 }
 
-vectorized! {
+by_lanes! {
     /// Copies the pixels of one residue.
-    fn fill_plane<const F>(p: &Planes, from: &[f32], residue: [usize; 2], first_row: usize, plane: &mut [f32]) {
+    ///
+    /// # Safety
+    /// `from` is an image, `plane` the rows of a band.
+    unsafe fn fill_plane<L>(p: &Planes, from: &[f32], residue: [usize; 2], first_row: usize, plane: &mut [f32]) {
         let [height, width] = p.input;
         let start = p.low[1] + residue[1] as isize;
         // Columns t with 0 ≤ start + step t < width.
@@ -141,21 +146,33 @@ vectorized! {
             let row = &mut row[begin..end];
             match p.step[1] {
                 1 => row.copy_from_slice(&from[..row.len()]),
-                2 => {
-                    let mut done = 0;
-                    // The last block would read one float beyond the row.
-                    for block in row.chunks_exact_mut(16) {
-                        if 2 * done + 32 > from.len() {
-                            break;
-                        }
-                        let pairs: &[f32; 32] = from[2 * done..2 * done + 32].try_into().unwrap_or(&[0.0; 32]);
-                        block.copy_from_slice(&std::array::from_fn::<f32, 16, _>(|i| pairs[2 * i]));
-                        done += 16;
-                    }
-                    row.iter_mut().enumerate().skip(done).for_each(|(i, v)| *v = from[2 * i]);
-                }
+                2 => every_second::<L>(from[..2 * row.len() - 1].as_ptr(), row.as_mut_ptr(), row.len()),
                 step => row.iter_mut().enumerate().for_each(|(i, o)| *o = from[i * step]),
             }
+        }
+    }
+}
+
+/// `to[i] = from[2 i]`
+///
+/// # Safety
+/// `from` has `2 count − 1` floats, `to` has `count`.
+#[inline(always)]
+unsafe fn every_second<L: Lane>(from: *const f32, to: *mut f32, count: usize) {
+    // SAFETY: as the caller vouches.
+    unsafe {
+        let mut i = 0;
+        while i + L::N < count {
+            L::store(to.add(i), L::load_pairs(from.add(2 * i)).0);
+            i += L::N;
+        }
+        if i > 0 {
+            // The float after the last is not there: the last vector is read from one before its first.
+            i = count - L::N;
+            return L::store(to.add(i), L::load_pairs(from.add(2 * i - 1)).1);
+        }
+        for i in 0..count {
+            *to.add(i) = *from.add(2 * i);
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Plain loops in f64.
 
 use super::{Conv2d, Images};
+use crate::ops::activation::reference as activation;
 
 /// Calls `visit(weight, input, output)` with the indices of every product that a convolution sums.
 pub fn products(c: &Conv2d, images: &Images, mut visit: impl FnMut(usize, usize, usize)) {
@@ -41,13 +42,13 @@ fn linear(c: &Conv2d, images: &Images, x: &[f64], w: &[f64], bias: &[f64]) -> Ve
 
 /// `y`, with an empty bias for none.
 pub fn forward(c: &Conv2d, images: &Images, x: &[f64], w: &[f64], bias: &[f64]) -> Vec<f64> {
-    linear(c, images, x, w, bias).into_iter().map(|v| c.activation.value(v)).collect()
+    linear(c, images, x, w, bias).into_iter().map(|v| activation::value(c.activation, v)).collect()
 }
 
 /// Gradients of x, w and the bias, given that of y.
 pub fn backward(c: &Conv2d, images: &Images, x: &[f64], w: &[f64], bias: &[f64], d: &[f64]) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
     let before = linear(c, images, x, w, bias);
-    let g: Vec<f64> = d.iter().zip(&before).map(|(d, v)| d * c.activation.slope(*v)).collect();
+    let g: Vec<f64> = d.iter().zip(&before).map(|(d, v)| d * activation::slope(c.activation, *v)).collect();
     let (mut dx, mut dw, mut db) = (vec![0.0; x.len()], vec![0.0; w.len()], vec![0.0; c.channels_out]);
     products(c, images, |weight, input, output| {
         dx[input] += g[output] * w[weight];

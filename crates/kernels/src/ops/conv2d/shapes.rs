@@ -1,6 +1,6 @@
 //! What is correlated and summed, whichever way it is computed.
 
-use super::Activation;
+use crate::ops::activation::Activation;
 
 /// A weight and the input pixel that it multiplies, seen from a grid cell.
 #[derive(Clone, Copy, Debug)]

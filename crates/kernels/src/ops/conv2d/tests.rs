@@ -1,4 +1,5 @@
 use super::*;
+use crate::ops::activation::tests::ALL as ACTIVATIONS;
 use crate::simd::{Level, with_level};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
@@ -20,6 +21,9 @@ fn cases() -> Vec<(Conv2d, Images)> {
         (same(conv(16, 20, [3, 3])), images(2, 19, 67)),
         (same(conv(70, 9, [3, 3])), images(1, 40, 41)),
         (same(conv(24, 17, [3, 3])), images(5, 5, 6)),
+        (conv(16, 24, [3, 3]), images(2, 21, 34)),
+        (Conv2d { padding: [2, 0], ..conv(65, 20, [3, 3]) }, images(1, 16, 49)),
+        (Conv2d { groups: 2, ..same(conv(48, 34, [3, 3])) }, images(2, 24, 27)),
         (same(conv(4, 6, [5, 3])), images(1, 13, 9)),
         (same(conv(3, 10, [7, 7])), images(1, 20, 23)),
         (Conv2d { stride: [2, 2], ..same(conv(3, 10, [7, 7])) }, images(2, 21, 30)),
@@ -38,9 +42,6 @@ fn cases() -> Vec<(Conv2d, Images)> {
         (Conv2d { groups: 4, dilation: [3, 2], padding: [3, 1], ..conv(4, 4, [3, 3]) }, images(1, 15, 40)),
     ]
 }
-
-const ACTIVATIONS: [Activation; 6] =
-    [Activation::None, Activation::Relu, Activation::LeakyRelu(0.2), Activation::Sigmoid, Activation::Tanh, Activation::Silu];
 
 /// Random tensors of a layer: x, weights of variance 1 / fan-in, bias, gradient of the outputs.
 fn tensors(c: &Conv2d, images: &Images) -> [Vec<f32>; 4] {
@@ -115,6 +116,7 @@ fn reference_gradients_match_central_differences() {
 fn results_do_not_depend_on_the_number_of_threads() {
     let c = Conv2d { padding: [1; 2], ..Conv2d::new(20, 24, 3) };
     let images = Images { batch: 3, height: 21, width: 50 };
+    assert!(c.weight_sums(&images).shares() > 1, "pixels of the weights' gradient are summed in parts");
     let [x, w, b, d] = tensors(&c, &images);
     let run = |threads: usize| {
         rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(|| {
@@ -133,4 +135,23 @@ fn results_do_not_depend_on_the_number_of_threads() {
 #[should_panic(expected = "a kernel that covers 3 pixels on an image of 2")]
 fn a_kernel_must_fit() {
     Conv2d::new(1, 1, 3).output(&Images { batch: 1, height: 2, width: 9 });
+}
+
+#[test]
+fn square_kernels_on_many_channels_take_fewer_products() {
+    let images = Images { batch: 2, height: 20, width: 31 };
+    let fewer = |c: Conv2d| {
+        let [x, w, bias, d] = tensors(&c, &images);
+        let mut out = vec![0.0; d.len()];
+        let t = shapes::Tensors { x: &x, weights: &w, bias: &bias, activation: c.activation, out: &mut out, before: None };
+        winograd::run(&c.correlation(&images), t).is_ok()
+    };
+    for level in Level::available() {
+        with_level(level, || {
+            let c = Conv2d { padding: [1; 2], ..Conv2d::new(64, 64, 3) };
+            assert!(fewer(c) && fewer(Conv2d { groups: 2, ..c }));
+            assert!(!fewer(Conv2d { stride: [2; 2], ..c }) && !fewer(Conv2d { dilation: [2; 2], ..c }));
+            assert!(!fewer(Conv2d { channels_in: 3, ..c }) && !fewer(Conv2d { kernel: [3, 1], ..c }));
+        });
+    }
 }

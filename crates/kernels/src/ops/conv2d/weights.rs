@@ -54,8 +54,7 @@ impl WeightSums {
         let part = self.rows.div_ceil(wanted).max(FEWEST_ROWS).next_multiple_of(kernel.rows);
         let parts = self.rows.div_ceil(part);
         let bands = Bands::plan(self.batch, self.grid[0], self.grid[1], PIXELS);
-        // By shapes alone, as it says in which order sums are added.
-        let shares = TASKS.div_ceil(self.groups * blocks * self.rows.div_ceil(FEWEST_ROWS)).min(bands.len()).max(1);
+        let shares = self.shares();
         let size = out.len();
         let mut partial = PARTIAL.take();
         partial.resize((shares - 1) * size, 0.0);
@@ -83,6 +82,13 @@ impl WeightSums {
             out.iter_mut().zip(share).for_each(|(o, v)| *o += v);
         }
         PARTIAL.set(partial);
+    }
+
+    /// Parts of the pixels that are summed apart, by shapes alone, as it says in which order sums are added.
+    pub(super) fn shares(&self) -> usize {
+        let blocks = self.columns.div_ceil(self.layout(kernel(simd::level())).channels);
+        let bands = Bands::plan(self.batch, self.grid[0], self.grid[1], PIXELS);
+        TASKS.div_ceil(self.groups * blocks * self.rows.div_ceil(FEWEST_ROWS)).min(bands.len()).max(1)
     }
 
     fn layout(&self, kernel: &Kernel) -> Layout {

@@ -1,6 +1,7 @@
 //! The passes of the adjoint convolution, exchanged.
 
-use super::{Activation, ConvTranspose2d, Gradients, Images};
+use super::{ConvTranspose2d, Gradients, Images};
+use crate::ops::activation::Activation;
 use crate::ops::conv2d::cpu::{bias_gradient, with_slopes};
 use crate::ops::conv2d::shapes::{Tensors, WeightSums};
 

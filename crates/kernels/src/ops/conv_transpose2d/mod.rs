@@ -5,8 +5,9 @@ pub mod reference;
 #[cfg(test)]
 mod tests;
 
+use super::activation::Activation;
 use super::conv2d::Conv2d;
-pub use super::conv2d::{Activation, Gradients, Images};
+pub use super::conv2d::{Gradients, Images};
 
 /// What a transposed convolution is besides its weights; pairs are (vertical, horizontal).
 ///

@@ -1,5 +1,5 @@
-//! Dropout (Srivastava et al. 2014): element `i` is kept and divided by `1 − p`, or set to 0 with probability `p`, as counter
-//! `first + i` of a random stream says. Backward is the same op on the gradient: nothing is stored.
+//! Dropout (Srivastava et al. 2014): element `i` is kept and divided by `1 − p`, or set to 0 with probability `p`, by number
+//! `first + i` of a random stream. Backward is the same op on the gradient: nothing is stored.
 
 pub mod cpu;
 pub mod reference;

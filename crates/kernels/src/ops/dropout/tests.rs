@@ -1,6 +1,6 @@
 use super::*;
 use crate::simd::{Level, with_level};
-use diorama_testkit::{assert_close, random, wide};
+use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
 #[test]
 fn matches_the_reference_at_every_level() {
@@ -14,6 +14,14 @@ fn matches_the_reference_at_every_level() {
             }
         }
     }
+}
+
+#[test]
+fn the_reference_is_its_own_derivative() {
+    let dropout = Dropout { rng: Rng::new(3, 4), first: 7, p: 0.4 };
+    let (x, d) = (wide(&random(40, 1)), wide(&random(40, 2)));
+    let loss = |x: &[f64]| reference::apply(&dropout, x).iter().zip(&d).map(|(y, d)| y * d).sum();
+    assert_gradient("x", &reference::apply(&dropout, &d), &x, 1e-6, loss);
 }
 
 #[test]

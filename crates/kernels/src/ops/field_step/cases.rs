@@ -1,7 +1,7 @@
 //! Cases of the op, for its tests and for `bench check`.
 
 #[cfg(feature = "gpu")]
-use super::gpu::{Arithmetic, FieldInput, GpuNet};
+use super::gpu::{Arithmetic, FieldInput, GpuNet, scale_near_gradients};
 use super::reference::{self, Step};
 use super::{FieldNet, Output};
 use crate::ops::composite::Composited;
@@ -123,8 +123,24 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         for way in [(Arithmetic::Layers, "layers"), (Arithmetic::Exact, "one launch"), (Arithmetic::Best, "tensor cores")] {
             check_case(gpu, table, &case, way)?;
         }
+        check_near_scaling(gpu, table, &case)?;
     }
     Ok(())
+}
+
+/// Gradients close to the camera.
+#[cfg(feature = "gpu")]
+fn check_near_scaling(gpu: &Gpu, table: &mut Table, case: &Case) -> Result<(), GpuError> {
+    let (p, c, reach) = (case.scene.packed(), case.net.channels(), 1.0);
+    let (d_sigma, d_outputs) = (random(p.samples(), 3), random(p.samples() * c, 4));
+    let (got_sigma, got_outputs) = (gpu.upload(&d_sigma), gpu.upload(&d_outputs));
+    scale_near_gradients(gpu, &GpuPacked::upload(gpu, &p), &got_sigma, &got_outputs, reach);
+    let scaled = |d: &[f32], width: usize| -> Vec<f64> {
+        d.iter().zip(0..).map(|(d, i)| *d as f64 * reference::near_share(&p, i / width, reach)).collect()
+    };
+    let shape = format!("R={} S={} C={c}", case.rays, p.samples());
+    table.close("near scaling", "d sigma", &shape, &got_sigma, &scaled(&d_sigma, 1))?;
+    table.close("near scaling", "d outputs", &shape, &got_outputs, &scaled(&d_outputs, c))
 }
 
 #[cfg(feature = "gpu")]

@@ -5,6 +5,13 @@ use crate::ops::composite::{self, Composited, Packed};
 use crate::ops::fused_mlp::{Head, reference as mlp};
 use crate::ops::linear::reference::{activate, slope};
 
+/// Share of sample `i`'s gradient that remains where gradients closer to the camera than `reach` are scaled (0: none are): `min(m / reach, 1)²`
+/// with the sample's middle `m`.
+pub fn near_share(p: &Packed, i: usize, reach: f32) -> f64 {
+    let middle = p.t[i] as f64 + 0.5 * p.dt[i] as f64;
+    if reach > 0.0 { (middle / reach as f64).min(1.0).powi(2) } else { 1.0 }
+}
+
 /// Per-ray results and the gradients of a linear loss.
 pub struct Step {
     pub out: Composited<f64>,

@@ -1,4 +1,6 @@
 use super::*;
+#[cfg(feature = "gpu")]
+use crate::gpu::table::TOLERANCE;
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
 #[test]
@@ -75,4 +77,25 @@ fn frozen_layers_have_no_gradient_and_what_lies_below_them_still_has() {
 #[should_panic(expected = "does not come before")]
 fn a_layer_cannot_read_ahead() {
     Mlp::new(vec![1], vec![Layer::new(vec![Source::Layer(0)], 1, Activation::None, false)]);
+}
+
+#[cfg(feature = "gpu")]
+#[test]
+fn what_is_off_by_more_than_half_precision_is_refused() {
+    use super::gpu::fused::Element;
+    let want = wide(&random(100, 1));
+    let off = |share: f64| want.iter().map(|v| (v * (1.0 + share)) as f32).collect::<Vec<f32>>();
+    for (element, result, allowed) in [
+        (None, "forward", TOLERANCE),
+        (Some(Element::F32), "d input", TOLERANCE),
+        (Some(Element::F16), "forward", 5e-3),
+        (Some(Element::F16), "d input", 5e-2),
+        (Some(Element::Bf16), "forward", 3e-2),
+        (Some(Element::Bf16), "d input", 2e-1),
+    ] {
+        assert!(cases::compare_as(element, result, &off(0.5 * allowed), &want).is_ok(), "{element:?} {result}");
+        assert!(cases::compare_as(element, result, &off(3.0 * allowed), &want).is_err(), "{element:?} {result}");
+        assert!(cases::compare_as(element, result, &[f32::NAN; 100], &want).is_err(), "{element:?} {result}");
+        assert!(cases::compare_as(element, result, &off(0.0)[1..], &want).is_err(), "{element:?} {result}");
+    }
 }

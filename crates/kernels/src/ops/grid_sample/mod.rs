@@ -1,6 +1,10 @@
 //! Values of an image at the points of a grid, whose coordinates −1 and 1 are the image's borders (Jaderberg et al. 2015).
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 #[cfg(test)]
 mod tests;

@@ -1,44 +1,22 @@
+use super::cases::{grid, modes};
 use super::*;
 use crate::simd::{Level, with_level};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
-fn modes() -> Vec<GridSample> {
-    let mut out = Vec::new();
-    for mode in [Mode::Bilinear, Mode::Nearest] {
-        for outside in [Outside::Zeros, Outside::Border] {
-            for align_corners in [false, true] {
-                out.push(GridSample { mode, outside, align_corners, images: 0, channels: 0, from: [1, 1], points: 0 });
-            }
-        }
-    }
-    out
-}
-
-/// Points inside and outside.
-fn grid(n: usize, seed: u64) -> Vec<f32> {
-    random(2 * n, seed).iter().map(|g| g * 1.4).collect()
-}
-
 #[test]
 fn matches_the_reference_both_ways_at_every_level() {
-    let shapes = [(0, 3, [4, 4], 5), (1, 1, [1, 1], 1), (2, 3, [5, 7], 33), (1, 17, [16, 9], 700), (2, 2, [3, 3], 0)];
     for level in Level::available() {
-        for (images, channels, from, points) in shapes {
-            for s in modes() {
-                let s = GridSample { images, channels, from, points, ..s };
-                let (x, grid) = (random(images * channels * from[0] * from[1], 1), grid(images * points, 2));
-                let d = random(images * channels * points, 3);
-                let (mut out, mut dx, mut d_grid) = (vec![9.0; d.len()], vec![9.0; x.len()], vec![9.0; grid.len()]);
-                with_level(level, || {
-                    cpu::forward(&s, &x, &grid, &mut out);
-                    cpu::backward_input(&s, &grid, &d, &mut dx);
-                    cpu::backward_grid(&s, &x, &grid, &d, &mut d_grid);
-                });
-                assert_close("forward", &out, &reference::forward(&s, &wide(&x), &wide(&grid)), 1e-4);
-                let (want_x, want_grid) = reference::backward(&s, &wide(&x), &wide(&grid), &wide(&d));
-                assert_close("dx", &dx, &want_x, 1e-4);
-                assert_close("d_grid", &d_grid, &want_grid, 1e-4);
-            }
+        for cases::Case { sample: s, x, grid, d } in cases::cases() {
+            let (mut out, mut dx, mut d_grid) = (vec![9.0; d.len()], vec![9.0; x.len()], vec![9.0; grid.len()]);
+            with_level(level, || {
+                cpu::forward(&s, &x, &grid, &mut out);
+                cpu::backward_input(&s, &grid, &d, &mut dx);
+                cpu::backward_grid(&s, &x, &grid, &d, &mut d_grid);
+            });
+            assert_close("forward", &out, &reference::forward(&s, &wide(&x), &wide(&grid)), 1e-4);
+            let (want_x, want_grid) = reference::backward(&s, &wide(&x), &wide(&grid), &wide(&d));
+            assert_close("dx", &dx, &want_x, 1e-4);
+            assert_close("d_grid", &d_grid, &want_grid, 1e-4);
         }
     }
 }

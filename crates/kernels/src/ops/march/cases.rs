@@ -62,7 +62,7 @@ pub fn cases() -> Vec<Case> {
     all.into_iter().flat_map(|(cascades, config)| [0, 1, 300].map(|n| (cascades, config, n))).map(of).collect()
 }
 
-/// Rays whose samples differ, as an outcome. A sample whose midpoint lies on a cell wall may fall to either side: no more than one
+/// Fails if the samples of too many rays differ. A sample whose midpoint lies on a cell wall may fall to either side: no more than one
 /// ray in fifty may differ.
 pub fn compare_rays(got: &Marched, want: &Marched) -> Result<f64, String> {
     let n = want.offsets.len() - 1;
@@ -75,7 +75,11 @@ pub fn compare_rays(got: &Marched, want: &Marched) -> Result<f64, String> {
         let b = want.offsets[i] as usize..want.offsets[i + 1] as usize;
         let same = a.end <= got.t.len()
             && a.len() == b.len()
-            && a.zip(b).all(|(a, b)| (got.t[a] - want.t[b]).abs() < 1e-4 * want.t[b].max(1.0) && got.cells[a] == want.cells[b]);
+            && a.zip(b).all(|(a, b)| {
+                let [starts, lengths] =
+                    [(got.t[a], want.t[b], 1.0), (got.dt[a], want.dt[b], 0.0)].map(|(a, b, least)| (a - b).abs() <= 1e-4 * b.max(least));
+                starts && lengths && got.cells[a] == want.cells[b]
+            });
         ties += !same as usize;
     }
     if ties * 50 <= n { Ok(0.0) } else { Err(format!("{ties} of {n} rays differ")) }
@@ -116,9 +120,9 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     Ok(())
 }
 
-/// Whether the places of samples are the middles of their intervals.
+/// Fails unless samples are placed at the middles of their intervals.
 #[cfg(feature = "gpu")]
-fn compare_places(got: &Marched, rays: &Rays, places: &[f32]) -> Result<f64, String> {
+pub fn compare_places(got: &Marched, rays: &Rays, places: &[f32]) -> Result<f64, String> {
     for r in 0..rays.jitter.len() {
         for i in got.offsets[r] as usize..got.offsets[r + 1] as usize {
             let mid = got.t[i] + 0.5 * got.dt[i];

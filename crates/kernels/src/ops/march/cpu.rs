@@ -61,96 +61,189 @@ pub fn march(grid: &OccupancyBits, rays: &MarchRays, config: &MarchConfig, scrat
 
 /// Adds the samples of ray `r` to `out`, whose offsets stay as they are; for callers that are parallel themselves.
 pub fn march_ray(grid: &OccupancyBits, rays: &MarchRays, r: usize, config: &MarchConfig, out: &mut Marched) {
-    let o = [rays.origins[r * 3], rays.origins[r * 3 + 1], rays.origins[r * 3 + 2]];
-    let d = [rays.dirs[r * 3], rays.dirs[r * 3 + 1], rays.dirs[r * 3 + 2]];
-    let inv = d.map(|v| if v == 0.0 { f32::INFINITY } else { 1.0 / v });
-    let (near, far, jitter) = (rays.near_far[r * 2], rays.near_far[r * 2 + 1], rays.jitter[r]);
-    let n = grid.resolution;
-    let (last, edge_of_cell) = (n as i32 - 1, 1.0 / n as f32);
-    let step = |t: f32| config.step(t);
-    let mut t = if rays.resumed { near } else { (near + (jitter - 0.5) * step(near)).max(near) };
-    let mut count = 0;
-    while t < far && count < config.max_samples {
-        let mut dt = step(t);
-        let mid = t + 0.5 * dt;
-        let x = [o[0] + mid * d[0], o[1] + mid * d[1], o[2] + mid * d[2]];
-        let reach = larger(larger((x[0] - 0.5).abs(), (x[1] - 0.5).abs()), (x[2] - 0.5).abs());
-        // The cube of cascade c: its edge doubles from one to the next.
-        let (mut c, mut size) = (0, 1.0f32);
-        while c + 1 < grid.cascades && (reach >= 0.5 * size || dt * n as f32 > size) {
-            c += 1;
+    let (near, jitter) = (rays.near_far[r * 2], rays.jitter[r]);
+    let t = if rays.resumed { near } else { (near + (jitter - 0.5) * config.step(near)).max(near) };
+    let mut march = RayMarch { ray: Ray::new(rays, r), grid, config, t, count: 0, out };
+    while march.t < march.ray.far && march.count < config.max_samples {
+        march.advance();
+    }
+}
+
+/// A ray of model space.
+struct Ray {
+    origin: [f32; 3],
+    dir: [f32; 3],
+    /// `1 / dir`
+    inverse: [f32; 3],
+    far: f32,
+    jitter: f32,
+}
+
+impl Ray {
+    #[inline(always)]
+    fn new(rays: &MarchRays, r: usize) -> Self {
+        let origin = [rays.origins[r * 3], rays.origins[r * 3 + 1], rays.origins[r * 3 + 2]];
+        let dir = [rays.dirs[r * 3], rays.dirs[r * 3 + 1], rays.dirs[r * 3 + 2]];
+        let inverse = dir.map(|v| if v == 0.0 { f32::INFINITY } else { 1.0 / v });
+        Ray { origin, dir, inverse, far: rays.near_far[r * 2 + 1], jitter: rays.jitter[r] }
+    }
+}
+
+/// The cube of a cascade, `low + [0, size]³`, divided into `cells³` cells.
+#[derive(Clone, Copy)]
+struct Cube {
+    cascade: usize,
+    cells: usize,
+    low: f32,
+    size: f32,
+    /// Whether a coarser cascade follows.
+    has_coarser: bool,
+}
+
+impl Cube {
+    /// The finest cascade that holds a point at `reach` from the center (by its greatest coordinate) and whose cells are no shorter than
+    /// the step `dt`; the coarsest where there is none.
+    #[inline(always)]
+    fn around(grid: &OccupancyBits, reach: f32, dt: f32) -> Self {
+        let n = grid.resolution;
+        // The edge doubles from one cascade to the next.
+        let (mut cascade, mut size) = (0, 1.0f32);
+        while cascade + 1 < grid.cascades && (reach >= 0.5 * size || dt * n as f32 > size) {
+            cascade += 1;
             size *= 2.0;
         }
-        let low = 0.5 - 0.5 * size;
-        let is_coarse = |dt: f32| c + 1 < grid.cascades && dt * n as f32 > size;
-        let is_outside = reach >= 0.5 * size;
-        if is_outside && !config.unbounded {
-            t += dt;
-            continue;
-        }
+        Cube { cascade, cells: n, low: 0.5 - 0.5 * size, size, has_coarser: cascade + 1 < grid.cascades }
+    }
+
+    /// Whether a step is too long for the cells of this cascade.
+    #[inline(always)]
+    fn is_too_fine(&self, dt: f32) -> bool {
+        self.has_coarser && dt * self.cells as f32 > self.size
+    }
+
+    /// The cell that holds a point, or the one at the wall next to it.
+    #[inline(always)]
+    fn cell(&self, x: [f32; 3]) -> [i32; 3] {
+        let last = self.cells as i32 - 1;
         // Exact, as the size is a power of two.
-        let scale = n as f32 * f32::from_bits((127 - c as u32) << 23);
-        let width = size * edge_of_cell;
-        let cell = x.map(|v| (((v - low) * scale) as i32).clamp(0, last));
-        let index = ((c * n + cell[2] as usize) * n + cell[1] as usize) * n + cell[0] as usize;
-        // Distances at which the ray leaves the cell, or its block, along each axis.
-        let walls = |shift: u32| {
-            let mut exits = [f32::INFINITY; 3];
-            for k in 0..3 {
-                let wall = low + (((cell[k] >> shift) + (d[k] > 0.0) as i32) << shift) as f32 * width;
-                exits[k] = if d[k] != 0.0 { (wall - o[k]) * inv[k] } else { f32::INFINITY };
-            }
-            exits
-        };
+        let scale = self.cells as f32 * f32::from_bits((127 - self.cascade as u32) << 23);
+        x.map(|v| (((v - self.low) * scale) as i32).clamp(0, last))
+    }
+
+    /// Place of a cell in the grid's memory.
+    #[inline(always)]
+    fn index(&self, cell: [i32; 3]) -> usize {
+        let n = self.cells;
+        ((self.cascade * n + cell[2] as usize) * n + cell[1] as usize) * n + cell[0] as usize
+    }
+
+    /// Edge of a cell.
+    #[inline(always)]
+    fn cell_width(&self) -> f32 {
+        self.size * (1.0 / self.cells as f32)
+    }
+
+    /// Distances at which a ray leaves, along each axis, the block of `2^shift` cells per axis that holds a cell.
+    #[inline(always)]
+    fn exits(&self, ray: &Ray, cell: [i32; 3], shift: u32) -> [f32; 3] {
+        let width = self.cell_width();
+        std::array::from_fn(|k| {
+            let wall = self.low + (((cell[k] >> shift) + (ray.dir[k] > 0.0) as i32) << shift) as f32 * width;
+            if ray.dir[k] != 0.0 { (wall - ray.origin[k]) * ray.inverse[k] } else { f32::INFINITY }
+        })
+    }
+}
+
+/// A march along one ray: where it stands, and the samples that it has taken.
+struct RayMarch<'a> {
+    ray: Ray,
+    grid: &'a OccupancyBits,
+    config: &'a MarchConfig,
+    t: f32,
+    count: usize,
+    out: &'a mut Marched,
+}
+
+impl RayMarch<'_> {
+    /// Takes samples in the cell ahead if it is occupied, else skips the empty space.
+    #[inline(always)]
+    fn advance(&mut self) {
+        let dt = self.config.step(self.t);
+        let mid = self.t + 0.5 * dt;
+        let (o, d) = (self.ray.origin, self.ray.dir);
+        let x = [o[0] + mid * d[0], o[1] + mid * d[1], o[2] + mid * d[2]];
+        let reach = larger(larger((x[0] - 0.5).abs(), (x[1] - 0.5).abs()), (x[2] - 0.5).abs());
+        let cube = Cube::around(self.grid, reach, dt);
+        let is_outside = reach >= 0.5 * cube.size;
+        if is_outside && !self.config.unbounded {
+            self.t += dt;
+            return;
+        }
+        let cell = cube.cell(x);
+        let index = cube.index(cell);
         if is_outside {
-            take(out, t, dt, index);
-            count += 1;
-            t += dt;
-            continue;
+            self.take(dt, index);
+        } else if self.grid.get(index) {
+            self.sample_cell(&cube, cell, index, dt);
+        } else {
+            self.skip_empty(&cube, cell, dt);
         }
-        if grid.get(index) {
-            // All samples whose midpoints lie in the cell, as long as their steps are no longer than it.
-            let [x, y, z] = walls(0);
-            let exit = x.min(y).min(z);
-            loop {
-                take(out, t, dt, index);
-                count += 1;
-                t += dt;
-                dt = step(t);
-                let stays = t + 0.5 * dt < exit && !is_coarse(dt);
-                if !stays || t >= far || count == config.max_samples {
-                    break;
-                }
-            }
-            continue;
-        }
-        // Past the block if that is empty, else past one cell after the other up to the block's far side.
-        let is_block_empty = grid.is_block_empty(c, cell.map(|v| v as usize));
-        let mut exits = walls(if is_block_empty { BLOCK_SHIFT } else { 0 });
-        let mut at = cell;
-        'cells: loop {
-            let jump = exits[nearest(exits)] + (jitter - 0.5) * dt;
-            t = if jump > t { jump } else { t + dt };
-            dt = step(t);
-            if is_block_empty || t >= far || is_coarse(dt) {
+    }
+
+    /// Takes all samples whose midpoints lie in the cell, as long as their steps are no longer than it.
+    #[inline(always)]
+    fn sample_cell(&mut self, cube: &Cube, cell: [i32; 3], index: usize, mut dt: f32) {
+        let [x, y, z] = cube.exits(&self.ray, cell, 0);
+        let exit = x.min(y).min(z);
+        loop {
+            self.take(dt, index);
+            dt = self.config.step(self.t);
+            let stays = self.t + 0.5 * dt < exit && !cube.is_too_fine(dt);
+            if !stays || self.t >= self.ray.far || self.count == self.config.max_samples {
                 break;
             }
-            let mid = t + 0.5 * dt;
+        }
+    }
+
+    /// Skips the block of an empty cell if that is empty, else one cell after the other up to the block's far side.
+    #[inline(always)]
+    fn skip_empty(&mut self, cube: &Cube, cell: [i32; 3], mut dt: f32) {
+        let (ray, width) = (&self.ray, cube.cell_width());
+        let is_block_empty = self.grid.is_block_empty(cube.cascade, cell.map(|v| v as usize));
+        let mut exits = cube.exits(ray, cell, if is_block_empty { BLOCK_SHIFT } else { 0 });
+        let mut at = cell;
+        loop {
+            let jump = exits[nearest(exits)] + (ray.jitter - 0.5) * dt;
+            self.t = if jump > self.t { jump } else { self.t + dt };
+            dt = self.config.step(self.t);
+            if is_block_empty || self.t >= ray.far || cube.is_too_fine(dt) {
+                return;
+            }
+            let mid = self.t + 0.5 * dt;
             loop {
                 let k = nearest(exits);
                 if exits[k] > mid {
                     break;
                 }
-                at[k] += if d[k] > 0.0 { 1 } else { -1 };
+                at[k] += if ray.dir[k] > 0.0 { 1 } else { -1 };
                 if at[k] >> BLOCK_SHIFT != cell[k] >> BLOCK_SHIFT {
-                    break 'cells;
+                    return;
                 }
-                exits[k] += inv[k].abs() * width;
+                exits[k] += ray.inverse[k].abs() * width;
             }
-            if grid.get(((c * n + at[2] as usize) * n + at[1] as usize) * n + at[0] as usize) {
-                break;
+            if self.grid.get(cube.index(at)) {
+                return;
             }
         }
+    }
+
+    #[inline(always)]
+    fn take(&mut self, dt: f32, cell: usize) {
+        self.out.cells.push(cell as u32);
+        self.out.t.push(self.t);
+        self.out.dt.push(dt);
+        self.count += 1;
+        self.t += dt;
     }
 }
 
@@ -165,13 +258,6 @@ fn larger(a: f32, b: f32) -> f32 {
 fn nearest(exits: [f32; 3]) -> usize {
     let first = if exits[1] < exits[0] { 1 } else { 0 };
     if exits[2] < exits[first] { 2 } else { first }
-}
-
-#[inline(always)]
-fn take(out: &mut Marched, t: f32, dt: f32, cell: usize) {
-    out.cells.push(cell as u32);
-    out.t.push(t);
-    out.dt.push(dt);
 }
 
 multiversion! {

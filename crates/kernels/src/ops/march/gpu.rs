@@ -1,7 +1,6 @@
-//! Rays are walked twice, one unit each: first to count their samples, then, with their places known,
-//! to write them. The walk is the CPU's.
+//! One unit per ray, in two passes of the same march as the CPU's: the first counts a ray's samples, the second writes them where a
+//! scan of the counts puts them.
 
-pub mod occupancy;
 mod positions;
 
 use super::{MarchConfig, OccupancyBits};
@@ -9,18 +8,18 @@ use crate::gpu::{Buffer, Gpu, GpuError, launch};
 use crate::ops::composite::gpu::GpuPacked;
 use crate::ops::scan;
 use cubecl::prelude::*;
-use positions::put;
 
+pub(crate) use positions::put;
 pub use positions::{Space, positions, positions_backward, to_space};
 
 const _: () = assert!(super::BLOCK == 8, "the kernel's blocks are 8 cells wide");
 
 /// Occupancy on the device: one bit per cell, one word per block of 8³ cells.
 pub struct GpuOccupancy {
-    resolution: usize,
-    cascades: usize,
-    bits: Buffer<u32>,
-    blocks: Buffer<u32>,
+    pub(crate) resolution: usize,
+    pub(crate) cascades: usize,
+    pub(crate) bits: Buffer<u32>,
+    pub(crate) blocks: Buffer<u32>,
 }
 
 impl GpuOccupancy {
@@ -40,8 +39,7 @@ impl GpuOccupancy {
     ///
     /// # Errors
     /// When the device was lost.
-    pub fn differences(&self, gpu: &Gpu, other: &OccupancyBits) -> Result<usize, GpuError> {
-        let other = GpuOccupancy::upload(gpu, other);
+    pub fn differences(&self, gpu: &Gpu, other: &GpuOccupancy) -> Result<usize, GpuError> {
         let mut wrong = 0;
         for (a, b) in [(&self.bits, &other.bits), (&self.blocks, &other.blocks)] {
             wrong += gpu.read(a)?.iter().zip(gpu.read(b)?).filter(|(a, b)| **a != *b).count();
@@ -88,7 +86,7 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
     let pass = |offsets: &Buffer<u32>, write: bool| {
         launch!(
             gpu,
-            walk,
+            march_rays,
             n,
             [
                 grid.bits => grid.cells() / 32,
@@ -133,8 +131,85 @@ pub(crate) fn bounded(gpu: &Gpu, offsets: &Buffer<u32>, cut: &Buffer<u32>, capac
     out
 }
 
+/// The cube of a cascade that a sample reads, around the center of model space.
+#[derive(CubeType)]
+struct Cube {
+    cascade: u32,
+    size: f32,
+    /// Whether the sample lies beyond it.
+    is_beyond: bool,
+}
+
+/// The finest cascade that holds a point and whose cells are no shorter than the step `dt`; the coarsest where there is none.
+#[cube]
+fn cube_around(x: &Array<f32>, dt: f32, resolution: u32, cascades: u32) -> Cube {
+    let mut reach = 0.0f32;
+    #[unroll]
+    for k in 0..3usize {
+        reach = max(reach, (x[k] - 0.5).abs());
+    }
+    let mut cascade = 0u32;
+    let mut size = 1.0f32;
+    while cascade + 1 < cascades && (reach >= 0.5 * size || dt * f32::cast_from(resolution) > size) {
+        cascade += 1;
+        size *= 2.0;
+    }
+    Cube { cascade, size, is_beyond: reach >= 0.5 * size }
+}
+
+/// The point of a ray at distance `t`.
+#[cube]
+fn put_point(o: &Array<f32>, d: &Array<f32>, t: f32, x: &mut Array<f32>) {
+    #[unroll]
+    for k in 0..3usize {
+        x[k] = o[k] + t * d[k];
+    }
+}
+
+/// Place of a cell, or of a block, in memory, with so many of them per side of a cascade.
+#[cube]
+fn index_of(x: u32, y: u32, z: u32, cascade: u32, side: u32) -> u32 {
+    ((cascade * side + z) * side + y) * side + x
+}
+
+/// The cell that holds a point, and its place in memory. What lies beyond the outermost cascade counts to the cells at its walls.
+#[cube]
+fn put_cell(x: &Array<f32>, cube: &Cube, resolution: u32, cell: &mut Array<u32>) -> u32 {
+    let low = 0.5 - 0.5 * cube.size;
+    let scale = f32::cast_from(resolution) / cube.size;
+    #[unroll]
+    for k in 0..3usize {
+        cell[k] = min(u32::cast_from(max((x[k] - low) * scale, 0.0)), resolution - 1);
+    }
+    index_of(cell[0], cell[1], cell[2], cube.cascade, resolution)
+}
+
+/// Distance at which a ray leaves an empty cell, or its block if all of that is empty.
+#[cube]
+fn exit_of_empty(o: &Array<f32>, d: &Array<f32>, cell: &Array<u32>, cube: &Cube, blocks: &[u32], resolution: u32) -> f32 {
+    let block = index_of(cell[0] / 8, cell[1] / 8, cell[2] / 8, cube.cascade, resolution / 8);
+    let mut edge = 1u32;
+    if blocks[block as usize] == 0 {
+        edge = 8u32;
+    }
+    let low = 0.5 - 0.5 * cube.size;
+    let scale = f32::cast_from(resolution) / cube.size;
+    let mut exit = 1e30f32;
+    #[unroll]
+    for k in 0..3usize {
+        if d[k] != 0.0 {
+            let mut wall = cell[k] / edge;
+            if d[k] > 0.0 {
+                wall += 1;
+            }
+            exit = min(exit, (low + f32::cast_from(wall * edge) / scale - o[k]) * (1.0 / d[k]));
+        }
+    }
+    exit
+}
+
 #[cube(launch_unchecked)]
-fn walk(
+fn march_rays(
     bits: &[u32],
     blocks: &[u32],
     origins: &[f32],
@@ -165,6 +240,8 @@ fn walk(
     }
     let mut o = Array::<f32>::new(3usize);
     let mut d = Array::<f32>::new(3usize);
+    let mut x = Array::<f32>::new(3usize);
+    let mut cell = Array::<u32>::new(3usize);
     #[unroll]
     for k in 0..3usize {
         o[k] = origins[r * 3 + k];
@@ -173,42 +250,20 @@ fn walk(
     let near = near_far[r * 2];
     let far = near_far[r * 2 + 1];
     let jitter = jitters[r];
-    let n = f32::cast_from(resolution);
     let mut t = near;
     if comptime!(!resumed) {
         t = max(near + (jitter - 0.5) * step(near, cone, dt_min, dt_max, disparity_from), near);
     }
     let mut count = 0u32;
-    let mut x = Array::<f32>::new(3usize);
-    let mut cell = Array::<u32>::new(3usize);
     while t < far && count < max_samples {
         let dt = step(t, cone, dt_min, dt_max, disparity_from);
-        let mid = t + 0.5 * dt;
-        let mut reach = 0.0f32;
-        #[unroll]
-        for k in 0..3usize {
-            x[k] = o[k] + mid * d[k];
-            reach = max(reach, (x[k] - 0.5).abs());
-        }
-        let mut cascade = 0u32;
-        let mut size = 1.0f32;
-        while cascade + 1 < cascades && (reach >= 0.5 * size || dt * n > size) {
-            cascade += 1;
-            size *= 2.0;
-        }
-        let beyond = reach >= 0.5 * size;
-        if beyond && unbounded == 0 {
+        put_point(&o, &d, t + 0.5 * dt, &mut x);
+        let cube = cube_around(&x, dt, resolution, cascades);
+        if cube.is_beyond && unbounded == 0 {
             t += dt;
         } else {
-            let low = 0.5 - 0.5 * size;
-            let scale = n / size;
-            #[unroll]
-            for k in 0..3usize {
-                // What lies beyond the outermost cascade counts to the cells at its walls.
-                cell[k] = min(u32::cast_from(max((x[k] - low) * scale, 0.0)), resolution - 1);
-            }
-            let index = ((cascade * resolution + cell[2]) * resolution + cell[1]) * resolution + cell[0];
-            if beyond || (bits[(index >> 5) as usize] >> (index & 31)) & 1 == 1 {
+            let index = put_cell(&x, &cube, resolution, &mut cell);
+            if cube.is_beyond || (bits[(index >> 5) as usize] >> (index & 31)) & 1 == 1 {
                 if comptime!(write) {
                     let to = offsets[r] + count;
                     if to < capacity {
@@ -220,25 +275,7 @@ fn walk(
                 count += 1;
                 t += dt;
             } else {
-                // Past the cell, or past its block if that is empty.
-                let side = resolution / 8;
-                let block = ((cascade * side + cell[2] / 8) * side + cell[1] / 8) * side + cell[0] / 8;
-                let mut edge = 1u32;
-                if blocks[block as usize] == 0 {
-                    edge = 8u32;
-                }
-                let mut exit = 1e30f32;
-                #[unroll]
-                for k in 0..3usize {
-                    if d[k] != 0.0 {
-                        let mut wall = cell[k] / edge;
-                        if d[k] > 0.0 {
-                            wall += 1;
-                        }
-                        exit = min(exit, (low + f32::cast_from(wall * edge) / scale - o[k]) * (1.0 / d[k]));
-                    }
-                }
-                let jump = exit + (jitter - 0.5) * dt;
+                let jump = exit_of_empty(&o, &d, &cell, &cube, blocks, resolution) + (jitter - 0.5) * dt;
                 if jump > t {
                     t = jump;
                 } else {

@@ -24,8 +24,22 @@ fn other_samples_are_told() {
     assert!(cases::compare_rays(&off, &want).is_err());
     off.t.clone_from(&want.t);
     assert_eq!(cases::compare_rays(&off, &want), Ok(0.0));
+    off.dt.iter_mut().for_each(|dt| *dt *= 1.001);
+    assert!(cases::compare_rays(&off, &want).is_err());
+    off.dt.clone_from(&want.dt);
     off.cells.iter_mut().for_each(|c| *c += 1);
     assert!(cases::compare_rays(&off, &want).is_err());
+}
+
+#[cfg(feature = "gpu")]
+#[test]
+fn other_places_are_told() {
+    let c = &cases::cases()[2];
+    let (samples, mut places) = (reference::march(&c.grid, &c.rays.view(), &c.config), Vec::new());
+    cpu::positions(&c.rays.view(), &samples, &mut places);
+    assert_eq!(cases::compare_places(&samples, &c.rays, &places), Ok(0.0));
+    places[7] += 1e-2;
+    assert!(cases::compare_places(&samples, &c.rays, &places).is_err());
 }
 
 #[test]

@@ -1,9 +1,12 @@
 //! The loss of a batch of rays: color, opacity, distortion and depth, each a mean over the rays.
 
-use super::ColorLoss;
+mod blend;
+
+use super::{ColorLoss, Measure, Terms};
 use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::{GpuComposited, GpuGradients, GpuPacked};
 use crate::ops::{depth_loss, distortion};
+use blend::blend_and_compare;
 use cubecl::prelude::*;
 
 /// Sums that [`loss`] adds to: loss, mean squared error, trained samples, marched samples, steps.
@@ -11,22 +14,6 @@ pub const SUMS: usize = 5;
 
 /// Parts in which rays are summed.
 const PARTS: usize = 256;
-
-/// What counts.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Terms {
-    pub color: ColorLoss,
-    /// For linear light: what is added to a prediction that its difference is divided by; 0: differences count as they are.
-    pub relative: f32,
-    /// Weight of the distortion loss.
-    pub distortion: f32,
-    /// Whether the distortion loss is taken in normalized distance ([`distortion::normalized_distance`]).
-    pub normalized: bool,
-    /// Weight of the squared difference between opacity and the photograph's alpha.
-    pub alpha: f32,
-    /// Weight of the light that ends away from surfaces of known distance ([`depth_loss`]).
-    pub depth: f32,
-}
 
 impl ColorLoss {
     /// Width of the quadratic part as kernels take it; 0: all of it.
@@ -62,12 +49,12 @@ pub struct Target<'a> {
     pub distance: &'a Buffer,
 }
 
-/// Composites packed samples with densities `[S]` and colours `[S, 3]`, compares them, and takes the gradients back to
+/// Composites packed samples with densities `[S]` and colors `[S, 3]`, compares them, and takes the gradients back to
 /// both, all rays in one launch; adds the step's figures. Also gives the squared error of each ray `[R]`. Gradients
 /// closer than `near_scaling` are scaled as by [`crate::ops::field_step::gpu::scale_near_gradients`].
 pub fn composite_and_loss(
     gpu: &Gpu,
-    terms: Terms,
+    (terms, measure): (Terms, Measure),
     p: &GpuPacked,
     (sigma, rgb): (&Buffer, &Buffer),
     target: Target,
@@ -77,9 +64,6 @@ pub fn composite_and_loss(
     let (r, s) = (p.rays(), p.t.len());
     let (values, errors) = (gpu.empty(r), gpu.empty(r));
     let g = GpuGradients { sigma: gpu.empty(s), features: gpu.empty(s * 3), background: gpu.empty(r * 3) };
-    if r == 0 {
-        return (g, errors);
-    }
     let by_depth = terms.depth > 0.0;
     launch!(
         gpu,
@@ -104,12 +88,12 @@ pub fn composite_and_loss(
         r as u32,
         1.0 / r as f32,
         terms.color.width(),
-        terms.relative,
+        measure.relative,
         terms.alpha,
         terms.distortion,
         near_scaling,
         terms.depth,
-        terms.normalized,
+        measure.normalized,
         by_depth,
     );
     // The values hold the distortion already.
@@ -118,7 +102,14 @@ pub fn composite_and_loss(
 }
 
 /// Gradients of what compositing gave, and the squared error of each ray `[R]`; adds the step's figures.
-pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target: Target, figures: Figures) -> (GpuComposited, Buffer) {
+pub fn loss(
+    gpu: &Gpu,
+    (terms, measure): (Terms, Measure),
+    p: &GpuPacked,
+    out: &GpuComposited,
+    target: Target,
+    figures: Figures,
+) -> (GpuComposited, Buffer) {
     let r = p.rays();
     let d = GpuComposited { color: gpu.empty(r * 3), depth: gpu.zeros(r), opacity: gpu.empty(r), weights: gpu.empty(0) };
     let (values, errors, d_spread) = (gpu.empty(r), gpu.empty(r), gpu.empty(r));
@@ -141,11 +132,11 @@ pub fn loss(gpu: &Gpu, terms: Terms, p: &GpuPacked, out: &GpuComposited, target:
         r as u32,
         1.0 / r as f32,
         terms.color.width(),
-        terms.relative,
+        measure.relative,
         terms.alpha,
         terms.distortion,
     );
-    let (spread, weights) = if terms.normalized {
+    let (spread, weights) = if measure.normalized {
         distortion::gpu::both(gpu, &distortion::gpu::normalized(gpu, p), &out.weights, &d_spread)
     } else {
         distortion::gpu::both(gpu, p, &out.weights, &d_spread)
@@ -224,152 +215,6 @@ fn color_error(got: f32, wanted: f32, huber: f32, relative: f32) -> Error {
         }
     }
     Error { value, slope: by * slope, squared: off * off }
-}
-
-/// Length of a sample as the distortion loss takes it.
-#[cube]
-fn length(t: f32, dt: f32, #[comptime] normalized: bool) -> f32 {
-    let mut share = 1.0f32;
-    if comptime!(normalized) {
-        share = 0.25 * (1.0 + t) * (1.0 + t + dt);
-    }
-    dt / share
-}
-
-/// Middle of a sample as the distortion loss takes it, from the beginning of its ray's first sample on.
-#[cube]
-fn middle(t: f32, dt: f32, first: f32, #[comptime] normalized: bool) -> f32 {
-    let mut share = 1.0f32;
-    if comptime!(normalized) {
-        share = 0.25 * (1.0 + t) * (1.0 + first);
-    }
-    (t - first) / share + 0.5 * length(t, dt, normalized)
-}
-
-#[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
-#[cube(launch_unchecked)]
-fn blend_and_compare(
-    offsets: &[u32],
-    t: &[f32],
-    dt: &[f32],
-    sigma: &[f32],
-    rgb: &[f32],
-    rgba: &[f32],
-    background: &[f32],
-    left_out: &[u32],
-    surface: &[f32],
-    d_sigma: &mut [f32],
-    d_rgb: &mut [f32],
-    d_background: &mut [f32],
-    values: &mut [f32],
-    errors: &mut [f32],
-    rays: u32,
-    scale: f32,
-    huber: f32,
-    relative: f32,
-    alpha: f32,
-    distortion: f32,
-    near: f32,
-    depth: f32,
-    #[comptime] normalized: bool,
-    #[comptime] by_depth: bool,
-) {
-    let r = ABSOLUTE_POS;
-    if r >= rays as usize {
-        terminate!();
-    }
-    let first = offsets[r] as usize;
-    let count = offsets[r + 1] as usize - first;
-    let mut light = 1.0f32;
-    let mut all_w = 0.0f32;
-    let mut all_m = 0.0f32;
-    let mut color = Array::<f32>::new(3usize);
-    #[unroll]
-    for k in 0..3usize {
-        color[k] = 0.0;
-    }
-    for j in 0..count {
-        let i = first + j;
-        let through = (-sigma[i] * dt[i]).exp();
-        let w = light * (1.0 - through);
-        light *= through;
-        all_w += w;
-        // Midpoints relative to the first keep the distortion's differences exact in f32.
-        all_m += w * middle(t[i], dt[i], t[first], normalized);
-        // Kept where the gradient will be.
-        d_sigma[i] = w;
-        #[unroll]
-        for k in 0..3usize {
-            color[k] += w * rgb[i * 3 + k];
-        }
-    }
-    let mut counts = scale;
-    if left_out[r] != 0 {
-        counts = 0.0f32;
-    }
-    let a = rgba[r * 4 + 3];
-    let off = 1.0 - light - a;
-    let mut value = alpha * off * off;
-    let mut error = 0.0f32;
-    let d_opacity = counts * alpha * 2.0 * off;
-    let mut out = -d_opacity;
-    let mut d_color = Array::<f32>::new(3usize);
-    #[unroll]
-    for k in 0..3usize {
-        let behind = background[r * 3 + k];
-        let e = color_error(color[k] + light * behind, rgba[r * 4 + k] * a + behind * (1.0 - a), huber, relative);
-        value += e.value / 3.0;
-        error += e.squared / 3.0;
-        let d = counts * e.slope / 3.0;
-        d_color[k] = d;
-        d_background[r * 3 + k] = light * d;
-        out += d * behind;
-    }
-    // From the back, where what is still behind is small.
-    let mut after = light;
-    let mut behind = light * out;
-    let mut sum_w = all_w;
-    let mut sum_m = all_m;
-    let mut spread = 0.0f32;
-    for j in 0..count {
-        let i = first + count - 1 - j;
-        let w = d_sigma[i];
-        // As in the distortion's own kernel, with the sums up to here.
-        let mid = middle(t[i], dt[i], t[first], normalized);
-        let length = length(t[i], dt[i], normalized);
-        let pairs = mid * (2.0 * sum_w - all_w) - (2.0 * sum_m - all_m);
-        sum_w -= w;
-        sum_m -= w * mid;
-        spread += w * (pairs + w * length / 3.0);
-        let mut kept = 1.0f32;
-        if near > 0.0 {
-            let share = min((t[i] + 0.5 * dt[i]) / near, 1.0);
-            kept = share * share;
-        }
-        let mut g = counts * distortion * (2.0 * pairs + w * length * 2.0 / 3.0);
-        if comptime!(by_depth) {
-            if surface[r] > 0.0 {
-                let away = depth * depth_loss::gpu::away(t[i] + 0.5 * dt[i], surface[r]);
-                value += away * w;
-                g += counts * away;
-            }
-        }
-        #[unroll]
-        for k in 0..3usize {
-            g += d_color[k] * rgb[i * 3 + k];
-            d_rgb[i * 3 + k] = kept * w * d_color[k];
-        }
-        d_sigma[i] = kept * dt[i] * (after * g - behind);
-        behind += w * g;
-        after += w;
-    }
-    value += distortion * spread;
-    if counts == 0.0 {
-        value = 0.0f32;
-        error = 0.0f32;
-    }
-    values[r] = value;
-    errors[r] = error;
 }
 
 #[cube(launch_unchecked)]
@@ -451,7 +296,7 @@ fn finish(parts: &[f32], offsets: &[u32], marched: &[u32], sums: &mut [f32], ray
         error += parts[i * 3 + 1];
         count += parts[i * 3 + 2];
     }
-    sums[0] += value / f32::cast_from(rays);
+    sums[0] += value / max(f32::cast_from(rays), 1.0f32);
     sums[2] += f32::cast_from(offsets[rays as usize]);
     sums[3] += f32::cast_from(marched[rays as usize]);
     if comptime!(is_main) {

@@ -169,7 +169,7 @@ impl GpuPhotographs {
         let n_cells = if errors.is_some() { self.count * CELLS * CELLS } else { 0 };
         launch!(
             gpu,
-            choose,
+            draw_pixels,
             n,
             [
                 self.sizes => self.count * PHOTOGRAPH,
@@ -199,7 +199,7 @@ impl GpuPhotographs {
         );
         launch!(
             gpu,
-            back,
+            fill_background,
             n * 3,
             [d.background => n * 3],
             (n * 3) as u32,
@@ -216,9 +216,107 @@ impl GpuPhotographs {
     }
 }
 
+/// A point of a photograph, in shares of its width and height.
+#[derive(CubeType)]
+struct Spot {
+    image: u32,
+    u: f32,
+    v: f32,
+}
+
+/// A pixel of a photograph, and the distance of what it shows, 0 where that is not known.
+#[derive(CubeType)]
+struct Pixel {
+    image: u32,
+    x: u32,
+    y: u32,
+    distance: f32,
+}
+
+/// The first cell up to which the errors' roots sum to a share of all.
+#[cube]
+fn cell_by_error(cdf: &[f32], cells: usize, share: f32) -> usize {
+    let wanted = share * cdf[cells - 1];
+    let mut from = 0usize;
+    let mut to = cells - 1;
+    while from < to {
+        let middle = (from + to) / 2;
+        if cdf[middle] < wanted {
+            from = middle + 1;
+        } else {
+            to = middle;
+        }
+    }
+    from
+}
+
+/// A random point of all photographs; for some rays, of a cell that is drawn by its error.
+#[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
+#[cube]
+fn draw_spot(r: usize, key: &Wide, draw: &Wide, cdf: &[f32], count: u32, #[comptime] by_error: bool) -> Spot {
+    let mut image = below(key, draw, count);
+    let mut u = uniform(key, &sum(draw, &widened(1u32)));
+    let mut v = uniform(key, &sum(draw, &widened(2u32)));
+    if comptime!(by_error) {
+        if r as u32 % 1024 >= UNIFORM {
+            let cell = cell_by_error(cdf, count as usize * comptime!(CELLS * CELLS), uniform(key, draw));
+            image = u32::cast_from(cell / comptime!(CELLS * CELLS));
+            u = (f32::cast_from(cell % CELLS) + u) / comptime!(CELLS as f32);
+            v = (f32::cast_from(cell / CELLS % CELLS) + v) / comptime!(CELLS as f32);
+        }
+    }
+    Spot { image, u, v }
+}
+
+/// The pixel that holds a point.
+#[cube]
+fn pixel_at(spot: &Spot, sizes: &[u32]) -> Pixel {
+    let own = spot.image as usize * PHOTOGRAPH;
+    let w = sizes[own];
+    let h = sizes[own + 1];
+    let x = min(u32::cast_from(spot.u * f32::cast_from(w)), w - 1);
+    let y = min(u32::cast_from(spot.v * f32::cast_from(h)), h - 1);
+    Pixel { image: spot.image, x, y, distance: 0.0f32 }
+}
+
+/// A random pixel of known distance.
+#[cube]
+fn draw_observed(key: &Wide, draw: &Wide, observations: &[u32], observed: u32) -> Pixel {
+    let at = below(key, draw, observed) as usize * OBSERVATION;
+    Pixel {
+        image: observations[at],
+        x: observations[at + 1],
+        y: observations[at + 2],
+        distance: f32::reinterpret(observations[at + 3]),
+    }
+}
+
+/// The pixel that was kept of another one's `stride × stride` square.
+#[cube]
+fn kept_of_square(pixel: &Pixel, sizes: &[u32], stride: u32) -> Pixel {
+    let own = pixel.image as usize * PHOTOGRAPH;
+    let mut x = pixel.x;
+    let mut y = pixel.y;
+    if stride > 1 {
+        let x0 = x / stride * stride;
+        let y0 = y / stride * stride;
+        let kept = bits(&Wide { high: sizes[own + 3], low: sizes[own + 4] }, &Wide { high: y0, low: x0 });
+        x = x0 + kept.low % min(stride, sizes[own] - x0);
+        y = y0 + kept.high % min(stride, sizes[own + 1] - y0);
+    }
+    Pixel { image: pixel.image, x, y, distance: pixel.distance }
+}
+
+/// Where a pixel's square is stored.
+#[cube]
+fn place_of(pixel: &Pixel, sizes: &[u32], stride: u32) -> u32 {
+    let own = pixel.image as usize * PHOTOGRAPH;
+    sizes[own + 2] + pixel.y / stride * sizes[own].div_ceil(stride) + pixel.x / stride
+}
+
 #[allow(clippy::collapsible_if, reason = "the outer condition is decided when the kernel is built")]
 #[cube(launch_unchecked)]
-fn choose(
+fn draw_pixels(
     sizes: &[u32],
     pixels: &[u32],
     mask: &[u32],
@@ -252,69 +350,18 @@ fn choose(
     jitter[r] = uniform(&key, &base);
     let mut refused = 1u32;
     let mut attempt = 0u32;
-    let mut image = 0u32;
-    let mut x = 0u32;
-    let mut y = 0u32;
     let mut at = 0u32;
-    let mut surface = 0.0f32;
     while refused == 1 && attempt < ATTEMPTS {
         let draw = sum(&base, &widened(1 + attempt * 3));
-        let mut u = uniform(&key, &sum(&draw, &widened(1u32)));
-        let mut v = uniform(&key, &sum(&draw, &widened(2u32)));
-        if comptime!(by_error) {
-            if r as u32 % 1024 >= UNIFORM {
-                let cells = count as usize * comptime!(CELLS * CELLS);
-                // The first cell up to which the errors' roots sum to as much.
-                let wanted = uniform(&key, &draw) * cdf[cells - 1];
-                let mut from = 0usize;
-                let mut to = cells - 1;
-                while from < to {
-                    let middle = (from + to) / 2;
-                    if cdf[middle] < wanted {
-                        from = middle + 1;
-                    } else {
-                        to = middle;
-                    }
-                }
-                image = u32::cast_from(from / comptime!(CELLS * CELLS));
-                u = (f32::cast_from(from % CELLS) + u) / comptime!(CELLS as f32);
-                v = (f32::cast_from(from / CELLS % CELLS) + v) / comptime!(CELLS as f32);
-            } else {
-                image = below(&key, &draw, count);
-            }
-        } else {
-            image = below(&key, &draw, count);
-        }
-        let mut seen = 0usize;
-        let mut is_seen = false;
+        let pixel = pixel_at(&draw_spot(r, &key, &draw, cdf, count, by_error), sizes);
+        at = place_of(&pixel, sizes, stride);
+        put_pixel(&kept_of_square(&pixel, sizes, stride), r, images, centres, distance);
         if comptime!(is_observed) {
-            is_seen = attempt == 0 && r as u32 % OBSERVED_EVERY < 1;
-            if is_seen {
-                seen = below(&key, &draw, observed) as usize * OBSERVATION;
-                image = observations[seen];
+            if attempt == 0 && r as u32 % OBSERVED_EVERY < 1 {
+                let pixel = draw_observed(&key, &draw, observations, observed);
+                at = place_of(&pixel, sizes, stride);
+                put_pixel(&kept_of_square(&pixel, sizes, stride), r, images, centres, distance);
             }
-        }
-        let own = image as usize * PHOTOGRAPH;
-        let w = sizes[own];
-        let h = sizes[own + 1];
-        x = min(u32::cast_from(u * f32::cast_from(w)), w - 1);
-        y = min(u32::cast_from(v * f32::cast_from(h)), h - 1);
-        surface = 0.0f32;
-        if comptime!(is_observed) {
-            if is_seen {
-                x = observations[seen + 1];
-                y = observations[seen + 2];
-                surface = f32::reinterpret(observations[seen + 3]);
-            }
-        }
-        at = sizes[own + 2] + y / stride * w.div_ceil(stride) + x / stride;
-        if stride > 1 {
-            // The pixel that was kept of its square.
-            let x0 = x / stride * stride;
-            let y0 = y / stride * stride;
-            let kept = bits(&Wide { high: sizes[own + 3], low: sizes[own + 4] }, &Wide { high: y0, low: x0 });
-            x = x0 + kept.low % min(stride, w - x0);
-            y = y0 + kept.high % min(stride, h - y0);
         }
         refused = 0u32;
         if comptime!(is_masked) {
@@ -322,19 +369,24 @@ fn choose(
         }
         attempt += 1;
     }
-    images[r] = image;
-    centres[r * 2] = f32::cast_from(x) + 0.5;
-    centres[r * 2 + 1] = f32::cast_from(y) + 0.5;
     left_out[r] = refused;
-    distance[r] = surface;
     target[r * 4] = channel(pixels, at as usize, 0usize, format);
     target[r * 4 + 1] = channel(pixels, at as usize, 1usize, format);
     target[r * 4 + 2] = channel(pixels, at as usize, 2usize, format);
     target[r * 4 + 3] = channel(pixels, at as usize, 3usize, format);
 }
 
+/// Writes down the pixel of a ray.
+#[cube]
+fn put_pixel(pixel: &Pixel, r: usize, images: &mut [u32], centres: &mut [f32], distance: &mut [f32]) {
+    images[r] = pixel.image;
+    centres[r * 2] = f32::cast_from(pixel.x) + 0.5;
+    centres[r * 2 + 1] = f32::cast_from(pixel.y) + 0.5;
+    distance[r] = pixel.distance;
+}
+
 #[cube(launch_unchecked)]
-fn back(
+fn fill_background(
     background: &mut [f32],
     n: u32,
     red: f32,

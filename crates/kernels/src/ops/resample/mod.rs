@@ -1,7 +1,11 @@
 //! Change of an image's size, and blur, by separable filters: every one is a table of weights per axis ([`Weights`]), a small sparse matrix,
 //! of which backward applies the transpose. Also [pixel shuffle](shuffle) (Shi et al. 2016).
 
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod reference;
 pub mod shuffle;
 #[cfg(test)]

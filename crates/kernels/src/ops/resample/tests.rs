@@ -1,47 +1,20 @@
+use super::cases::{Case, FILTERS};
 use super::*;
 use crate::simd::{Level, with_level};
 use diorama_testkit::{assert_close, assert_gradient, random, wide};
 
-const FILTERS: [Filter; 6] = [
-    Filter::Nearest,
-    Filter::Bilinear { align_corners: false },
-    Filter::Bilinear { align_corners: true },
-    Filter::BilinearAntialiased,
-    Filter::BicubicAntialiased,
-    Filter::Area,
-];
-
-fn check(r: &Resample, planes: usize) {
-    let ([h, w], [oh, ow]) = (r.from(), r.to());
-    let (x, d) = (random(planes * h * w, 1), random(planes * oh * ow, 2));
-    let (mut out, mut dx) = (vec![9.0; d.len()], vec![9.0; x.len()]);
-    cpu::forward(r, planes, &x, &mut out);
-    cpu::backward(r, planes, &d, &mut dx);
-    assert_close("forward", &out, &reference::forward(r, planes, &wide(&x)), 1e-5);
-    assert_close("backward", &dx, &reference::backward(r, planes, &wide(&d)), 1e-5);
+fn check(c: &Case) {
+    let (mut out, mut dx) = (vec![9.0; c.d.len()], vec![9.0; c.x.len()]);
+    cpu::forward(&c.resample, c.planes, &c.x, &mut out);
+    cpu::backward(&c.resample, c.planes, &c.d, &mut dx);
+    assert_close("forward", &out, &reference::forward(&c.resample, c.planes, &wide(&c.x)), 1e-5);
+    assert_close("backward", &dx, &reference::backward(&c.resample, c.planes, &wide(&c.d)), 1e-5);
 }
 
 #[test]
 fn filters_match_the_reference_both_ways_at_every_level() {
-    let sizes = [
-        ([1, 1], [1, 1]),
-        ([5, 7], [10, 14]),
-        ([13, 40], [5, 17]),
-        ([3, 1], [1, 6]),
-        ([40, 33], [3, 2]),
-        ([4, 5], [4, 5]),
-        ([3, 3], [0, 4]),
-    ];
     for level in Level::available() {
-        for filter in FILTERS {
-            for (from, to) in sizes {
-                for planes in [0, 1, 3] {
-                    with_level(level, || check(&Resample::new(filter, from, to), planes));
-                }
-            }
-        }
-        // More than one band.
-        with_level(level, || check(&Resample::new(Filter::BilinearAntialiased, [20, 30], [70, 900]), 1));
+        cases::cases().iter().for_each(|c| with_level(level, || check(c)));
     }
 }
 
@@ -52,7 +25,8 @@ fn blurs_match_the_reference_both_ways_at_every_level() {
         for (up, down, padding) in [(1, 1, [1, 2]), (1, 2, [1, 1]), (2, 1, [2, 1]), (3, 2, [0, 5])] {
             for from in [[4, 4], [9, 21], [1, 30]] {
                 if from[0] * up + padding[0] + padding[1] >= 4 {
-                    with_level(level, || check(&Resample::fir(&Fir { taps: &taps, up, down, padding }, from), 2));
+                    let blur = Resample::fir(&Fir { taps: &taps, up, down, padding }, from);
+                    with_level(level, || check(&Case::new("blur".into(), blur, 2)));
                 }
             }
         }

@@ -10,7 +10,7 @@ use crate::gpu::table::{TOLERANCE, Table};
 use crate::gpu::{Gpu, GpuError};
 use diorama_testkit::random_unit;
 #[cfg(feature = "gpu")]
-use diorama_testkit::{compare, wide};
+use diorama_testkit::{compare_proven, wide};
 
 /// Two images of a width, height and channels.
 pub struct Case {
@@ -33,7 +33,7 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let values = gpu.read(&on_gpu::forward(gpu, pair))?;
         let mean = values.iter().sum::<f32>() / values.len() as f32;
         let want = reference::ssim(w, h, c, &wide(&x), &wide(&y));
-        let outcome = if want.is_nan() && mean.is_nan() { Ok(0.0) } else { compare(&[mean], &[want], TOLERANCE) };
+        let outcome = if want.is_nan() && mean.is_nan() { Ok(0.0) } else { compare_proven(&[mean], &[want], TOLERANCE) };
         table.row("SSIM", "mean", shape.clone(), outcome);
         let fits = w >= WINDOW && h >= WINDOW;
         let want = if fits { reference::gradient(w, h, c, &wide(&x), &wide(&y)) } else { vec![0.0; x.len()] };

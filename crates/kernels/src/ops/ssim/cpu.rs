@@ -22,7 +22,7 @@ fn blur(w: usize, h: usize, plane: &[f64]) -> Vec<f64> {
     out
 }
 
-/// Transpose of [`blur`]: spreads window values back over the plane.
+/// Transpose of [`blur`]: spreads window values over the plane.
 fn spread(w: usize, h: usize, windows: &[f64]) -> Vec<f64> {
     let g = gaussian();
     let (ow, oh) = (w + 1 - WINDOW, h + 1 - WINDOW);

@@ -22,7 +22,7 @@ pub enum Space {
 
 impl Space {
     /// Kind and width, for a launch.
-    pub(super) fn arg(self) -> (u32, f32) {
+    pub(crate) fn arg(self) -> (u32, f32) {
         match self {
             Space::Model => (0, 1.0),
             Space::Cube(width) => (1, width),
@@ -87,7 +87,7 @@ pub fn positions_backward(gpu: &Gpu, rays: &GpuRays, samples: &GpuPacked, d: &Bu
 
 /// Writes a model point as coordinates of a space.
 #[cube]
-pub(super) fn put(out: &mut [f32], at: usize, x: f32, y: f32, z: f32, width: f32, #[comptime] kind: u32) {
+pub(crate) fn put(out: &mut [f32], at: usize, x: f32, y: f32, z: f32, width: f32, #[comptime] kind: u32) {
     if comptime!(kind == 0) {
         out[at] = x;
         out[at + 1] = y;

@@ -14,7 +14,7 @@ const TASK: usize = 1 << 12;
 ///
 /// # Panics
 /// When an index is too high.
-pub fn scatter_max(indices: &[u32], values: &[f32], out: &mut [f32]) {
+pub(super) fn scatter_max(indices: &[u32], values: &[f32], out: &mut [f32]) {
     // SAFETY: f32 and AtomicU32 have the same size and alignment, any bits are valid for both, and the
     // exclusive borrow outlives the slice.
     let out: &[AtomicU32] = unsafe { std::slice::from_raw_parts(out.as_mut_ptr().cast(), out.len()) };

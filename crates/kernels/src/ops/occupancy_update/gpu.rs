@@ -1,20 +1,16 @@
-//! The occupancy grid's upkeep on the device (instant-ngp, section E.2): decayed maxima of densities per cell,
-//! and the bits that marching reads.
+//! One unit per point, cell or word of bits.
 
-use super::super::OccupancyBits;
-use super::{GpuOccupancy, Space, put};
+use super::{OccupancyGrid, UNKNOWN};
 use crate::gpu::random::{Wide, below, halves, key, product, sum, uniform, widened};
 use crate::gpu::{Buffer, Gpu, GpuError, Rows, launch};
+use crate::ops::march::gpu::{GpuOccupancy, Space, put};
 use cubecl::prelude::*;
 use diorama_geom::rng::Rng;
 
 /// Parts in which densities are summed.
 const PARTS: usize = 1024;
 
-/// Density that stands for "not sampled yet".
-const UNKNOWN: f32 = f32::MAX;
-
-/// A grid that is kept up to date on the device.
+/// [`OccupancyGrid`] on the device.
 pub struct GpuOccupancyGrid {
     /// What marching reads.
     pub bits: GpuOccupancy,
@@ -30,16 +26,14 @@ pub struct GpuOccupancyGrid {
 }
 
 impl GpuOccupancyGrid {
-    pub fn upload(gpu: &Gpu, bits: &OccupancyBits, density: &[f32], fresh: &[f32], live: &[u32], decay: f32, thresholds: &[f32]) -> Self {
-        assert!(thresholds.len() == bits.cascades, "occupancy: a threshold for each cascade");
-        assert!(density.len() == bits.cells() && fresh.len() == bits.cells(), "occupancy: {} cells", bits.cells());
+    pub fn upload(gpu: &Gpu, grid: &OccupancyGrid) -> Self {
         GpuOccupancyGrid {
-            bits: GpuOccupancy::upload(gpu, bits),
-            density: gpu.upload(density),
-            fresh: gpu.upload(fresh).cast(),
-            live: gpu.upload(live),
-            decay,
-            thresholds: gpu.upload(thresholds),
+            bits: GpuOccupancy::upload(gpu, &grid.bits),
+            density: gpu.upload(&grid.density),
+            fresh: gpu.upload(&grid.fresh).cast(),
+            live: gpu.upload(&grid.live),
+            decay: grid.decay,
+            thresholds: gpu.upload(&grid.thresholds),
         }
     }
 
@@ -51,7 +45,7 @@ impl GpuOccupancyGrid {
         Ok((gpu.read(&self.density)?, gpu.read(&self.fresh.cast())?))
     }
 
-    /// Notes densities met in cells, but for negative ones; they count at the next update.
+    /// [`OccupancyGrid::record`] for some rows.
     pub fn record(&self, gpu: &Gpu, rows: &Rows, cells: &Buffer<u32>, sigma: &Buffer) {
         self.note(gpu, rows, cells, sigma, 1);
     }
@@ -136,7 +130,7 @@ impl GpuOccupancyGrid {
             launch!(gpu, pool, n.pow(3) / 32, [self.bits.bits => words], c as u32, n as u32);
         }
         let blocks = self.bits.blocks.len();
-        launch!(gpu, summarise, blocks, [self.bits.bits => words, self.bits.blocks => blocks], blocks as u32, n as u32);
+        launch!(gpu, summarize, blocks, [self.bits.bits => words, self.bits.blocks => blocks], blocks as u32, n as u32);
     }
 }
 
@@ -150,9 +144,10 @@ fn highest(live: &[u32], cells: &[u32], sigma: &[f32], fresh: &[Atomic<u32>], at
         terminate!();
     }
     let k = unit % (b * b * b);
-    if sigma[row] > 0.0 {
+    if sigma[row] >= 0.0 {
         let cell = cells[row] as usize + k % b + n * (k / b % b) + n * n * (k / b / b);
-        fresh[cell].fetch_max(u32::reinterpret(sigma[row]));
+        // A density of 0 differs from an untouched cell.
+        fresh[cell].fetch_max(u32::reinterpret(max(sigma[row], f32::MIN_POSITIVE)));
     }
 }
 
@@ -296,7 +291,7 @@ fn pool(bits: &mut [u32], cascade: u32, resolution: u32) {
 }
 
 #[cube(launch_unchecked)]
-fn summarise(bits: &[u32], blocks: &mut [u32], count: u32, resolution: u32) {
+fn summarize(bits: &[u32], blocks: &mut [u32], count: u32, resolution: u32) {
     let unit = ABSOLUTE_POS;
     if unit >= count as usize {
         terminate!();
