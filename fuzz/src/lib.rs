@@ -8,7 +8,7 @@ use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, ImageU8, Pose, Similarity, SparsePoint};
 use diorama_pipelines::Application;
 use diorama_pipelines::object::config::{Config, Method};
-use diorama_pipelines::object::viewing;
+use diorama_pipelines::run::viewer_files;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
@@ -338,9 +338,9 @@ fn config_seeds() -> Vec<Vec<u8>> {
 
 fn crop_json(data: &[u8]) {
     let path = file("crop.json", data);
-    let _ = viewing::read_crop(path.parent().expect("a folder"));
+    let _ = viewer_files::read_crop(path.parent().expect("a folder"));
     let path = file("scale.json", data);
-    let _ = viewing::read_scale(path.parent().expect("a folder"));
+    let _ = viewer_files::read_scale(path.parent().expect("a folder"));
 }
 
 fn crop_seeds() -> Vec<Vec<u8>> {

@@ -1,6 +1,7 @@
 //! Progress on stderr, results on stdout, errors in one line.
 
-use diorama_engine::train::Event;
+use diorama_engine::train::scalar::{label, text};
+use diorama_engine::train::{Event, Scores};
 use diorama_pipelines::PipelineError;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::IsTerminal;
@@ -31,8 +32,8 @@ pub fn report(error: &PipelineError, json: bool) -> u8 {
 pub struct Progress {
     bar: Option<ProgressBar>,
     last_line: Option<Instant>,
-    /// PSNR of held-out pixels when they were last scored.
-    held_out: Option<f64>,
+    /// Of the last evaluation.
+    scores: Scores,
 }
 
 impl Progress {
@@ -42,7 +43,7 @@ impl Progress {
             bar.set_style(ProgressStyle::with_template("{bar:30} {msg} {eta} left").expect("a valid template"));
             bar
         });
-        Progress { bar, last_line: None, held_out: None }
+        Progress { bar, last_line: None, scores: Scores::default() }
     }
 
     fn line(&self, text: &str) {
@@ -56,9 +57,10 @@ impl Progress {
         match event {
             Event::Started { step, .. } if *step > 0 => self.line(&format!("continuing at step {step}")),
             Event::Started { .. } | Event::Saved { .. } => {}
-            Event::Progress { step, seconds, progress, loss, psnr, rays_per_s, .. } => {
-                let held_out = self.held_out.map_or(String::new(), |p| format!("  held out {p:.2}"));
-                let text = format!("step {step}  {seconds:.0} s  loss {loss:.5}  psnr {psnr:.2}{held_out}  {rays_per_s:.0} rays/s");
+            Event::Progress { step, seconds, progress, loss, scalars } => {
+                let mut text = format!("step {step}  {seconds:.0} s  {}", shown("", "loss", *loss));
+                scalars.shown().for_each(|s| text += &shown("  ", &s.name, s.value));
+                self.scores.shown().for_each(|s| text += &shown("  held out ", &s.name, s.value));
                 if let Some(b) = &self.bar {
                     b.set_position((progress * 1000.0) as u64);
                     b.set_message(text);
@@ -67,7 +69,7 @@ impl Progress {
                     eprintln!("{text}");
                 }
             }
-            Event::Evaluated { psnr, .. } => self.held_out = Some(*psnr),
+            Event::Evaluated { scores, .. } => self.scores = scores.clone(),
             Event::Recovered { step, to_step, why } => self.line(&format!("step {step}: {why}; back to step {to_step}")),
             Event::Note(n) => self.line(&format!("note: {n}")),
             Event::Finished { step, seconds, interrupted } => {
@@ -79,6 +81,11 @@ impl Progress {
             }
         }
     }
+}
+
+/// A figure after its name in words.
+fn shown(before: &str, name: &str, value: f64) -> String {
+    format!("{before}{} {}", label(name), text(name, value))
 }
 
 /// Shows the progress of work with a known share: a bar on a terminal, otherwise a line every few seconds; both with the remaining time.

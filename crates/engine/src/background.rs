@@ -1,4 +1,4 @@
-//! A background that is learned as a function of direction: `a(Σ_i c_i Y_i(d))` per channel, with spherical harmonics of degree 4;
+//! Learned background, a function of direction: `a(Σ_i c_i Y_i(d))` per channel, with spherical harmonics of degree 4;
 //! `a` is the sigmoid, or for linear light the exponential.
 
 use crate::params::ParamGroup;
@@ -20,12 +20,12 @@ impl LearnedBackground {
         LearnedBackground { group: ParamGroup::dense("background", vec![0.0; TERMS * 3], adam), activation, codes: Vec::new() }
     }
 
-    /// A copy to look at, which cannot be trained.
-    pub fn to_look_at(&self) -> Self {
+    /// A copy of the values alone, for rendering; it cannot be trained.
+    pub fn for_rendering(&self) -> Self {
         LearnedBackground { group: self.group.values_only(), activation: self.activation, codes: Vec::new() }
     }
 
-    /// Colours `[R, 3]` for unit directions `[R, 3]`.
+    /// Colors `[R, 3]` for unit directions `[R, 3]`.
     pub fn forward(&self, dirs: &[f32], rgb: &mut Vec<f32>) {
         let mut codes = vec![0.0; dirs.len() / 3 * TERMS];
         sh::forward(4, dirs, &mut codes);
@@ -41,7 +41,7 @@ impl LearnedBackground {
         }
     }
 
-    /// Adds the gradient for that of the colours.
+    /// Adds the gradient for that of the colors.
     pub fn backward(&mut self, dirs: &[f32], rgb: &[f32], d_rgb: &[f32]) {
         self.codes.resize(dirs.len() / 3 * TERMS, 0.0);
         sh::forward(4, dirs, &mut self.codes);

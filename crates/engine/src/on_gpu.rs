@@ -2,6 +2,7 @@
 //! [`GpuTrainer::figures`] and, for a checkpoint, [`GpuTrainer::download`].
 
 pub mod check;
+mod place;
 mod shape;
 mod tracer;
 mod trainer;

@@ -1,4 +1,4 @@
-//! Where a step's time goes.
+//! Time that each stage of a step takes.
 
 use std::time::Instant;
 

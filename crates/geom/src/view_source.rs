@@ -69,28 +69,49 @@ pub struct MeasuredLength {
 }
 
 /// Progress of training.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct ViewStatus {
     pub step: u64,
     pub seconds: f64,
-    pub loss: f64,
-    pub psnr: f64,
-    /// PSNR of held-out pixels when they were last scored.
-    pub held_out: Option<f64>,
-    pub rays_per_s: f64,
     /// Completed share of the training, 0 to 1; 0 if nothing is being trained.
     pub progress: f64,
     pub running: bool,
+    /// What the source wants shown, in its order.
+    pub figures: Vec<ViewFigure>,
 }
 
-/// A point of the training curve.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct ViewPoint {
-    pub step: u64,
-    /// PSNR of training pixels, in dB.
-    pub psnr: Option<f64>,
-    /// PSNR of held-out pixels, in dB.
-    pub held_out: Option<f64>,
+/// A figure of training, such as its loss.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewFigure {
+    /// Identifier, by which lines of charts refer to it.
+    pub id: String,
+    /// Name on the page.
+    pub label: String,
+    pub value: f64,
+    /// The value with its unit, as the page shows it.
+    pub text: String,
+}
+
+/// Figures over the steps of training, on common axes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewChart {
+    /// Name on the page.
+    pub label: String,
+    pub unit: String,
+    pub lines: Vec<ViewLine>,
+}
+
+/// A figure's values so far.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewLine {
+    /// Id of the figure whose values follow while training goes on.
+    pub figure: String,
+    /// Name of the line in its chart.
+    pub label: String,
+    /// Whether it is of data that was held out: few values, each shown as a dot.
+    pub held_out: bool,
+    /// Steps and values, oldest first.
+    pub points: Vec<(u64, f64)>,
 }
 
 /// A request for a mesh.
@@ -109,8 +130,8 @@ pub trait ViewSource: Send + Sync {
 
     fn status(&self) -> ViewStatus;
 
-    /// The training curve so far, oldest point first; empty if nothing was trained.
-    fn history(&self) -> Vec<ViewPoint> {
+    /// Charts of training so far; none where nothing was trained. Asked again when the status has figures that it had not.
+    fn charts(&self) -> Vec<ViewChart> {
         Vec::new()
     }
 

@@ -5,10 +5,11 @@
 use diorama_data::photo;
 use diorama_engine::fields::{self, Batch, Field, FieldBuffers, Loss, VisibleSamples};
 use diorama_engine::metrics;
-use diorama_engine::renderers::volume::{Quality, Sampling, Tracer, View};
+use diorama_engine::renderers::volume::{Quality, Tracer, View};
 use diorama_engine::samplers::RayBatch;
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::pixels::{self, DrawOptions, PixelSource};
+use diorama_engine::samplers::placement::Placement;
 use diorama_geom::contraction::Space;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::composite::Packed;
@@ -117,8 +118,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let occupancy = Occupancy::new(32, 1, false);
     for (name, c) in [("squares", 1e3), ("cauchy", 0.1)] {
         let field = train(&photographs, &cameras, &occupancy, c);
-        let sampling = Sampling::Occupancy { grid: &occupancy, max_samples: 1024 };
-        let view: View = Tracer::new(&field, sampling, (0.0, 1.0)).view(&posed(&held_out), &mut |_| {});
+        let placement = Placement::occupied(&occupancy, 1024, Quality::Full.pruning());
+        let tracer = Tracer { occupancy: Some(&occupancy), ..Tracer::new(&field, placement, (0.0, 1.0)) };
+        let view: View = tracer.view(&posed(&held_out), &mut |_| {});
         let truth = held_out.image.data.chunks_exact(4).flat_map(|p| [0, 1, 2].map(|k| p[k] as f32 * p[3] as f32 / 255.0 / 255.0));
         let mse = view.rgb.data.iter().zip(truth).map(|(a, b)| (a - b).powi(2) as f64).sum::<f64>() / view.rgb.data.len() as f64;
         let file = out.join(format!("{name}.png"));

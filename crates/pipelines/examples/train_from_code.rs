@@ -28,8 +28,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let stop = AtomicBool::new(false);
     let mut run = RunFolder::create(&out.join("run"), true)?;
     let trained = recipe::train(&config, &mut run, false, None, &stop, &mut |event| {
-        if let Event::Progress { step, psnr, .. } = event {
-            println!("step {step}: {psnr:.1} dB on training rays");
+        if let Event::Progress { step, scalars, .. } = event {
+            println!("step {step}: {:.1} dB on training rays", scalars.get("psnr").unwrap_or(f64::NAN));
         }
     })?;
     let model = trained.model;

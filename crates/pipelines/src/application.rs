@@ -1,4 +1,4 @@
-//! The applications, and which of them a run is of. Verbs that accept any run (`eval`, `render`, `export`, `view`, `info`, `compare`,
+//! List of the applications, and the application of a run. Verbs that accept any run (`eval`, `render`, `export`, `view`, `info`, `compare`,
 //! `train --resume`) match on [`Application::of_run`]: a new application does not compile until each of them says what it does with it.
 
 use crate::error::Result;
@@ -42,7 +42,7 @@ impl Application {
         })
     }
 
-    /// What a run of this application is, as `diorama info` tells it.
+    /// Description of a run of this application for `diorama info`.
     ///
     /// # Errors
     /// When the run is damaged.

@@ -1,4 +1,4 @@
-//! What an application can fail with.
+//! Errors of applications.
 
 use diorama_data::DataError;
 
@@ -12,14 +12,14 @@ pub enum PipelineError {
     /// The request cannot be met as it stands (exit code 2).
     #[error("{0}")]
     Usage(String),
-    /// What was learned was not finite at step `first`, and again at step `again`.
+    /// The loss or a parameter was not finite at step `first`, and again at step `again`.
     #[error(
         "the loss was not finite at step {first}, and again at step {again} after going back and lowering the rate: stopped; {kept}; lower --set optim.rate"
     )]
     Diverged {
         first: u64,
         again: u64,
-        /// What is left of the run, in words.
+        /// Description of what is left of the run.
         kept: String,
     },
     /// The machine or a device has no room for the work: needs, has, cure.

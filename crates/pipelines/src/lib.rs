@@ -39,6 +39,10 @@
 //! # }
 //! ```
 //!
+//! Main types: [`Application`] lists the applications. [`object::config::Config`] is everything that an object run depends on,
+//! [`run::RunFolder`] the folder that it writes, [`run::device::Device`] where its steps are carried out, [`run::viewing::RunView`] the run in
+//! the viewer.
+//!
 //! [`object`] holds the recipe ([`object::recipe::train`]), its configuration ([`object::config::Config`]), and what follows training:
 //! views ([`object::render`]), scores ([`object::evaluate`]), meshes ([`object::export`]) and point clouds ([`object::points`]).
 //! [`object::run_folder::load_model`] reads a run again. [`run`] is shared by all applications. The examples of this crate show losses,

@@ -1,9 +1,9 @@
 //! A device that fails while it draws: the result where it was named, said once where it was not.
 
-use diorama_engine::fields::Pruning;
 use diorama_engine::renderers::supervised::{Supervised, Unserved};
-use diorama_engine::renderers::volume::{Accelerator, Placement, Quality, Traced};
+use diorama_engine::renderers::volume::{Accelerator, Quality, Traced};
 use diorama_engine::samplers::RayBatch;
+use diorama_engine::samplers::placement::Placement;
 use diorama_geom::capture::Split;
 use diorama_pipelines::PipelineError;
 use diorama_pipelines::object::config::{Config, Method};
@@ -19,7 +19,7 @@ use std::sync::{Arc, Mutex};
 struct Broken;
 
 impl Accelerator for Broken {
-    fn trace(&self, _: &RayBatch, _: &Placement, _: Pruning, _: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
+    fn trace(&self, _: &RayBatch, _: &Placement, _: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
         Err(Unserved::Failed("device fake: unplugged".into()))
     }
     fn density(&self, _: &[f32]) -> Result<Vec<f32>, Unserved> {

@@ -1,10 +1,10 @@
 //! Floaters in an exported mesh: the field is three balls, of which a device that stands for a GPU knows the densities.
 
 use diorama_data::splat_ply;
-use diorama_engine::fields::Pruning;
 use diorama_engine::renderers::supervised::{Supervised, Unserved};
-use diorama_engine::renderers::volume::{Accelerator, Placement, Traced};
+use diorama_engine::renderers::volume::{Accelerator, Traced};
 use diorama_engine::samplers::RayBatch;
+use diorama_engine::samplers::placement::Placement;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, Pose, Similarity};
 use diorama_pipelines::object::config::{Config, Method};
@@ -22,7 +22,7 @@ struct Balls {
 }
 
 impl Accelerator for Balls {
-    fn trace(&self, _: &RayBatch, _: &Placement, _: Pruning, _: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
+    fn trace(&self, _: &RayBatch, _: &Placement, _: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
         Err(Unserved::Failed("only densities and colors are known".into()))
     }
     fn density(&self, model: &[f32]) -> Result<Vec<f32>, Unserved> {

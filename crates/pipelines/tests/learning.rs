@@ -25,8 +25,8 @@ fn score(steps: u64) -> (f64, f64) {
     }
     c.run.steps = steps;
     let mut folder = RunFolder::create(&dir.path().join("run"), true).unwrap();
-    let recipe::Trained { model, summary, .. } = recipe::train(&c, &mut folder, false, None, &AtomicBool::new(false), &mut |_| {}).unwrap();
-    assert!(summary.samples > 0);
+    let recipe::Trained { model, .. } = recipe::train(&c, &mut folder, false, None, &AtomicBool::new(false), &mut |_| {}).unwrap();
+    assert!(model.samples > 0);
     let scores = evaluate::evaluate(&model, Split::Test, Quality::Full, &mut |_, _| Ok(())).unwrap();
     (scores.psnr, scores.psnr_mean_image.unwrap())
 }

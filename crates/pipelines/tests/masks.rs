@@ -62,7 +62,7 @@ fn train(data: &Path, out: &Path, overrides: &[(&str, &str)]) -> (ObjectModel, S
     (made.model, notes)
 }
 
-fn parameters(model: &ObjectModel) -> Vec<u32> {
+fn parameters(mut model: ObjectModel) -> Vec<u32> {
     model.entries().0.iter().flat_map(|e| e.data).map(|v| v.to_bits()).collect()
 }
 
@@ -78,8 +78,8 @@ fn training_follows_each_use_and_meaning_and_says_so() {
     let (model, notes) = train(&data, &out, &[]);
     assert!(notes.contains("masks for 10 of 10") && notes.contains("empty space") && notes.contains("--mask-meaning"), "{notes}");
     assert!(model.has_alpha && model.capture.masks.meaning == MaskMeaning::Object);
-    let auto = parameters(&model);
-    let with = |key: &str, value: &str| parameters(&train(&data, &out, &[(key, value)]).0);
+    let auto = parameters(model);
+    let with = |key: &str, value: &str| parameters(train(&data, &out, &[(key, value)]).0);
     assert!(auto == with("data.mask_meaning", "object"), "one object, cut out");
     let unknown = with("data.mask_meaning", "unknown");
     let [inverted, ignored] = ["invert", "ignore"].map(|v| with("data.mask", v));

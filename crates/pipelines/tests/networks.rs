@@ -1,12 +1,25 @@
 //! Networks and files together: weights that PyTorch wrote, and a run that goes on from a checkpoint.
 
 use diorama_data::{checkpoint, weights as files};
+use diorama_engine::fields::{DirectionCode, Encoder, Field, RayCodes};
+use diorama_engine::params::ParamGroup;
+use diorama_engine::samplers::placement::Placement;
+use diorama_engine::step::{GivenRays, Loss, RaySource, Scene, Step, Trainees};
+use diorama_geom::contraction::Space;
+use diorama_geom::rng::Rng;
+use diorama_kernels::ops::adam::Adam;
+use diorama_kernels::ops::field_step::{BatchLoss, FieldNet, RayGradients, RayOutputs};
+use diorama_kernels::ops::frequency::Frequency;
+use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
+use diorama_kernels::ops::linear as kernels;
+use diorama_nets::bridge::backward_from;
 use diorama_nets::layers::{BatchNorm, Conv2d, Init, Linear};
 use diorama_nets::ops::{self, Activation, Conv, Error};
 use diorama_nets::param::{self, Mode, Module, Visitor};
 use diorama_nets::train::{self, Gradients, Optimizer, Rule};
 use diorama_nets::weights::{KeyMap, Strictness, load};
 use diorama_nets::{Device, Tensor, TensorData};
+use diorama_pipelines::run::device::Device as RunDevice;
 use diorama_testkit::random;
 use std::collections::HashMap;
 use std::path::Path;
@@ -104,4 +117,106 @@ fn a_run_goes_on_from_a_checkpoint_bit_for_bit() {
     resumed.steps(&mut resumed_steps, 5);
     assert_eq!(param::arrays(&whole), param::arrays(&resumed));
     assert_eq!(steps.state(), resumed_steps.state());
+}
+
+/// Codes of rays by a network: a vector per style, from its number.
+struct Styles {
+    hidden: Linear,
+    head: Linear,
+}
+
+const STYLE: usize = 4;
+
+impl Module for Styles {
+    fn visit(&self, v: &mut Visitor) {
+        v.part("hidden", &self.hidden);
+        v.part("head", &self.head);
+    }
+}
+
+impl Styles {
+    fn new() -> Styles {
+        let mut init = Init::new(5, &Device::flex());
+        Styles { hidden: Linear::new(&mut init, 2, 16, Activation::Tanh), head: Linear::new(&mut init, 16, STYLE, Activation::None) }
+    }
+
+    /// `[R, STYLE]` of rays whose styles take turns.
+    fn codes(&self, rays: usize, mode: Mode) -> Tensor<2> {
+        let numbers: Vec<f32> = (0..rays).flat_map(|r| if r % 2 == 0 { [1.0, 0.0] } else { [0.0, 1.0] }).collect();
+        let x = Tensor::<2>::from_data(TensorData::new(numbers, [rays, 2]), &Device::flex());
+        self.head.forward(self.hidden.forward(x, mode).unwrap(), mode).unwrap()
+    }
+}
+
+/// A field whose color is a function of position and style.
+fn styled_field() -> Field {
+    use Source::{Input, Layer as L};
+    let encoding = Frequency { dims: 3, bands: 2, include_input: true, pi: true, window: None };
+    let layers = vec![
+        Layer::new(vec![Input(0), Input(1)], 32, kernels::Activation::Relu, true),
+        Layer::new(vec![L(0)], 16, kernels::Activation::None, true),
+    ];
+    let head = |channel, activation, shift| Head { layer: 1, channel, activation, shift };
+    let mlp = Mlp::new(vec![encoding.output_dims(), STYLE], layers);
+    let net = FieldNet::of_color(mlp, head(3, kernels::Activation::Softplus, 2.0), head(0, kernels::Activation::Sigmoid, 0.0));
+    let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(3, 3)), Adam { rate: 5e-3, ..Adam::default() });
+    let codes = RayCodes { given: vec![STYLE], ..RayCodes::new(DirectionCode::None, None) };
+    Field { encoder: Encoder::Frequency(encoding), codes, net, space: Space::Cube(1.0), weights }
+}
+
+/// Rays of even number are red, the others blue.
+struct TwoColors;
+
+impl BatchLoss for TwoColors {
+    fn batch(&self, out: &RayOutputs, g: &mut RayGradients) -> f64 {
+        let rays = out.opacity.len();
+        let error = |i: usize| out.values[i] - if [0, 5].contains(&(i % 6)) { 0.9 } else { 0.1 };
+        g.values.iter_mut().enumerate().for_each(|(i, g)| *g = 2.0 * error(i) / rays as f32);
+        (0..rays * 3).map(|i| (error(i) * error(i)) as f64).sum::<f64>() / rays as f64
+    }
+}
+
+/// Losses of steps in which a network gives a field its codes; the field is frozen, or learns by an optimizer of its own.
+fn train_with_styles(is_frozen: bool) -> (Vec<f64>, bool, bool) {
+    let (mut field, styles) = (styled_field(), Styles::new());
+    if is_frozen {
+        field.freeze();
+    }
+    let (first_weights, first_styles) = (field.weights.values.clone(), param::arrays(&styles));
+    let mut optimizer = Optimizer::new(&styles, Rule::ADAM_W, 2e-2, 0.0, &[]);
+    let mut of = Trainees::of(&mut field);
+    let mut device = RunDevice::open("cpu").unwrap();
+    device.begin(&of, Scene { cameras: Vec::new(), near: 0.05, cube: (0.0, 1.0) }, None).unwrap();
+    let rays = 64;
+    let origins: Vec<f32> = random(rays * 2, 1).chunks_exact(2).flat_map(|p| [2.0, 0.5 + 0.3 * p[0], 0.5 + 0.3 * p[1]]).collect();
+    let (dirs, images, jitter, background) = ([-1.0, 0.0, 0.0].repeat(rays), vec![0; rays], vec![0.5; rays], vec![0.0; rays * 3]);
+    let mut losses = Vec::new();
+    for number in 0..80 {
+        let codes = styles.codes(rays, Mode::Train);
+        let values = diorama_nets::read_values(codes.clone());
+        let given = GivenRays {
+            images: &images,
+            origins: &origins,
+            dirs: &dirs,
+            jitter: &jitter,
+            target: &[],
+            background: &background,
+            codes: &[&values],
+        };
+        let placement = Placement::Stratified { samples: 12, noise: None };
+        let step = Step::new(number, number * rays as u64, RaySource::Given(given), placement, Loss::Batch(&TwoColors));
+        losses.push(device.step(&mut of, None, &step, 1).unwrap().shown.loss);
+        let gradients = Gradients::take(&styles, backward_from(codes, &device.given_gradients().unwrap()[0]));
+        optimizer.step(&styles, gradients, 1.0);
+    }
+    (losses, field.weights.values != first_weights, param::arrays(&styles) != first_styles)
+}
+
+#[test]
+fn a_network_learns_through_the_codes_that_it_gives_a_field() {
+    let (losses, field_moved, styles_moved) = train_with_styles(false);
+    assert!(field_moved && styles_moved && losses[79] < 0.2 * losses[0], "{losses:?}");
+    // The field is frozen: what is learned, the network has learned from the field's gradients.
+    let (losses, field_moved, styles_moved) = train_with_styles(true);
+    assert!(!field_moved && styles_moved && losses[79] < 0.97 * losses[0], "{losses:?}");
 }

@@ -92,7 +92,8 @@ proptest! {
         let dir = tempfile::tempdir().unwrap();
         let run = dir.path().join("run");
         let mut folder = RunFolder::create(&run, false).unwrap();
-        let rows: Vec<Row> = steps.iter().map(|s| Row { step: *s, seconds: loss * *s as f64, loss: Some(loss), ..Row::default() }).collect();
+        let row = |s: &u64| Row { step: *s, seconds: loss * *s as f64, figures: [("loss".to_string(), loss.into())].into_iter().collect() };
+        let rows: Vec<Row> = steps.iter().map(row).collect();
         std::fs::write(run.join("metrics.jsonl"), rows.iter().map(Row::line).collect::<String>()).unwrap();
         prop_assert_eq!(&read_rows(&run), &rows);
         folder.cut_metrics(cut).unwrap();

@@ -95,7 +95,7 @@ fn train(data: &Path, out: &Path, overrides: &[(&str, &str)]) -> Vec<u32> {
         c.set(k, v).unwrap();
     }
     let mut folder = RunFolder::create(out, true).unwrap();
-    let recipe::Trained { model, .. } = recipe::train(&c, &mut folder, false, None, &AtomicBool::new(false), &mut |_| {}).unwrap();
+    let recipe::Trained { mut model, .. } = recipe::train(&c, &mut folder, false, None, &AtomicBool::new(false), &mut |_| {}).unwrap();
     let (entries, _) = model.entries();
     entries.iter().flat_map(|e| e.data).map(|v| v.to_bits()).collect()
 }

@@ -5,7 +5,8 @@
 use diorama_engine::fields::{DirectionCode, Encoder, Field, Pruning, RayCodes, VoxelGrid};
 use diorama_engine::params::ParamGroup;
 use diorama_engine::samplers::occupancy::Occupancy;
-use diorama_engine::step::{Backdrop, GivenRays, Loss, Placement, RaySource, Scene, Step, Trainees};
+use diorama_engine::samplers::placement::Placement;
+use diorama_engine::step::{GivenRays, Loss, RaySource, Scene, Step, Trainees};
 use diorama_geom::contraction::Space;
 use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
@@ -150,9 +151,9 @@ impl BatchLoss for Loosely<'_> {
 fn train(device: &mut Device) -> (Vec<f64>, Field) {
     let (mut field, mut occupancy) = (field(), occupancy());
     let march = MarchConfig { cone: 0.0, dt_min: 0.015, dt_max: 0.015, max_samples: 128, ..MarchConfig::default() };
+    let placement = Placement::Occupancy { march, pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 } };
     let scene = Scene { cameras: Vec::new(), near: 0.05, cube: (0.0, 1.0) };
-    let mut of =
-        Trainees { field: &mut field, coarse: None, learned: None, occupancy: Some(&mut occupancy), corrections: None, error_map: None };
+    let mut of = Trainees { occupancy: Some(&mut occupancy), ..Trainees::of(&mut field) };
     device.begin(&of, scene, None).unwrap();
     let rays = PATCH * PATCH;
     let (images, jitter, background) = (vec![0; rays], vec![0.5; rays], vec![0.0; rays * CHANNELS]);
@@ -168,22 +169,9 @@ fn train(device: &mut Device) -> (Vec<f64>, Field) {
             background: &background,
             codes: &[],
         };
-        let step = Step {
-            number,
-            rays: RaySource::Given(given),
-            first: number * rays as u64,
-            backdrop: Backdrop::Color([0.0; 3]),
-            placement: Placement::Occupancy {
-                march,
-                pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 },
-                room: (1 << 15, 1 << 15),
-            },
-            probes: None,
-            loss: Loss::Batch(&Loosely { wanted: &patch.wanted, step: number }),
-            near_scaling: 0.0,
-            rate_scale: 1.0,
-            refresh_errors: false,
-        };
+        let loss = Loosely { wanted: &patch.wanted, step: number };
+        let step = Step::new(number, number * rays as u64, RaySource::Given(given), placement, Loss::Batch(&loss));
+        let step = Step { room: (1 << 15, 1 << 15), ..step };
         losses.push(device.step(&mut of, None, &step, 1).unwrap().shown.loss);
     }
     device.download(&mut of).unwrap();

@@ -145,6 +145,37 @@ pub struct Photograph {
     pub held_out: bool,
 }
 
+/// A figure of training; `text` is its value with the unit.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+pub struct Figure {
+    pub id: String,
+    pub label: String,
+    pub value: f64,
+    pub text: String,
+}
+
+/// Figures over the steps of training, on common axes.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+pub struct Chart {
+    pub label: String,
+    pub unit: String,
+    pub lines: Vec<Line>,
+}
+
+/// Values of a figure: steps and values, oldest first.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[cfg_attr(test, derive(ts_rs::TS))]
+pub struct Line {
+    /// Id of the figure.
+    pub figure: String,
+    pub label: String,
+    /// Of data that was held out: few values, each shown as a dot.
+    pub held_out: bool,
+    pub points: Vec<(f64, f64)>,
+}
+
 /// Messages from the program.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[cfg_attr(test, derive(ts_rs::TS))]
@@ -178,18 +209,14 @@ pub enum ServerMessage {
         #[cfg_attr(test, ts(type = "number"))]
         step: u64,
         seconds: f64,
-        loss: f64,
-        psnr: f64,
-        /// PSNR of held-out pixels.
-        held_out: Option<f64>,
-        rays_per_s: f64,
         /// Completed share of the training, 0 to 1.
         progress: f64,
         running: bool,
+        figures: Vec<Figure>,
     },
-    /// The training curve so far, oldest point first: step, PSNR in dB, and PSNR of held-out pixels.
+    /// Charts of training so far. Values of later figures follow in `Status`.
     History {
-        points: Vec<(f64, Option<f64>, Option<f64>)>,
+        charts: Vec<Chart>,
     },
     /// Indices of the photographs whose views are behind fog.
     Fog {
@@ -231,8 +258,9 @@ mod tests {
     fn the_pages_types_are_those_of_this_file() {
         let c = Config::default();
         let of_views = [Layer::decl(&c), Legend::decl(&c), Class::decl(&c), Control::decl(&c), Input::decl(&c), Choice::decl(&c)];
+        let of_training = [Figure::decl(&c), Line::decl(&c), Chart::decl(&c)];
         let types = [Value::decl(&c), View::decl(&c), ClientMessage::decl(&c), Photograph::decl(&c), ServerMessage::decl(&c)];
-        let types = of_views.into_iter().chain(types);
+        let types = of_views.into_iter().chain(of_training).chain(types);
         let text: String = types.map(|t| format!("export {t}\n")).collect();
         let text = format!("// Made from crates/viewer/src/messages.rs by its test; do not edit.\n\n{text}");
         let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("web/src/messages.ts");

@@ -1,11 +1,11 @@
 //! Converts a source's scene, controls and history to and from messages.
 
-use crate::messages::{Choice, Class, Control, Input, Layer, Legend, Photograph, ServerMessage, Value};
+use crate::messages::{Chart, Choice, Class, Control, Figure, Input, Layer, Legend, Line, Photograph, ServerMessage, Value};
 use diorama_geom::view_controls::{self as geom, ControlInput, ControlValue, ControlValues, ViewControl, ViewLayer};
-use diorama_geom::view_source::{ViewPoint, ViewScene};
+use diorama_geom::view_source::{ViewChart, ViewLine, ViewScene, ViewStatus};
 use std::collections::BTreeMap;
 
-/// Approximate number of training values in a curve sent to the page.
+/// Approximate number of values in a line sent to the page.
 const MOST_POINTS: usize = 400;
 
 /// The message that describes a scene.
@@ -68,12 +68,26 @@ fn control(c: &ViewControl) -> Control {
     Control { id: c.id.clone(), label: c.label.clone(), help: c.help.clone(), layers: c.layers.clone(), input }
 }
 
-/// The message with the training curve: every n-th training value if there are many, and all held-out values.
-pub fn history(points: &[ViewPoint]) -> ServerMessage {
-    let nth = points.len().div_ceil(MOST_POINTS).max(1);
-    let finite = |v: Option<f64>| v.filter(|v| v.is_finite());
-    let shown = points.iter().enumerate().filter(|(i, p)| i % nth == 0 || p.held_out.is_some() || i + 1 == points.len());
-    ServerMessage::History { points: shown.map(|(_, p)| (p.step as f64, finite(p.psnr), finite(p.held_out))).collect() }
+/// The message with the progress of training. JSON has no infinity: figures that are not finite are left out.
+pub fn status(s: &ViewStatus) -> ServerMessage {
+    let finite = |v: f64| if v.is_finite() { v } else { 0.0 };
+    let figures = s.figures.iter().filter(|f| f.value.is_finite());
+    let figures = figures.map(|f| Figure { id: f.id.clone(), label: f.label.clone(), value: f.value, text: f.text.clone() }).collect();
+    ServerMessage::Status { step: s.step, seconds: finite(s.seconds), progress: finite(s.progress), running: s.running, figures }
+}
+
+/// The message with the charts.
+pub fn history(charts: &[ViewChart]) -> ServerMessage {
+    let chart = |c: &ViewChart| Chart { label: c.label.clone(), unit: c.unit.clone(), lines: c.lines.iter().map(line).collect() };
+    ServerMessage::History { charts: charts.iter().map(chart).collect() }
+}
+
+/// Every n-th value and the last, if there are many.
+fn line(l: &ViewLine) -> Line {
+    let nth = l.points.len().div_ceil(MOST_POINTS).max(1);
+    let sent = l.points.iter().enumerate().filter(|(i, p)| p.1.is_finite() && (i % nth == 0 || i + 1 == l.points.len()));
+    let points = sent.map(|(_, p)| (p.0 as f64, p.1)).collect();
+    Line { figure: l.figure.clone(), label: l.label.clone(), held_out: l.held_out, points }
 }
 
 /// Checks control values from a page against the source's controls.
@@ -111,14 +125,21 @@ pub fn with_layer(id: &str) -> ViewScene {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use diorama_geom::view_source::ViewFigure;
 
     #[test]
-    fn long_curves_are_thinned_and_keep_what_was_held_out() {
-        let point = |i: u64| ViewPoint { step: i, psnr: Some(i as f64), held_out: (i == 777).then_some(20.0) };
-        let ServerMessage::History { points } = history(&(0..4000).map(point).collect::<Vec<_>>()) else { panic!("no curve") };
-        assert!((400..500).contains(&points.len()), "{}", points.len());
-        assert!(points.contains(&(777.0, Some(777.0), Some(20.0))) && points.last() == Some(&(3999.0, Some(3999.0), None)));
-        let infinite = [ViewPoint { step: 1, psnr: Some(f64::INFINITY), held_out: None }];
-        assert_eq!(history(&infinite), ServerMessage::History { points: vec![(1.0, None, None)] });
+    fn long_lines_are_thinned_and_what_is_not_finite_is_left_out() {
+        let line = |points| ViewLine { figure: "accuracy".into(), label: "training".into(), held_out: false, points };
+        let told = |points| {
+            let chart = ViewChart { label: "Accuracy".into(), unit: String::new(), lines: vec![line(points)] };
+            let ServerMessage::History { mut charts } = history(&[chart]) else { panic!("no charts") };
+            charts.remove(0).lines.remove(0).points
+        };
+        let long = told((0..4000).map(|i| (i, i as f64)).collect());
+        assert!((400..500).contains(&long.len()) && long.last() == Some(&(3999.0, 3999.0)), "{}", long.len());
+        assert_eq!(told(vec![(1, f64::INFINITY), (2, 3.0)]), [(2.0, 3.0)]);
+        let figure = |value| ViewFigure { id: "accuracy".into(), label: "Accuracy".into(), value, text: value.to_string() };
+        let s = ViewStatus { figures: vec![figure(0.5), figure(f64::NAN)], ..ViewStatus::default() };
+        assert!(matches!(status(&s), ServerMessage::Status { figures, .. } if figures.len() == 1 && figures[0].text == "0.5"));
     }
 }

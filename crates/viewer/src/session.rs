@@ -4,7 +4,7 @@ use crate::messages::{Box6, ClientMessage, ServerMessage, View};
 use crate::scene;
 use crate::shared::Shared;
 use diorama_geom::view_controls::check_lists;
-use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewRequest, ViewScene};
+use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewRequest, ViewScene, ViewStatus};
 use diorama_geom::{Camera, ImageU8, Pose};
 use glam::{DMat3, DVec3};
 use std::net::TcpStream;
@@ -57,9 +57,10 @@ impl Session<'_> {
             return self.fail(why);
         }
         self.send(&scene::message(&self.scene))?;
-        self.send(&scene::history(&self.shared.source.history()))?;
+        let (mut last, mut foggy) = (self.shared.source.status(), Vec::new());
+        self.send(&scene::history(&self.shared.source.charts()))?;
+        self.send(&scene::status(&last))?;
         let mut last_status = Instant::now() - STATUS_INTERVAL;
-        let (mut last, mut foggy) = (None, Vec::new());
         while !self.shared.stop.load(Ordering::Relaxed) {
             self.listen()?;
             while let Ok(t) = self.inbox.try_recv() {
@@ -68,14 +69,14 @@ impl Session<'_> {
             if last_status.elapsed() >= STATUS_INTERVAL {
                 last_status = Instant::now();
                 let s = self.shared.source.status();
-                if last != Some(s) {
-                    last = Some(s);
-                    // JSON has no infinity.
-                    let finite = |v: f64| if v.is_finite() { v } else { 0.0 };
-                    let (step, seconds, loss, psnr) = (s.step, s.seconds, finite(s.loss), finite(s.psnr));
-                    let held_out = s.held_out.filter(|v| v.is_finite());
-                    let (rays_per_s, progress, running) = (finite(s.rays_per_s), finite(s.progress), s.running);
-                    self.send(&ServerMessage::Status { step, seconds, loss, psnr, held_out, rays_per_s, progress, running })?;
+                if last != s {
+                    let ids = |s: &ViewStatus| s.figures.iter().map(|f| f.id.clone()).collect::<Vec<_>>();
+                    // A new figure has a line of its own in the charts.
+                    if ids(&last) != ids(&s) {
+                        self.send(&scene::history(&self.shared.source.charts()))?;
+                    }
+                    self.send(&scene::status(&s))?;
+                    last = s;
                 }
                 let fog = self.shared.source.behind_fog();
                 if fog != foggy {

@@ -4,12 +4,65 @@
 #[path = "../examples/own_picture.rs"]
 mod own_picture;
 
+use diorama_geom::ImageU8;
+use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewChart, ViewFigure, ViewLine};
+use diorama_geom::view_source::{ViewRequest, ViewScene, ViewSource, ViewStatus};
 use diorama_viewer::{Server, ViewerOptions};
+use own_picture::Ball;
 use serde_json::{Value, json};
 use std::net::TcpStream;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use tungstenite::{Message, WebSocket};
+
+/// The ball of the example as something that learns, with figures that no other source has.
+struct Learning(AtomicBool);
+
+impl ViewSource for Learning {
+    fn scene(&self) -> ViewScene {
+        Ball.scene()
+    }
+    fn status(&self) -> ViewStatus {
+        let figure = |id: &str, value: f64| ViewFigure { id: id.into(), label: id.to_uppercase(), value, text: format!("{value} %") };
+        let mut figures = vec![figure("accuracy", 71.0)];
+        figures.extend(self.0.load(Ordering::Relaxed).then(|| figure("val_accuracy", 64.0)));
+        ViewStatus { step: 3, running: true, figures, ..ViewStatus::default() }
+    }
+    fn charts(&self) -> Vec<ViewChart> {
+        let lines = self.status().figures.into_iter().map(|f| ViewLine {
+            held_out: f.id.starts_with("val_"),
+            figure: f.id,
+            label: f.label,
+            points: vec![(1, 60.0), (3, f.value)],
+        });
+        vec![ViewChart { label: "Accuracy".into(), unit: "%".into(), lines: lines.collect() }]
+    }
+    fn view(&self, r: &ViewRequest) -> Result<ImageU8, String> {
+        Ball.view(r)
+    }
+    fn point(&self, _: &ViewRequest, _: f64, _: f64) -> Option<[f64; 3]> {
+        None
+    }
+    fn thumbnail(&self, frame: usize) -> Result<ImageU8, String> {
+        Ball.thumbnail(frame)
+    }
+    fn save_crop(&self, crop: Option<([f32; 3], [f32; 3])>) -> Result<(), String> {
+        Ball.save_crop(crop)
+    }
+    fn save_measured(&self, measured: Option<MeasuredLength>) -> Result<(), String> {
+        Ball.save_measured(measured)
+    }
+    fn save_path(&self, json: &str) -> Result<PathBuf, String> {
+        Ball.save_path(json)
+    }
+    fn open_path(&self, json: &str) -> Result<String, String> {
+        Ball.open_path(json)
+    }
+    fn export(&self, r: &MeshRequest, progress: &mut dyn FnMut(&str, usize, usize)) -> Result<(PathBuf, f64), String> {
+        Ball.export(r, progress)
+    }
+}
 
 struct Page(WebSocket<TcpStream>);
 
@@ -73,7 +126,7 @@ fn differ(a: [f64; 3], b: [f64; 3]) -> bool {
 
 #[test]
 fn a_source_shows_layers_and_controls_of_its_own() {
-    let server = Server::bind(&ViewerOptions { port: 0, ..ViewerOptions::default() }, Arc::new(own_picture::Ball)).unwrap();
+    let server = Server::bind(&ViewerOptions { port: 0, ..ViewerOptions::default() }, Arc::new(Ball)).unwrap();
     let (address, end) = (server.address(), Arc::new(AtomicBool::new(false)));
     let serving = std::thread::spawn({
         let end = end.clone();
@@ -109,6 +162,29 @@ fn a_source_shows_layers_and_controls_of_its_own() {
         let failed = page.next("failed");
         assert_eq!((failed["why"].as_str(), failed["view"].as_u64()), (Some(why), Some(7)));
     }
+    end.store(true, Ordering::Relaxed);
+    serving.join().unwrap();
+}
+
+#[test]
+fn a_source_shows_figures_and_charts_of_its_own() {
+    let source = Arc::new(Learning(AtomicBool::new(false)));
+    let server = Server::bind(&ViewerOptions { port: 0, ..ViewerOptions::default() }, source.clone()).unwrap();
+    let (address, end) = (server.address(), Arc::new(AtomicBool::new(false)));
+    let serving = std::thread::spawn({
+        let end = end.clone();
+        move || server.run(&end)
+    });
+    let mut page = Page::open(&address);
+    let training = json!({ "figure": "accuracy", "label": "ACCURACY", "held_out": false, "points": [[1.0, 60.0], [3.0, 71.0]] });
+    assert_eq!(page.next("history")["charts"], json!([{ "label": "Accuracy", "unit": "%", "lines": [training] }]));
+    let accuracy = json!({ "id": "accuracy", "label": "ACCURACY", "value": 71.0, "text": "71 %" });
+    let status = page.next("status");
+    assert_eq!((&status["figures"], &status["step"], &status["running"]), (&json!([accuracy]), &json!(3), &json!(true)));
+    // A figure that comes later brings its line with it.
+    source.0.store(true, Ordering::Relaxed);
+    assert_eq!(page.next("history")["charts"][0]["lines"][1]["held_out"], json!(true));
+    assert_eq!(page.next("status")["figures"][1]["text"], "64 %");
     end.store(true, Ordering::Relaxed);
     serving.join().unwrap();
 }

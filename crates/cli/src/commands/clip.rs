@@ -3,7 +3,7 @@
 use diorama_geom::Similarity;
 use diorama_geom::glam::DVec3;
 use diorama_pipelines::object::model::ObjectModel;
-use diorama_pipelines::object::viewing::{self, Crop};
+use diorama_pipelines::run::viewer_files::{self, Crop};
 use diorama_pipelines::{PipelineError, Result};
 use std::path::Path;
 
@@ -33,7 +33,7 @@ pub fn clip_or_crop(clip: Option<&str>, whole: &str, run: &Path, model: &ObjectM
         Some(c) if c == whole => Ok(None),
         Some(c) => parse_clip(c, &model.capture.world_from_capture).map(Some),
         None => {
-            let crop = viewing::read_crop(run)?;
+            let crop = viewer_files::read_crop(run)?;
             if crop.is_some() {
                 eprintln!(
                     "note: limited to the crop box saved in the viewer ({}); --clip {whole} ignores it",

@@ -13,7 +13,7 @@ use diorama_pipelines::object::memory;
 use diorama_pipelines::object::model::ObjectModel;
 use diorama_pipelines::object::recipe::{self, Trained};
 use diorama_pipelines::object::run_folder::read_config;
-use diorama_pipelines::object::viewing::RunView;
+use diorama_pipelines::object::viewing::{self, RunView};
 use diorama_pipelines::run::RunFolder;
 use diorama_pipelines::run::config::key_and_value;
 use diorama_pipelines::{Application, PipelineError, Result};
@@ -141,7 +141,7 @@ impl Train {
         if self.json {
             println!("{}", self.results(&trained));
         } else {
-            self.print(&trained.summary);
+            self.print(&trained);
         }
         if let Some((_, server)) = viewing {
             eprintln!("the viewer keeps running until Ctrl-C");
@@ -153,34 +153,34 @@ impl Train {
     fn results(&self, trained: &Trained) -> serde_json::Value {
         let Trained { model, summary, device } = trained;
         let seconds = summary.seconds.max(1e-9);
+        let (rays, samples) = (model.rays, model.samples);
         serde_json::json!({
             "run": self.out,
             "method": model.config.method,
             "device": device,
             "steps": summary.step,
             "seconds": summary.seconds,
-            "rays": summary.rays,
-            "samples": summary.samples,
-            "rays_per_s": summary.rays as f64 / seconds,
-            "samples_per_s": summary.samples as f64 / seconds,
+            "rays": rays,
+            "samples": samples,
+            "rays_per_s": rays as f64 / seconds,
+            "samples_per_s": samples as f64 / seconds,
             "loss": finite(summary.loss),
-            "psnr_train": finite(summary.psnr),
-            "psnr_held_out": summary.held_out.and_then(finite),
+            "psnr_train": summary.scalars.get("psnr").and_then(finite),
+            "psnr_held_out": held_out(summary).and_then(finite),
         })
     }
 
-    fn print(&self, summary: &Summary) {
-        if !summary.psnr.is_finite() {
-            return;
-        }
+    fn print(&self, trained: &Trained) {
+        let summary = &trained.summary;
+        let Some(psnr) = summary.scalars.get("psnr").and_then(finite) else { return };
         println!(
             "{}: {} steps in {:.1} s, {:.0} rays/s, psnr {:.2} dB on training rays{}",
             self.out.display(),
             summary.step,
             summary.seconds,
-            summary.rays as f64 / summary.seconds.max(1e-9),
-            summary.psnr,
-            summary.held_out.map_or(String::new(), |p| format!(", {p:.2} dB on held-out pixels"))
+            trained.model.rays as f64 / summary.seconds.max(1e-9),
+            psnr,
+            held_out(summary).map_or(String::new(), |p| format!(", {p:.2} dB on held-out pixels"))
         );
         println!("next: diorama eval {}", self.out.display());
     }
@@ -189,10 +189,15 @@ impl Train {
 /// The view source of a run in training, and a bound server that does not serve yet.
 fn watch(a: &Train, config: &Config, resumed: Option<&RunFolder>) -> Result<(Arc<RunView>, Server)> {
     let capture = resumed.map_or_else(|| recipe::load_capture(config), RunFolder::capture)?;
-    let view = RunView::new(&a.out, ObjectModel::new(config.clone(), capture, false)?, true)?;
+    let view = viewing::open(&a.out, ObjectModel::new(config.clone(), capture, false)?, true)?;
     let server = a.listen.bind(view.clone())?;
     eprintln!("view: {}", server.address());
     Ok((view, server))
+}
+
+/// PSNR of held-out pixels.
+fn held_out(summary: &Summary) -> Option<f64> {
+    summary.scores.as_ref().and_then(|s| s.get("psnr"))
 }
 
 fn finite(v: f64) -> Option<f64> {

@@ -5,9 +5,9 @@ use super::{Outcome, Verb};
 use clap::Args;
 use diorama_data::import::{self, ImportOptions};
 use diorama_geom::view_source::ViewSource;
-use diorama_pipelines::object::viewing::RunView;
-use diorama_pipelines::object::viewing_points::PointsView;
+use diorama_pipelines::object::viewing::{self, RunView};
 use diorama_pipelines::object::{device, run_folder};
+use diorama_pipelines::run::viewing_points::PointsView;
 use diorama_pipelines::run::{description, folder, kept_capture};
 use diorama_pipelines::{Application, PipelineError, Result};
 use diorama_viewer::{Server, ViewerOptions};
@@ -143,5 +143,5 @@ fn object(a: &View) -> Result<Source> {
         note(&format!("photographs cannot be shown: {e}"));
     }
     device::accelerate(&mut model, &a.device, Box::new(note))?;
-    Ok(Source::Run(RunView::new(&a.path, model, false)?))
+    Ok(Source::Run(viewing::open(&a.path, model, false)?))
 }

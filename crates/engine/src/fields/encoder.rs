@@ -1,4 +1,4 @@
-//! Encodings of position: what a field's network reads in place of three coordinates.
+//! Encodings of position, which a field's network reads instead of coordinates.
 
 use crate::params::ParamGroup;
 use diorama_kernels::ops::field_step::{BlockEncoding, Positions};
@@ -7,7 +7,7 @@ use diorama_kernels::ops::hash_grid::{self, HashGrid};
 use diorama_kernels::ops::triangle_wave;
 use diorama_kernels::ops::trilinear_corner_grid::{self as corner_grid, Corners};
 
-/// How positions are encoded. Encodings that are learned hold their table.
+/// An encoding of positions. Learned encodings hold their table.
 #[derive(Clone, Debug)]
 pub enum Encoder {
     /// Multiresolution hash grid over the field's space as `[0, 1]³` (Müller et al. 2022).
@@ -91,7 +91,7 @@ impl VoxelGrid {
 pub struct Encoded {
     /// Positions in the encoder's coordinates, `[S, 3]`.
     pub unit: Vec<f32>,
-    /// Of encoders with a table: level-major features `[L, S, F]`, replaced by their gradients in training.
+    /// Level-major features `[L, S, F]` of encoders with a table; training replaces them by their gradients.
     pub features: Vec<f32>,
 }
 
@@ -134,8 +134,8 @@ impl Encoder {
         }
     }
 
-    /// A copy to look at, which cannot be trained.
-    pub fn to_look_at(&self) -> Encoder {
+    /// A copy of the values alone, for rendering; it cannot be trained.
+    pub fn for_rendering(&self) -> Encoder {
         match self {
             Encoder::Hash { grid, table } => Encoder::Hash { grid: grid.clone(), table: table.values_only() },
             Encoder::VoxelCorners { grid, table } => Encoder::VoxelCorners { grid: grid.clone(), table: table.values_only() },
@@ -176,16 +176,17 @@ impl Encoder {
         }
     }
 
-    /// Encoded samples as the fused step takes them; `d_points` receives gradients of positions that are encoded there.
-    pub fn positions<'a>(&self, encoded: &'a mut Encoded, d_points: Option<&'a mut [f32]>) -> Positions<'a> {
+    /// Encoded samples as the fused step takes them; `d_points` receives gradients of positions that are encoded there, and features of a
+    /// table are replaced by their gradients if those are `wanted`.
+    pub fn positions<'a>(&self, encoded: &'a mut Encoded, d_points: Option<&'a mut [f32]>, wanted: bool) -> Positions<'a> {
         let in_block = match self {
             Encoder::Frequency(f) => BlockEncoding::Frequency(*f),
             Encoder::TriangleWave { bands } => BlockEncoding::TriangleWave { bands: *bands },
             Encoder::Hash { grid, .. } => {
-                return Positions::Features { data: &mut encoded.features, levels: grid.levels.len(), width: grid.config.features };
+                return Positions::Features { data: &mut encoded.features, levels: grid.levels.len(), width: grid.config.features, wanted };
             }
             Encoder::VoxelCorners { grid, .. } => {
-                return Positions::Features { data: &mut encoded.features, levels: 1, width: grid.features };
+                return Positions::Features { data: &mut encoded.features, levels: 1, width: grid.features, wanted };
             }
         };
         Positions::Encoded { encoding: in_block, points: &encoded.unit, d_points }

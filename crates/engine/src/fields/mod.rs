@@ -32,7 +32,7 @@ pub struct Field {
     pub weights: ParamGroup,
 }
 
-/// What gives the density of points, whatever it is made of.
+/// Anything with a density at every point, for occupancy grids and meshing.
 pub trait DensityQuery {
     /// Densities `[N]` (per unit of model space) at model points `[N, 3]`.
     fn density(&self, model: &[f32], sigma: &mut [f32]);
@@ -56,7 +56,7 @@ pub struct Batch<'a> {
     pub near_scaling: f32,
 }
 
-/// What training minimizes.
+/// Loss that training minimizes.
 #[derive(Clone, Copy)]
 pub enum Loss<'a> {
     /// A sum over rays, which is computed while a block's activations are in cache.
@@ -82,10 +82,24 @@ pub struct FieldBuffers {
 }
 
 impl Field {
-    /// Freezes the network's layers that `is_frozen` says: their parameters keep their values, and no gradient is computed.
+    /// Freezes the network's layers that `is_frozen` says, and no others: their parameters keep their values, and no gradient is computed.
     pub fn freeze_layers(&mut self, is_frozen: impl Fn(usize) -> bool) {
         self.net.mlp.layers.iter_mut().enumerate().for_each(|(j, l)| l.frozen = is_frozen(j));
+        self.weights.frozen = self.net.mlp.layers.iter().all(|l| l.frozen);
         self.weights.trained = Some(self.net.mlp.trained());
+    }
+
+    /// Freezes all of the field: a step then costs no gradient but those of what lies before it, such as cameras and given codes.
+    pub fn freeze(&mut self) {
+        self.freeze_layers(|_| true);
+        self.groups_mut().into_iter().for_each(|g| g.frozen = true);
+    }
+
+    /// # Panics
+    /// When the weights are frozen and layers are not, whose gradients would be computed for nothing.
+    pub(crate) fn check_freezing(&self) {
+        let is_consistent = !self.weights.frozen || self.net.mlp.layers.iter().all(|l| l.frozen);
+        assert!(is_consistent, "freeze a field's weights by Field::freeze_layers");
     }
 
     /// The encoder's coordinates of model points.
@@ -114,7 +128,7 @@ impl Field {
         }
     }
 
-    /// Whether space has no bound.
+    /// Whether the field's space is unbounded.
     pub fn is_unbounded(&self) -> bool {
         matches!(self.space, Space::Contracted(_))
     }
@@ -130,13 +144,13 @@ impl Field {
         let (mut direction, mut appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
         self.codes.encode(batch.dirs, batch.images, &mut direction, &mut appearance);
         let mut codes = self.ray_codes(batch, &direction, &appearance);
-        let positions = self.encoder.positions(encoded, None);
+        let positions = self.encoder.positions(encoded, None, false);
         field_step::run(&self.step_input(batch), positions, &mut codes, None, &mut buf.step, &mut buf.out, &mut []);
         drop(codes);
         (buf.direction, buf.appearance) = (direction, appearance);
     }
 
-    /// The field's own outputs `[N, C]` at model points, seen along unit directions, wearing the mean appearance.
+    /// Outputs `[N, C]` of the field at model points `[N, 3]`, viewed along unit directions `[N, 3]`, with the mean appearance code.
     pub fn outputs_at<'a>(&self, model: &[f32], dirs: &[f32], buf: &'a mut FieldBuffers) -> &'a [f32] {
         // One sample per ray, so long that it is opaque.
         let n = model.len() / 3;
@@ -201,17 +215,20 @@ impl Field {
         d_appearance.resize(appearance.len(), 0.0);
         d_given.resize_with(batch.given.len(), Vec::new);
         d_given.iter_mut().zip(batch.given).for_each(|(d, v)| d.resize(v.len(), 0.0));
+        self.check_freezing();
+        let wants_appearance = self.codes.appearance.as_ref().is_some_and(|a| !a.group.frozen);
+        let wants_features = self.encoder.table().is_some_and(|t| !t.frozen) || d_positions.is_some();
         let mut grads = std::mem::take(&mut self.weights.grads);
         let mut codes = self.ray_codes(batch, &direction, &appearance);
         let own = codes.len() - batch.given.len();
-        if self.codes.appearance.is_some() {
+        if wants_appearance {
             codes[own - 1].gradient = Some(&mut d_appearance);
         }
         codes[own..].iter_mut().zip(&mut d_given).for_each(|(c, d)| c.gradient = Some(d));
         // Gradients of positions that are encoded in the step; features have theirs in place.
         let in_step = d_positions.is_some() && self.encoder.levels().is_none();
         buf.d_points.resize(if in_step { batch.positions.len() } else { 0 }, 0.0);
-        let positions = self.encoder.positions(encoded, in_step.then_some(&mut buf.d_points[..]));
+        let positions = self.encoder.positions(encoded, in_step.then_some(&mut buf.d_points[..]), wants_features);
         field_step::run(&self.step_input(batch), positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut grads);
         drop(codes);
         self.weights.grads = grads;
@@ -226,7 +243,7 @@ impl Field {
             }
             self.unit_backward(batch.positions, d);
         }
-        if let (Some(a), Some(images)) = (&mut self.codes.appearance, batch.images) {
+        if let (true, Some(a), Some(images)) = (wants_appearance, &mut self.codes.appearance, batch.images) {
             for (row, &i) in d_appearance.chunks_exact(a.dims).zip(images) {
                 let g = &mut a.group.grads[i as usize * a.dims..][..a.dims];
                 g.iter_mut().zip(row).for_each(|(g, d)| *g += d);
@@ -235,11 +252,11 @@ impl Field {
         (buf.direction, buf.appearance, buf.d_appearance, buf.d_given) = (direction, appearance, d_appearance, d_given);
     }
 
-    /// A copy to look at, which cannot be trained.
-    pub fn to_look_at(&self) -> Field {
+    /// A copy of the values alone, for rendering; it cannot be trained.
+    pub fn for_rendering(&self) -> Field {
         Field {
-            encoder: self.encoder.to_look_at(),
-            codes: self.codes.to_look_at(),
+            encoder: self.encoder.for_rendering(),
+            codes: self.codes.for_rendering(),
             net: self.net.clone(),
             space: self.space,
             weights: self.weights.values_only(),

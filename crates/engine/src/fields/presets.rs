@@ -97,13 +97,13 @@ pub fn nerf(space: Space, rate: f32, images: usize, dims: usize, seed: u64, stre
 }
 
 /// The report's primary network: sin and cos of position to 60 values, 4 fully connected layers of 256,
-/// ReLU; density and colour.
+/// ReLU; density and color.
 pub fn mlp(space: Space, rate: f32, seed: u64) -> Field {
     let encoding = Frequency { dims: 3, bands: 10, include_input: false, pi: true, window: None };
     plain(encoding, &[256, 256, 256, 256, PADDED], space, rate, seed)
 }
 
-/// The report's baseline: raw input, 2 fully connected layers of 256; density and colour.
+/// The report's baseline: raw input, 2 fully connected layers of 256; density and color.
 pub fn baseline(space: Space, rate: f32, seed: u64) -> Field {
     let encoding = Frequency { dims: 3, bands: 0, include_input: true, pi: true, window: None };
     plain(encoding, &[256, 256, PADDED], space, rate, seed)

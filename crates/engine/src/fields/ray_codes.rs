@@ -1,9 +1,10 @@
-//! Vectors that all samples of a ray share: the encoded direction, the appearance of its image, or whatever a caller gives.
+//! Codes: vectors that all samples of a ray share, such as its encoded direction, the appearance of its image, or one that the caller
+//! gives.
 
 use crate::params::ParamGroup;
 use diorama_kernels::ops::{frequency, spherical_harmonics};
 
-/// How directions are encoded.
+/// An encoding of directions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum DirectionCode {
     None,
@@ -30,7 +31,7 @@ impl DirectionCode {
     }
 }
 
-/// A vector per training image that the colour network reads (NeRF in the Wild).
+/// A vector per training image that the color network reads (Martin-Brualla et al. 2021, NeRF in the Wild).
 #[derive(Clone, Debug)]
 pub struct Appearance {
     pub dims: usize,
@@ -56,7 +57,7 @@ pub struct RayCodes {
 }
 
 impl RayCodes {
-    /// Of directions and appearance alone.
+    /// Codes of direction and appearance alone.
     pub fn new(direction: DirectionCode, appearance: Option<Appearance>) -> RayCodes {
         RayCodes { direction, appearance, given: Vec::new() }
     }
@@ -84,8 +85,8 @@ impl RayCodes {
         }
     }
 
-    /// A copy to look at, which cannot be trained.
-    pub fn to_look_at(&self) -> RayCodes {
+    /// A copy of the values alone, for rendering; it cannot be trained.
+    pub fn for_rendering(&self) -> RayCodes {
         let appearance = self.appearance.as_ref().map(|a| Appearance { dims: a.dims, group: a.group.values_only() });
         RayCodes { direction: self.direction, appearance, given: self.given.clone() }
     }

@@ -1,5 +1,6 @@
-//! Marching that leaves out samples that cannot matter before the costly part of a step ([`prune`]). Rays advance in waves, each one
-//! marched, encoded and put through the density layers, so that hidden samples are not even encoded.
+//! Marching that drops samples of low weight before the costly part of a step ([`prune`]). Rays advance in waves: a wave is marched,
+//! encoded and put through the density layers, and only rays that light still passes join the next, so that hidden samples are not even
+//! encoded.
 
 use super::{Encoded, Field, FieldBuffers};
 use diorama_kernels::ops::fused_mlp::Mlp;
@@ -15,10 +16,11 @@ const TASK: usize = 4096;
 /// Samples per ray in the first wave and at most.
 const WAVE: (usize, usize) = (24, 96);
 
-/// Rays that still have light, and where they go on.
+/// Rays of a wave: those that light still passes, and where they resume.
 #[derive(Default)]
-struct Crew {
-    rays: Vec<u32>,
+struct RayWave {
+    /// Their numbers in the batch.
+    indices: Vec<u32>,
     origins: Vec<f32>,
     dirs: Vec<f32>,
     near_far: Vec<f32>,
@@ -26,13 +28,13 @@ struct Crew {
     resumed: bool,
 }
 
-/// One advance of a crew.
+/// One advance of the rays that are left: up to `size` samples for each.
 #[derive(Default)]
 struct Wave {
     /// Most samples per ray.
     size: usize,
-    crew: Crew,
-    /// Share of light that is left after the wave, per ray.
+    rays: RayWave,
+    /// Transmittance of each ray behind the wave.
     light: Vec<f32>,
     marched: Marched,
     positions: Vec<f32>,
@@ -40,13 +42,13 @@ struct Wave {
     sigma: Vec<f32>,
     /// Opacities, or [`prune::DROPPED`].
     alpha: Vec<f32>,
-    /// Samples that stay, per ray.
+    /// Number of kept samples per ray.
     counts: Vec<u32>,
-    /// Samples that stay, and where they go.
+    /// Kept samples: index in the wave, and place among the samples of all waves.
     kept: Vec<(u32, u32)>,
 }
 
-/// Samples that matter, packed, with their positions `[S, 3]` in model space and their encoding.
+/// Packed samples that were not dropped, with their positions `[S, 3]` in model space and their encoding.
 #[derive(Clone, Debug, Default)]
 pub struct VisibleSamples {
     pub samples: Marched,
@@ -65,29 +67,28 @@ pub struct VisibleBuffers {
 }
 
 impl VisibleBuffers {
-    /// Cells `[N]` and densities `[N]` of all samples of the last march, wave by wave; densities that no
-    /// light reaches are negative.
-    pub fn seen(&self) -> impl Iterator<Item = (&[u32], &[f32])> {
+    /// Cells `[N]` and densities `[N]` of all samples of the last march, wave by wave; densities that no light reaches are negative.
+    pub fn densities(&self) -> impl Iterator<Item = (&[u32], &[f32])> {
         self.waves[..self.used].iter().map(|w| (&w.marched.cells[..], &w.sigma[..]))
     }
 
-    /// Share of light that passes all samples of the last march, left out or not, per ray `[R]`.
+    /// Transmittance of each ray behind all samples of the last march, dropped ones included, `[R]`.
     pub fn light(&self, rays: usize) -> Vec<f32> {
         let mut light = vec![1.0; rays];
         for w in &self.waves[..self.used] {
-            w.crew.rays.iter().zip(&w.light).for_each(|(r, l)| light[*r as usize] = *l);
+            w.rays.indices.iter().zip(&w.light).for_each(|(r, l)| light[*r as usize] = *l);
         }
         light
     }
 
-    /// Samples that were marched to.
+    /// Number of samples of the last march, dropped ones included.
     pub fn marched(&self) -> usize {
         self.waves[..self.used].iter().map(|w| w.sigma.len()).sum()
     }
 }
 
 impl Field {
-    /// Marches through occupied cells and keeps what [`Pruning`] leaves. A field whose encoder has no table keeps every sample.
+    /// Marches through occupied cells and keeps the samples that [`Pruning`] does not drop. A field whose encoder has no table keeps all.
     pub fn visible(
         &self,
         grid: &OccupancyBits,
@@ -114,13 +115,13 @@ impl Field {
             }
             let (before, rest) = v.waves.split_at_mut(v.used);
             let wave = &mut rest[0];
-            wave.board(rays, before.last(), pruning.stop);
+            wave.admit_rays(rays, before.last(), pruning.stop);
             wave.size = size;
-            if wave.crew.rays.is_empty() {
+            if wave.rays.indices.is_empty() {
                 break;
             }
             v.used += 1;
-            let own = wave.crew.view();
+            let own = wave.rays.as_march_rays();
             march::cpu::march(grid, &own, &MarchConfig { max_samples: size, ..*config }, &mut v.march, &mut wave.marched);
             march::cpu::positions(&own, &wave.marched, &mut wave.positions);
             buf.stages.done("march");
@@ -195,49 +196,49 @@ impl Field {
     }
 }
 
-impl Crew {
+impl RayWave {
     fn clear(&mut self) {
-        self.rays.clear();
+        self.indices.clear();
         [&mut self.origins, &mut self.dirs, &mut self.near_far, &mut self.jitter].into_iter().for_each(Vec::clear);
     }
 
-    fn take(&mut self, all: &MarchRays, ray: usize, start: f32) {
-        self.rays.push(ray as u32);
+    fn push(&mut self, all: &MarchRays, ray: usize, start: f32) {
+        self.indices.push(ray as u32);
         self.origins.extend_from_slice(&all.origins[ray * 3..ray * 3 + 3]);
         self.dirs.extend_from_slice(&all.dirs[ray * 3..ray * 3 + 3]);
         self.near_far.extend([start, all.near_far[ray * 2 + 1]]);
         self.jitter.push(all.jitter[ray]);
     }
 
-    fn view(&self) -> MarchRays<'_> {
+    fn as_march_rays(&self) -> MarchRays<'_> {
         MarchRays { origins: &self.origins, dirs: &self.dirs, near_far: &self.near_far, jitter: &self.jitter, resumed: self.resumed }
     }
 }
 
 impl Wave {
-    /// Takes in all rays that the wave before used up with light left; the first wave takes those with an extent.
-    fn board(&mut self, rays: &MarchRays, before: Option<&Wave>, stop: f32) {
-        self.crew.clear();
+    /// Admits the rays that filled all of their samples in the wave before and still have light; to the first wave, all rays that have an extent.
+    fn admit_rays(&mut self, rays: &MarchRays, before: Option<&Wave>, stop: f32) {
+        self.rays.clear();
         self.light.clear();
-        self.crew.resumed = before.is_some();
+        self.rays.resumed = before.is_some();
         let Some(w) = before else {
             let with_extent = |r: &usize| rays.near_far[r * 2] < rays.near_far[r * 2 + 1];
-            (0..rays.jitter.len()).filter(with_extent).for_each(|r| self.crew.take(rays, r, rays.near_far[r * 2]));
-            return self.light.resize(self.crew.rays.len(), 1.0);
+            (0..rays.jitter.len()).filter(with_extent).for_each(|r| self.rays.push(rays, r, rays.near_far[r * 2]));
+            return self.light.resize(self.rays.indices.len(), 1.0);
         };
-        for (i, &r) in w.crew.rays.iter().enumerate() {
+        for (i, &r) in w.rays.indices.iter().enumerate() {
             let (a, b) = (w.marched.offsets[i] as usize, w.marched.offsets[i + 1] as usize);
             if b - a == w.size && w.light[i] >= stop {
-                self.crew.take(rays, r as usize, w.marched.t[b - 1] + w.marched.dt[b - 1]);
+                self.rays.push(rays, r as usize, w.marched.t[b - 1] + w.marched.dt[b - 1]);
                 self.light.push(w.light[i]);
             }
         }
     }
 
-    /// Lets light through: opacities, what is dropped, and the light that is left.
+    /// Computes opacities, drops samples, and lowers the transmittance of each ray.
     fn prune(&mut self, pruning: Pruning) {
         self.counts.clear();
-        self.counts.resize(self.crew.rays.len(), 0);
+        self.counts.resize(self.rays.indices.len(), 0);
         let samples = prune::cpu::Samples {
             offsets: &self.marched.offsets,
             dt: &self.marched.dt,
@@ -250,12 +251,12 @@ impl Wave {
     }
 }
 
-/// Decides where kept samples go, so that those of a ray lie together, and returns their number.
+/// Assigns a place to each kept sample, so that those of a ray lie together; returns their number.
 fn place(waves: &mut [Wave], next: &mut Vec<u32>, rays: usize, offsets: &mut Vec<u32>) -> usize {
     offsets.clear();
     offsets.resize(rays + 1, 0);
     for w in waves.iter() {
-        w.crew.rays.iter().zip(&w.counts).for_each(|(r, c)| offsets[*r as usize + 1] += c);
+        w.rays.indices.iter().zip(&w.counts).for_each(|(r, c)| offsets[*r as usize + 1] += c);
     }
     for r in 0..rays {
         offsets[r + 1] += offsets[r];
@@ -264,7 +265,7 @@ fn place(waves: &mut [Wave], next: &mut Vec<u32>, rays: usize, offsets: &mut Vec
     next.extend_from_slice(&offsets[..rays]);
     for w in waves {
         w.kept.clear();
-        for (i, r) in w.crew.rays.iter().enumerate() {
+        for (i, r) in w.rays.indices.iter().enumerate() {
             let to = &mut next[*r as usize];
             for s in w.marched.offsets[i]..w.marched.offsets[i + 1] {
                 if w.alpha[s as usize] >= 0.0 {
@@ -396,8 +397,8 @@ mod tests {
         // Rounding may move a sample across a threshold.
         let missing = want.iter().filter(|t| !got.t.contains(t)).count();
         assert!(missing <= 2 && got.t.len().abs_diff(want.len()) <= 2, "{missing} of {} and {}", want.len(), got.t.len());
-        let met: usize = buf.visible.seen().map(|(_, s)| s.iter().filter(|s| **s >= 0.0).count()).sum();
-        assert!(met >= got.t.len() && met < buf.visible.marched(), "only what light reaches is told");
+        let met: usize = buf.visible.densities().map(|(_, s)| s.iter().filter(|s| **s >= 0.0).count()).sum();
+        assert!(met >= got.t.len() && met < buf.visible.marched(), "only densities that light reaches are given");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Image quality.
+//! Image quality: MSE, PSNR, SSIM and LPIPS.
 
 pub mod lpips;
 
@@ -7,7 +7,7 @@ use diorama_kernels::ops::ssim;
 
 /// Scores of one image against its photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Scores {
+pub struct ImageScores {
     pub mse: f64,
     /// `−10 log₁₀ mse`, dB.
     pub psnr: f64,
@@ -26,7 +26,7 @@ pub fn psnr(mse: f64) -> f64 {
 ///
 /// # Panics
 /// When sizes differ.
-pub fn compare(rendered: &Image, photo: &Image, counts: impl Fn(usize, usize) -> bool) -> Scores {
+pub fn compare(rendered: &Image, photo: &Image, counts: impl Fn(usize, usize) -> bool) -> ImageScores {
     assert_eq!((rendered.width, rendered.height, rendered.channels), (photo.width, photo.height, photo.channels), "scores");
     let pixels: Vec<usize> = (0..photo.width * photo.height).filter(|i| counts(i % photo.width, i / photo.width)).collect();
     let c = photo.channels;
@@ -49,7 +49,7 @@ pub fn compare(rendered: &Image, photo: &Image, counts: impl Fn(usize, usize) ->
         pixels.iter().for_each(|i| admitted[*i] = true);
         ssim::cpu::ssim_where(photo.width, photo.height, c, &rendered.data, &photo.data, &admitted)
     };
-    Scores { mse, psnr: psnr(mse), ssim, psnr_affine: psnr(affine) }
+    ImageScores { mse, psnr: psnr(mse), ssim, psnr_affine: psnr(affine) }
 }
 
 /// Least-squares `y ≈ a x + b`.

@@ -1,4 +1,4 @@
-//! What a field is on the device besides its parameters.
+//! Device-side description of a field: encoding, network, space and precision. Parameters are kept apart.
 
 use crate::fields::{DirectionCode, Encoder as FieldEncoder, Field};
 use crate::step::measure;
@@ -20,19 +20,19 @@ enum Encoder {
     VoxelCorners { voxels: GpuVoxels, features: usize },
 }
 
-/// A field's shape on the device.
+/// Encoder, network and space of a field on the device; its parameters are passed to each call.
 pub struct Shape {
     encoder: Encoder,
     directions: DirectionCode,
     pub net: GpuNet,
-    /// In which positions are encoded.
+    /// Space in which positions are encoded.
     pub space: Space,
     /// How a loss measures colors and distances.
     pub measure: Measure,
 }
 
 impl Shape {
-    /// `moves` says whether gradients of positions will be asked for.
+    /// `moves`: gradients of positions will be computed.
     pub fn new(gpu: &Gpu, field: &Field, moves: bool) -> Self {
         let arithmetic = if field.net.mlp.precision == Precision::F32 { Arithmetic::Exact } else { Arithmetic::Best };
         let (encoder, per_level) = match &field.encoder {
@@ -44,10 +44,10 @@ impl Shape {
                 (Encoder::VoxelCorners { voxels, features: grid.features }, 0)
             }
         };
-        // The features' where there is a table or positions move, and the appearance codes'; directions have none.
-        let mut wanted = vec![field.encoder.table().is_some() || moves];
+        // The features' where there is a table to be trained or positions move, and the appearance codes'; directions have none.
+        let mut wanted = vec![field.encoder.table().is_some_and(|t| !t.frozen) || moves];
         wanted.extend((field.codes.direction.dims() > 0).then_some(false));
-        wanted.extend(field.codes.appearance.as_ref().map(|_| true).into_iter().chain(field.codes.given.iter().map(|_| true)));
+        wanted.extend(field.codes.appearance.as_ref().map(|a| !a.group.frozen).into_iter().chain(field.codes.given.iter().map(|_| true)));
         let space = match (field.encoder.is_centered(), field.space) {
             (false, geom::Space::Contracted(edge)) => Space::Contracted(edge),
             (false, geom::Space::Cube(edge)) => Space::Cube(edge),

@@ -1,27 +1,26 @@
-//! Views by the device.
+//! Rendering on the device.
 
+use super::place::{self, FieldRef, PlaceOn};
 use super::shape::Shape;
-use crate::fields::{Appearance, Field, Pruning};
+use crate::fields::{Appearance, Field};
 use crate::renderers::supervised::Unserved;
-use crate::renderers::volume::{Accelerator, Placement, Traced};
+use crate::renderers::volume::{Accelerator, Traced};
 use crate::samplers::RayBatch;
 use crate::samplers::occupancy::Occupancy;
+use crate::samplers::placement::Placement;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
-use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays};
-use diorama_kernels::ops::prune::gpu as prune;
-use diorama_kernels::ops::strata::gpu as strata;
 
-/// Samples that there is room for, and where the CPU plays the device.
+/// Samples per call: on a GPU, and where the CPU plays one.
 const ROOM: usize = 1 << 20;
 const SOFTWARE_ROOM: usize = 1 << 17;
-/// Samples of a call where a network goes layer by layer and keeps all of its layers' outputs.
+/// Samples per call of networks that run layer by layer and keep the outputs of every layer.
 const LAYERED_ROOM: usize = 1 << 16;
 
 /// A trained field's parameters on the device.
-struct Looks {
+struct ViewField {
     shape: Shape,
     table: Option<Buffer>,
     weights: Buffer,
@@ -29,10 +28,10 @@ struct Looks {
     appearance: Option<(Buffer, usize)>,
 }
 
-impl Looks {
+impl ViewField {
     fn upload(gpu: &Gpu, field: &Field) -> Self {
         let codes = |a: &Appearance| (gpu.upload(&[&a.group.values[..], &a.mean()].concat()), a.dims);
-        Looks {
+        ViewField {
             shape: Shape::new(gpu, field, false),
             table: field.encoder.table().map(|t| gpu.upload(&t.values)),
             weights: gpu.upload(&field.weights.values),
@@ -40,13 +39,12 @@ impl Looks {
         }
     }
 
-    fn features(&self, gpu: &Gpu, rays: &GpuRays, packed: &GpuPacked) -> Buffer {
-        let points = march::positions(gpu, rays, packed, self.shape.space);
-        self.shape.features(gpu, &packed.rows(), &points, self.table.as_ref())
+    fn read(&self) -> FieldRef<'_> {
+        FieldRef { shape: &self.shape, table: self.table.as_ref(), weights: &self.weights }
     }
 
-    /// Samples composited before black.
-    fn see(&self, gpu: &Gpu, rays: &GpuRays, packed: &GpuPacked, features: &Buffer, appearance: Option<u32>) -> GpuComposited {
+    /// Evaluates and composites encoded samples before black.
+    fn shade(&self, gpu: &Gpu, rays: &GpuRays, packed: &GpuPacked, features: &Buffer, appearance: Option<u32>) -> GpuComposited {
         let n = packed.rays();
         let direction = self.shape.direction(gpu, &rays.dirs);
         let code = self.appearance.as_ref().map(|(codes, dims)| {
@@ -59,22 +57,22 @@ impl Looks {
     }
 }
 
-/// A trained field on the device, ready to be looked at.
+/// Renders a trained field on the device.
 pub struct GpuTracer {
     gpu: Gpu,
-    field: Looks,
-    coarse: Option<Looks>,
+    field: ViewField,
+    coarse: Option<ViewField>,
     occupancy: Option<GpuOccupancy>,
-    /// Samples that there is room for.
+    /// Samples per call.
     room: usize,
 }
 
 impl GpuTracer {
     pub fn new(gpu: Gpu, field: &Field, coarse: Option<&Field>, occupancy: Option<&Occupancy>) -> Self {
-        let field = Looks::upload(&gpu, field);
+        let field = ViewField::upload(&gpu, field);
         let all = if gpu.software { SOFTWARE_ROOM } else { ROOM };
         GpuTracer {
-            coarse: coarse.map(|f| Looks::upload(&gpu, f)),
+            coarse: coarse.map(|f| ViewField::upload(&gpu, f)),
             occupancy: occupancy.map(|o| GpuOccupancy::upload(&gpu, o.bits())),
             room: if field.shape.net.element().is_some() || occupancy.is_some() { all } else { LAYERED_ROOM },
             field,
@@ -82,7 +80,7 @@ impl GpuTracer {
         }
     }
 
-    /// The same with room for other than the usual number of samples.
+    /// The same tracer with memory for `samples` samples per call.
     #[must_use]
     pub fn with_room(self, samples: usize) -> Self {
         GpuTracer { room: samples, ..self }
@@ -105,7 +103,7 @@ impl GpuTracer {
         Ok(out)
     }
 
-    /// The field's own colours `[N, 3]` at model points, seen along `dirs`, wearing the mean appearance.
+    /// Colors `[N, 3]` of the field at model points `[N, 3]`, viewed along unit directions `[N, 3]`, with the mean appearance code.
     ///
     /// # Errors
     /// When the device was lost.
@@ -122,7 +120,7 @@ impl GpuTracer {
             let rays = GpuRays { origins: points.clone(), dirs: gpu.upload(dirs), near_far, jitter, resumed: false };
             let points = march::to_space(gpu, &points, f.shape.space);
             let features = f.shape.features(gpu, &packed.rows(), &points, f.table.as_ref());
-            out.extend(gpu.read(&f.see(gpu, &rays, &packed, &features, None).color)?);
+            out.extend(gpu.read(&f.shade(gpu, &rays, &packed, &features, None).color)?);
         }
         Ok(out)
     }
@@ -133,7 +131,6 @@ impl GpuTracer {
         batch: &RayBatch,
         (first, n): (usize, usize),
         placement: &Placement,
-        pruning: Pruning,
         appearance: Option<u32>,
         out: &mut (Traced, Vec<f32>),
     ) -> Result<(), GpuError> {
@@ -146,54 +143,25 @@ impl GpuTracer {
             jitter: of(&batch.jitter, 1),
             resumed: false,
         };
-        let view = match (placement, &self.occupancy, &self.coarse) {
-            (Placement::March(config), Some(grid), _) => {
-                let Some((view, light)) = self.marched(grid, &rays, config, pruning, appearance, n > 1)? else {
-                    self.part(batch, (first, n / 2), placement, pruning, appearance, out)?;
-                    return self.part(batch, (first + n / 2, n - n / 2), placement, pruning, appearance, out);
-                };
-                out.1.extend(gpu.read(&light)?);
-                view
-            }
-            (Placement::Stratified { samples }, _, _) => {
-                let packed = strata::stratified(gpu, &rays.near_far, *samples, None);
-                self.field.see(gpu, &rays, &packed, &self.field.features(gpu, &rays, &packed), appearance)
-            }
-            (Placement::Hierarchical { samples, more }, _, Some(coarse)) => {
-                let guide = strata::stratified(gpu, &rays.near_far, *samples, None);
-                let seen = coarse.see(gpu, &rays, &guide, &coarse.features(gpu, &rays, &guide), appearance);
-                let packed = strata::refine(gpu, &guide, &seen.weights, *samples, *more, None);
-                self.field.see(gpu, &rays, &packed, &self.field.features(gpu, &rays, &packed), appearance)
-            }
-            _ => unreachable!("samples are placed as the field was trained"),
+        let (grid, room) = (self.occupancy.as_ref(), (self.room, self.room));
+        let on = PlaceOn { field: self.field.read(), grid, rays: &rays, first: 0, room, all_or_none: n > 1 };
+        let mut weights = |packed: &GpuPacked| {
+            let coarse = self.coarse.as_ref().expect("a coarse field");
+            let (_, features) = coarse.read().encode(gpu, &rays, packed);
+            Ok(coarse.shade(gpu, &rays, packed, &features, appearance).weights)
         };
+        let Some(samples) = place::place(gpu, placement, &on, &mut weights)? else {
+            self.part(batch, (first, n / 2), placement, appearance, out)?;
+            return self.part(batch, (first + n / 2, n - n / 2), placement, appearance, out);
+        };
+        let view = self.field.shade(gpu, &rays, &samples.packed, &samples.features, appearance);
+        if let Some(march) = &samples.march {
+            out.1.extend(gpu.read(&march.light)?);
+        }
         out.0.rgb.extend(gpu.read(&view.color)?);
         out.0.opacity.extend(gpu.read(&view.opacity)?);
         out.0.depth.extend(gpu.read(&view.depth)?);
         Ok(())
-    }
-
-    /// Rays through occupied cells, and the light that passes each; none where samples found no room and
-    /// `may_split`.
-    fn marched(
-        &self,
-        grid: &GpuOccupancy,
-        rays: &GpuRays,
-        config: &MarchConfig,
-        pruning: Pruning,
-        appearance: Option<u32>,
-        may_split: bool,
-    ) -> Result<Option<(GpuComposited, Buffer)>, GpuError> {
-        let (gpu, f) = (&self.gpu, &self.field);
-        let marched = march::march(gpu, grid, rays, config, self.room);
-        if may_split && gpu.read(&marched.cut)?.contains(&1) {
-            return Ok(None);
-        }
-        let features = f.features(gpu, rays, &marched.packed);
-        let sigma = f.shape.net.density(gpu, &f.weights, &features, &marched.packed.rows());
-        let pruned = prune::prune(gpu, &marched.packed, &sigma, &pruning, &marched.cut, self.room);
-        let features = f.shape.net.take(gpu, &pruned, &features);
-        Ok(Some((f.see(gpu, rays, &pruned.packed, &features, appearance), pruned.light)))
     }
 }
 
@@ -202,24 +170,18 @@ fn unserved(e: GpuError) -> Unserved {
 }
 
 impl Accelerator for GpuTracer {
-    fn trace(
-        &self,
-        batch: &RayBatch,
-        placement: &Placement,
-        pruning: Pruning,
-        appearance: Option<u32>,
-    ) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
+    fn trace(&self, batch: &RayBatch, placement: &Placement, appearance: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
         let mut out = (Traced::default(), Vec::new());
         let at_once = match placement {
-            Placement::March(_) => batch.len(),
-            Placement::Stratified { samples } => self.room / samples.max(&1),
-            Placement::Hierarchical { samples, more } => self.room / (samples + more).max(1),
+            Placement::Occupancy { .. } => batch.len(),
+            Placement::Stratified { samples, .. } => self.room / samples.max(&1),
+            Placement::Hierarchical { samples, more, .. } => self.room / (samples + more).max(1),
         };
         for first in (0..batch.len()).step_by(at_once.max(1)) {
             let n = at_once.max(1).min(batch.len() - first);
-            self.part(batch, (first, n), placement, pruning, appearance, &mut out).map_err(unserved)?;
+            self.part(batch, (first, n), placement, appearance, &mut out).map_err(unserved)?;
         }
-        Ok((out.0, matches!(placement, Placement::March(_)).then_some(out.1)))
+        Ok((out.0, matches!(placement, Placement::Occupancy { .. }).then_some(out.1)))
     }
 
     fn density(&self, model: &[f32]) -> Result<Vec<f32>, Unserved> {

@@ -1,9 +1,10 @@
-//! Training steps that stay on the device.
+//! Training steps on the device: parameters, samples and gradients stay in its memory.
 
+use super::place::{self, FieldRef, GpuSamples, PlaceOn};
 use super::shape::Shape;
 use crate::fields::Field;
-use crate::params::ParamGroup;
-use crate::step::{Figures, GivenRays, Loss, Placement, Probes, RaySource, Scene, Step, Trainees};
+use crate::params::{ParamGroup, Schedule};
+use crate::step::{Figures, GivenRays, Loss, Probes, RaySource, Scene, Step, Trainees};
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
@@ -15,14 +16,12 @@ use diorama_kernels::ops::march::gpu::{self as march, GpuRays};
 use diorama_kernels::ops::occupancy_update::gpu::GpuOccupancyGrid;
 use diorama_kernels::ops::photometric_loss::gpu::{self as loss, SUMS, Target};
 use diorama_kernels::ops::pixel_draw::gpu::{Drawn, GpuPhotographs};
-use diorama_kernels::ops::prune::gpu as prune;
 use diorama_kernels::ops::ray_generation::gpu::GpuCameras;
-use diorama_kernels::ops::strata::gpu as strata;
 use diorama_kernels::ops::{ray_aabb, spherical_harmonics};
 use std::ops::Range;
 
 /// Terms of the learned background per channel.
-const SKY: usize = 16;
+const BACKDROP_TERMS: usize = 16;
 
 /// A group of parameters on the device.
 struct GpuGroup {
@@ -30,6 +29,7 @@ struct GpuGroup {
     moment1: Buffer,
     moment2: Buffer,
     adam: Adam,
+    schedule: Schedule,
     sparse: bool,
     frozen: bool,
     /// Ranges that are trained; none: all.
@@ -43,6 +43,7 @@ impl GpuGroup {
             moment1: gpu.upload_or_zeros(&g.moment1),
             moment2: gpu.upload_or_zeros(&g.moment2),
             adam: g.adam,
+            schedule: g.schedule,
             sparse: !g.touched.is_empty(),
             frozen: g.frozen,
             trained: g.trained.clone(),
@@ -56,11 +57,12 @@ impl GpuGroup {
         Ok(())
     }
 
-    /// One step `t ≥ 1` along `grads`, which are cleared.
-    fn step(&self, gpu: &Gpu, (t, scale): (u32, f32), grads: &Buffer) {
+    /// One optimizer step along `grads`, which are cleared.
+    fn step(&self, gpu: &Gpu, s: &Step, grads: &Buffer) {
         if self.frozen {
             return;
         }
+        let (t, scale) = (s.number as u32 + 1, self.schedule.scale(s.progress) * s.rate_scale);
         let a = Adam { rate: self.adam.rate * scale, ..self.adam };
         let all = std::iter::once(0..self.values.len()).collect();
         for range in self.trained.as_ref().unwrap_or(&all) {
@@ -79,23 +81,17 @@ struct GpuField {
     appearance: Option<(GpuGroup, usize)>,
 }
 
-/// Samples that a field is trained on.
-struct Samples<'a> {
-    packed: &'a GpuPacked,
-    /// In the field's space, and encoded.
-    points: Buffer,
-    features: Buffer,
-    /// Offsets of all samples that were marched, `[R + 1]`.
-    marched: &'a Buffer<u32>,
+/// What is computed for one field's samples.
+struct Pass<'a> {
     left_out: &'a Buffer<u32>,
-    /// Whether the step is judged by them.
+    /// Whether the step's loss and errors are those of these samples.
     is_main: bool,
     wants_weights: bool,
     /// Whether gradients of positions are wanted.
     moves: bool,
 }
 
-/// The rays of a step, and what belongs to them.
+/// Rays of a step with their targets, backgrounds and codes.
 struct Rays {
     rays: GpuRays,
     drawn: Drawn,
@@ -105,7 +101,7 @@ struct Rays {
     codes: Vec<Buffer>,
 }
 
-/// What training on samples gives besides better parameters.
+/// Results of a training pass besides updated parameters.
 struct Learned {
     /// Squared error of each ray; none: not compared with photographs.
     errors: Option<Buffer>,
@@ -114,12 +110,22 @@ struct Learned {
     points: Option<Buffer>,
     /// Gradients of the given codes.
     codes: Vec<Buffer>,
-    /// Of a [`BatchLoss`].
+    /// Value of a [`BatchLoss`].
     loss: Option<f64>,
+}
+
+/// Device, step and the sums that steps add to.
+#[derive(Clone, Copy)]
+struct Executor<'a> {
+    gpu: &'a Gpu,
+    step: &'a Step<'a>,
+    /// Sums of losses, errors and counts, kept on the device.
+    sums: &'a Buffer,
 }
 
 impl GpuField {
     fn upload(gpu: &Gpu, field: &Field, moves: bool) -> Self {
+        field.check_freezing();
         GpuField {
             shape: Shape::new(gpu, field, moves),
             table: field.encoder.table().map(|t| (GpuGroup::upload(gpu, t), gpu.zeros(t.values.len()))),
@@ -143,19 +149,17 @@ impl GpuField {
         self.table.as_ref().map(|(t, _)| &t.values)
     }
 
-    /// Points of samples in the field's space, and encoded.
-    fn encode(&self, gpu: &Gpu, rays: &GpuRays, packed: &GpuPacked) -> (Buffer, Buffer) {
-        let points = march::positions(gpu, rays, packed, self.shape.space);
-        let features = self.shape.features(gpu, &packed.rows(), &points, self.table());
-        (points, features)
+    fn read(&self) -> FieldRef<'_> {
+        FieldRef { shape: &self.shape, table: self.table(), weights: &self.weights.values }
     }
 
     /// Evaluates samples, compares them, and steps along the gradients.
     ///
     /// # Errors
     /// When the device was lost while a [`BatchLoss`] waited for it.
-    fn train(&self, gpu: &Gpu, s: &Step, sums: &Buffer, r: &Rays, on: &Samples) -> Result<Learned, GpuError> {
-        let (net, weights, packed) = (&self.shape.net, &self.weights.values, on.packed);
+    fn train(&self, at: &Executor, r: &Rays, on: &GpuSamples, pass: &Pass) -> Result<Learned, GpuError> {
+        let &Executor { gpu, step: s, sums } = at;
+        let (net, weights, packed) = (&self.shape.net, &self.weights.values, &on.packed);
         let direction = self.shape.direction(gpu, &r.rays.dirs);
         let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &r.drawn.images, *dims));
         let codes: Vec<&Buffer> = direction.iter().chain(&appearance).chain(&r.codes).collect();
@@ -164,7 +168,7 @@ impl GpuField {
         let (g, errors, composited, loss) = match s.loss {
             Loss::Batch(loss) => {
                 let step = net.forward(gpu, weights, &input, background, true);
-                let (d, value) = by_batch(gpu, loss, &step.out, net.net.channels(), packed)?;
+                let (d, value) = evaluate_batch_loss(gpu, loss, &step.out, net.net.channels(), packed)?;
                 let g = net.backward(gpu, weights, &step, &d, s.near_scaling);
                 (g, None, Some(step.out.weights), Some(value))
             }
@@ -172,13 +176,13 @@ impl GpuField {
                 assert_eq!(net.net.channels(), 3, "a photometric loss compares colors alone");
                 let terms = (terms, self.shape.measure);
                 let (rgba, distance) = (&r.drawn.target, &r.drawn.distance);
-                let target = Target { rgba, background, left_out: on.left_out, distance };
-                let figures = loss::Figures { sums, marched: on.marched, is_main: on.is_main };
-                if !on.wants_weights {
-                    let at = net.evaluate(gpu, weights, &input, true);
+                let target = Target { rgba, background, left_out: pass.left_out, distance };
+                let figures = loss::Figures { sums, marched: &on.marched, is_main: pass.is_main };
+                if !pass.wants_weights {
+                    let out = net.evaluate(gpu, weights, &input, true);
                     let (d, errors) =
-                        loss::composite_and_loss(gpu, terms, packed, (&at.sigma, &at.outputs), target, s.near_scaling, figures);
-                    (net.gradients(gpu, weights, &at, &d), Some(errors), None, None)
+                        loss::composite_and_loss(gpu, terms, packed, (&out.sigma, &out.outputs), target, s.near_scaling, figures);
+                    (net.gradients(gpu, weights, &out, &d), Some(errors), None, None)
                 } else {
                     let step = net.forward(gpu, weights, &input, background, true);
                     let (d, errors) = loss::loss(gpu, terms, packed, &step.out, target, figures);
@@ -187,32 +191,31 @@ impl GpuField {
                 }
             }
         };
-        let points = match (&g.features, on.moves) {
+        let points = match (&g.features, pass.moves) {
             (Some(d), true) => Some(self.shape.points_backward(gpu, &packed.rows(), &on.points, self.table(), d)),
             _ => None,
         };
-        let at = (s.number as u32 + 1, s.rate_scale);
-        self.weights.step(gpu, at, &g.params);
+        self.weights.step(gpu, s, &g.params);
         if let (Some((table, d_table)), Some(d)) = (&self.table, &g.features)
             && !table.frozen
         {
             self.shape.table_backward(gpu, &packed.rows(), &on.points, d, d_table);
-            table.step(gpu, at, d_table);
+            table.step(gpu, s, d_table);
         }
         let own = codes.len() - r.codes.len();
         let mut d_codes = g.codes;
         let d_given = d_codes.split_off(own.min(d_codes.len())).into_iter().flatten().collect();
-        if let (Some((group, dims)), Some(Some(d_codes))) = (&self.appearance, d_codes.last()) {
+        if let (Some((group, dims)), Some(Some(d_codes))) = (self.appearance.as_ref().filter(|a| !a.0.frozen), d_codes.last()) {
             let d = gpu.zeros(group.values.len());
             field::look_up_backward(gpu, d_codes, &r.drawn.images, *dims, &d);
-            group.step(gpu, at, &d);
+            group.step(gpu, s, &d);
         }
         Ok(Learned { errors, background: g.background, weights: composited, points, codes: d_given, loss })
     }
 }
 
-/// The gradients that a batch's loss gives for what was composited, and its value.
-fn by_batch(
+/// Gradients of a batch loss for the composited outputs, and its value.
+fn evaluate_batch_loss(
     gpu: &Gpu,
     loss: &dyn BatchLoss,
     out: &GpuComposited,
@@ -232,7 +235,7 @@ fn by_batch(
     Ok((d, value))
 }
 
-/// See the module.
+/// Carries out [`Step`]s on a GPU; keeps parameters, photographs and buffers there.
 pub struct GpuTrainer {
     gpu: Gpu,
     field: GpuField,
@@ -252,7 +255,7 @@ pub struct GpuTrainer {
 }
 
 impl GpuTrainer {
-    /// Uploads all that training needs.
+    /// Uploads parameters, grid, photographs and cameras.
     pub fn new(gpu: Gpu, scene: Scene, of: &Trainees, photographs: Option<GpuPhotographs>) -> Self {
         let cameras = GpuCameras::upload(&gpu, &scene.cameras);
         let error_map = of.error_map.as_ref().zip(photographs.as_ref()).map(|(m, p)| GpuErrorMap::upload(&gpu, m, p.sizes()));
@@ -293,13 +296,13 @@ impl GpuTrainer {
         }
         let mut rays = self.rays(s);
         let gpu = &self.gpu;
-        let sky = self.learned.as_ref().map(|(g, activation)| {
-            let every_ray = Rows::all(gpu, s.rays.count());
+        let backdrop = self.learned.as_ref().map(|(g, activation)| {
+            let all_rays = Rows::all(gpu, s.rays.count());
             let codes = spherical_harmonics::gpu::forward(gpu, 4, &rays.rays.dirs);
-            let rgb = linear::gpu::forward(gpu, &every_ray, &Dense::without_bias(SKY, 3, *activation), &codes, &g.values, None);
-            (every_ray, codes, rgb)
+            let rgb = linear::gpu::forward(gpu, &all_rays, &Dense::without_bias(BACKDROP_TERMS, 3, *activation), &codes, &g.values, None);
+            (all_rays, codes, rgb)
         });
-        if let Some((_, _, rgb)) = &sky {
+        if let Some((_, _, rgb)) = &backdrop {
             rays.background = rgb.clone();
         }
         let (samples, marched, learned) = self.place(s, &rays)?;
@@ -310,16 +313,15 @@ impl GpuTrainer {
             (f.steps, f.loss, f.trained, f.marched) = (f.steps + 1, f.loss + loss, f.trained + trained, f.marched + marched);
         }
         self.on_host.rays += s.rays.count() as u64;
-        let at = (s.number as u32 + 1, s.rate_scale);
-        if let (Some((group, activation)), Some((every_ray, codes, rgb))) = (&self.learned, &sky) {
-            let layer = Dense::without_bias(SKY, 3, *activation);
-            let d = linear::gpu::backward(gpu, every_ray, &layer, codes, &group.values, rgb, &learned.background);
-            group.step(gpu, at, &d.w);
+        if let (Some((group, activation)), Some((all_rays, codes, rgb))) = (self.learned.as_ref().filter(|l| !l.0.frozen), &backdrop) {
+            let layer = Dense::without_bias(BACKDROP_TERMS, 3, *activation);
+            let d = linear::gpu::backward(gpu, all_rays, &layer, codes, &group.values, rgb, &learned.background);
+            group.step(gpu, s, &d.w);
         }
         if let (Some((group, focal)), Some(d_points)) = (&self.corrections, &learned.points) {
             let (d_origins, d_dirs) = march::positions_backward(gpu, &rays.rays, &samples, d_points, self.field.shape.space);
             let d = self.cameras.backward(gpu, &rays.drawn.images, &rays.drawn.pixels, &rays.rays.dirs, &d_origins, &d_dirs);
-            group.step(gpu, at, &d);
+            group.step(gpu, s, &d);
             self.cameras.correct(gpu, &group.values, *focal);
         }
         let drawn_from = self.photographs.as_ref().filter(|_| s.rays.is_of_cameras());
@@ -366,53 +368,38 @@ impl GpuTrainer {
 
     /// Places samples and trains on them; the samples, the offsets of all that were marched, and what was learned.
     fn place(&self, s: &Step, r: &Rays) -> Result<(GpuPacked, Buffer<u32>, Learned), GpuError> {
-        let (gpu, rays, left_out) = (&self.gpu, &r.rays, &r.drawn.left_out);
-        let moves = self.corrections.is_some() && s.rays.is_of_cameras();
-        let all = |of: &GpuField, packed: &GpuPacked, is_main: bool| {
-            let (points, features) = of.encode(gpu, rays, packed);
-            let marched = &packed.offsets;
-            let on = Samples { packed, points, features, marched, left_out, is_main, wants_weights: !is_main, moves: moves && is_main };
-            of.train(gpu, s, &self.sums, r, &on)
+        let at = Executor { gpu: &self.gpu, step: s, sums: &self.sums };
+        let grid = self.occupancy.as_ref();
+        let on = PlaceOn {
+            field: self.field.read(),
+            grid: grid.map(|g| &g.bits),
+            rays: &r.rays,
+            first: s.first,
+            room: s.room,
+            all_or_none: false,
         };
-        match s.placement {
-            Placement::Occupancy { march: config, pruning, room } => {
-                // All samples in occupied cells: their densities decide which are trained, and keep the grid up to date.
-                let grid = self.occupancy.as_ref().expect("an occupancy grid");
-                let marched = march::march(gpu, &grid.bits, rays, &config, room.0);
-                let (points, features) = self.field.encode(gpu, rays, &marched.packed);
-                let all = marched.packed.rows();
-                let sigma = self.field.shape.net.density(gpu, &self.field.weights.values, &features, &all);
-                let pruned = prune::prune(gpu, &marched.packed, &sigma, &pruning, &marched.cut, room.1);
-                grid.record(gpu, &all, &marched.cells, &sigma);
-                let on = Samples {
-                    packed: &pruned.packed,
-                    points: pruned.take(gpu, &points, 3),
-                    features: self.field.shape.net.take(gpu, &pruned, &features),
-                    marched: &marched.packed.offsets,
-                    left_out: &gpu.either(left_out, &marched.cut),
-                    is_main: true,
-                    wants_weights: false,
-                    moves,
-                };
-                let learned = self.field.train(gpu, s, &self.sums, r, &on)?;
-                Ok((pruned.packed, marched.packed.offsets, learned))
+        let mut coarse_loss = None;
+        let mut train_coarse = |packed: &GpuPacked| {
+            let field = self.coarse.as_ref().expect("a coarse field");
+            let (points, features) = field.read().encode(at.gpu, &r.rays, packed);
+            let on = GpuSamples { packed: packed.clone(), points, features, marched: packed.offsets.clone(), march: None };
+            let pass = Pass { left_out: &r.drawn.left_out, is_main: false, wants_weights: true, moves: false };
+            let learned = field.train(&at, r, &on, &pass)?;
+            coarse_loss = learned.loss;
+            Ok(learned.weights.expect("weights were asked for"))
+        };
+        let samples = place::place(at.gpu, &s.placement, &on, &mut train_coarse)?.expect("rays without room are left out");
+        let left_out = match (&samples.march, grid) {
+            (Some(m), Some(grid)) => {
+                grid.record(at.gpu, &m.rows, &m.cells, &m.sigma);
+                at.gpu.either(&r.drawn.left_out, &m.cut)
             }
-            Placement::Stratified { samples, rng } => {
-                let packed = strata::stratified(gpu, &rays.near_far, samples, Some((rng, s.first)));
-                let learned = all(&self.field, &packed, true)?;
-                Ok((packed.clone(), packed.offsets, learned))
-            }
-            Placement::Hierarchical { samples, more, coarse, fine } => {
-                let guide = self.coarse.as_ref().expect("a coarse field");
-                let first = strata::stratified(gpu, &rays.near_far, samples, Some((coarse, s.first)));
-                let seen = all(guide, &first, false)?;
-                let weights = seen.weights.expect("weights were asked for");
-                let packed = strata::refine(gpu, &first, &weights, samples, more, Some((fine, s.first)));
-                let mut learned = all(&self.field, &packed, true)?;
-                learned.loss = learned.loss.map(|l| l + seen.loss.unwrap_or(0.0));
-                Ok((packed.clone(), packed.offsets, learned))
-            }
-        }
+            _ => r.drawn.left_out.clone(),
+        };
+        let moves = self.corrections.as_ref().is_some_and(|(group, _)| !group.frozen) && s.rays.is_of_cameras();
+        let mut learned = self.field.train(&at, r, &samples, &Pass { left_out: &left_out, is_main: true, wants_weights: false, moves })?;
+        learned.loss = learned.loss.map(|l| l + coarse_loss.unwrap_or(0.0));
+        Ok((samples.packed, samples.marched, learned))
     }
 
     /// Samples the field at random points of the cells that a camera sees, and decides anew which are occupied.
@@ -468,7 +455,7 @@ impl GpuTrainer {
     }
 }
 
-/// The caller's rays as if they had been drawn.
+/// Rays of the caller, in the form of drawn ones.
 fn given(gpu: &Gpu, g: &GivenRays) -> Drawn {
     let n = g.images.len();
     Drawn {

@@ -1,9 +1,8 @@
-//! The device that traces rays instead of the CPU, as renderers see it.
+//! Interface of devices that render instead of the CPU.
 
 use super::traced::Traced;
-use crate::fields::Pruning;
 use crate::samplers::RayBatch;
-use diorama_kernels::ops::march::MarchConfig;
+use crate::samplers::placement::Placement;
 
 /// Why an accelerator did not serve a call.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -16,27 +15,13 @@ pub enum Unserved {
     Abandoned,
 }
 
-/// Sample placement strategy, borrowed by callers that already hold a field and its occupancy grid.
-#[derive(Clone, Copy, Debug)]
-pub enum Placement {
-    March(MarchConfig),
-    Stratified { samples: usize },
-    Hierarchical { samples: usize, more: usize },
-}
-
 /// Evaluates a field elsewhere than on the CPU.
 pub trait Accelerator: Send + Sync {
-    /// Composites rays in front of black; for marched rays also the transmittance `[R]` behind their last sample.
+    /// Composites rays in front of black; where an occupancy grid places the samples also the transmittance `[R]` behind the last.
     ///
     /// # Errors
     /// When the device failed.
-    fn trace(
-        &self,
-        batch: &RayBatch,
-        placement: &Placement,
-        pruning: Pruning,
-        appearance: Option<u32>,
-    ) -> Result<(Traced, Option<Vec<f32>>), Unserved>;
+    fn trace(&self, batch: &RayBatch, placement: &Placement, appearance: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved>;
 
     /// Densities `[N]` at model points `[N, 3]`.
     ///

@@ -23,7 +23,7 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
-/// What blocks read.
+/// Field, grid and limits that all blocks share.
 #[derive(Clone, Copy)]
 pub(super) struct Blocks<'a> {
     pub field: &'a Field,
@@ -186,7 +186,7 @@ impl Blocks<'_> {
     }
 }
 
-/// Where a block's results go.
+/// Output rows of a block.
 struct Traces<'a> {
     rgb: &'a mut [f32],
     opacity: &'a mut [f32],
@@ -254,9 +254,10 @@ impl Colors {
 mod tests {
     use super::*;
     use crate::fields::{self, FieldBuffers};
-    use crate::renderers::volume::{Backdrop, Quality, Sampling, Tracer};
+    use crate::renderers::volume::{Backdrop, Quality, Tracer};
     use crate::samplers::RayBatch;
     use crate::samplers::occupancy::Occupancy;
+    use crate::samplers::placement::Placement;
     use diorama_geom::contraction::Space;
     use diorama_geom::rng::Rng;
     use diorama_kernels::gemm::Precision;
@@ -293,20 +294,14 @@ mod tests {
     }
 
     fn traced(field: &Field, occupancy: &Occupancy, stop: f32, shared_weight: f32, appearance: Option<u32>) -> Traced {
+        let pruning = Pruning { stop, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 };
         let tracer = Tracer {
-            field,
-            sampling: Sampling::Occupancy { grid: occupancy, max_samples: 700 },
+            occupancy: Some(occupancy),
             backdrop: Backdrop::Color([0.2, 0.5, 0.9]),
             near: 0.1,
-            cube: (0.0, 1.0),
-            clip: None,
-            crop: None,
-            is_linear: false,
-            pruning: Pruning { stop, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
             shared_weight,
             appearance,
-            tolerance: 0.0,
-            accelerator: None,
+            ..Tracer::new(field, Placement::occupied(occupancy, 700, pruning), (0.0, 1.0))
         };
         tracer.trace(&mut batch(), &mut FieldBuffers::default())
     }

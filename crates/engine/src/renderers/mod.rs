@@ -1,4 +1,4 @@
-//! From fields to images.
+//! Renderers: volume rendering of fields, and Gaussian splats.
 
 pub mod accelerator;
 mod blocks;

@@ -1,11 +1,11 @@
-//! Failures of an accelerator: each is said once, and never hidden behind the CPU's own results.
+//! Handling of a device's failures: each is reported once, and never hidden behind results of the CPU.
 
 pub use super::accelerator::Unserved;
 
-use super::accelerator::{Accelerator, Placement};
+use super::accelerator::Accelerator;
 use super::traced::Traced;
-use crate::fields::Pruning;
 use crate::samplers::RayBatch;
+use crate::samplers::placement::Placement;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
@@ -24,7 +24,7 @@ pub struct Supervised {
 }
 
 impl Supervised {
-    /// `named`: the user asked for this device; `say` is told that the CPU goes on, once.
+    /// `named`: the user asked for this device; `say` is called once, when the CPU takes over.
     pub fn new(device: Box<dyn Accelerator>, name: impl Into<String>, named: bool, say: Say) -> Self {
         Supervised { device, name: name.into(), named, say, failure: Mutex::new(None), served: AtomicUsize::new(0) }
     }
@@ -73,14 +73,8 @@ impl Supervised {
 }
 
 impl Accelerator for Supervised {
-    fn trace(
-        &self,
-        batch: &RayBatch,
-        placement: &Placement,
-        pruning: Pruning,
-        appearance: Option<u32>,
-    ) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
-        self.call(|d| d.trace(batch, placement, pruning, appearance))
+    fn trace(&self, batch: &RayBatch, placement: &Placement, appearance: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
+        self.call(|d| d.trace(batch, placement, appearance))
     }
 
     fn density(&self, model: &[f32]) -> Result<Vec<f32>, Unserved> {
@@ -100,7 +94,7 @@ impl Accelerator for Supervised {
 mod tests {
     use super::*;
     use crate::fields::{self, FieldBuffers};
-    use crate::renderers::volume::{Backdrop, Quality, Sampling, Tracer};
+    use crate::renderers::volume::Tracer;
     use diorama_geom::contraction::Space;
     use std::sync::Arc;
 
@@ -120,7 +114,7 @@ mod tests {
     }
 
     impl Accelerator for Fails {
-        fn trace(&self, batch: &RayBatch, _: &Placement, _: Pruning, _: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
+        fn trace(&self, batch: &RayBatch, _: &Placement, _: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
             self.serves()?;
             let n = batch.len();
             Ok((Traced { rgb: vec![7.0; n * 3], opacity: vec![1.0; n], depth: vec![1.0; n] }, None))
@@ -138,21 +132,8 @@ mod tests {
 
     fn traced(by: Option<&dyn Accelerator>) -> Traced {
         let field = fields::baseline(Space::Cube(1.0), 1e-3, 3);
-        let tracer = Tracer {
-            field: &field,
-            sampling: Sampling::Stratified { samples: 8 },
-            backdrop: Backdrop::Color([0.0; 3]),
-            near: 0.0,
-            cube: (0.0, 1.0),
-            clip: None,
-            crop: None,
-            is_linear: false,
-            pruning: Quality::Full.pruning(),
-            shared_weight: Quality::Full.shared_weight(),
-            appearance: None,
-            tolerance: 0.0,
-            accelerator: by,
-        };
+        let placement = Placement::Stratified { samples: 8, noise: None };
+        let tracer = Tracer { accelerator: by, ..Tracer::new(&field, placement, (0.0, 1.0)) };
         let mut batch = RayBatch::default();
         batch.resize(4);
         batch.origins.fill(0.5);

@@ -1,6 +1,6 @@
-//! Volume rendering of whole images.
+//! Volume rendering of views: `Σ_i T_i α_i c_i` along each ray (Mildenhall et al. 2020, equation 3).
 
-pub use super::accelerator::{Accelerator, Placement};
+pub use super::accelerator::Accelerator;
 pub use super::quality::Quality;
 pub use super::traced::Traced;
 pub use super::view::View;
@@ -9,58 +9,42 @@ use super::accelerator::Unserved;
 use super::blocks::{self, Blocks};
 use super::view::{interpolate_between, sort_by_tiles};
 use crate::background::LearnedBackground;
-use crate::fields::{Batch, Encoded, Field, FieldBuffers, Pruning, VisibleSamples};
+use crate::fields::{Batch, Field, FieldBuffers, Pruning, VisibleSamples};
 use crate::samplers::occupancy::Occupancy;
+use crate::samplers::placement::{self, PlaceOn, PlacedSamples, Placement};
 use crate::samplers::{RayBatch, pixels};
 use diorama_geom::OrientedBox;
 use diorama_geom::color::srgb_from_linear;
 use diorama_geom::glam::DVec3;
 use diorama_kernels::ops::composite::Packed;
-use diorama_kernels::ops::march::{self, MarchRays, Marched};
+use diorama_kernels::ops::march::MarchRays;
 use diorama_kernels::ops::ray_generation::PosedCamera;
-use diorama_kernels::ops::strata::cpu as strata;
 
-/// What stands behind the scene.
+/// Background of rendered views.
 #[derive(Clone, Copy)]
 pub enum Backdrop<'a> {
     Color([f32; 3]),
     Learned(&'a LearnedBackground),
 }
 
-/// How samples are placed.
-#[derive(Clone, Copy)]
-pub enum Sampling<'a> {
-    Occupancy {
-        grid: &'a Occupancy,
-        max_samples: usize,
-    },
-    Stratified {
-        samples: usize,
-    },
-    /// `samples` for the coarse field decide where `more` go for the main one.
-    Hierarchical {
-        coarse: &'a Field,
-        samples: usize,
-        more: usize,
-    },
-}
-
-/// A field ready to be looked at.
+/// Renders views of a field.
 #[derive(Clone, Copy)]
 pub struct Tracer<'a> {
     pub field: &'a Field,
-    pub sampling: Sampling<'a>,
+    /// Places samples for the main field ([`Placement::Hierarchical`]).
+    pub coarse: Option<&'a Field>,
+    /// Occupied cells ([`Placement::Occupancy`]).
+    pub occupancy: Option<&'a Occupancy>,
+    pub placement: Placement,
     pub backdrop: Backdrop<'a>,
     pub near: f32,
     /// The scene's outer cube in model space: lowest corner and edge.
     pub cube: (f32, f32),
     /// Only what lies in this box (lowest and highest corner, model space) is shown.
     pub clip: Option<([f32; 3], [f32; 3])>,
-    /// And only what lies in this box, which may be turned (model space).
+    /// Only what also lies in this box, which may be rotated, is shown (model space).
     pub crop: Option<OrientedBox>,
-    /// Samples that are left out where an occupancy grid places them.
-    pub pruning: Pruning,
-    /// Training image whose appearance is worn; none: the mean.
+    /// Training image whose appearance code is used; none: the mean code.
     pub appearance: Option<u32>,
     /// Whether colors are linear light, which [`Tracer::view`] encodes to sRGB; values above 1 go on along the curve.
     pub is_linear: bool,
@@ -68,7 +52,7 @@ pub struct Tracer<'a> {
     pub shared_weight: f32,
     /// Pixels are interpolated where traced neighbours differ by no more than this; 0: all are traced.
     pub tolerance: f32,
-    /// Traces instead of the CPU, which goes on where it fails; rays of an abandoned device come back empty.
+    /// Device that traces instead of the CPU. Where it fails, the CPU goes on; rays of an abandoned device come back empty.
     pub accelerator: Option<&'a dyn Accelerator>,
 }
 
@@ -91,16 +75,17 @@ const COARSEST: usize = 4;
 
 impl<'a> Tracer<'a> {
     /// Full quality before black, without bounds besides the outer `cube` (lowest corner and edge, model space).
-    pub fn new(field: &'a Field, sampling: Sampling<'a>, cube: (f32, f32)) -> Tracer<'a> {
+    pub fn new(field: &'a Field, placement: Placement, cube: (f32, f32)) -> Tracer<'a> {
         Tracer {
             field,
-            sampling,
+            coarse: None,
+            occupancy: None,
+            placement,
             backdrop: Backdrop::Color([0.0; 3]),
             near: 0.0,
             cube,
             clip: None,
             crop: None,
-            pruning: Quality::Full.pruning(),
             appearance: None,
             is_linear: false,
             shared_weight: Quality::Full.shared_weight(),
@@ -111,7 +96,7 @@ impl<'a> Tracer<'a> {
 }
 
 impl Tracer<'_> {
-    /// Renders the view of a camera that stands in model space; `progress` is told the rows done.
+    /// Renders the view of a camera that stands in model space; `progress` receives the number of rows done since the last call.
     pub fn view(&self, camera: &PosedCamera, progress: &mut dyn FnMut(usize)) -> View {
         let (w, h) = (camera.camera.width as usize, camera.camera.height as usize);
         let mut out = View::empty(w, h);
@@ -136,7 +121,7 @@ impl Tracer<'_> {
         out
     }
 
-    /// Traces the listed pixels of a view; `progress` is told how many rows' worth.
+    /// Traces the listed pixels of a view; `progress` receives the number of rows' worth of pixels.
     fn pixels(
         &self,
         camera: &PosedCamera,
@@ -147,7 +132,7 @@ impl Tracer<'_> {
         progress: &mut dyn FnMut(usize),
     ) {
         let (w, mut done) = (out.rgb.width, 0);
-        let in_blocks = self.shared_weight > 0.0 && matches!(self.sampling, Sampling::Occupancy { .. });
+        let in_blocks = self.shared_weight > 0.0 && matches!(self.placement, Placement::Occupancy { .. });
         let on_cpu = if in_blocks { CHUNK_OF_BLOCKS } else { CHUNK };
         for part in wanted.chunks(self.accelerator.map_or(on_cpu, |a| a.rays())) {
             batch.resize(part.len());
@@ -181,70 +166,56 @@ impl Tracer<'_> {
         if let Some(crop) = &self.crop {
             cut_to(crop, batch);
         }
-        let placement = match self.sampling {
-            Sampling::Occupancy { grid, max_samples } => Placement::March(grid.march_config(max_samples)),
-            Sampling::Stratified { samples } => Placement::Stratified { samples },
-            Sampling::Hierarchical { samples, more, .. } => Placement::Hierarchical { samples, more },
+        let restored = |mut out: Traced, light: &[f32], pruning: Pruning| {
+            if pruning.min_alpha > 0.0 || pruning.min_weight > 0.0 {
+                out.restore_opacity(light, pruning.stop);
+            }
+            out
         };
-        match self.accelerator.map(|a| a.trace(batch, &placement, self.pruning, self.appearance)) {
-            Some(Ok((mut out, light))) => {
-                if let Some(light) = light
-                    && (self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0)
-                {
-                    out.restore_opacity(&light, self.pruning.stop);
-                }
+        match self.accelerator.map(|a| a.trace(batch, &self.placement, self.appearance)) {
+            Some(Ok((out, light))) => {
+                let out = match (self.placement, light) {
+                    (Placement::Occupancy { pruning, .. }, Some(light)) => restored(out, &light, pruning),
+                    _ => out,
+                };
                 return self.before_backdrop(batch, out);
             }
             Some(Err(Unserved::Abandoned)) => return Traced::nothing(batch.len()),
             Some(Err(Unserved::Failed(_))) | None => {}
         }
-        let out = match self.sampling {
-            Sampling::Occupancy { grid, max_samples } => {
-                let rays = MarchRays {
-                    origins: &batch.origins,
-                    dirs: &batch.dirs,
-                    near_far: &batch.near_far,
-                    jitter: &batch.jitter,
-                    resumed: false,
-                };
-                let march = grid.march_config(max_samples);
-                if self.shared_weight > 0.0 {
-                    let images = self.appearance.map(|i| vec![i; batch.len()]);
-                    let (field, pruning, shared_weight) = (self.field, self.pruning, self.shared_weight);
-                    let blocks = Blocks { field, grid: grid.bits(), march, pruning, shared_weight };
-                    if let Some(out) = blocks.trace(&rays, images.as_deref()) {
-                        return self.before_backdrop(batch, out);
-                    }
-                }
-                let mut visible = VisibleSamples::default();
-                self.field.visible(grid.bits(), &rays, &march, self.pruning, &mut visible, buf);
-                let VisibleSamples { samples, positions, mut encoded } = visible;
-                self.composite(self.field, batch, &samples, &positions, &mut encoded, buf);
-                let mut out = take_traced(buf);
-                if self.pruning.min_alpha > 0.0 || self.pruning.min_weight > 0.0 {
-                    out.restore_opacity(&buf.visible.light(batch.len()), self.pruning.stop);
-                }
-                out
-            }
-            Sampling::Stratified { samples } => {
-                let mut marched = Marched::default();
-                strata::stratified(&batch.near_far, samples, None, &mut marched);
-                self.evaluate(self.field, batch, &marched, buf);
-                take_traced(buf)
-            }
-            Sampling::Hierarchical { coarse, samples, more } => {
-                let (mut first, mut second) = (Marched::default(), Marched::default());
-                strata::stratified(&batch.near_far, samples, None, &mut first);
-                self.evaluate(coarse, batch, &first, buf);
-                strata::refine(&first, &buf.out.weights, samples, more, None, &mut second);
-                self.evaluate(self.field, batch, &second, buf);
-                take_traced(buf)
-            }
+        if let Some(out) = self.trace_blocks(batch) {
+            return self.before_backdrop(batch, out);
+        }
+        let mut samples = PlacedSamples::default();
+        let on = PlaceOn { field: self.field, occupancy: self.occupancy.map(Occupancy::bits), batch, first: 0 };
+        self.placement.place(&on, &mut samples, buf, &mut |samples, buf| {
+            let coarse = self.coarse.expect("a coarse field");
+            placement::encode(coarse, batch, samples);
+            self.composite(coarse, batch, samples, buf);
+        });
+        self.composite(self.field, batch, &mut samples.main, buf);
+        let out = take_traced(buf);
+        let out = match self.placement {
+            Placement::Occupancy { pruning, .. } => restored(out, &buf.visible.light(batch.len()), pruning),
+            _ => out,
         };
         self.before_backdrop(batch, out)
     }
 
-    /// Lets the backdrop show through.
+    /// Traces block by block; none where samples are not placed by a grid, or the field cannot be evaluated this way.
+    fn trace_blocks(&self, batch: &RayBatch) -> Option<Traced> {
+        let Placement::Occupancy { march, pruning } = self.placement else { return None };
+        if self.shared_weight == 0.0 {
+            return None;
+        }
+        let RayBatch { origins, dirs, near_far, jitter, .. } = batch;
+        let images = self.appearance.map(|i| vec![i; batch.len()]);
+        let grid = self.occupancy.expect("an occupancy grid").bits();
+        let blocks = Blocks { field: self.field, grid, march, pruning, shared_weight: self.shared_weight };
+        blocks.trace(&MarchRays { origins, dirs, near_far, jitter, resumed: false }, images.as_deref())
+    }
+
+    /// Adds the background, weighted by the transmittance.
     fn before_backdrop(&self, batch: &RayBatch, mut out: Traced) -> Traced {
         let mut behind = Vec::new();
         match self.backdrop {
@@ -259,34 +230,18 @@ impl Tracer<'_> {
         out
     }
 
-    fn evaluate(&self, field: &Field, batch: &RayBatch, marched: &Marched, buf: &mut FieldBuffers) {
-        let rays =
-            MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
-        let (mut positions, mut encoded) = (Vec::new(), Encoded::default());
-        march::cpu::positions(&rays, marched, &mut positions);
-        field.encode(&positions, &mut encoded);
-        self.composite(field, batch, marched, &positions, &mut encoded, buf);
-    }
-
-    fn composite(
-        &self,
-        field: &Field,
-        batch: &RayBatch,
-        marched: &Marched,
-        positions: &[f32],
-        encoded: &mut Encoded,
-        buf: &mut FieldBuffers,
-    ) {
+    /// Evaluates and composites encoded samples before black.
+    fn composite(&self, field: &Field, batch: &RayBatch, on: &mut VisibleSamples, buf: &mut FieldBuffers) {
         let background = vec![0.0; batch.len() * field.net.channels()];
         let images = self.appearance.map(|i| vec![i; batch.len()]);
-        let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
+        let samples = Packed { offsets: &on.samples.offsets, t: &on.samples.t, dt: &on.samples.dt };
         let (dirs, images, background) = (&batch.dirs[..], images.as_deref(), &background[..]);
-        let b = Batch { samples, positions, dirs, images, given: &[], background, near_scaling: 0.0 };
-        field.render(&b, encoded, buf);
+        let b = Batch { samples, positions: &on.positions, dirs, images, given: &[], background, near_scaling: 0.0 };
+        field.render(&b, &mut on.encoded, buf);
     }
 }
 
-/// Moves what a field rendered out of its buffers.
+/// Moves a field's rendered rays out of its buffers.
 fn take_traced(buf: &mut FieldBuffers) -> Traced {
     let o = &mut buf.out;
     Traced { rgb: std::mem::take(&mut o.values), opacity: std::mem::take(&mut o.opacity), depth: std::mem::take(&mut o.depth) }
@@ -300,6 +255,7 @@ mod tests {
     use diorama_geom::glam::DVec3;
     use diorama_geom::{Camera, Pose};
     use diorama_kernels::ops::hash_grid::HashGridConfig;
+    use diorama_kernels::ops::march;
 
     #[test]
     fn waves_equal_one_long_march() {
@@ -309,20 +265,13 @@ mod tests {
         let occupancy = Occupancy::new(16, 1, false);
         let pose = Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z);
         let camera = PosedCamera { camera: Camera::pinhole(12, 10, 0.6), pose };
+        let pruning = Pruning { stop: 0.0, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 };
         let tracer = Tracer {
-            field: &field,
-            sampling: Sampling::Occupancy { grid: &occupancy, max_samples: 4096 },
+            occupancy: Some(&occupancy),
             backdrop: Backdrop::Color([0.2, 0.5, 0.9]),
             near: 0.1,
-            cube: (0.0, 1.0),
-            clip: None,
-            crop: None,
-            is_linear: false,
             shared_weight: 0.0,
-            pruning: Pruning { stop: 0.0, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
-            appearance: None,
-            tolerance: 0.0,
-            accelerator: None,
+            ..Tracer::new(&field, Placement::occupied(&occupancy, 4096, pruning), (0.0, 1.0))
         };
         let view = tracer.view(&camera, &mut |_| {});
         let mut batch = RayBatch::default();
@@ -335,10 +284,11 @@ mod tests {
         pixels::rays(&[camera], 0.1, (0.0, 1.0), &mut batch);
         let rays =
             MarchRays { origins: &batch.origins, dirs: &batch.dirs, near_far: &batch.near_far, jitter: &batch.jitter, resumed: false };
-        let mut marched = Marched::default();
-        march::cpu::march(occupancy.bits(), &rays, &occupancy.march_config(4096), &mut Default::default(), &mut marched);
+        let mut long = VisibleSamples::default();
+        march::cpu::march(occupancy.bits(), &rays, &occupancy.march_config(4096), &mut Default::default(), &mut long.samples);
         let mut buf = FieldBuffers::default();
-        tracer.evaluate(&field, &batch, &marched, &mut buf);
+        placement::encode(&field, &batch, &mut long);
+        tracer.composite(&field, &batch, &mut long, &mut buf);
         for r in 0..120 {
             for k in 0..3 {
                 let want = buf.out.values[r * 3 + k] + (1.0 - buf.out.opacity[r]) * [0.2, 0.5, 0.9][k];
@@ -355,21 +305,10 @@ mod tests {
         let occupancy = Occupancy::new(16, 1, false);
         let pose = Pose::look_at(DVec3::new(0.5, -1.5, 0.5), DVec3::splat(0.5), DVec3::Z);
         let camera = PosedCamera { camera: Camera::pinhole(9, 9, 0.8), pose };
-        let mut tracer = Tracer {
-            field: &field,
-            sampling: Sampling::Occupancy { grid: &occupancy, max_samples: 1024 },
-            backdrop: Backdrop::Color([0.0; 3]),
-            near: 0.1,
-            cube: (0.0, 1.0),
-            clip: None,
-            crop: None,
-            is_linear: false,
-            shared_weight: 0.0,
-            pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
-            appearance: None,
-            tolerance: 0.0,
-            accelerator: None,
-        };
+        let pruning = Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 };
+        let placement = Placement::occupied(&occupancy, 1024, pruning);
+        let mut tracer =
+            Tracer { occupancy: Some(&occupancy), near: 0.1, shared_weight: 0.0, ..Tracer::new(&field, placement, (0.0, 1.0)) };
         assert!(tracer.view(&camera, &mut |_| {}).opacity.data[40 + 2] > 0.9);
         tracer.clip = Some(([0.45, 0.0, 0.45], [0.55, 1.0, 0.55]));
         let v = tracer.view(&camera, &mut |_| {});
@@ -392,19 +331,10 @@ mod tests {
         let pose = Pose::look_at(DVec3::new(0.5, -1.5, 0.5), DVec3::new(0.5, -9.0, 0.5), DVec3::Z);
         let camera = PosedCamera { camera: Camera::pinhole(2, 2, 0.8), pose };
         let tracer = Tracer {
-            field: &field,
-            sampling: Sampling::Stratified { samples: 2 },
             backdrop: Backdrop::Color([0.214_041, 1.0, 7.0]),
             near: 0.1,
-            cube: (0.0, 1.0),
-            clip: None,
-            crop: None,
             is_linear: true,
-            shared_weight: 0.0,
-            pruning: Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 },
-            appearance: None,
-            tolerance: 0.0,
-            accelerator: None,
+            ..Tracer::new(&field, Placement::Stratified { samples: 2, noise: None }, (0.0, 1.0))
         };
         let v = tracer.view(&camera, &mut |_| {});
         let want = [0.5, 1.0, srgb_from_linear(7.0)];
@@ -421,19 +351,12 @@ mod tests {
         let camera = PosedCamera { camera: Camera::pinhole(40, 32, 0.6), pose };
         let draw = |quality: Quality| {
             let tracer = Tracer {
-                field: &field,
-                sampling: Sampling::Occupancy { grid: &occupancy, max_samples: 1024 },
+                occupancy: Some(&occupancy),
                 backdrop: Backdrop::Color([0.2, 0.5, 0.9]),
                 near: 0.1,
-                cube: (0.0, 1.0),
-                clip: None,
-                crop: None,
-                is_linear: false,
-                pruning: quality.pruning(),
                 shared_weight: quality.shared_weight(),
-                appearance: None,
                 tolerance: quality.tolerance(),
-                accelerator: None,
+                ..Tracer::new(&field, Placement::occupied(&occupancy, 1024, quality.pruning()), (0.0, 1.0))
             };
             let mut rays = 0;
             let view = tracer.view(&camera, &mut |rows| rays += rows * 40);

@@ -1,7 +1,8 @@
-//! Where rays are drawn and where samples lie on them.
+//! Sampling: pixels and their rays, and the placement of samples on rays.
 
 pub mod occupancy;
 pub mod pixels;
+pub mod placement;
 pub mod stereo;
 
 use diorama_kernels::ops::photometric_loss::Targets;

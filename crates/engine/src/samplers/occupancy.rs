@@ -52,7 +52,7 @@ impl Occupancy {
         &self.grid.bits
     }
 
-    /// The marching that belongs to this grid. `max_samples` bounds the samples of a ray.
+    /// Step lengths of marching through this grid; `max_samples` bounds the samples of a ray.
     pub fn march_config(&self, max_samples: usize) -> MarchConfig {
         let (cascades, resolution) = (self.grid.bits.cascades, self.grid.bits.resolution);
         let cone = if cascades > 1 { 1.0 / 256.0 } else { 0.0 };

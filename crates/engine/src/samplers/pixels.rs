@@ -9,7 +9,7 @@ use diorama_kernels::ops::{ray_aabb, ray_generation};
 pub use diorama_kernels::ops::error_map::ErrorMap;
 pub use diorama_kernels::ops::pixel_draw::{OBSERVED_EVERY, Observation, PixelSource};
 
-/// What [`draw`] needs besides the pixels.
+/// Cameras, random numbers and optional guidance of [`draw`].
 pub struct DrawOptions<'a> {
     pub cameras: &'a [PosedCamera],
     /// Counter of the first ray: the number of rays drawn so far.

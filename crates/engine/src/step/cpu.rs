@@ -1,18 +1,19 @@
 //! Training steps on the CPU.
 
-use super::{Backdrop, Figures, GivenRays, Loss, Photographs, Placement, RaySource, Scene, Step, Trainees, corrected};
+use super::{Backdrop, Figures, GivenRays, Loss, Photographs, RaySource, Scene, Step, Trainees, corrected};
 use crate::fields::{self, Batch, Field, FieldBuffers, VisibleSamples};
 use crate::params::ParamGroup;
 use crate::samplers::RayBatch;
+use crate::samplers::occupancy::Occupancy;
 use crate::samplers::pixels::{self, DrawOptions, ErrorMap, PixelSource};
+use crate::samplers::placement::{self, PlaceOn, PlacedSamples, Placement};
 use crate::stages::Stages;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::linear::Activation;
-use diorama_kernels::ops::march::{self, MarchRays};
+use diorama_kernels::ops::march;
 use diorama_kernels::ops::photometric_loss::{Measure, Photometric, RELATIVE, squared_error};
 use diorama_kernels::ops::ray_aabb;
 use diorama_kernels::ops::ray_generation::{self, CORRECTION, PosedCamera};
-use diorama_kernels::ops::strata::cpu as strata;
 
 /// Carries out [`Step`]s on the CPU; keeps its buffers.
 pub struct CpuTrainer {
@@ -21,8 +22,7 @@ pub struct CpuTrainer {
     pub(super) cameras: Vec<PosedCamera>,
     pub(super) batch: RayBatch,
     background: Vec<f32>,
-    visible: VisibleSamples,
-    guide: VisibleSamples,
+    samples: PlacedSamples,
     d_positions: Vec<f32>,
     field: FieldBuffers,
 }
@@ -34,8 +34,7 @@ impl CpuTrainer {
             scene,
             batch: RayBatch::default(),
             background: Vec::new(),
-            visible: VisibleSamples::default(),
-            guide: VisibleSamples::default(),
+            samples: PlacedSamples::default(),
             d_positions: Vec::new(),
             field: FieldBuffers::default(),
         };
@@ -43,7 +42,7 @@ impl CpuTrainer {
         trainer
     }
 
-    /// Where the time of steps goes.
+    /// Time that each stage of the steps took.
     pub fn stages(&mut self) -> &mut Stages {
         &mut self.field.stages
     }
@@ -51,6 +50,12 @@ impl CpuTrainer {
     /// Gradients of the last step's given codes, `[R, width]` each.
     pub fn given_gradients(&self) -> &[Vec<f32>] {
         &self.field.d_given
+    }
+
+    /// The main field's samples of the last step, as its network read them.
+    #[cfg(test)]
+    pub(super) fn encoded(&self) -> &crate::fields::Encoded {
+        &self.samples.main.encoded
     }
 
     /// Brings the cameras up to date with their corrections.
@@ -74,11 +79,7 @@ impl CpuTrainer {
             grid.update(&*of.field, &p.rng, s.number, p.points, p.block);
             self.field.stages.done("occupancy");
         }
-        let (loss, trained, marched) = match s.placement {
-            Placement::Occupancy { .. } => self.occupied(of, s),
-            Placement::Stratified { .. } => self.stratified(of, s),
-            Placement::Hierarchical { .. } => self.hierarchical(of, s),
-        };
+        let (loss, trained, marched) = self.place_and_train(of, s);
         self.field.stages.done("network");
         let mse = match s.loss {
             Loss::Photometric(_) => {
@@ -91,17 +92,17 @@ impl CpuTrainer {
         if !loss.is_finite() {
             return figures;
         }
-        if let Some(l) = &mut of.learned {
+        if let Some(l) = of.learned.as_mut().filter(|l| !l.group.frozen) {
             l.backward(&self.batch.dirs, &self.background, &self.field.out.d_background);
         }
-        let moves = s.rays.is_of_cameras();
+        let moves = of.moves_cameras(s);
         if let Some((group, _)) = of.corrections.as_mut().filter(|_| moves) {
             self.correct_cameras(group);
         }
         self.field.stages.done("score");
         optimise(of, s);
         self.field.stages.done("optimise");
-        if of.corrections.is_some() && moves {
+        if moves {
             self.correct(of);
         }
         if s.refresh_errors
@@ -151,7 +152,7 @@ impl CpuTrainer {
         }
     }
 
-    /// Takes the caller's rays.
+    /// Copies the caller's rays into the batch.
     fn take(&mut self, g: &GivenRays) {
         let b = &mut self.batch;
         b.images.copy_from_slice(g.images);
@@ -170,65 +171,28 @@ impl CpuTrainer {
         ray_aabb::cpu::intersect(&b.origins, &b.dirs, [low; 3], [low + size; 3], self.scene.near, &mut b.near_far);
     }
 
-    /// Samples in occupied cells through the one field: loss, samples trained, samples marched.
-    fn occupied(&mut self, of: &mut Trainees, s: &Step) -> (f64, usize, usize) {
-        let Placement::Occupancy { march, pruning, .. } = s.placement else { unreachable!("placed otherwise") };
-        let grid = &mut of.occupancy.as_mut().expect("an occupancy grid").grid;
-        of.field.visible(&grid.bits, &rays(&self.batch), &march, pruning, &mut self.visible, &mut self.field);
-        self.field.visible.seen().for_each(|(cells, sigma)| grid.record(cells, sigma));
-        let marched = self.field.visible.marched();
-        let loss = self.train(of, s, Which::Main);
-        (loss, self.visible.samples.t.len(), marched)
-    }
-
-    /// Samples in equal intervals through the one field.
-    fn stratified(&mut self, of: &mut Trainees, s: &Step) -> (f64, usize, usize) {
-        let Placement::Stratified { samples, rng } = s.placement else { unreachable!("placed otherwise") };
-        strata::stratified(&self.batch.near_far, samples, Some((rng, s.first)), &mut self.visible.samples);
-        encode(of.field, &self.batch, &mut self.visible);
-        let loss = self.train(of, s, Which::Main);
-        (loss, self.visible.samples.t.len(), self.visible.samples.t.len())
-    }
-
-    /// Samples in equal intervals through the coarse field, then more where it found matter through the main one.
-    fn hierarchical(&mut self, of: &mut Trainees, s: &Step) -> (f64, usize, usize) {
-        let Placement::Hierarchical { samples, more, coarse, fine } = s.placement else { unreachable!("placed otherwise") };
-        strata::stratified(&self.batch.near_far, samples, Some((coarse, s.first)), &mut self.guide.samples);
-        encode(of.coarse.as_ref().expect("a coarse field"), &self.batch, &mut self.guide);
-        let coarse_loss = self.train(of, s, Which::Coarse);
-        let (from, to) = (&self.guide.samples, &mut self.visible.samples);
-        strata::refine(from, &self.field.out.weights, samples, more, Some((fine, s.first)), to);
-        encode(of.field, &self.batch, &mut self.visible);
-        let loss = self.train(of, s, Which::Main);
-        let trained = self.guide.samples.t.len() + self.visible.samples.t.len();
-        (coarse_loss + loss, trained, trained)
-    }
-
-    /// Gradients of a field for its samples, and of the positions where cameras move; the loss.
-    fn train(&mut self, of: &mut Trainees, s: &Step, which: Which) -> f64 {
-        let (field, on) = match which {
-            Which::Main => (&mut *of.field, &mut self.visible),
-            Which::Coarse => (&mut **of.coarse.as_mut().expect("a coarse field"), &mut self.guide),
+    /// Places samples and computes gradients for them: loss, samples trained, samples marched.
+    fn place_and_train(&mut self, of: &mut Trainees, s: &Step) -> (f64, usize, usize) {
+        let moves = of.moves_cameras(s);
+        let drawn = Drawn { batch: &self.batch, background: &self.background, step: s };
+        let on = PlaceOn { field: &*of.field, occupancy: of.occupancy.as_deref().map(Occupancy::bits), batch: &self.batch, first: s.first };
+        let (coarse, mut coarse_loss, mut trained) = (&mut of.coarse, 0.0, 0);
+        let train_coarse = &mut |samples: &mut VisibleSamples, buffers: &mut FieldBuffers| {
+            let field = &mut **coarse.as_mut().expect("a coarse field");
+            placement::encode(field, drawn.batch, samples);
+            drawn.train(field, samples, buffers, None);
+            (coarse_loss, trained) = (buffers.out.loss, samples.samples.t.len());
         };
-        let marched = &on.samples;
-        let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
-        let given = match &s.rays {
-            RaySource::Given(g) => g.codes,
-            RaySource::Photographs { .. } => &[],
-        };
-        let (dirs, images, background) = (&self.batch.dirs[..], Some(&self.batch.images[..]), &self.background[..]);
-        let b = Batch { samples, positions: &on.positions, dirs, images, given, background, near_scaling: s.near_scaling };
-        let moves = of.corrections.is_some() && s.rays.is_of_cameras() && matches!(which, Which::Main);
-        let d_positions = moves.then_some(&mut self.d_positions);
-        match s.loss {
-            Loss::Batch(loss) => field.train(&b, &mut on.encoded, fields::Loss::Batch(loss), &mut self.field, d_positions),
-            Loss::Photometric(terms) => {
-                assert_eq!(field.net.channels(), 3, "a photometric loss compares colors alone");
-                let loss = Photometric::new(terms, measure(field), self.batch.targets(background), samples);
-                field.train(&b, &mut on.encoded, fields::Loss::Rays(&loss), &mut self.field, d_positions);
-            }
+        s.placement.place(&on, &mut self.samples, &mut self.field, train_coarse);
+        let main = &mut self.samples.main;
+        trained += main.samples.t.len();
+        let mut marched = trained;
+        if let (Placement::Occupancy { .. }, Some(grid)) = (s.placement, &mut of.occupancy) {
+            self.field.visible.densities().for_each(|(cells, sigma)| grid.grid.record(cells, sigma));
+            marched = self.field.visible.marched();
         }
-        self.field.out.loss
+        drawn.train(of.field, main, &mut self.field, moves.then_some(&mut self.d_positions));
+        (coarse_loss + self.field.out.loss, trained, marched)
     }
 
     /// Squared error of the step's colors, and what the error map learns from it.
@@ -255,18 +219,42 @@ impl CpuTrainer {
     fn correct_cameras(&self, group: &mut ParamGroup) {
         let b = &self.batch;
         let (mut d_origins, mut d_dirs) = (vec![0.0; b.len() * 3], vec![0.0; b.len() * 3]);
-        march::cpu::positions_backward(&self.visible.samples, &self.d_positions, &mut d_origins, &mut d_dirs);
+        march::cpu::positions_backward(&self.samples.main.samples, &self.d_positions, &mut d_origins, &mut d_dirs);
         let mut d = vec![0.0f64; group.values.len()];
         ray_generation::cpu::backward(&self.cameras, &b.images, &b.pixels, &b.dirs, &d_origins, &d_dirs, &mut d);
         group.grads.iter_mut().zip(&d).for_each(|(g, d)| *g += *d as f32);
     }
 }
 
-/// Which of a step's fields.
+/// Rays of a step, which fields are trained on.
 #[derive(Clone, Copy)]
-enum Which {
-    Main,
-    Coarse,
+struct Drawn<'a> {
+    batch: &'a RayBatch,
+    background: &'a [f32],
+    step: &'a Step<'a>,
+}
+
+impl Drawn<'_> {
+    /// Computes gradients of a field for its samples, and of their positions where asked; the loss is in the buffers.
+    fn train(&self, field: &mut Field, on: &mut VisibleSamples, buffers: &mut FieldBuffers, d_positions: Option<&mut Vec<f32>>) {
+        let &Drawn { batch, background, step: s } = self;
+        let marched = &on.samples;
+        let samples = Packed { offsets: &marched.offsets, t: &marched.t, dt: &marched.dt };
+        let given = match &s.rays {
+            RaySource::Given(g) => g.codes,
+            RaySource::Photographs { .. } => &[],
+        };
+        let (dirs, images) = (&batch.dirs[..], Some(&batch.images[..]));
+        let b = Batch { samples, positions: &on.positions, dirs, images, given, background, near_scaling: s.near_scaling };
+        match s.loss {
+            Loss::Batch(loss) => field.train(&b, &mut on.encoded, fields::Loss::Batch(loss), buffers, d_positions),
+            Loss::Photometric(terms) => {
+                assert_eq!(field.net.channels(), 3, "a photometric loss compares colors alone");
+                let loss = Photometric::new(terms, measure(field), batch.targets(background), samples);
+                field.train(&b, &mut on.encoded, fields::Loss::Rays(&loss), buffers, d_positions);
+            }
+        }
+    }
 }
 
 /// How a loss measures a field's colors and distances. Linear light has a color head of its own.
@@ -275,28 +263,13 @@ pub(crate) fn measure(field: &Field) -> Measure {
     Measure { relative: if is_linear { RELATIVE } else { 0.0 }, normalized: field.is_unbounded() }
 }
 
-/// The batch's rays as marching takes them.
-fn rays(b: &RayBatch) -> MarchRays<'_> {
-    MarchRays { origins: &b.origins, dirs: &b.dirs, near_far: &b.near_far, jitter: &b.jitter, resumed: false }
-}
-
-/// Positions of samples along their rays, and their encoding.
-fn encode(field: &Field, batch: &RayBatch, out: &mut VisibleSamples) {
-    march::cpu::positions(&rays(batch), &out.samples, &mut out.positions);
-    field.encode(&out.positions, &mut out.encoded);
-}
-
-/// One optimiser step for every group; focal lengths that are not refined stay as they were given.
+/// One optimizer step for every group; cameras only follow rays of their own, and focal lengths that are not refined stay as they were
+/// given.
 fn optimise(of: &mut Trainees, s: &Step) {
-    let t = s.number as u32 + 1;
-    let mut fields = vec![&mut *of.field];
-    fields.extend(of.coarse.as_deref_mut());
-    let groups = fields.into_iter().flat_map(Field::groups_mut).chain(of.learned.as_mut().map(|l| &mut l.group));
-    groups.for_each(|g| g.step(t, s.rate_scale));
-    if let Some((group, focal)) = of.corrections.as_mut().filter(|_| s.rays.is_of_cameras()) {
-        group.step(t, s.rate_scale);
-        if !*focal {
-            group.values.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);
-        }
+    let mut now = of.reborrow();
+    now.corrections = now.corrections.filter(|_| s.rays.is_of_cameras());
+    now.into_params().0.step(s.number, s.progress, s.rate_scale);
+    if let Some((group, false)) = of.corrections.as_mut().filter(|_| s.rays.is_of_cameras()) {
+        group.values.iter_mut().skip(6).step_by(CORRECTION).for_each(|v| *v = 0.0);
     }
 }

@@ -1,5 +1,5 @@
-//! A training step, described once: where rays come from, how samples are placed on them, what is compared, and how parameters follow.
-//! [`CpuTrainer`] carries it out here, `on_gpu::GpuTrainer` on a device.
+//! A training step, described once ([`Step`]): source of rays, placement of samples, loss and rates. [`CpuTrainer`] carries it out on the
+//! CPU, `on_gpu::GpuTrainer` on a device.
 
 mod cpu;
 
@@ -9,17 +9,17 @@ pub(crate) use cpu::measure;
 pub use diorama_kernels::ops::pixel_draw::Backdrop;
 
 use crate::background::LearnedBackground;
-use crate::fields::{Field, Pruning};
-use crate::params::ParamGroup;
+use crate::fields::Field;
+use crate::params::{ParamGroup, ParamSet};
 use crate::samplers::occupancy::Occupancy;
 use crate::samplers::pixels::{ErrorMap, Observation, PixelSource};
+use crate::samplers::placement::Placement;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::field_step::BatchLoss;
-use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::photometric_loss::Terms;
 use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
 
-/// What a step depends on besides what is trained.
+/// Description of a training step.
 #[derive(Clone, Copy)]
 pub struct Step<'a> {
     /// Number of the step, from 0.
@@ -27,21 +27,47 @@ pub struct Step<'a> {
     pub rays: RaySource<'a>,
     /// Rays of the steps before, from which random numbers are counted on.
     pub first: u64,
-    /// Ignored where a background is learned.
+    /// Background of the rays; ignored where one is learned, and for rays of the caller's.
     pub backdrop: Backdrop,
     pub placement: Placement,
-    /// Where the occupancy grid is sampled before the step; none: nowhere.
+    /// Samples that a device has memory for where an occupancy grid places them: before and after those are dropped that cannot matter.
+    /// Rays beyond it are left out of the step.
+    pub room: (usize, usize),
+    /// Points at which the occupancy grid samples the field before the step; none: it stays as it is.
     pub probes: Option<Probes>,
     pub loss: Loss<'a>,
     /// Distance within which samples learn more slowly; 0: none.
     pub near_scaling: f32,
-    /// Times each group's own rate.
+    /// Share of the run that is done, 0 to 1, for the groups' schedules.
+    pub progress: f32,
+    /// Factor of each group's own rate.
     pub rate_scale: f32,
     /// Whether draws go by the errors as they are after this step.
     pub refresh_errors: bool,
 }
 
-/// Where the rays of a step come from.
+impl<'a> Step<'a> {
+    /// Step `number` before black, whose random numbers are counted on from ray `first`, with room for 2¹⁸ samples on a device and without
+    /// anything else.
+    pub fn new(number: u64, first: u64, rays: RaySource<'a>, placement: Placement, loss: Loss<'a>) -> Step<'a> {
+        Step {
+            number,
+            rays,
+            first,
+            backdrop: Backdrop::Color([0.0; 3]),
+            placement,
+            room: (1 << 18, 1 << 18),
+            probes: None,
+            loss,
+            near_scaling: 0.0,
+            progress: 0.0,
+            rate_scale: 1.0,
+            refresh_errors: false,
+        }
+    }
+}
+
+/// Source of a step's rays.
 #[derive(Clone, Copy)]
 pub enum RaySource<'a> {
     /// Random pixels of the training photographs, half of them where errors are high if there is an [`ErrorMap`].
@@ -75,26 +101,14 @@ pub struct GivenRays<'a> {
     pub origins: &'a [f32],
     /// Unit length, `[R, 3]`.
     pub dirs: &'a [f32],
-    /// Where in a marching step the first sample lies, in `[0, 1)`, `[R]`.
+    /// Offset of the first sample within a marching step, in `[0, 1)`, `[R]`.
     pub jitter: &'a [f32],
     /// Straight RGBA `[R, 4]`; may be empty where a [`BatchLoss`] knows what to compare with.
     pub target: &'a [f32],
-    /// What the field's channels are composited on, `[R, C]`.
+    /// Background of the field's channels, `[R, C]`.
     pub background: &'a [f32],
     /// Vectors of [`crate::fields::RayCodes::given`], `[R, width]` each.
     pub codes: &'a [&'a [f32]],
-}
-
-/// How samples are placed on rays.
-#[derive(Clone, Copy, Debug)]
-pub enum Placement {
-    /// In occupied cells, but for those that cannot matter. `room`: samples that a device has memory for, before and after those are
-    /// left out; rays beyond it are left out of the step.
-    Occupancy { march: MarchConfig, pruning: Pruning, room: (usize, usize) },
-    /// One in each of equal intervals.
-    Stratified { samples: usize, rng: Rng },
-    /// As many for the coarse field, whose weights decide where `more` go for the main one.
-    Hierarchical { samples: usize, more: usize, coarse: Rng, fine: Rng },
 }
 
 /// Random points at which the occupancy grid is sampled.
@@ -106,16 +120,16 @@ pub struct Probes {
     pub block: usize,
 }
 
-/// What a step minimizes.
+/// Loss of a step.
 #[derive(Clone, Copy)]
 pub enum Loss<'a> {
-    /// Of colors `[R, 3]` against photographs, ray by ray.
+    /// Colors `[R, 3]` against photographs, ray by ray.
     Photometric(Terms),
     /// A function of all rays' outputs `[R, C]`, computed on the CPU; the network is evaluated once more for its gradients.
     Batch(&'a dyn BatchLoss),
 }
 
-/// What a step draws from.
+/// Photographs that a step draws from.
 #[derive(Clone, Copy)]
 pub struct Photographs<'a> {
     pub pixels: &'a dyn PixelSource,
@@ -123,7 +137,7 @@ pub struct Photographs<'a> {
     pub observations: &'a [Observation],
 }
 
-/// Where rays begin and end, and the training cameras as they were given.
+/// Extent of rays, and the training cameras before corrections.
 #[derive(Clone, Debug)]
 pub struct Scene {
     pub cameras: Vec<PosedCamera>,
@@ -133,19 +147,53 @@ pub struct Scene {
     pub cube: (f32, f32),
 }
 
-/// All that a step trains.
+/// Everything that a step changes: fields, background, grid, cameras and error map.
 pub struct Trainees<'a> {
     pub field: &'a mut Field,
     /// Places samples for the main field ([`Placement::Hierarchical`]).
     pub coarse: Option<&'a mut Field>,
     pub learned: Option<&'a mut LearnedBackground>,
     pub occupancy: Option<&'a mut Occupancy>,
-    /// Of the cameras, `[cameras, 7]`, and whether focal lengths are among what is refined.
+    /// Corrections of the cameras, `[cameras, 7]`, and whether focal lengths are refined, too.
     pub corrections: Option<(&'a mut ParamGroup, bool)>,
     pub error_map: Option<&'a mut ErrorMap>,
 }
 
-/// What steps came to.
+impl<'a> Trainees<'a> {
+    /// A field alone.
+    pub fn of(field: &'a mut Field) -> Trainees<'a> {
+        Trainees { field, coarse: None, learned: None, occupancy: None, corrections: None, error_map: None }
+    }
+
+    /// The parameters among them, by the names that checkpoints have, then the grid and the map, which learn without gradients.
+    pub fn into_params(self) -> (ParamSet<'a>, Option<&'a mut Occupancy>, Option<&'a mut ErrorMap>) {
+        let mut params = ParamSet::default();
+        params.add("field", self.field.groups_mut());
+        params.add("coarse", self.coarse.into_iter().flat_map(Field::groups_mut));
+        params.add("", self.learned.map(|l| &mut l.group));
+        params.add("", self.corrections.map(|(group, _)| group));
+        (params, self.occupancy, self.error_map)
+    }
+
+    /// The same, borrowed for a shorter time.
+    pub fn reborrow(&mut self) -> Trainees<'_> {
+        Trainees {
+            field: self.field,
+            coarse: self.coarse.as_deref_mut(),
+            learned: self.learned.as_deref_mut(),
+            occupancy: self.occupancy.as_deref_mut(),
+            corrections: self.corrections.as_mut().map(|(group, focal)| (&mut **group, *focal)),
+            error_map: self.error_map.as_deref_mut(),
+        }
+    }
+
+    /// Whether the cameras learn from a step's rays.
+    pub(crate) fn moves_cameras(&self, s: &Step) -> bool {
+        self.corrections.as_ref().is_some_and(|(group, _)| !group.frozen) && s.rays.is_of_cameras()
+    }
+}
+
+/// Losses and counts of steps.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Figures {
     pub steps: u64,

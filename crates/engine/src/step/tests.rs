@@ -9,6 +9,7 @@ use diorama_kernels::ops::field_step::{FieldNet, Output, RayGradients, RayOutput
 use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
 use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::linear::Activation;
+use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::photometric_loss::ColorLoss;
 use diorama_testkit::random_unit;
 
@@ -41,30 +42,16 @@ fn hash_field() -> Field {
 }
 
 fn step(number: u64, placement: Placement, loss: Loss<'_>) -> Step<'_> {
-    Step {
-        number,
-        rays: RaySource::Photographs { count: 64, rng: Rng::new(1, 1) },
-        first: number * 64,
-        backdrop: Backdrop::Color([0.0; 3]),
-        placement,
-        probes: None,
-        loss,
-        near_scaling: 0.0,
-        rate_scale: 1.0,
-        refresh_errors: false,
-    }
+    let rays = RaySource::Photographs { count: 64, rng: Rng::new(1, 1) };
+    Step::new(number, number * 64, rays, placement, loss)
 }
 
 fn stratified() -> Placement {
-    Placement::Stratified { samples: 16, rng: Rng::new(1, 2) }
+    Placement::Stratified { samples: 16, noise: Some(Rng::new(1, 2)) }
 }
 
 fn photometric(color: ColorLoss) -> Loss<'static> {
     Loss::Photometric(Terms { color, distortion: 0.0, depth: 0.0, alpha: 0.0 })
-}
-
-fn of(field: &mut Field) -> Trainees<'_> {
-    Trainees { field, coarse: None, learned: None, occupancy: None, corrections: None, error_map: None }
 }
 
 #[test]
@@ -72,11 +59,11 @@ fn every_placement_learns_the_colors_of_photographs() {
     let pixels = Plain([[0.8, 0.3, 0.1, 1.0]; 2]);
     let photographs = Photographs { pixels: &pixels, observations: &[] };
     let march = MarchConfig { cone: 0.0, dt_min: 0.06, dt_max: 0.06, max_samples: 64, ..MarchConfig::default() };
-    let pruning = Pruning { stop: 1e-4, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 };
-    let hierarchical = Placement::Hierarchical { samples: 8, more: 8, coarse: Rng::new(1, 3), fine: Rng::new(1, 4) };
-    for placement in [stratified(), hierarchical, Placement::Occupancy { march, pruning, room: (0, 0) }] {
+    let pruning = fields::Pruning { stop: 1e-4, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 };
+    let hierarchical = Placement::Hierarchical { samples: 8, more: 8, noise: Some([Rng::new(1, 3), Rng::new(1, 4)]) };
+    for placement in [stratified(), hierarchical, Placement::Occupancy { march, pruning }] {
         let (mut field, mut coarse, mut occupancy) = (hash_field(), hash_field(), Occupancy::new(8, 1, false));
-        let mut of = Trainees { coarse: Some(&mut coarse), occupancy: Some(&mut occupancy), ..of(&mut field) };
+        let mut of = Trainees { coarse: Some(&mut coarse), occupancy: Some(&mut occupancy), ..Trainees::of(&mut field) };
         let mut trainer = CpuTrainer::new(scene(), &of);
         let mut run = |i: u64| {
             let probes = (i > 0 && i.is_multiple_of(16)).then_some(Probes { rng: Rng::new(1, 5), points: 256, block: 1 });
@@ -95,7 +82,7 @@ fn a_loss_that_is_not_finite_changes_nothing() {
     let photographs = Photographs { pixels: &pixels, observations: &[] };
     let mut field = hash_field();
     let before = field.weights.values.clone();
-    let mut of = of(&mut field);
+    let mut of = Trainees::of(&mut field);
     let figures = CpuTrainer::new(scene(), &of).step(&mut of, Some(&photographs), &step(0, stratified(), photometric(ColorLoss::Mse)));
     assert!(figures.loss.is_nan() && of.field.weights.values == before);
 }
@@ -107,7 +94,7 @@ fn cameras_follow_their_corrections_and_keep_focal_lengths_that_are_not_refined(
     for focal in [false, true] {
         let mut field = hash_field();
         let mut group = ParamGroup::dense("corrections", vec![0.0; 2 * CORRECTION], Adam::default());
-        let mut of = Trainees { corrections: Some((&mut group, focal)), ..of(&mut field) };
+        let mut of = Trainees { corrections: Some((&mut group, focal)), ..Trainees::of(&mut field) };
         let mut trainer = CpuTrainer::new(scene(), &of);
         for i in 0..20 {
             trainer.step(&mut of, Some(&photographs), &step(i, stratified(), photometric(ColorLoss::Mse)));
@@ -178,7 +165,7 @@ fn rays_of_the_callers_train_any_outputs_by_a_loss_of_the_batch_but_frozen_layer
         background: &background,
         codes: &[&style],
     };
-    let mut of = of(&mut field);
+    let mut of = Trainees::of(&mut field);
     let mut trainer = CpuTrainer::new(Scene { cameras: Vec::new(), near: 0.05, cube: (0.0, 1.0) }, &of);
     let mut run = |i: u64| {
         let described = step(i, stratified(), Loss::Batch(&Spread(0.7)));
@@ -199,7 +186,7 @@ fn rays_through_pixels_of_known_distance_and_masked_ones_are_told_apart() {
     let seen = [Observation { image: 1, x: 2, y: 3, distance: 1.5 }, Observation { image: 0, x: 7, y: 3, distance: 1.5 }];
     let photographs = Photographs { pixels: &pixels, observations: &seen };
     let mut field = hash_field();
-    let of = of(&mut field);
+    let of = Trainees::of(&mut field);
     let mut trainer = CpuTrainer::new(scene(), &of);
     trainer.draw(&of, Some(&photographs), &step(0, stratified(), photometric(ColorLoss::Mse)));
     let b = &trainer.batch;
@@ -228,10 +215,47 @@ fn rays_of_the_callers_teach_cameras_and_the_error_map_nothing() {
         background: &background,
         codes: &[],
     };
-    let mut of = Trainees { corrections: Some((&mut group, true)), error_map: Some(&mut map), ..of(&mut field) };
+    let mut of = Trainees { corrections: Some((&mut group, true)), error_map: Some(&mut map), ..Trainees::of(&mut field) };
     let mut trainer = CpuTrainer::new(scene(), &of);
     let described = step(0, stratified(), photometric(ColorLoss::Mse));
     let figures = trainer.step(&mut of, Some(&photographs), &Step { rays: RaySource::Given(given), ..described });
     assert!(figures.mse > 0.0 && figures.trained > 0.0, "{figures:?}");
     assert!(group.values.iter().all(|v| *v == 0.01) && map.errors == ErrorMap::new(2).errors);
+}
+
+#[test]
+fn what_is_frozen_stays_and_no_gradient_of_it_is_computed() {
+    let pixels = Plain([[0.9, 0.1, 0.1, 1.0], [0.1, 0.1, 0.9, 1.0]]);
+    let photographs = Photographs { pixels: &pixels, observations: &[] };
+    let config = HashGridConfig { levels: 2, features: 2, log2_size: 8, base: 4, finest: 8 };
+    for is_frozen in [false, true] {
+        // Two images, each with a code.
+        let mut field = fields::ngp(config, Space::Cube(1.0), 1e-2, 2, 4, 3);
+        if is_frozen {
+            field.freeze();
+        }
+        let before: Vec<Vec<f32>> = field.groups().iter().map(|g| g.values.clone()).collect();
+        let mut of = Trainees::of(&mut field);
+        let mut trainer = CpuTrainer::new(scene(), &of);
+        let figures = trainer.step(&mut of, Some(&photographs), &step(0, stratified(), photometric(ColorLoss::Mse)));
+        assert!(figures.loss > 0.0);
+        let moved: Vec<bool> = field.groups().iter().zip(&before).map(|(g, b)| g.values != *b).collect();
+        assert_eq!(moved, [!is_frozen; 3], "table, weights and codes");
+        // Gradients of features take the features' place.
+        let visible = trainer.encoded();
+        let mut features = Vec::new();
+        field.encoder.forward(&visible.unit, &mut features);
+        assert_eq!(features == visible.features, is_frozen);
+    }
+}
+
+#[test]
+#[should_panic(expected = "Field::freeze_layers")]
+fn weights_that_are_frozen_beside_layers_that_are_not_are_refused() {
+    let pixels = Plain([[0.5; 4]; 2]);
+    let mut field = hash_field();
+    field.weights.frozen = true;
+    let mut of = Trainees::of(&mut field);
+    let described = step(0, stratified(), photometric(ColorLoss::Mse));
+    CpuTrainer::new(scene(), &of).step(&mut of, Some(&Photographs { pixels: &pixels, observations: &[] }), &described);
 }

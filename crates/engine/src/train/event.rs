@@ -1,13 +1,14 @@
-//! What a run tells the terminal, the metrics file and the viewer.
+//! Events of a run, which the terminal, the log and the viewer listen to.
 
-/// What one step did.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+use super::scalar::{Scalars, Scores};
+
+/// Result of one step.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct StepReport {
+    /// Loss of the step. If it is not finite, the run goes back ([`super::Trainee::recover`]).
     pub loss: f64,
-    /// Mean squared colour error of the step's rays.
-    pub mse: f64,
-    pub rays: u64,
-    pub samples: u64,
+    /// Other figures for the log, the terminal and the viewer.
+    pub scalars: Scalars,
 }
 
 /// Something that happened in a run.
@@ -19,31 +20,25 @@ pub enum Event {
         steps: Option<u64>,
         seconds: Option<f64>,
     },
-    /// Means since the last such event; totals are from the start of the run.
+    /// Mean loss and figures of the steps since the last such event.
     Progress {
         step: u64,
         seconds: f64,
+        /// Share of the budget that is spent, 0 to 1.
         progress: f64,
         loss: f64,
-        mse: f64,
-        psnr: f64,
-        rays: u64,
-        samples: u64,
-        rays_per_s: f64,
+        scalars: Scalars,
     },
-    /// Held-out pixels were judged.
+    /// The model was scored on held-out data.
     Evaluated {
         step: u64,
         seconds: f64,
-        psnr: f64,
-        mse: f64,
-        /// PSNR of each view, named by its frame.
-        views: Vec<(usize, f64)>,
+        scores: Scores,
     },
     Saved {
         step: u64,
     },
-    /// What went wrong at `step`; the run goes on from `to_step`.
+    /// The run failed at `step` because of `why` and goes on from `to_step`.
     Recovered {
         step: u64,
         to_step: u64,

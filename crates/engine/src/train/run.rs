@@ -1,36 +1,33 @@
-//! The loop.
+//! The training loop: steps until the budget is spent, with logging, checkpoints, evaluations and recovery.
 
-use super::{Event, StepReport};
-use crate::metrics::psnr;
+use super::{Event, Scalar, Scalars, Scores, StepReport};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// How often held-out pixels are judged, and the share of the time that this may take.
-const JUDGE_SECONDS: f64 = 10.0;
-const JUDGE_SHARE: f64 = 0.03;
-/// What judging may take at the end of a run too short for the share.
-const JUDGE_ONCE_SECONDS: f64 = 1.0;
+/// Seconds between evaluations, and the share of the time that they may take.
+const EVALUATE_SECONDS: f64 = 10.0;
+const EVALUATE_SHARE: f64 = 0.03;
+/// Seconds that an evaluation may take at the end of a run too short for the share.
+const EVALUATE_ONCE_SECONDS: f64 = 1.0;
 
-/// When a run ends, logs, saves and judges.
+/// When a run ends, logs, saves and evaluates.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RunOptions {
     pub steps: Option<u64>,
-    /// Budget of training time, without decoding; what judging takes counts.
+    /// Budget of training time, without decoding; evaluations count.
     pub seconds: Option<f64>,
     pub log_every: u64,
     pub save_every_seconds: f64,
     /// Also save each time so many steps are done.
     pub save_every_steps: Option<u64>,
-    /// Judge each time so many steps are done; none: every ten seconds, within 3 % of the time.
+    /// Evaluate each time so many steps are done; none: every ten seconds, within 3 % of the time.
     pub evaluate_every: Option<u64>,
-    /// Rays that judging traces; 0: nothing is held out.
-    pub held_out_rays: u64,
 }
 
-/// What is trained.
+/// A model in training, as the loop drives it.
 pub trait Trainee {
     type Error;
-    /// One optimiser step; `progress` in [0, 1] drives the schedules.
+    /// One optimizer step; `progress` in [0, 1] drives the schedules.
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport, Self::Error>;
     /// Writes a checkpoint that `step` steps and `seconds` have gone into; false, with nothing written, where a
     /// parameter is not finite.
@@ -38,32 +35,28 @@ pub trait Trainee {
     /// After a loss or a parameter that is not finite: goes back to where it was; the step to go on from and what went
     /// wrong, or `None` if that was tried before.
     fn recover(&mut self) -> Result<Option<(u64, String)>, Self::Error>;
-    /// Judges held-out pixels; `None` where that cannot be done now.
-    fn evaluate(&mut self) -> Result<Option<HeldOut>, Self::Error>;
-}
-
-/// How held-out pixels look.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct HeldOut {
-    /// Of all pixels together.
-    pub psnr: f64,
-    pub mse: f64,
-    /// PSNR of each view, named by its frame.
-    pub views: Vec<(usize, f64)>,
+    /// Scores what has been learned so far; `None` where nothing is held out, or it cannot be done now.
+    fn evaluate(&mut self) -> Result<Option<Scores>, Self::Error> {
+        Ok(None)
+    }
+    /// About how many seconds the first [`Trainee::evaluate`] will take, after `seconds` of training; later ones are expected to take as
+    /// long as the last.
+    fn evaluation_seconds(&self, _seconds: f64) -> f64 {
+        0.0
+    }
 }
 
 /// How a run ended.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Summary {
     pub step: u64,
     pub seconds: f64,
-    pub rays: u64,
-    pub samples: u64,
-    /// Means over the last logging interval.
+    /// Mean over the last logging interval; not a number where there was none.
     pub loss: f64,
-    pub psnr: f64,
-    /// PSNR of held-out pixels when they were judged last.
-    pub held_out: Option<f64>,
+    /// Figures of the last logging interval.
+    pub scalars: Scalars,
+    /// Of the last evaluation.
+    pub scores: Option<Scores>,
     pub interrupted: bool,
 }
 
@@ -76,13 +69,11 @@ pub enum RunError<E> {
     Diverged { first: u64, again: u64 },
 }
 
-/// Where a run begins: zero, or what a checkpoint says.
+/// Step and seconds at which a run begins: zero, or those of a checkpoint.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Origin {
     pub step: u64,
     pub seconds: f64,
-    pub rays: u64,
-    pub samples: u64,
 }
 
 /// Trains until the budget is spent or `interrupt` is set; a last checkpoint is always written.
@@ -93,27 +84,27 @@ pub fn run<T: Trainee>(
     interrupt: &AtomicBool,
     events: &mut dyn FnMut(&Event),
 ) -> Result<Summary, RunError<T::Error>> {
-    let Origin { mut step, seconds: before, mut rays, mut samples } = origin;
+    let Origin { mut step, seconds: before } = origin;
     events(&Event::Started { step, steps: options.steps, seconds: options.seconds });
     let clock = Clock { start: Instant::now(), before };
-    let mut since = Window::new(before);
-    let mut judging = Judging::new(options, origin);
-    let mut summary = Summary { step, seconds: before, rays, samples, loss: f64::NAN, psnr: f64::NAN, held_out: None, interrupted: false };
+    let mut interval = Interval::new(before);
+    let mut evaluations = Evaluations::new(options, origin);
+    let mut summary = Summary { step, seconds: before, loss: f64::NAN, scalars: Scalars::default(), scores: None, interrupted: false };
     let (mut last_save, mut fault) = (before, None);
     loop {
         let seconds = clock.seconds();
         let progress = budget_share(options, step, seconds);
         summary.interrupted = interrupt.load(Ordering::Relaxed);
         if progress >= 1.0 || summary.interrupted {
-            if since.steps > 0 {
-                since.end(&mut summary, (step, clock.seconds(), 1.0), (rays, samples), events);
+            if interval.steps > 0 {
+                interval.end(&mut summary, (step, clock.seconds(), 1.0), events);
             }
             if !trainee.save(step, clock.seconds()).map_err(RunError::Failed)? {
                 step = go_back(trainee, step, &mut fault, events)?;
                 continue;
             }
-            if !summary.interrupted && judging.is_worth_it(step, seconds, rays) {
-                judging.judge(trainee, step, &clock, &mut summary, events)?;
+            if !summary.interrupted && evaluations.is_last_worth_it(step, seconds, trainee) {
+                evaluations.evaluate(trainee, step, &clock, &mut summary, events)?;
             }
             break;
         }
@@ -123,12 +114,10 @@ pub fn run<T: Trainee>(
             continue;
         }
         step += 1;
-        rays += report.rays;
-        samples += report.samples;
-        since.add(&report);
+        interval.add(report);
         if step.is_multiple_of(options.log_every) {
             let seconds = clock.seconds();
-            since.end(&mut summary, (step, seconds, budget_share(options, step, seconds)), (rays, samples), events);
+            interval.end(&mut summary, (step, seconds, budget_share(options, step, seconds)), events);
         }
         let due =
             clock.seconds() - last_save > options.save_every_seconds || options.save_every_steps.is_some_and(|n| step.is_multiple_of(n));
@@ -140,12 +129,12 @@ pub fn run<T: Trainee>(
             }
             events(&Event::Saved { step });
         }
-        if judging.is_due(step, clock.seconds(), rays) {
-            judging.judge(trainee, step, &clock, &mut summary, events)?;
+        if evaluations.are_due(step, clock.seconds(), trainee) {
+            evaluations.evaluate(trainee, step, &clock, &mut summary, events)?;
         }
     }
     events(&Event::Saved { step });
-    summary = Summary { step, seconds: clock.seconds(), rays, samples, ..summary };
+    summary = Summary { step, seconds: clock.seconds(), ..summary };
     events(&Event::Finished { step, seconds: summary.seconds, interrupted: summary.interrupted });
     Ok(summary)
 }
@@ -179,50 +168,46 @@ impl Clock {
     }
 }
 
-/// Decides when held-out pixels are judged, so that it costs little.
-struct Judging {
+/// Decides when to evaluate, so that it costs little.
+struct Evaluations {
     every: Option<u64>,
-    rays: u64,
-    /// Seconds and rays at the start.
-    began: (f64, u64),
+    /// Step and seconds at the start.
+    began: (u64, f64),
     last: Option<(u64, f64)>,
-    /// Seconds that all judging took, and the last.
+    /// Seconds that all evaluations took, and the last.
     spent: f64,
     cost: Option<f64>,
 }
 
-impl Judging {
+impl Evaluations {
     fn new(options: &RunOptions, origin: Origin) -> Self {
-        let began = (origin.seconds, origin.rays);
-        Judging { every: options.evaluate_every, rays: options.held_out_rays, began, last: None, spent: 0.0, cost: None }
+        Evaluations { every: options.evaluate_every, began: (origin.step, origin.seconds), last: None, spent: 0.0, cost: None }
     }
 
-    /// What judging will cost: what it cost, else as if its rays were trained on.
-    fn expected(&self, seconds: f64, rays: u64) -> f64 {
-        let rays_per_s = (rays - self.began.1.min(rays)) as f64 / (seconds - self.began.0).max(1e-9);
-        self.cost.unwrap_or(self.rays as f64 / rays_per_s.max(1e-9))
+    /// Seconds that the next evaluation will take: as the last did, else the trainee's guess.
+    fn expected(&self, seconds: f64, trainee: &impl Trainee) -> f64 {
+        self.cost.unwrap_or_else(|| trainee.evaluation_seconds(seconds - self.began.1))
     }
 
-    fn is_affordable(&self, seconds: f64, rays: u64) -> bool {
-        self.spent + self.expected(seconds, rays) <= JUDGE_SHARE * (seconds - self.began.0)
+    fn are_affordable(&self, seconds: f64, trainee: &impl Trainee) -> bool {
+        self.spent + self.expected(seconds, trainee) <= EVALUATE_SHARE * (seconds - self.began.1)
     }
 
-    fn is_due(&self, step: u64, seconds: f64, rays: u64) -> bool {
+    fn are_due(&self, step: u64, seconds: f64, trainee: &impl Trainee) -> bool {
         match self.every {
-            _ if self.rays == 0 => false,
             Some(n) => step.is_multiple_of(n),
-            None => seconds - self.last.map_or(self.began.0, |l| l.1) >= JUDGE_SECONDS && self.is_affordable(seconds, rays),
+            None => seconds - self.last.map_or(self.began.1, |l| l.1) >= EVALUATE_SECONDS && self.are_affordable(seconds, trainee),
         }
     }
 
-    /// At the end of a run.
-    fn is_worth_it(&self, step: u64, seconds: f64, rays: u64) -> bool {
-        let new = self.last.is_none_or(|l| l.0 != step);
-        let cheap = self.is_affordable(seconds, rays) || (self.last.is_none() && self.expected(seconds, rays) <= JUDGE_ONCE_SECONDS);
-        self.rays > 0 && rays > self.began.1 && new && cheap
+    /// Whether to evaluate at the end of a run.
+    fn is_last_worth_it(&self, step: u64, seconds: f64, trainee: &impl Trainee) -> bool {
+        let is_new = self.last.is_none_or(|l| l.0 != step);
+        let is_cheap = self.last.is_none() && self.expected(seconds, trainee) <= EVALUATE_ONCE_SECONDS;
+        step > self.began.0 && is_new && (is_cheap || self.are_affordable(seconds, trainee))
     }
 
-    fn judge<T: Trainee>(
+    fn evaluate<T: Trainee>(
         &mut self,
         trainee: &mut T,
         step: u64,
@@ -231,52 +216,52 @@ impl Judging {
         events: &mut dyn FnMut(&Event),
     ) -> Result<(), RunError<T::Error>> {
         let begin = Instant::now();
-        let judged = trainee.evaluate().map_err(RunError::Failed)?;
+        let scores = trainee.evaluate().map_err(RunError::Failed)?;
         let cost = begin.elapsed().as_secs_f64();
         (self.cost, self.spent, self.last) = (Some(cost), self.spent + cost, Some((step, clock.seconds())));
-        if let Some(HeldOut { psnr, mse, views }) = judged {
-            summary.held_out = Some(psnr);
-            events(&Event::Evaluated { step, seconds: clock.seconds(), psnr, mse, views });
+        if let Some(scores) = scores {
+            events(&Event::Evaluated { step, seconds: clock.seconds(), scores: scores.clone() });
+            summary.scores = Some(scores);
         }
         Ok(())
     }
 }
 
-/// Sums since the last log.
-struct Window {
+/// Sums over the steps of a logging interval.
+struct Interval {
     steps: u64,
     loss: f64,
-    mse: f64,
-    rays: u64,
+    /// Of each figure, with the number of steps that reported it.
+    scalars: Vec<(Scalar, u64)>,
     began: f64,
 }
 
-impl Window {
+impl Interval {
     fn new(began: f64) -> Self {
-        Window { steps: 0, loss: 0.0, mse: 0.0, rays: 0, began }
+        Interval { steps: 0, loss: 0.0, scalars: Vec::new(), began }
     }
 
-    fn add(&mut self, r: &StepReport) {
+    fn add(&mut self, report: StepReport) {
         self.steps += 1;
-        self.loss += r.loss;
-        self.mse += r.mse;
-        self.rays += r.rays;
+        self.loss += report.loss;
+        for s in report.scalars.0 {
+            match self.scalars.iter_mut().find(|(sum, _)| sum.name == s.name) {
+                Some((sum, steps)) => {
+                    sum.add(s.value);
+                    *steps += 1;
+                }
+                None => self.scalars.push((s, 1)),
+            }
+        }
     }
 
-    /// Tells the means, and begins anew.
-    fn end(
-        &mut self,
-        summary: &mut Summary,
-        (step, seconds, progress): (u64, f64, f64),
-        (rays, samples): (u64, u64),
-        events: &mut dyn FnMut(&Event),
-    ) {
-        let n = self.steps.max(1) as f64;
-        let (loss, mse) = (self.loss / n, self.mse / n);
-        (summary.loss, summary.psnr) = (loss, psnr(mse));
-        let rays_per_s = self.rays as f64 / (seconds - self.began).max(1e-9);
-        events(&Event::Progress { step, seconds, progress, loss, mse, psnr: psnr(mse), rays, samples, rays_per_s });
-        *self = Window::new(seconds);
+    /// Emits what the steps came to, and begins anew.
+    fn end(&mut self, summary: &mut Summary, (step, seconds, progress): (u64, f64, f64), events: &mut dyn FnMut(&Event)) {
+        let took = (seconds - self.began).max(1e-9);
+        let Interval { steps, loss, scalars, .. } = std::mem::replace(self, Interval::new(seconds));
+        summary.loss = loss / steps.max(1) as f64;
+        summary.scalars = Scalars(scalars.into_iter().map(|(s, steps)| s.over(steps, took)).collect());
+        events(&Event::Progress { step, seconds, progress, loss: summary.loss, scalars: summary.scalars.clone() });
     }
 }
 
@@ -298,8 +283,12 @@ mod tests {
         /// Steps at which parameters are not finite.
         broken_at: Vec<u64>,
         recovered: bool,
-        /// What a step and judging take.
+        steps: u64,
+        /// What a step and an evaluation take.
         takes: [Duration; 2],
+        /// What the first evaluation is guessed to take for each second of training.
+        guess: f64,
+        nothing_held_out: bool,
     }
 
     impl Trainee for Fake {
@@ -310,7 +299,11 @@ mod tests {
             if bad {
                 self.nan_at.remove(0);
             }
-            Ok(StepReport { loss: if bad { f64::NAN } else { 1.0 }, mse: 0.01, rays: 10, samples: 100 })
+            self.steps += 1;
+            // A figure that no other application has, and one that only every second step knows.
+            let mut scalars = vec![Scalar::psnr("psnr", 0.01), Scalar::count("words", 10 * self.steps)];
+            scalars.extend(step.is_multiple_of(2).then(|| Scalar::new("accuracy", step as f64)));
+            Ok(StepReport { loss: if bad { f64::NAN } else { 1.0 }, scalars: Scalars(scalars) })
         }
         fn save(&mut self, step: u64, _: f64) -> Result<bool, ()> {
             if self.broken_at.first() == Some(&step) {
@@ -325,9 +318,12 @@ mod tests {
             self.recovered = true;
             Ok(first.then_some((2, "a NaN".into())))
         }
-        fn evaluate(&mut self) -> Result<Option<HeldOut>, ()> {
+        fn evaluate(&mut self) -> Result<Option<Scores>, ()> {
             std::thread::sleep(self.takes[1]);
-            Ok(Some(HeldOut { psnr: 19.0, mse: 0.0126, views: vec![(3, 19.0)] }))
+            Ok((!self.nothing_held_out).then(|| Scores::from([Scalar::new("albedo_psnr", 19.0)])))
+        }
+        fn evaluation_seconds(&self, seconds: f64) -> f64 {
+            self.guess * seconds
         }
     }
 
@@ -339,7 +335,6 @@ mod tests {
             save_every_seconds: 1e9,
             save_every_steps: Some(5),
             evaluate_every: Some(5),
-            held_out_rays: 10,
         }
     }
 
@@ -350,17 +345,19 @@ mod tests {
     }
 
     #[test]
-    fn it_counts_logs_saves_and_judges() {
+    fn it_counts_logs_saves_and_evaluates() {
         let mut f = Fake::default();
         let (s, log) = ends(&mut f, &options());
         let s = s.unwrap();
-        assert_eq!((s.step, s.rays, s.samples, s.interrupted), (10, 100, 1000, false));
-        assert!((s.psnr - 20.0).abs() < 1e-9 && s.held_out == Some(19.0));
+        assert_eq!((s.step, s.scalars.get("words"), s.interrupted), (10, Some(100.0), false));
+        assert!((s.scalars.get("psnr").unwrap() - 20.0).abs() < 1e-9);
+        assert_eq!(s.scores.and_then(|s| s.get("albedo_psnr")), Some(19.0));
         assert_eq!(f.saved, [5, 10, 10]);
-        assert_eq!(log.iter().filter(|e| matches!(e, Event::Progress { .. })).count(), 3);
+        let accuracy = |e: &Event| if let Event::Progress { scalars, .. } = e { scalars.get("accuracy") } else { None };
+        assert_eq!(log.iter().filter_map(accuracy).collect::<Vec<_>>(), [1.0, 5.0, 8.0], "means of the steps that know it");
         assert_eq!(log.iter().filter(|e| matches!(e, Event::Evaluated { .. })).count(), 2);
-        let (s, log) = ends(&mut Fake::default(), &RunOptions { held_out_rays: 0, ..options() });
-        assert!(s.unwrap().held_out.is_none() && !log.iter().any(|e| matches!(e, Event::Evaluated { .. })), "nothing is held out");
+        let (s, log) = ends(&mut Fake { nothing_held_out: true, ..Fake::default() }, &options());
+        assert!(s.unwrap().scores.is_none() && !log.iter().any(|e| matches!(e, Event::Evaluated { .. })), "nothing is held out");
     }
 
     #[test]
@@ -393,22 +390,24 @@ mod tests {
     }
 
     #[test]
-    fn judging_takes_its_share_of_the_budget_and_no_more() {
+    fn evaluations_take_their_share_of_the_budget_and_no_more() {
         let o = RunOptions { evaluate_every: None, ..options() };
-        let origin = Origin { seconds: 100.0, rays: 7000, ..Origin::default() };
-        let j = Judging::new(&o, origin);
-        // 10 rays at 50 rays a second are expected to take 0.2 s: 3 % of 6.7 s, but not before ten seconds are over.
-        assert!(!j.is_due(9, 107.0, 7350) && j.is_due(9, 110.0, 7500));
-        let dear = Judging { spent: 0.6, cost: Some(0.6), last: Some((9, 110.0)), ..j };
-        assert!(!dear.is_due(50, 130.0, 9000) && dear.is_due(50, 140.5, 9000));
-        // Slow trainees are judged later, and a short run once at its end.
-        let slow = Judging::new(&RunOptions { held_out_rays: 1000, ..o.clone() }, origin);
-        assert!(!slow.is_due(9, 110.0, 7500) && !slow.is_worth_it(9, 110.0, 7500));
-        assert!(Judging::new(&o, origin).is_worth_it(9, 101.0, 7050));
+        let origin = Origin { step: 5, seconds: 100.0 };
+        let e = Evaluations::new(&o, origin);
+        // Guessed to take 2 % of the training before it: within 3 % at once, but not before ten seconds are over.
+        let f = Fake { guess: 0.02, ..Fake::default() };
+        assert!(!e.are_due(9, 107.0, &f) && e.are_due(9, 110.0, &f));
+        let dear = Evaluations { spent: 0.6, cost: Some(0.6), last: Some((9, 110.0)), ..e };
+        assert!(!dear.are_due(50, 130.0, &f) && dear.are_due(50, 140.5, &f));
+        // What takes long comes later, and once at the end of a short run.
+        let slow = Fake { guess: 2.0, ..Fake::default() };
+        let e = Evaluations::new(&o, origin);
+        assert!(!e.are_due(9, 110.0, &slow) && !e.is_last_worth_it(9, 110.0, &slow));
+        assert!(e.is_last_worth_it(9, 100.4, &slow) && !e.is_last_worth_it(5, 100.4, &slow));
         // It counts in the seconds of a run.
         let mut f = Fake { takes: [Duration::from_millis(1), Duration::from_millis(200)], ..Fake::default() };
         let o = RunOptions { steps: None, seconds: Some(0.5), evaluate_every: Some(5), save_every_steps: None, ..options() };
         let s = ends(&mut f, &o).0.unwrap();
-        assert!(s.step <= 20, "{} steps of a millisecond, one of five judged for 200", s.step);
+        assert!(s.step <= 20, "{} steps of a millisecond, one of five evaluated for 200", s.step);
     }
 }

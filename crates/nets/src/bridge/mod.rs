@@ -12,6 +12,7 @@ mod frequency;
 mod fused_mlp;
 mod graph;
 mod hash_grid;
+mod leaf;
 mod linear;
 #[cfg(feature = "gpu")]
 mod on_gpu;
@@ -32,6 +33,7 @@ pub use error::{OpError, expect_inputs, expect_shape};
 pub use frequency::frequency;
 pub use fused_mlp::fused_mlp;
 pub use hash_grid::hash_grid;
+pub use leaf::{backward_from, gradient, leaf};
 pub use linear::linear;
 pub(crate) use linear::linear_of_rows;
 #[cfg(feature = "gpu")]

@@ -1,4 +1,4 @@
-//! Every op on a GPU against its reference.
+//! `diorama bench check`: every op on a GPU compared with its reference.
 
 #[cfg(feature = "gpu")]
 use crate::object::config::Method;
@@ -16,7 +16,7 @@ pub struct Line {
     pub fault: Option<String>,
 }
 
-/// What a check found.
+/// Result of a check.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct Report {
     pub device: &'static str,
@@ -40,13 +40,13 @@ pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
     use diorama_kernels::gpu::{Gpu, GpuError};
     use diorama_kernels::ops::fused_mlp::gpu::fused::tensor_element;
     let begin = std::time::Instant::now();
-    let told = |e: GpuError| match e {
+    let to_pipeline_error = |e: GpuError| match e {
         GpuError::Lost(..) | GpuError::Memory(..) => PipelineError::Device(e.to_string()),
         _ => PipelineError::Usage(e.to_string()),
     };
-    let gpu = Gpu::open(device.parse().map_err(PipelineError::Usage)?).map_err(told)?;
-    let mut rows = check::run(&gpu).map_err(told)?;
-    rows.extend(diorama_engine::on_gpu::check::run(&gpu).map_err(told)?);
+    let gpu = Gpu::open(device.parse().map_err(PipelineError::Usage)?).map_err(to_pipeline_error)?;
+    let mut rows = check::run(&gpu).map_err(to_pipeline_error)?;
+    rows.extend(diorama_engine::on_gpu::check::run(&gpu).map_err(to_pipeline_error)?);
     let line =
         |r: check::Row| Line { op: r.op, result: r.result, shape: r.shape, error: r.error.is_finite().then_some(r.error), fault: r.fault };
     let mut lines: Vec<Line> = rows.into_iter().map(line).collect();
@@ -87,7 +87,7 @@ const WIDE_STEPS: u64 = 10;
 /// sets of one CPU are 42 % apart after 50 steps.
 #[cfg(feature = "gpu")]
 const CAMERAS_APART: [f64; 2] = [0.02, 0.4];
-/// How far losses may be apart in f32, and on tensor cores.
+/// Largest relative difference of losses in f32, and on tensor cores.
 #[cfg(feature = "gpu")]
 const APART: [f64; 2] = [0.02, 0.05];
 
@@ -163,7 +163,7 @@ pub fn run(device: &str, _: Option<&Path>) -> Result<Report> {
     Err(not_built(device))
 }
 
-/// What a build without GPU kernels says of a device.
+/// Error of a build without GPU kernels.
 #[cfg(not(feature = "gpu"))]
 pub fn not_built(device: &str) -> PipelineError {
     PipelineError::Usage(match device.parse::<diorama_kernels::device::Api>() {

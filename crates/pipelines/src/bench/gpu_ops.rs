@@ -44,7 +44,7 @@ struct Table<'a> {
     progress: &'a mut dyn FnMut(&OpFigure),
 }
 
-fn told(e: GpuError) -> PipelineError {
+fn to_pipeline_error(e: GpuError) -> PipelineError {
     match e {
         GpuError::Lost(..) | GpuError::Memory(..) => PipelineError::Device(e.to_string()),
         _ => PipelineError::Usage(e.to_string()),
@@ -60,10 +60,10 @@ impl Table<'_> {
             (0..batch).for_each(|_| f());
             lost = lost.take().or(self.gpu.sync().err());
         });
-        lost.map_or(Ok(seconds / batch as f64), |e| Err(told(e)))
+        lost.map_or(Ok(seconds / batch as f64), |e| Err(to_pipeline_error(e)))
     }
 
-    /// `flops` and `bytes` per unit, which is given with how many a call does; 0: not told.
+    /// `flops` and `bytes` per unit, which is given with how many a call does; 0: unknown.
     fn row(&mut self, op: &str, shape: &str, (unit, units): (&'static str, usize), flops: f64, bytes: f64, f: impl FnMut()) -> Result<()> {
         let ns = self.seconds(f)? * 1e9 / units as f64;
         let rate = |n: f64| (n > 0.0).then_some(n / ns);
@@ -85,7 +85,7 @@ fn random(gpu: &Gpu, n: usize, stream: u64) -> Buffer {
 /// # Errors
 /// When the device is unknown, not part of the build, absent or lost.
 pub fn run(device: &str, repeats: usize, progress: &mut dyn FnMut(&OpFigure)) -> Result<GpuOpsReport> {
-    let gpu = Gpu::open(device.parse().map_err(PipelineError::Usage)?).map_err(told)?;
+    let gpu = Gpu::open(device.parse().map_err(PipelineError::Usage)?).map_err(to_pipeline_error)?;
     let samples = if gpu.software { 1 << 14 } else { 1 << 20 };
     let mut table = Table { gpu: &gpu, repeats, ops: Vec::new(), progress };
     let n = samples * 32;

@@ -1,5 +1,4 @@
-//! What the machine and the kernels reach: each op against the machine's own measured limits, and where
-//! a training step's time goes, and how fast views are drawn.
+//! `diorama bench`: each op against the machine's measured limits, the stages of a training step, networks, and the speed of rendering.
 
 pub mod check;
 #[cfg(feature = "gpu")]

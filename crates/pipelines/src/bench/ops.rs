@@ -17,7 +17,7 @@ use diorama_kernels::ops::{spherical_harmonics, ssim};
 use diorama_kernels::probe;
 use serde::Serialize;
 
-/// What this machine can do, measured on one thread.
+/// Limits of this machine, measured on one thread.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Limits {
     pub fma_gflops: f64,
@@ -29,11 +29,11 @@ pub struct Limits {
 pub struct OpFigure {
     pub op: String,
     pub shape: String,
-    /// What `ns` counts: a sample, a ray, a parameter…
+    /// Unit of `ns`: a sample, a ray, a parameter…
     pub unit: &'static str,
     /// Nanoseconds per unit, all threads together.
     pub ns: f64,
-    /// Where the op computes.
+    /// Device of the op.
     pub gflops: Option<f64>,
     /// Of the measured multiply-add peak of the threads in use.
     pub share_of_peak: Option<f64>,

@@ -15,7 +15,7 @@ use serde::Serialize;
 /// Nothing but what next to no light reaches is left out.
 const EXHAUSTIVE: Pruning = Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 };
 
-/// What one quality reaches over all views.
+/// Speed and scores of one quality over all views.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct QualityFigure {
     pub frames_per_s: f64,
@@ -30,7 +30,7 @@ pub struct QualityFigure {
 pub struct RenderReport {
     pub threads: usize,
     pub simd: &'static str,
-    /// What draws.
+    /// Device that renders.
     pub device: String,
     pub views: usize,
     pub width: u32,
@@ -49,11 +49,9 @@ pub fn run(model: &ObjectModel, repeats: usize, device: String) -> Result<Render
         return Err(PipelineError::Usage("the run holds no views out; train with --split every:8".into()));
     };
     let camera = model.posed(first).camera;
-    let tracers = [
-        Tracer { shared_weight: 0.0, pruning: EXHAUSTIVE, ..model.tracer(Quality::Full) },
-        model.tracer(Quality::Full),
-        model.tracer(Quality::Fast),
-    ];
+    let full = model.tracer(Quality::Full);
+    let exhaustive = Tracer { shared_weight: 0.0, placement: full.placement.with_pruning(EXHAUSTIVE), ..full };
+    let tracers = [exhaustive, full, model.tracer(Quality::Fast)];
     let mut sums = [QualityFigure::default(); 3];
     let mut seconds = [0.0; 3];
     for &i in &frames {

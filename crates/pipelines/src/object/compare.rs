@@ -90,8 +90,8 @@ pub fn compare(runs: &[PathBuf], data: Option<&Path>, out: &Path, note: &mut dyn
             method: model.config.method.to_string(),
             steps: model.origin.step,
             seconds: model.origin.seconds,
-            rays: model.origin.rays,
-            samples: model.origin.samples,
+            rays: model.rays,
+            samples: model.samples,
             parameters: model
                 .field
                 .groups()

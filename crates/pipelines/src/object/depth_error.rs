@@ -1,5 +1,5 @@
-//! How far the surfaces of held-out views are from the sparse points that the views show: scores of pixels hide it, as a wall of
-//! one color looks the same in any depth.
+//! Distance between the surfaces of held-out views and the sparse points that the views show. Scores of pixels do not tell it: a wall of
+//! one color looks the same at any depth.
 
 use super::fog::median;
 use super::model::ObjectModel;

@@ -1,4 +1,4 @@
-//! What the object application asks of its device: how much a step holds, and who renders.
+//! Use of the device by the object application: samples per step, and rendering.
 
 use super::config::{Config, Method};
 use super::model::ObjectModel;
@@ -11,7 +11,7 @@ use diorama_engine::renderers::supervised::Supervised;
 use diorama_engine::renderers::volume::Accelerator;
 
 /// Lets the named device evaluate a model's field; which that is, in words. `auto` is the best GPU that is no software,
-/// else the CPU, which goes on where that GPU fails: `say` is told so, once. The failure of a device that was named is
+/// else the CPU, which goes on where that GPU fails: `say` is then called once. The failure of a device that was named is
 /// [`ObjectModel::check_device`]'s.
 ///
 /// # Errors
@@ -52,12 +52,8 @@ mod tests {
     use super::*;
     #[cfg(feature = "gpu")]
     use diorama_engine::{
-        fields::Pruning,
-        renderers::{
-            supervised::Unserved,
-            volume::{Placement, Traced},
-        },
-        samplers::RayBatch,
+        renderers::{supervised::Unserved, volume::Traced},
+        samplers::{RayBatch, placement::Placement},
     };
 
     #[cfg(feature = "gpu")]
@@ -68,7 +64,7 @@ mod tests {
 
     #[cfg(feature = "gpu")]
     impl Accelerator for Unplugged {
-        fn trace(&self, _: &RayBatch, _: &Placement, _: Pruning, _: Option<u32>) -> std::result::Result<TracedRays, Unserved> {
+        fn trace(&self, _: &RayBatch, _: &Placement, _: Option<u32>) -> std::result::Result<TracedRays, Unserved> {
             Err(Unserved::Failed("unplugged".into()))
         }
         fn density(&self, _: &[f32]) -> std::result::Result<Vec<f32>, Unserved> {

@@ -1,4 +1,4 @@
-//! What a capture is and what will likely go wrong with it, before any training.
+//! `diorama doctor DATA`: what a capture holds, and what will likely go wrong with it in training.
 
 use crate::error::Result;
 use diorama_data::{masks, photo, pixel_store, sparse, video};
@@ -20,7 +20,7 @@ pub enum Grade {
     Trouble,
 }
 
-/// One thing that was looked at.
+/// Result of one check.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Finding {
     pub subject: &'static str,

@@ -8,7 +8,7 @@ use super::scored_view::{Doing, ScoredView, admits, reference, score_view, where
 use crate::error::{PipelineError, Result};
 use diorama_data::{photo, weights};
 use diorama_engine::metrics::lpips::{self, Lpips};
-use diorama_engine::metrics::{self, Scores};
+use diorama_engine::metrics::{self, ImageScores};
 use diorama_engine::renderers::volume::Quality;
 use diorama_geom::Image;
 use diorama_geom::capture::Split;
@@ -101,7 +101,7 @@ const SHARES: [(f64, f64); 2] = [(0.5, 0.1), (0.9, 0.1)];
 struct Count<'a> {
     done: usize,
     all: usize,
-    told: &'a mut dyn FnMut(EvaluationProgress),
+    report: &'a mut dyn FnMut(EvaluationProgress),
 }
 
 impl Count<'_> {
@@ -114,7 +114,7 @@ impl Count<'_> {
             Doing::PerceptualDistance => drawing + scoring,
         };
         let share = (self.done as f64 + within) / self.all.max(1) as f64;
-        (self.told)(EvaluationProgress { share, views: (self.done, self.all), view, doing });
+        (self.report)(EvaluationProgress { share, views: (self.done, self.all), view, doing });
     }
 }
 
@@ -135,7 +135,7 @@ pub fn evaluate_with_training(
 ) -> Result<Report> {
     let held_out = held_out::frames(&model.capture, split).len();
     let beside = training_views(model, split, held_out);
-    let mut count = Count { done: 0, all: held_out + beside.len(), told: progress };
+    let mut count = Count { done: 0, all: held_out + beside.len(), report: progress };
     let mut report = evaluate_counted(model, split, quality, lpips, each, &mut count)?;
     if split == Split::Train {
         return Ok(report);
@@ -147,7 +147,7 @@ pub fn evaluate_with_training(
         scores.push(score_view(model, i, full, quality, &mut |part, doing| count.tell(&frame.name, part, doing, false))?.scores);
         count.done += 1;
     }
-    let mean = |f: fn(&Scores) -> f64| mean_of_numbers(scores.iter().map(f));
+    let mean = |f: fn(&ImageScores) -> f64| mean_of_numbers(scores.iter().map(f));
     let training = TrainingScores { views: scores.len(), psnr: mean(|s| s.psnr), ssim: mean(|s| s.ssim) };
     let middle = fog::median(scores.iter().map(|s| s.psnr).filter(|p| !p.is_nan()).collect()).unwrap_or(training.psnr);
     let mut surfaces = None;
@@ -171,7 +171,7 @@ pub fn evaluate(
     each: &mut dyn FnMut(&str, &ScoredView) -> Result<()>,
 ) -> Result<Report> {
     let all = held_out::frames(&model.capture, split).len();
-    evaluate_counted(model, split, quality, None, each, &mut Count { done: 0, all, told: &mut |_| {} })
+    evaluate_counted(model, split, quality, None, each, &mut Count { done: 0, all, report: &mut |_| {} })
 }
 
 /// Reads the network and the heads of LPIPS, which may be one file or several.

@@ -144,7 +144,7 @@ pub struct Removed {
     pub before_cameras: usize,
 }
 
-/// Extracts, cleans, simplifies, colours and writes; `note` hears what the user should know, `progress` is told the
+/// Extracts, cleans, simplifies, colours and writes; `note` receives messages for the user, `progress` receives the
 /// stage and (done, of).
 pub fn export(
     model: &ObjectModel,

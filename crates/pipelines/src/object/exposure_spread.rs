@@ -1,4 +1,5 @@
-//! How exposure and light differ between training photographs, by the colors of places that several show, and what is done about it.
+//! Differences of exposure and light between training photographs, measured by the colors of places that several show, and their
+//! correction.
 
 use super::config::Auto;
 use super::model::ObjectModel;
@@ -10,7 +11,7 @@ use diorama_geom::glam::DVec3;
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use rayon::prelude::*;
 
-/// Standard deviation of the log exposures from which on each photograph wears an appearance code, and the code's numbers.
+/// Standard deviation of the log exposures from which on each photograph has an appearance code, and the code's numbers.
 const DIFFERS: f32 = 0.1;
 const CODE: f32 = 8.0;
 

@@ -1,4 +1,4 @@
-//! What a capture is of: the box that a mesh is taken from when nobody says which.
+//! The default box of exported meshes: the surface that most cameras look at.
 
 use super::model::ObjectModel;
 use diorama_engine::renderers::volume::{Quality, Tracer};

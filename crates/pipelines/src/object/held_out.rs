@@ -1,4 +1,4 @@
-//! Held-out photographs: which they are, pixels of them by which training is judged while it runs, and views behind fog.
+//! Held-out photographs: their selection, the pixels that score training while it runs, and views behind fog.
 
 use super::config::Method;
 use super::model::ObjectModel;
@@ -10,7 +10,7 @@ use diorama_engine::metrics::psnr;
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::samplers::RayBatch;
 use diorama_engine::samplers::pixels::{self, DrawOptions};
-use diorama_engine::train::HeldOut;
+use diorama_engine::train::{Scalar, Scores};
 use diorama_geom::Capture;
 use diorama_geom::capture::Split;
 use diorama_geom::rng::Rng;
@@ -28,10 +28,10 @@ const BUDGET: u64 = 64 << 20;
 
 /// A held-out view this many dB below the training views is behind fog, whatever its depth says.
 pub const FOG_DB: f64 = 6.0;
-/// Mean gap in dB between training and held-out views from which on users are told what that means.
+/// Mean gap in dB between training and held-out views from which on its meaning is explained to users.
 pub const GAP_DB: f64 = 3.0;
 
-/// What a gap means, and what helps.
+/// Explanation of a gap, and its cures.
 pub const GAP_MEANS: &str = "photographs are explained in ways that do not hold from other places: fog, surfaces at wrong distances, mostly \
 where few photographs look; what helps: more photographs between these, poses that were checked (diorama doctor DATA), \
 --set field.appearance=8 where light or exposure vary (docs/troubleshooting.md)";
@@ -51,6 +51,22 @@ pub fn spread(all: &[usize], count: usize) -> Vec<usize> {
 /// Frames whose PSNR lies so far below the training rays' that they are behind fog.
 pub fn far_below(views: &[(usize, f64)], training: f64) -> Vec<usize> {
     views.iter().filter(|(_, psnr)| *psnr < training - FOG_DB).map(|v| v.0).collect()
+}
+
+/// Scores of held-out pixels.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Judged {
+    /// Of all pixels together.
+    pub mse: f64,
+    /// PSNR of each view, named by its frame, dB.
+    pub views: Vec<(usize, f64)>,
+}
+
+impl Judged {
+    /// The figures of all pixels together.
+    pub fn scores(&self) -> Scores {
+        Scores::from([Scalar::new("psnr", psnr(self.mse)), Scalar::new("mse", self.mse).logged_only()])
+    }
 }
 
 /// Pixels of held-out photographs, the same whenever they are judged.
@@ -92,13 +108,13 @@ impl HeldOutPixels {
         Ok(Some(HeldOutPixels { batch, frames }))
     }
 
-    /// Rays that judging traces.
+    /// Number of pixels, each of which takes a ray.
     pub fn rays(&self) -> usize {
         self.batch.len()
     }
 
     /// Traces the pixels on the CPU and compares them; not numbers where no pixel counts.
-    pub fn judge(&self, model: &ObjectModel) -> HeldOut {
+    pub fn judge(&self, model: &ObjectModel) -> Judged {
         let mut batch = self.batch.clone();
         let seen = model.tracer(Quality::Full).trace(&mut batch, &mut FieldBuffers::default());
         let (back, is_linear) = (model.backdrop_color(), model.is_linear());
@@ -112,7 +128,7 @@ impl HeldOutPixels {
         let (error, n) = sums.iter().fold((0.0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         let mse = error / n as f64;
         let views = self.frames.iter().zip(&sums).filter(|(_, s)| s.1 > 0).map(|(f, s)| (*f, psnr(s.0 / s.1 as f64))).collect();
-        HeldOut { psnr: psnr(mse), mse, views }
+        Judged { mse, views }
     }
 }
 
@@ -140,9 +156,10 @@ mod tests {
         let (a, b) = (pixels.judge(&m), pixels.judge(&m));
         assert_eq!(a, b);
         assert_eq!(a.views.iter().map(|v| v.0).collect::<Vec<_>>(), [0, 3, 6]);
-        assert!((5.0..40.0).contains(&a.psnr) && (a.psnr - psnr(a.mse)).abs() < 1e-9);
+        let all = a.scores().get("psnr").unwrap();
+        assert!((5.0..40.0).contains(&all) && (all - psnr(a.mse)).abs() < 1e-9);
         let (low, high) = a.views.iter().fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(v.1), h.max(v.1)));
-        assert!(low <= a.psnr && a.psnr <= high);
+        assert!(low <= all && all <= high);
         assert!(HeldOutPixels::draw(&model(dir.path(), "all").unwrap()).unwrap().is_none());
     }
 

@@ -1,4 +1,4 @@
-//! Captures as configurations name them.
+//! Loading of the capture that a configuration names.
 
 use super::config::Config;
 use crate::error::{PipelineError, Result};

@@ -1,5 +1,5 @@
-//! What training and export take in memory, before they begin: needs, what the machine has, and what helps. Only what
-//! is certain counts, so that nothing is refused that would fit.
+//! Memory that training and export will take, compared with what the machine has before they begin. Only certain needs are counted, so
+//! that nothing is refused that would fit.
 
 use super::config::{Auto, Config, Method};
 use super::device;

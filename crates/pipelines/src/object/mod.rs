@@ -1,4 +1,4 @@
-//! Photographs to a radiance field, novel views and a mesh.
+//! The object application: photographs become a radiance field, novel views and a mesh. Training is [`recipe::train`].
 
 pub mod compare;
 pub mod config;
@@ -30,4 +30,3 @@ pub mod seen_by;
 mod texture;
 mod trainer;
 pub mod viewing;
-pub mod viewing_points;

@@ -1,15 +1,16 @@
-//! A capture with the fields that are fitted to it: what a run folder holds.
+//! The model of the object application: a capture with the fields that are fitted to it.
 
 use super::config::{Background, Config, Method};
 use super::field_shape::{cascades, hash_grid, space, viewing_distance};
 use crate::error::{PipelineError, Result};
 use diorama_engine::background::LearnedBackground;
 use diorama_engine::fields::{self, DensityQuery, Field, FieldBuffers, Pruning};
-use diorama_engine::params::ParamGroup;
+use diorama_engine::params::{ParamGroup, Schedule};
 use diorama_engine::renderers::supervised::{Supervised, Unserved};
-use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Sampling, Tracer};
+use diorama_engine::renderers::volume::{Accelerator, Backdrop, Quality, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::pixels::ErrorMap;
+use diorama_engine::samplers::placement::Placement;
 use diorama_engine::step::{self, Scene, Trainees};
 use diorama_engine::train::Origin;
 use diorama_geom::capture::{ColorSpace, Split};
@@ -44,12 +45,16 @@ pub struct ObjectModel {
     pub train: Vec<usize>,
     /// Whether the photographs have transparent pixels.
     pub has_alpha: bool,
+    /// How far training is.
     pub origin: Origin,
+    /// Rays and samples that were trained on so far.
+    pub rays: u64,
+    pub samples: u64,
     /// Running mean of samples per ray, which sets the rays per step.
     pub samples_per_ray: f64,
     /// Lowered once after a loss that was not finite.
     pub rate_scale: f32,
-    /// Draws views instead of the CPU.
+    /// Device that renders instead of the CPU.
     pub accelerator: Option<Supervised>,
 }
 
@@ -107,6 +112,8 @@ impl ObjectModel {
             train,
             has_alpha,
             origin: Origin::default(),
+            rays: 0,
+            samples: 0,
             samples_per_ray: 256.0,
             rate_scale: 1.0,
             accelerator: None,
@@ -130,6 +137,9 @@ impl ObjectModel {
             let color = f.net.color_mut();
             (color.activation, color.shift) = color_head(is_linear);
         }
+        let o = &model.config.optim;
+        let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
+        model.trainees().into_params().0.groups().for_each(|(_, g)| g.schedule = schedule);
         Ok(model)
     }
 
@@ -170,18 +180,18 @@ impl ObjectModel {
         0.7 * self.field.net.density.shift.exp()
     }
 
-    /// Which samples of training are left out.
+    /// Limits below which samples are dropped in training.
     pub fn pruning(&self) -> Pruning {
         let s = &self.config.sampling;
         Pruning { stop: s.stop, min_alpha: s.min_alpha, thin: self.thin(), min_weight: 0.0 }
     }
 
-    /// Where rays of training begin and end.
+    /// Cameras and extent of the rays of training.
     pub fn scene(&self) -> Scene {
         Scene { cameras: self.base_cameras(), near: self.config.sampling.near, cube: self.cube() }
     }
 
-    /// All that a step trains.
+    /// Everything that a step changes.
     pub fn trainees(&mut self) -> Trainees<'_> {
         let focal = self.config.camera.refine_focal;
         Trainees {
@@ -194,7 +204,7 @@ impl ObjectModel {
         }
     }
 
-    /// What counts at a training step, and how much.
+    /// Weights of the loss at a training step.
     pub fn terms(&self, step: u64) -> Terms {
         let l = &self.config.loss;
         let color = if l.color == "huber" { ColorLoss::Huber(HUBER) } else { ColorLoss::Mse };
@@ -238,24 +248,25 @@ impl ObjectModel {
         is_linear(&self.capture)
     }
 
-    /// Ready to render, wearing the mean appearance.
+    /// A renderer of the model, with the mean appearance code.
     pub fn tracer(&self, quality: Quality) -> Tracer<'_> {
         let s = &self.config.sampling;
-        let sampling = match (&self.occupancy, &self.coarse) {
-            (Some(grid), _) => Sampling::Occupancy { grid, max_samples: s.max_samples },
-            (None, Some(coarse)) => Sampling::Hierarchical { coarse, samples: s.samples, more: s.importance },
-            (None, None) => Sampling::Stratified { samples: s.samples },
+        let placement = match (&self.occupancy, &self.coarse) {
+            (Some(grid), _) => Placement::occupied(grid, s.max_samples, quality.pruning()),
+            (None, Some(_)) => Placement::Hierarchical { samples: s.samples, more: s.importance, noise: None },
+            (None, None) => Placement::Stratified { samples: s.samples, noise: None },
         };
         Tracer {
             field: &self.field,
-            sampling,
+            coarse: self.coarse.as_ref(),
+            occupancy: self.occupancy.as_ref(),
+            placement,
             backdrop: self.learned.as_ref().map_or(Backdrop::Color(self.backdrop_color()), Backdrop::Learned),
             near: s.near,
             cube: self.cube(),
             clip: None,
             crop: None,
             is_linear: self.is_linear(),
-            pruning: quality.pruning(),
             shared_weight: quality.shared_weight(),
             appearance: None,
             tolerance: quality.tolerance(),
@@ -272,46 +283,34 @@ impl ObjectModel {
         }
     }
 
-    /// What has drawn views so far, in words: a device, unless it failed or was never asked.
+    /// Name of the device that has rendered so far; the CPU if it failed or was not used.
     pub fn drew_on(&self) -> String {
         let device = self.accelerator.as_ref().filter(|a| a.served() > 0 && a.failure().is_none());
         device.map_or("cpu".into(), |a| a.name().to_string())
     }
 
-    pub(super) fn groups(&self) -> Vec<(String, &ParamGroup)> {
-        let field = self.field.groups().into_iter().map(|g| (format!("field.{}", g.name), g));
-        let coarse = self.coarse.iter().flat_map(|f| f.groups()).map(|g| (format!("coarse.{}", g.name), g));
-        let rest = self.learned.iter().map(|l| &l.group).chain(self.corrections.iter()).map(|g| (g.name.to_string(), g));
-        field.chain(coarse).chain(rest).collect()
-    }
-
-    pub(super) fn groups_mut(&mut self) -> Vec<(String, &mut ParamGroup)> {
-        let field = self.field.groups_mut().into_iter().map(|g| (format!("field.{}", g.name), g));
-        let coarse = self.coarse.iter_mut().flat_map(|f| f.groups_mut()).map(|g| (format!("coarse.{}", g.name), g));
-        let rest = self.learned.iter_mut().map(|l| &mut l.group).chain(self.corrections.iter_mut()).map(|g| (g.name.to_string(), g));
-        field.chain(coarse).chain(rest).collect()
-    }
-
     /// Whether any parameter is not finite.
-    pub fn is_broken(&self) -> bool {
-        self.groups().iter().any(|(_, g)| g.is_broken())
+    pub fn is_broken(&mut self) -> bool {
+        self.trainees().into_params().0.is_broken()
     }
 
-    /// A copy to look at, which cannot be trained.
-    pub fn to_look_at(&self) -> ObjectModel {
+    /// A copy of the values alone, for rendering; it cannot be trained.
+    pub fn for_rendering(&self) -> ObjectModel {
         ObjectModel {
             config: self.config.clone(),
             capture: self.capture.clone(),
             model_from_world: self.model_from_world,
-            field: self.field.to_look_at(),
-            coarse: self.coarse.as_ref().map(Field::to_look_at),
+            field: self.field.for_rendering(),
+            coarse: self.coarse.as_ref().map(Field::for_rendering),
             occupancy: self.occupancy.clone(),
-            learned: self.learned.as_ref().map(LearnedBackground::to_look_at),
+            learned: self.learned.as_ref().map(LearnedBackground::for_rendering),
             corrections: self.corrections.as_ref().map(ParamGroup::values_only),
             error_map: None,
             train: self.train.clone(),
             has_alpha: self.has_alpha,
             origin: self.origin,
+            rays: self.rays,
+            samples: self.samples,
             samples_per_ray: self.samples_per_ray,
             rate_scale: self.rate_scale,
             accelerator: None,

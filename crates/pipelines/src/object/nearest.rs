@@ -1,4 +1,4 @@
-//! How near to cameras matter may be.
+//! Least distance between cameras and matter.
 
 use diorama_engine::samplers::pixels::Observation;
 use diorama_geom::Capture;

@@ -101,7 +101,7 @@ const PATIENCE: usize = 40;
 const STREAM: u64 = 0x706f_696e_7473;
 
 /// Draws pixels of the training cameras at random, follows their rays to the surface, and writes what they meet with colors and
-/// normals; `progress` is told the stage and (done, of).
+/// normals; `progress` receives the stage and (done, of).
 ///
 /// # Errors
 /// When no camera sees a surface in the region, the device that was named failed, or the disk refuses.

@@ -1,4 +1,4 @@
-//! Training, from top to bottom.
+//! Training recipe of the object application, to be read from top to bottom.
 
 use super::config::Config;
 use super::exposure_spread;
@@ -21,7 +21,7 @@ use diorama_data::photo_check;
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_engine::samplers::pixels::Observation;
 use diorama_engine::stages::Stages;
-use diorama_engine::train::{self, Event, HeldOut, RunError, RunOptions, Summary, Trainee};
+use diorama_engine::train::{self, Event, RunError, RunOptions, Summary, Trainee};
 use diorama_geom::Capture;
 use diorama_geom::capture::Split;
 use diorama_geom::rng::Rng;
@@ -39,7 +39,7 @@ pub fn device(config: &Config) -> Result<String> {
     Ok(if device.is_gpu() { device.name() } else { cpu_name() })
 }
 
-/// What training gives.
+/// Result of training.
 pub struct Trained {
     pub model: ObjectModel,
     pub summary: Summary,
@@ -49,7 +49,7 @@ pub struct Trained {
 
 /// Trains into `folder`, from the start or from its checkpoint.
 ///
-/// Capture → pixels → model → loop of steps → checkpoint; `events` hears of all of it, and `view` sees it.
+/// Capture → pixels → model → loop of steps → checkpoint. `events` receives every event, `view` shows the run in the viewer.
 pub fn train(
     config: &Config,
     folder: &mut RunFolder,
@@ -85,20 +85,16 @@ pub fn train(
     } else {
         folder.write_description(&model.config, &model.capture)?;
     }
-    let options = RunOptions { held_out_rays: held_out.as_ref().map_or(0, |h| h.rays() as u64), ..run_options(config) };
     let origin = model.origin;
     let checkpoints = folder.checkpoints();
     let mut trainer = Trainer::new(model, photographs, observations, &checkpoints, opened)?;
     (trainer.view, trainer.held_out) = (view, held_out);
-    let (mut log_error, mut judged) = (None, HeldOut::default());
-    let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
+    let mut log_error = None;
+    let result = train::run(&run_options(config), origin, &mut trainer, interrupt, &mut |e| {
         if let Err(e) = folder.log(e) {
             log_error.get_or_insert(e);
         }
-        if let Event::Evaluated { views, .. } = e {
-            judged.views.clone_from(views);
-        }
-        view.into_iter().for_each(|v| v.hear(e));
+        view.into_iter().for_each(|v| v.update(e));
         events(e);
     });
     if let Some(e) = log_error {
@@ -119,24 +115,25 @@ pub fn train(
         )));
         return Ok(Trained { device: trainer.device.name(), model: trainer.model, summary });
     }
+    let psnr = summary.scalars.get("psnr").unwrap_or(f64::NAN);
     folder.write_summary(&RunSummary {
         steps: summary.step,
         seconds: summary.seconds,
         device: trainer.device.name(),
-        psnr_train: Some(summary.psnr).filter(|p| p.is_finite()),
-        psnr_held_out: summary.held_out,
-        behind_fog: held_out::far_below(&judged.views, summary.psnr).into_iter().map(name).collect(),
+        psnr_train: psnr.is_finite().then_some(psnr),
+        psnr_held_out: summary.scores.as_ref().and_then(|s| s.get("psnr")),
+        behind_fog: held_out::far_below(&trainer.judged, psnr).into_iter().map(name).collect(),
         peak_memory_bytes: diorama_data::memory::peak_of_process(),
     })?;
     Ok(Trained { device: trainer.device.name(), model: trainer.model, summary })
 }
 
-/// What the user is told where photographs hold linear light.
+/// Note for the user where photographs hold linear light.
 fn white_note(white: f32) -> Option<String> {
     (white > 0.0).then(|| format!("the photographs hold linear light: {white} is shown as white (--set data.white={white})"))
 }
 
-/// Takes the model to the run's last checkpoint, or leaves it at its start; what the user is told.
+/// Restores the run's last checkpoint, or leaves the model at its start; a note for the user.
 fn go_on(model: &mut ObjectModel, folder: &mut RunFolder) -> Result<Option<String>> {
     let mut note = Some("the run was stopped before its first checkpoint: it begins again".into());
     if checkpoint::exists(&folder.checkpoints()) {
@@ -148,7 +145,7 @@ fn go_on(model: &mut ObjectModel, folder: &mut RunFolder) -> Result<Option<Strin
     Ok(note)
 }
 
-/// What a run that ended with an error leaves, in words.
+/// Description of what a run that failed leaves.
 fn kept(checkpoints: &Path) -> String {
     if checkpoint::exists(checkpoints) {
         format!("{} is the last good checkpoint", checkpoint::latest(checkpoints).display())
@@ -157,7 +154,7 @@ fn kept(checkpoints: &Path) -> String {
     }
 }
 
-/// What the first steps came to.
+/// Results of the first steps.
 pub struct Beginning {
     /// Per step.
     pub losses: Vec<f64>,
@@ -179,7 +176,7 @@ pub fn begin(config: &Config, steps: u64) -> Result<Beginning> {
     Ok(Beginning { losses, cameras })
 }
 
-/// Where a step's time goes: `warmup` steps, then `steps` measured ones; writes nothing.
+/// Measures the stages of a step: `warmup` steps, then `steps` measured ones; writes nothing.
 pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> {
     let mut trainer = scratch_trainer(config, false)?;
     for step in 0..warmup {
@@ -187,15 +184,15 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
     }
     trainer.settle()?;
     trainer.device.stages().into_iter().for_each(|s| *s = Stages::default());
-    let before = (trainer.model.origin, trainer.marched);
+    let before = (trainer.model.rays, trainer.model.samples, trainer.marched);
     let begin = Instant::now();
     for step in warmup..warmup + steps {
         trainer.step(step, 0.0)?;
     }
     trainer.settle()?;
     let seconds = begin.elapsed().as_secs_f64();
-    let (o, marched) = (trainer.model.origin, trainer.marched - before.1);
-    let (rays, trained) = ((o.rays - before.0.rays) as f64, (o.samples - before.0.samples) as f64);
+    let marched = trainer.marched - before.2;
+    let (rays, trained) = ((trainer.model.rays - before.0) as f64, (trainer.model.samples - before.1) as f64);
     let stages = trainer.device.stages().map(|s| s.seconds.clone()).unwrap_or_default();
     let total: f64 = stages.iter().map(|s| s.1).sum();
     Ok(TrainReport {
@@ -287,7 +284,6 @@ fn run_options(config: &Config) -> RunOptions {
         save_every_seconds: r.save_every_seconds,
         save_every_steps: positive(r.save_every_steps),
         evaluate_every: positive(r.evaluate_every),
-        held_out_rays: 0,
     }
 }
 

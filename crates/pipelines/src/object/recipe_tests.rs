@@ -3,7 +3,7 @@
 use super::*;
 use crate::object::config::Method;
 use diorama_engine::renderers::volume::Quality;
-use diorama_engine::train::StepReport;
+use diorama_engine::train::{Scores, StepReport};
 use diorama_geom::Reduction;
 use diorama_geom::capture::SparsePoint;
 
@@ -35,7 +35,7 @@ impl Trainee for Spoilt {
     fn recover(&mut self) -> Result<Option<(u64, String)>> {
         self.trainer.recover()
     }
-    fn evaluate(&mut self) -> Result<Option<HeldOut>> {
+    fn evaluate(&mut self) -> Result<Option<Scores>> {
         self.trainer.evaluate()
     }
 }

@@ -196,7 +196,7 @@ fn other_size(c: &Camera, size: Option<(u32, u32)>, fov: Option<f64>) -> Result<
 }
 
 /// Renders a path; returns the number of frames and whether it was interrupted: then the film has the frames until there,
-/// and there is none without any. `progress` is told (frame, of).
+/// and there is none without any. `progress` receives (frame, of).
 pub fn render(
     model: &ObjectModel,
     o: &RenderOptions,

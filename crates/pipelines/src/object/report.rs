@@ -52,11 +52,12 @@ pub fn write(path: &Path, summary: &Summary, device: &str, scores: &Report, mesh
 mod tests {
     use super::*;
     use crate::object::evaluate::{TrainingScores, ViewScore};
+    use diorama_engine::train::Scalars;
 
     fn page(device: &str, held_out: f64) -> String {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("report.html");
-        let summary = Summary { step: 9, seconds: 1.0, rays: 1, samples: 1, loss: 0.1, psnr: 30.0, held_out: None, interrupted: false };
+        let summary = Summary { step: 9, seconds: 1.0, loss: 0.1, scalars: Scalars::default(), scores: None, interrupted: false };
         let view = |name: &str, psnr: f64, behind_fog: bool| ViewScore {
             name: name.into(),
             psnr,

@@ -34,7 +34,7 @@ pub fn read_config(run: &Path) -> Result<Config> {
     RunDescription::read(run)?.config()
 }
 
-/// What a run came to, as `summary.json` keeps it.
+/// Results of a run, as `summary.json` keeps them.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct RunSummary {
     pub steps: u64,
@@ -51,7 +51,7 @@ pub struct RunSummary {
     pub peak_memory_bytes: Option<u64>,
 }
 
-/// What a run came to; none before its end.
+/// Results of a run; none before its end.
 ///
 /// # Errors
 /// When the file is malformed.
@@ -82,7 +82,7 @@ pub fn load_model_of(run: &Path, data: Option<&Path>) -> Result<(ObjectModel, Ve
     Ok((model, note.into_iter().collect()))
 }
 
-/// What a run is, as `diorama info` tells it.
+/// Description of a run for `diorama info`.
 ///
 /// # Errors
 /// As [`load_model`].
@@ -96,8 +96,8 @@ pub fn describe(run: &Path) -> Result<serde_json::Value> {
         "downscale": model.config.data.downscale,
         "steps": o.step,
         "seconds": o.seconds,
-        "rays": o.rays,
-        "samples": o.samples,
+        "rays": model.rays,
+        "samples": model.samples,
         "parameters": model.field.groups().iter().map(|g| g.values.len()).sum::<usize>(),
         "training_views": model.train.len(),
         "held_out_views": model.capture.indices(Split::Test).len(),

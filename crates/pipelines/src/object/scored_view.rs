@@ -4,7 +4,7 @@ use super::model::ObjectModel;
 use crate::error::Result;
 use diorama_data::masks;
 use diorama_data::photo::Photo;
-use diorama_engine::metrics::{self, Scores};
+use diorama_engine::metrics::{self, ImageScores};
 use diorama_engine::renderers::volume::{Quality, View};
 use diorama_geom::{Image, ImageU8};
 use diorama_kernels::ops::photometric_loss::shown;
@@ -16,7 +16,7 @@ pub struct ScoredView {
     /// 255 where pixels count; none: all do.
     pub counts: Option<ImageU8>,
     /// Not numbers where no pixel counts.
-    pub scores: Scores,
+    pub scores: ImageScores,
 }
 
 /// What an evaluation does to a view.
@@ -72,7 +72,7 @@ pub(crate) fn reference(model: &ObjectModel, i: usize, full: Photo) -> Result<(I
 }
 
 /// Renders frame `i` and scores it against `full`, its photograph at full size, where its mask says that pixels count.
-/// `progress` is told the share that is drawn, and when scoring begins.
+/// `progress` receives the share that is drawn, and when scoring begins.
 ///
 /// # Errors
 /// When the mask cannot be decoded, or is not that of the photograph; or when the device that was named failed.
@@ -97,7 +97,7 @@ pub fn score_view(
 }
 
 /// Scores of a view against its reference.
-pub(crate) fn scores(view: &View, photo: &Image, counts: &Option<ImageU8>) -> Scores {
+pub(crate) fn scores(view: &View, photo: &Image, counts: &Option<ImageU8>) -> ImageScores {
     let mut shown = view.rgb.clone();
     shown.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     metrics::compare(&shown, photo, admits(counts))
@@ -134,7 +134,7 @@ mod tests {
             view: View { rgb: image(&[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]), opacity: none.clone(), depth: none },
             photo: image(&[0.9; 6]),
             counts: Some(mask),
-            scores: Scores { mse: 0.0, psnr: 0.0, ssim: 0.0, psnr_affine: 0.0 },
+            scores: ImageScores { mse: 0.0, psnr: 0.0, ssim: 0.0, psnr_affine: 0.0 },
         };
         assert_eq!(where_it_counts(&scored).data, [0.1, 0.2, 0.3, 0.9, 0.9, 0.9]);
         scored.counts = None;

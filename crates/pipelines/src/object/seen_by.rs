@@ -1,4 +1,4 @@
-//! Where held-out rays end, and how many training views see that place: what few of them see, nothing but those few explains.
+//! Number of training views that see the places where held-out rays end. Errors are large where few do.
 
 use super::held_out::spread;
 use super::model::ObjectModel;
@@ -78,7 +78,7 @@ pub struct SeenBy {
 pub struct Sights(Vec<Sight>);
 
 impl Sights {
-    /// Draws the training views; `progress` is told how many of how many are done.
+    /// Draws the training views; `progress` receives (done, of).
     pub fn of(model: &ObjectModel, progress: &mut dyn FnMut(usize, usize)) -> Sights {
         let frames = spread(&model.train, VIEWS);
         let tracer = model.tracer(Quality::Fast);
@@ -137,7 +137,7 @@ impl Sights {
             map.data.extend(COLORS[seeing.len().min(MANY)]);
             tally.add(seeing, view.opacity.data[i] as f64, squared_error(&view.rgb, &scored.photo, i));
         }
-        (tally.told(&f.name, |i| model.capture.frames[i].name.clone()), map)
+        (tally.summarize(&f.name, |i| model.capture.frames[i].name.clone()), map)
     }
 }
 
@@ -170,7 +170,7 @@ impl Tally {
         }
     }
 
-    fn told(mut self, name: &str, name_of: impl Fn(usize) -> String) -> SeenBy {
+    fn summarize(mut self, name: &str, name_of: impl Fn(usize) -> String) -> SeenBy {
         let all = self.light.iter().sum::<f64>().max(1e-300);
         self.of_few.sort_by(|a, b| b.1.total_cmp(&a.1));
         let sources = self.of_few.iter().take(NAMED).map(|(frame, light)| Source { name: name_of(*frame), share: light / all }).collect();
@@ -219,14 +219,14 @@ mod tests {
             tally.add(&sights.seeing(p, 9), 1.0, error);
         }
         assert!(sights.seeing(DVec3::ZERO, 3).iter().all(|s| s.frame != 3), "a training view does not vouch for itself");
-        let told = tally.told("held out", |i| format!("view {i}"));
-        assert_eq!(told.shares, [0.25, 0.25, 0.5, 0.0, 0.0]);
-        assert_eq!(told.errors.map(|e| e.map(|e| (e * 10.0).round())), [Some(5.0), Some(7.0), Some(2.0), None, None]);
-        assert!((told.psnr_where_seen.unwrap() - 6.9897).abs() < 1e-3, "{:?} of 0.1 and 0.3", told.psnr_where_seen);
+        let summary = tally.summarize("held out", |i| format!("view {i}"));
+        assert_eq!(summary.shares, [0.25, 0.25, 0.5, 0.0, 0.0]);
+        assert_eq!(summary.errors.map(|e| e.map(|e| (e * 10.0).round())), [Some(5.0), Some(7.0), Some(2.0), None, None]);
+        assert!((summary.psnr_where_seen.unwrap() - 6.9897).abs() < 1e-3, "{:?} of 0.1 and 0.3", summary.psnr_where_seen);
         let mut of_one = Tally::default();
         of_one.add(&sights.seeing(DVec3::new(0.0, -3.0, 0.0), 9), 1.0, 0.7);
-        assert_eq!(of_one.told("held out", |i| i.to_string()).psnr_where_seen, None);
-        let sources: Vec<(&str, f64)> = told.sources.iter().map(|s| (&s.name[..], s.share)).collect();
+        assert_eq!(of_one.summarize("held out", |i| i.to_string()).psnr_where_seen, None);
+        let sources: Vec<(&str, f64)> = summary.sources.iter().map(|s| (&s.name[..], s.share)).collect();
         assert_eq!(sources, [("view 3", 0.75), ("view 5", 0.5)], "the third camera has something before it");
     }
 }

@@ -25,7 +25,7 @@ const RAYS: usize = 1 << 16;
 
 /// Bakes `mesh`, whose texture coordinates and normals are set, into a texture of `size × size`; `cell` is the edge of the cells
 /// it was extracted with. Each texel is the mean of what the cameras that face it see within [`REACH`] cells of the surface.
-/// `progress` is told texels done, of all.
+/// `progress` receives texels done, of all.
 pub fn bake(model: &ObjectModel, mesh: &mut Mesh, size: usize, cell: f32, progress: &mut dyn FnMut(usize, usize)) {
     let texels = bake::texels(mesh, size);
     let maps = depth_maps(model, mesh);

@@ -1,4 +1,4 @@
-//! The steps of a run, as its configuration describes them, on the CPU or on a GPU.
+//! Training of an object run: describes each step by the configuration, carries it out on the device, and saves, recovers and evaluates.
 
 use super::config::{Background, Method};
 use super::device;
@@ -10,10 +10,10 @@ use crate::error::{PipelineError, Result};
 use crate::run::device::{Aftermath, Device, Pictures, aftermath};
 use crate::run::photographs::StoredPhotographs;
 use diorama_data::checkpoint;
-use diorama_engine::params::Schedule;
 use diorama_engine::samplers::pixels::Observation;
-use diorama_engine::step::{Backdrop, Figures, Loss, Placement, Probes, RaySource, Step};
-use diorama_engine::train::{HeldOut, StepReport, Trainee};
+use diorama_engine::samplers::placement::Placement;
+use diorama_engine::step::{Backdrop, Figures, Loss, Probes, RaySource, Step};
+use diorama_engine::train::{Scalar, Scalars, Scores, StepReport, Trainee};
 use diorama_geom::rng::Rng;
 use std::path::Path;
 
@@ -59,12 +59,15 @@ pub(super) struct Trainer<'a> {
     pub observations: Vec<Observation>,
     pub device: Device,
     pub held_out: Option<HeldOutPixels>,
-    /// Who looks on.
+    /// PSNR of each held-out view when they were judged last, named by its frame.
+    pub judged: Vec<(usize, f64)>,
+    /// Viewer of the run.
     pub view: Option<&'a RunView>,
     /// Samples before any were left out.
     pub marched: u64,
+    /// Rays that were trained on before this part of the run.
+    began: u64,
     checkpoints: &'a Path,
-    schedule: Schedule,
     recovered: bool,
     /// How a device failed, and what was made of it.
     setback: Option<Setback>,
@@ -78,42 +81,42 @@ impl<'a> Trainer<'a> {
         checkpoints: &'a Path,
         device: Device,
     ) -> Result<Self> {
-        let o = &model.config.optim;
-        let schedule = Schedule { warmup: o.warmup, final_scale: o.final_scale, decay_from: o.decay_from };
         let mut trainer = Trainer {
             model,
             photographs,
             observations,
             device,
             held_out: None,
+            judged: Vec::new(),
             view: None,
+            began: 0,
             marched: 0,
             checkpoints,
-            schedule,
             recovered: false,
             setback: None,
         };
+        trainer.began = trainer.model.rays;
         trainer.begin()?;
         Ok(trainer)
     }
 
-    /// Brings the model to the device.
+    /// Uploads the model to the device.
     fn begin(&mut self) -> Result<()> {
         let scene = self.model.scene();
         let pictures = Pictures { photographs: &self.photographs, observations: &self.observations };
         self.device.begin(&self.model.trainees(), scene, Some(pictures))
     }
 
-    /// Shows what has been learned so far.
+    /// Shows the model as it is now in the viewer.
     pub fn show(&mut self) -> Result<()> {
         if let Some(view) = self.view {
             self.download()?;
-            view.show(self.model.to_look_at());
+            view.show(self.model.for_rendering());
         }
         Ok(())
     }
 
-    /// Brings what was learned back to the host.
+    /// Downloads the model from the device.
     pub fn download(&mut self) -> Result<()> {
         self.device.download(&mut self.model.trainees())
     }
@@ -125,11 +128,11 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Books what steps came to.
+    /// Adds the counts of steps.
     fn count(&mut self, f: &Figures) {
         let m = &mut self.model;
-        let before = m.origin.samples;
-        m.origin.samples += f.trained as u64;
+        let before = m.samples;
+        m.samples += f.trained as u64;
         self.marched += f.marched as u64;
         // Without an occupancy grid, each ray has as many samples as the configuration says.
         if m.occupancy.is_none() && !self.device.is_gpu() {
@@ -170,13 +173,11 @@ impl<'a> Trainer<'a> {
         };
         let of = |stream: u64| Rng::new(c.seed, stream);
         let placement = match (&m.occupancy, &m.coarse) {
-            (Some(grid), _) => Placement::Occupancy {
-                march: grid.march_config(s.max_samples).stretched(stretch(step)),
-                pruning: m.pruning(),
-                room: (self.batch_samples() * ROOM.0, self.batch_samples() * ROOM.1),
-            },
-            (None, Some(_)) => Placement::Hierarchical { samples: s.samples, more: s.importance, coarse: of(COARSE), fine: of(FINE) },
-            (None, None) => Placement::Stratified { samples: s.samples, rng: of(COARSE) },
+            (Some(grid), _) => {
+                Placement::Occupancy { march: grid.march_config(s.max_samples).stretched(stretch(step)), pruning: m.pruning() }
+            }
+            (None, Some(_)) => Placement::Hierarchical { samples: s.samples, more: s.importance, noise: Some([of(COARSE), of(FINE)]) },
+            (None, None) => Placement::Stratified { samples: s.samples, noise: Some(of(COARSE)) },
         };
         let (until, block) = OCCUPANCY_WARMUP;
         let block = if step <= until { block } else { 1 };
@@ -184,13 +185,15 @@ impl<'a> Trainer<'a> {
         Step {
             number: step,
             rays: RaySource::Photographs { count: self.rays(step), rng: of(PIXELS) },
-            first: m.origin.rays,
+            first: m.rays,
             backdrop: if is_random { Backdrop::Random(of(BACKGROUND)) } else { Backdrop::Color(m.backdrop_color()) },
             placement,
+            room: (self.batch_samples() * ROOM.0, self.batch_samples() * ROOM.1),
             probes: is_probed.then(|| Probes { rng: of(OCCUPANCY), points: s.occupancy_points, block }),
             loss: Loss::Photometric(m.terms(step)),
             near_scaling: c.loss.near_scaling,
-            rate_scale: self.schedule.scale(progress as f32) * m.rate_scale,
+            progress: progress as f32,
+            rate_scale: m.rate_scale,
             refresh_errors: step.is_multiple_of(ERROR_REFRESH),
         }
     }
@@ -207,7 +210,7 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// What follows from a device's failure.
+    /// Decides how to go on after a device's failure.
     fn survive(&mut self, e: PipelineError) -> Result<Setback> {
         let m = &self.model;
         let needs = memory::of_training(&m.config, &m.capture, self.photographs.store().format(), self.batch_samples()).to_string();
@@ -229,7 +232,7 @@ impl Trainee for Trainer<'_> {
     type Error = PipelineError;
 
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport> {
-        if self.view.is_some_and(RunView::wants) {
+        if self.view.is_some_and(RunView::wants_update) {
             // A device that fails here fails in the step below as well, which knows what to do.
             let _ = self.show();
         }
@@ -244,12 +247,19 @@ impl Trainee for Trainer<'_> {
             }
         };
         let (rays, f) = (described.rays.count() as u64, done.shown);
-        let report = StepReport { loss: f.loss, mse: f.mse, rays, samples: (f.trained / f.steps.max(1) as f64) as u64 };
-        if report.loss.is_finite() {
-            self.model.origin.rays += rays;
+        if f.loss.is_finite() {
+            self.model.rays += rays;
             done.counted.iter().for_each(|f| self.count(f));
         }
-        Ok(report)
+        let m = &self.model;
+        let scalars = Scalars::from([
+            Scalar::new("mse", f.mse).logged_only(),
+            Scalar::psnr("psnr", f.mse),
+            Scalar::count("rays", m.rays),
+            Scalar::count("samples", m.samples),
+            Scalar::rate("rays_per_s", rays as f64),
+        ]);
+        Ok(StepReport { loss: f.loss, scalars })
     }
 
     fn save(&mut self, step: u64, seconds: f64) -> Result<bool> {
@@ -288,14 +298,25 @@ impl Trainee for Trainer<'_> {
         Ok(Some((self.model.origin.step, why)))
     }
 
-    fn evaluate(&mut self) -> Result<Option<HeldOut>> {
+    fn evaluate(&mut self) -> Result<Option<Scores>> {
         let Some(pixels) = &self.held_out else { return Ok(None) };
         match self.device.download(&mut self.model.trainees()) {
-            Ok(()) => Ok(Some(pixels.judge(&self.model))),
+            Ok(()) => {}
             // A device that fails here fails in the next step as well, which knows what to do.
-            Err(PipelineError::Device(_) | PipelineError::Memory(_)) => Ok(None),
-            Err(e) => Err(e),
+            Err(PipelineError::Device(_) | PipelineError::Memory(_)) => return Ok(None),
+            Err(e) => return Err(e),
         }
+        let judged = pixels.judge(&self.model);
+        let scores = judged.scores();
+        self.view.into_iter().for_each(|v| v.mark_fog(&judged.views));
+        self.judged = judged.views;
+        Ok(Some(scores))
+    }
+
+    /// Its pixels take as long as if they were trained on.
+    fn evaluation_seconds(&self, seconds: f64) -> f64 {
+        let trained = self.model.rays.saturating_sub(self.began).max(1);
+        self.held_out.as_ref().map_or(0.0, |h| h.rays() as f64 * seconds / trained as f64)
     }
 }
 

@@ -1,4 +1,4 @@
-//! `config.toml` of a run before it is known which application reads it.
+//! `config.toml` of a run whose application is not known yet.
 
 use super::config::{self, Configuration};
 use crate::error::Result;
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 pub const NAME: &str = "config.toml";
 const LIMIT: u64 = 1 << 30;
 
-/// What a run is: the application, and the configuration that only the application understands.
+/// Application of a run, and its configuration, which only the application understands.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RunDescription {
     /// The file.

@@ -1,4 +1,4 @@
-//! Where a run trains: on the CPU, or on a GPU that keeps all of its state.
+//! Device of a run: carries out its steps on the CPU, or on a GPU that keeps all of its state.
 
 use super::photographs::StoredPhotographs;
 use crate::error::{PipelineError, Result};
@@ -17,11 +17,11 @@ pub struct Device {
     gpu: Option<Running>,
     cpu: Option<CpuTrainer>,
     note: Option<String>,
-    /// How often batches were halved because memory was short.
+    /// Number of times that batches were halved because memory was short.
     halvings: u32,
 }
 
-/// What a step came to.
+/// Result of a step.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Done {
     /// Means and counts of the last steps that are known.
@@ -36,7 +36,7 @@ const HALVINGS: u32 = 2;
 /// Most rays per step on a CPU; GPUs take eight times as many, as they take samples.
 const MOST_RAYS: usize = 1 << 14;
 
-/// What follows from the failure of a device in training.
+/// Reaction to the failure of a device in training.
 #[derive(Debug)]
 pub enum Aftermath {
     /// The step is tried again with half the batch; why, in words.
@@ -98,7 +98,7 @@ impl Device {
         }
     }
 
-    /// How often batches were halved because memory was short.
+    /// Number of times that batches were halved because memory was short.
     pub fn halvings(&self) -> u32 {
         self.halvings
     }
@@ -108,12 +108,12 @@ impl Device {
         self.halvings += 1;
     }
 
-    /// What the user is told.
+    /// Message for the user about the choice of device.
     pub fn note(&self) -> Option<String> {
         self.note.clone()
     }
 
-    /// Where the time of steps goes, as far as the CPU took them.
+    /// Time that each stage of steps on the CPU took.
     pub fn stages(&mut self) -> Option<&mut Stages> {
         self.cpu.as_mut().map(CpuTrainer::stages)
     }
@@ -135,7 +135,13 @@ impl Device {
     }
 }
 
-/// What is drawn from, on either side.
+impl Device {
+    fn given_gradients_on_cpu(&self) -> Vec<Vec<f32>> {
+        self.cpu.as_ref().map_or_else(Vec::new, |c| c.given_gradients().to_vec())
+    }
+}
+
+/// Photographs for the CPU and for a GPU.
 #[derive(Clone, Copy)]
 pub struct Pictures<'a> {
     pub photographs: &'a StoredPhotographs,
@@ -194,12 +200,20 @@ impl Device {
         Ok(self.step_on_cpu(of, pictures.map(|p| p.on_cpu()).as_ref(), step))
     }
 
-    /// What steps came to that was not counted.
+    /// Results of steps that were not counted yet.
     ///
     /// # Errors
     /// None in this build.
     pub fn count(&mut self) -> Result<Option<Figures>> {
         Ok(None)
+    }
+
+    /// Gradients of the last step's given codes, `[R, width]` each.
+    ///
+    /// # Errors
+    /// None in this build.
+    pub fn given_gradients(&self) -> Result<Vec<Vec<f32>>> {
+        Ok(self.given_gradients_on_cpu())
     }
 
     /// Brings what is trained back.
@@ -277,12 +291,20 @@ impl Device {
         }
     }
 
-    /// Waits for a GPU; what its steps came to that was not counted.
+    /// Waits for a GPU; results of its steps that were not counted yet.
     ///
     /// # Errors
     /// When the device was lost or is full.
     pub fn count(&mut self) -> Result<Option<Figures>> {
         self.gpu.as_mut().map_or(Ok(None), Running::count)
+    }
+
+    /// Gradients of the last step's given codes, `[R, width]` each.
+    ///
+    /// # Errors
+    /// When the device was lost.
+    pub fn given_gradients(&self) -> Result<Vec<Vec<f32>>> {
+        self.gpu.as_ref().map_or_else(|| Ok(self.given_gradients_on_cpu()), Running::given_gradients)
     }
 
     /// Brings what is trained back.
@@ -322,7 +344,7 @@ mod running {
             &self.gpu
         }
 
-        /// What the device calls itself, and how it is reached.
+        /// Name of the device and of the interface that reaches it.
         pub fn name(&self) -> String {
             format!("{} ({})", self.gpu.name, self.gpu.api.name())
         }
@@ -356,7 +378,7 @@ mod running {
         }
 
         pub fn step(&mut self, step: &Step, ask_every: u64) -> Result<Done> {
-            self.trainer().step(step).map_err(told)?;
+            self.trainer().step(step).map_err(to_pipeline_error)?;
             self.is_behind = true;
             let is_asked = self.last.is_none() || (step.number + 1).is_multiple_of(ask_every);
             let counted = if is_asked { self.count()? } else { None };
@@ -367,16 +389,20 @@ mod running {
             if !std::mem::take(&mut self.is_behind) {
                 return Ok(None);
             }
-            self.last = Some(self.trainer().figures().map_err(told)?);
+            self.last = Some(self.trainer().figures().map_err(to_pipeline_error)?);
             Ok(self.last)
         }
 
+        pub fn given_gradients(&self) -> Result<Vec<Vec<f32>>> {
+            self.trainer.as_ref().expect("the run has begun").given_gradients().map_err(to_pipeline_error)
+        }
+
         pub fn download(&mut self, to: &mut Trainees) -> Result<()> {
-            self.trainer().download(to).map_err(told)
+            self.trainer().download(to).map_err(to_pipeline_error)
         }
     }
 
-    fn told(e: GpuError) -> PipelineError {
+    fn to_pipeline_error(e: GpuError) -> PipelineError {
         match e {
             GpuError::Memory(..) => PipelineError::Memory(e.to_string()),
             e => PipelineError::Device(e.to_string()),

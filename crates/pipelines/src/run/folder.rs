@@ -82,7 +82,7 @@ impl RunFolder {
         checkpoints(&self.path)
     }
 
-    /// What the run is.
+    /// Description of the run: its application and configuration.
     ///
     /// # Errors
     /// When its `config.toml` is damaged.
@@ -100,7 +100,7 @@ impl RunFolder {
         Ok(capture)
     }
 
-    /// The data set that the run was trained on, where it is now.
+    /// Present location of the data set that the run was trained on.
     ///
     /// # Errors
     /// When the run's capture is damaged.
@@ -108,7 +108,7 @@ impl RunFolder {
         kept_capture::data_set(&self.path, &self.description()?.data_set())
     }
 
-    /// Takes note that the photographs are in `data` now; returns the configuration, which says so.
+    /// Records that the photographs are in `data` now; returns the changed configuration.
     ///
     /// # Errors
     /// When one is missing there.
@@ -125,7 +125,7 @@ impl RunFolder {
         Ok(config)
     }
 
-    /// Clears an earlier run and writes what this one was started with.
+    /// Removes an earlier run and writes configuration, capture and command of this one.
     ///
     /// # Errors
     /// When a file cannot be written.
@@ -147,7 +147,7 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Writes what the run came to so far; the peak of memory is that of all of its parts.
+    /// Writes the results of the run so far; the peak of memory is that of all of its parts.
     ///
     /// # Errors
     /// When the file cannot be written.
@@ -172,7 +172,7 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Appends what an event says to the metrics.
+    /// Appends the figures of an event to the metrics.
     ///
     /// # Errors
     /// When a file cannot be written.

@@ -13,7 +13,7 @@ use std::path::{Component, Path, PathBuf};
 pub const NAME: &str = "capture.json";
 const LIMIT: u64 = 1 << 30;
 
-/// What the file holds. Files of earlier versions have no folders; their paths are relative to the folder that the
+/// Contents of the file. Files of earlier versions have no folders; their paths are relative to the folder that the
 /// program was called in.
 #[derive(Serialize, Deserialize)]
 struct KeptCapture {

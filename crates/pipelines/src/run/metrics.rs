@@ -1,8 +1,11 @@
-//! Metrics of a run over its steps: `metrics.jsonl`, and the curves that are drawn of it.
+//! Metrics of a run over its steps: `metrics.jsonl`, and the curves that are drawn of it. Which figures there are, only the run knows.
 
 use diorama_data::plot::{Chart, Series};
 use diorama_data::tfevents::TfEvents;
-use diorama_engine::train::Event;
+use diorama_engine::train::scalar::{self, SCORE_PREFIX};
+use diorama_engine::train::{Event, Scalar, Scalars};
+use serde_json::{Map, Value};
+use std::collections::BTreeSet;
 use std::path::Path;
 
 /// File of the metrics.
@@ -13,44 +16,31 @@ pub const NAME: &str = "metrics.jsonl";
 pub struct Row {
     pub step: u64,
     pub seconds: f64,
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub loss: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub mse: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub psnr: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub rays: Option<u64>,
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub samples: Option<u64>,
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub rays_per_s: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub val_psnr: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub val_mse: Option<f64>,
+    /// Numbers by name: the loss, the figures of steps, and those of evaluations after [`SCORE_PREFIX`]. Counts are whole numbers.
+    #[serde(flatten)]
+    pub figures: Map<String, Value>,
 }
 
 impl Row {
-    /// What an event says of a step; none of events that say nothing of it.
+    /// The row of an event that has figures; figures that are not finite are left out.
     pub fn of(event: &Event) -> Option<Row> {
-        match *event {
-            Event::Progress { step, seconds, loss, mse, psnr, rays, samples, rays_per_s, .. } => Some(Row {
-                step,
-                seconds,
-                loss: Some(loss),
-                mse: Some(mse),
-                psnr: Some(psnr),
-                rays: Some(rays),
-                samples: Some(samples),
-                rays_per_s: Some(rays_per_s),
-                ..Row::default()
-            }),
-            Event::Evaluated { step, seconds, psnr, mse, .. } => {
-                Some(Row { step, seconds, val_psnr: Some(psnr), val_mse: Some(mse), ..Row::default() })
-            }
-            _ => None,
-        }
+        let (step, seconds, loss, prefix, Scalars(scalars)) = match event {
+            Event::Progress { step, seconds, loss, scalars, .. } => (*step, *seconds, Some(*loss), "", scalars),
+            Event::Evaluated { step, seconds, scores } => (*step, *seconds, None, SCORE_PREFIX, scores),
+            _ => return None,
+        };
+        let number = |s: &Scalar| match s.over_steps {
+            scalar::OverSteps::Count => Some(Value::from(s.value as u64)),
+            _ => s.value.is_finite().then(|| s.value.into()),
+        };
+        let scalars = scalars.iter().filter_map(|s| Some((format!("{prefix}{}", s.name), number(s)?)));
+        let loss = loss.filter(|l| l.is_finite()).map(|l| ("loss".to_string(), l.into()));
+        Some(Row { step, seconds, figures: loss.into_iter().chain(scalars).collect() })
+    }
+
+    /// The value of a figure, if the row has it.
+    pub fn get(&self, name: &str) -> Option<f64> {
+        self.figures.get(name).and_then(Value::as_f64)
     }
 
     /// The row as a line of JSON.
@@ -58,22 +48,15 @@ impl Row {
         format!("{}\n", serde_json::to_string(self).expect("a row is JSON"))
     }
 
-    /// Writes the row's values as scalars.
+    /// Writes the row's values as scalars: those of steps below `train/`, those of evaluations below `val/`.
     ///
     /// # Errors
     /// When they cannot be written.
     pub fn to_tensorboard(&self, t: &mut TfEvents) -> std::io::Result<()> {
-        let tags = [
-            ("train/loss", self.loss),
-            ("train/mse", self.mse),
-            ("train/psnr", self.psnr),
-            ("train/rays_per_s", self.rays_per_s),
-            ("val/psnr", self.val_psnr),
-            ("val/mse", self.val_mse),
-        ];
-        for (tag, value) in tags {
-            if let Some(v) = value {
-                t.scalar(tag, self.step, self.seconds, v as f32)?;
+        for (name, value) in &self.figures {
+            let tag = name.strip_prefix(SCORE_PREFIX).map_or_else(|| format!("train/{name}"), |score| format!("val/{score}"));
+            if let Some(v) = value.as_f64() {
+                t.scalar(&tag, self.step, self.seconds, v as f32)?;
             }
         }
         Ok(())
@@ -86,24 +69,55 @@ pub fn read_rows(path: &Path) -> Vec<Row> {
     text.lines().filter_map(|l| serde_json::from_str(l).ok()).collect()
 }
 
-/// PSNR and MSE curves of named runs; held-out values where there are any.
+/// Steps and values of a figure.
+pub fn curve(rows: &[Row], name: &str) -> Vec<(u64, f64)> {
+    rows.iter().filter_map(|r| r.get(name).map(|v| (r.step, v))).collect()
+}
+
+/// A chart for each figure of named runs, with what was held out beside what was trained on; none for counts and rates.
 pub fn charts(runs: &[(String, Vec<Row>)]) -> Vec<Chart> {
-    let series = |f: fn(&Row) -> Option<f64>, suffix: &str| -> Vec<Series> {
-        runs.iter()
-            .map(|(name, rows)| Series {
-                name: format!("{name}{suffix}"),
-                points: rows.iter().filter_map(|r| f(r).map(|v| (r.step as f64, v))).collect(),
-            })
-            .filter(|s| !s.points.is_empty())
-            .collect()
+    let figures = runs.iter().flat_map(|(_, rows)| rows).flat_map(|r| &r.figures);
+    let curves = figures.filter(|(name, value)| value.is_f64() && scalar::unit(name) != "/s");
+    let names: BTreeSet<&str> = curves.map(|(name, _)| name.strip_prefix(SCORE_PREFIX).unwrap_or(name)).collect();
+    let series = |name: String, suffix: &str| -> Vec<Series> {
+        let of = |(run, rows): &(String, Vec<Row>)| Series {
+            name: format!("{run}{suffix}"),
+            points: curve(rows, &name).into_iter().map(|(step, v)| (step as f64, v)).collect(),
+        };
+        runs.iter().map(of).filter(|s| !s.points.is_empty()).collect()
     };
-    let both = |train: fn(&Row) -> Option<f64>, val: fn(&Row) -> Option<f64>| {
-        let mut s = series(train, " train");
-        s.extend(series(val, " held out"));
-        s
+    let chart = |name: &str| {
+        let mut both = series(name.to_string(), " train");
+        both.extend(series(format!("{SCORE_PREFIX}{name}"), " held out"));
+        Chart { title: scalar::label(name), x: "step".into(), y: scalar::unit(name).into(), series: both }
     };
-    vec![
-        Chart { title: "PSNR".into(), x: "step".into(), y: "dB".into(), series: both(|r| r.psnr, |r| r.val_psnr) },
-        Chart { title: "MSE".into(), x: "step".into(), y: "mean squared error".into(), series: both(|r| r.mse, |r| r.val_mse) },
-    ]
+    names.into_iter().map(chart).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diorama_engine::train::Scores;
+
+    #[test]
+    fn figures_that_only_one_application_has_are_logged_and_drawn() {
+        let scalars = Scalars::from([Scalar::new("accuracy", 0.5), Scalar::count("words", 7), Scalar::new("mse", f64::NAN)]);
+        let progress = Event::Progress { step: 3, seconds: 1.5, progress: 0.1, loss: 2.0, scalars };
+        let scores = Scores::from([Scalar::new("albedo_psnr", 21.5)]);
+        let rows = [progress, Event::Evaluated { step: 4, seconds: 2.0, scores }].map(|e| Row::of(&e).unwrap());
+        assert_eq!(rows[0].line(), "{\"step\":3,\"seconds\":1.5,\"loss\":2.0,\"accuracy\":0.5,\"words\":7}\n");
+        assert_eq!(rows[1].line(), "{\"step\":4,\"seconds\":2.0,\"val_albedo_psnr\":21.5}\n");
+        let back: Vec<Row> = rows.iter().map(|r| serde_json::from_str(&r.line()).unwrap()).collect();
+        assert_eq!(back, rows);
+        let charts = charts(&[("a".into(), back)]);
+        let titles: Vec<(&str, &str, &str)> = charts.iter().map(|c| (&c.title[..], &c.y[..], &c.series[0].name[..])).collect();
+        assert_eq!(titles, [("accuracy", "", "a train"), ("albedo psnr", "dB", "a held out"), ("loss", "", "a train")]);
+    }
+
+    #[test]
+    fn lines_of_earlier_versions_are_read() {
+        let old = r#"{"step":10,"seconds":0.5,"loss":0.1,"mse":null,"psnr":null,"rays":640,"samples":9000,"rays_per_s":1280.0}"#;
+        let row: Row = serde_json::from_str(old).unwrap();
+        assert_eq!((row.get("loss"), row.get("mse"), row.get("samples")), (Some(0.1), None, Some(9000.0)));
+    }
 }

@@ -1,4 +1,5 @@
-//! What the runs of all applications share: configuration, device, folder, kept capture, metrics, summary. It imports no application.
+//! Everything that runs of all applications share: configuration, device, folder, capture, checkpoints, metrics, summary and viewing.
+//! It imports no application.
 
 pub mod config;
 pub mod description;
@@ -6,9 +7,13 @@ pub mod device;
 pub mod folder;
 pub mod kept_capture;
 pub mod metrics;
+pub mod param_state;
 pub mod photographs;
 pub mod profile;
 pub mod summary;
+pub mod viewer_files;
+pub mod viewing;
+pub mod viewing_points;
 
 pub use description::RunDescription;
 pub use folder::RunFolder;

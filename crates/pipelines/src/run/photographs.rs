@@ -1,4 +1,4 @@
-//! Training photographs as samplers and devices read them.
+//! Training photographs in the form that samplers and devices read.
 
 use diorama_data::pixel_store::PixelStore;
 use diorama_engine::samplers::pixels::PixelSource;

@@ -1,4 +1,4 @@
-//! Where the time of a training step goes.
+//! Report of the time that each stage of a training step takes.
 
 use serde::Serialize;
 
@@ -11,7 +11,7 @@ pub struct StageFigure {
     pub ms: f64,
 }
 
-/// Where a training step's time goes, over the last part of a run.
+/// Stages and speed of training steps.
 #[derive(Clone, Debug, Serialize)]
 pub struct TrainReport {
     pub threads: usize,

@@ -1,4 +1,4 @@
-//! What a run came to: `summary.json`. Which figures there are is the application's choice.
+//! Results of a run, `summary.json`; the application chooses the figures.
 
 use crate::error::Result;
 use diorama_data::{DataError, atomic, error};
@@ -13,7 +13,7 @@ pub const NAME: &str = "summary.json";
 const PEAK: &str = "peak_memory_bytes";
 const LIMIT: u64 = 1 << 30;
 
-/// Writes what the run came to so far; the peak of memory is that of all of its parts.
+/// Writes the results of the run so far; the peak of memory is that of all of its parts.
 ///
 /// # Errors
 /// When the file cannot be written.
@@ -28,7 +28,7 @@ pub fn write(run: &Path, summary: &impl Serialize) -> Result<()> {
     Ok(atomic::write(&run.join(NAME), &json)?)
 }
 
-/// What a run came to; none before its end.
+/// Results of a run; none before its end.
 ///
 /// # Errors
 /// When the file is malformed.

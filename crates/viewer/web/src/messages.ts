@@ -10,6 +10,17 @@ export type Control = { id: string, label: string, help: string,
 layers: Array<string>, input: Input, };
 export type Input = { "kind": "slider", min: number, max: number, step: number, unit: string, default: number, } | { "kind": "toggle", default: boolean, } | { "kind": "pick", options: Array<Choice>, default: string, };
 export type Choice = { id: string, label: string, };
+export type Figure = { id: string, label: string, value: number, text: string, };
+export type Line = { 
+/**
+ * Id of the figure.
+ */
+figure: string, label: string, 
+/**
+ * Of data that was held out: few values, each shown as a dot.
+ */
+held_out: boolean, points: Array<[number, number]>, };
+export type Chart = { label: string, unit: string, lines: Array<Line>, };
 export type Value = number | boolean | string;
 export type View = { width: number, height: number, fov_y: number, pose: [number, number, number, number, number, number, number, number, number, number, number, number], layer: string, 
 /**
@@ -34,15 +45,11 @@ world_from_capture: [number, number, number, number, number, number, number, num
 /**
  * Two points of the world, and the meters between them.
  */
-measured: [number, number, number, number, number, number, number] | null, path: string | null, } | { "kind": "picked", point: [number, number, number] | null, } | { "kind": "status", step: number, seconds: number, loss: number, psnr: number, 
-/**
- * PSNR of held-out pixels.
- */
-held_out: number | null, rays_per_s: number, 
+measured: [number, number, number, number, number, number, number] | null, path: string | null, } | { "kind": "picked", point: [number, number, number] | null, } | { "kind": "status", step: number, seconds: number, 
 /**
  * Completed share of the training, 0 to 1.
  */
-progress: number, running: boolean, } | { "kind": "history", points: Array<[number, number | null, number | null]>, } | { "kind": "fog", frames: Array<number>, } | { "kind": "working", what: string, percent: number, } | { "kind": "exported", file: string, glb: boolean, 
+progress: number, running: boolean, figures: Array<Figure>, } | { "kind": "history", charts: Array<Chart>, } | { "kind": "fog", frames: Array<number>, } | { "kind": "working", what: string, percent: number, } | { "kind": "exported", file: string, glb: boolean, 
 /**
  * Meters of the mesh per unit of the capture.
  */

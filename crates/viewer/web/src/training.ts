@@ -1,26 +1,21 @@
-// Progress of training: figures, a bar, and a small curve of PSNR.
+// Progress of training: figures, a bar, and small charts. The program chooses figures and charts.
 
 import type { Connection, Received } from "./connection";
-import { element, svg } from "./dom";
+import { element, make, svg } from "./dom";
+import type { Chart, Figure, Line } from "./messages";
 
-interface Point {
-  step: number;
-  psnr: number | null;
-  heldOut: number | null;
-}
-
-/** Most points of the curve; when there are more, every second one is dropped. */
+/** Most points of a line; when there are more, every second one is dropped. */
 const MOST = 400;
 const [WIDTH, HEIGHT] = [272, 64];
 
 export class Training {
-  private points: Point[] = [];
+  private charts: Chart[] = [];
 
   /** `running` is called with whether training is running. */
   constructor(connection: Connection, private readonly running: (on: boolean) => void) {
     connection.on("status", (t) => this.show(t));
     connection.on("history", (t) => {
-      this.points = t.points.map(([step, psnr, heldOut]) => ({ step, psnr, heldOut }));
+      this.charts = t.charts;
       this.draw();
     });
   }
@@ -33,57 +28,68 @@ export class Training {
     element("card-training").hidden = !known;
     element("status").hidden = !known;
     element("status-text").textContent = t.running ? `Training · step ${group(t.step)}` : `Step ${group(t.step)}`;
-    const rows: [string, string | null][] = [
-      ["step", group(t.step)],
-      ["loss", t.loss > 0 ? t.loss.toPrecision(3) : null],
-      ["psnr", t.psnr > 0 ? `${t.psnr.toFixed(2)} dB` : null],
-      ["held-out", t.held_out === null ? null : `${t.held_out.toFixed(2)} dB`],
-      ["rays", t.rays_per_s > 0 ? group(Math.round(t.rays_per_s)) : null],
-      ["time", t.seconds > 0 ? duration(t.seconds) : null],
-    ];
-    for (const [name, text] of rows) {
-      element(`figure-${name}`).textContent = text ?? "";
-      element(`row-${name}`).hidden = text === null;
-    }
+    const rows: [string, string, string][] = [["step", "Step", group(t.step)]];
+    for (const f of t.figures) rows.push([f.id, f.label, grouped(f.text)]);
+    if (t.seconds > 0) rows.push(["seconds", "Time", duration(t.seconds)]);
+    element("training-figures").replaceChildren(...rows.map(([id, label, text]) => {
+      const value = make("dd", { textContent: text });
+      value.dataset.figure = id;
+      return make("div", {}, make("dt", { textContent: label, title: label }), value);
+    }));
     element("training-state").textContent = t.running ? `${Math.round(100 * t.progress)} %` : "finished";
     element("training-progress").hidden = !t.running;
     element("training-bar").style.width = `${100 * t.progress}%`;
-    this.add(t);
+    if (t.running) this.add(t.step, t.figures);
   }
 
-  private add(t: Received<"status">): void {
-    const last = this.points.at(-1);
-    if (!t.running || t.psnr <= 0 || t.step === last?.step) return;
-    // Another run starts with an empty curve.
-    if (last && t.step < last.step) this.points = [];
-    const before = this.points.filter((p) => p.heldOut !== null).at(-1)?.heldOut ?? null;
-    this.points.push({ step: t.step, psnr: t.psnr, heldOut: t.held_out === before ? null : t.held_out });
-    if (this.points.length > MOST) this.points = this.points.filter((p, i) => i % 2 === 0 || p.heldOut !== null || i === this.points.length - 1);
-    this.draw();
+  private add(step: number, figures: Figure[]): void {
+    const lines = this.charts.flatMap((c) => c.lines);
+    // Another run starts with empty lines.
+    if (lines.some((l) => (l.points.at(-1)?.[0] ?? 0) > step)) lines.forEach((l) => (l.points = []));
+    let grew = false;
+    for (const l of lines) {
+      const value = figures.find((f) => f.id === l.figure)?.value;
+      const last = l.points.at(-1);
+      // What is the same as before was not measured again.
+      if (value === undefined || value === last?.[1] || step === last?.[0]) continue;
+      l.points.push([step, value]);
+      if (l.points.length > MOST) l.points = l.points.filter((_, i) => i % 2 === 0 || i === l.points.length - 1);
+      grew = true;
+    }
+    if (grew) this.draw();
   }
 
   private draw(): void {
-    const values = this.points.flatMap((p) => [p.psnr, p.heldOut]).filter((v) => v !== null);
-    element("curve").hidden = values.length < 2;
-    const [first, last] = [this.points[0], this.points.at(-1)];
-    if (!first || !last || values.length < 2) return;
-    const [low, high] = [Math.min(...values), Math.max(...values)];
-    const x = (p: Point) => 5 + ((WIDTH - 10) * (p.step - first.step)) / Math.max(1, last.step - first.step);
-    const y = (v: number) => HEIGHT - 6 - ((HEIGHT - 12) * (v - low)) / Math.max(0.1, high - low);
-    const places = (of: (p: Point) => number | null) => this.points.flatMap((p) => {
-      const v = of(p);
-      return v === null ? [] : [[x(p).toFixed(1), y(v).toFixed(1)] as const];
-    });
-    const line = (name: string, at: (readonly [string, string])[]) => svg("polyline", { class: name, points: at.map((p) => p.join()).join(" ") });
-    const held = places((p) => p.heldOut);
-    const dots = held.map(([cx, cy]) => svg("circle", { class: "held-out", cx, cy, r: 2.4 }));
-    element<SVGElement>("curve-lines").replaceChildren(line("psnr", places((p) => p.psnr)), line("held-out", held), ...dots);
-    element("curve-low").textContent = low.toFixed(1);
-    element("curve-high").textContent = `${high.toFixed(1)} dB`;
+    element("charts").replaceChildren(...this.charts.filter((c) => c.lines.some((l) => l.points.length > 1)).map(chart));
   }
 }
 
-const group = (n: number) => String(n).replace(/\B(?=(\d{3})+$)/g, "\u202f");
+/** A chart with what its lines are called and from where to where they go. */
+function chart(c: Chart): HTMLElement {
+  const points = c.lines.flatMap((l) => l.points);
+  const [steps, values] = [points.map((p) => p[0]), points.map((p) => p[1])];
+  const [first, low, high] = [Math.min(...steps), Math.min(...values), Math.max(...values)];
+  const x = (step: number) => 5 + ((WIDTH - 10) * (step - first)) / Math.max(1, Math.max(...steps) - first);
+  const y = (v: number) => HEIGHT - 6 - ((HEIGHT - 12) * (v - low)) / (high - low || 1);
+  const drawn = (l: Line) => {
+    const at = l.points.map(([step, v]) => [x(step).toFixed(1), y(v).toFixed(1)] as const);
+    const dots = l.held_out ? at.map(([cx, cy]) => svg("circle", { cx, cy, r: 2.4 })) : [];
+    const points = at.map((p) => p.join()).join(" ");
+    return [svg("polyline", { class: l.held_out ? "held-out" : "", "data-figure": l.figure, points }), ...dots];
+  };
+  const picture = svg("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": `${c.label} over the steps` });
+  picture.append(...c.lines.flatMap(drawn));
+  const keys = c.lines.filter((l) => l.points.length > 0).map((l) => make("span", { className: l.held_out ? "key held-out" : "key", textContent: l.label }));
+  const range = make("span", { textContent: `${short(low)} – ${short(high)}${c.unit && ` ${c.unit}`}` });
+  return make("figure", { className: "chart" }, picture, make("figcaption", {}, make("b", { textContent: c.label }), ...keys, range));
+}
+
+const short = (v: number) => (Math.abs(v) >= 10 ? v.toFixed(1) : v.toPrecision(2));
+
+const group = (n: number) => grouped(String(n));
+
+/** Thin spaces between groups of three digits of a whole number. */
+const grouped = (text: string) => text.replace(/^\d{4,}(?![\d.])/, (n) => n.replace(/\B(?=(\d{3})+$)/g, "\u202f"));
 
 function duration(seconds: number): string {
   const s = Math.round(seconds);

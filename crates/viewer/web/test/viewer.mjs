@@ -52,8 +52,8 @@ async function looking(p) {
   check("a view is shown", spread > 40, `(brightness spans ${spread})`);
   await p.shot("first");
   check("photographs are listed", await p.thumbnails(3));
-  await until("the curve", () => p.shown("#curve"));
-  check("a trained run shows its curve and figures", /\d+\.\d+ dB/.test(await p.text("#figure-psnr")) && /\d+\.\d+ dB/.test(await p.text("#figure-held-out")));
+  await until("the curve", () => p.shown("#charts .chart"));
+  check("a trained run shows its curve and figures", /\d+\.\d+ dB/.test(await p.text("dd[data-figure=psnr]")) && /\d+\.\d+ dB/.test(await p.text("dd[data-figure=val_psnr]")));
 
   const before = await p.views();
   const begin = Date.now();
@@ -211,10 +211,10 @@ async function live(browser) {
   const seen = await p.views();
   const later = await until("later steps", async () => (await step()) > early + 50 && (await step()));
   await until("views without a touch", async () => (await p.views()) > seen + 2);
-  await until("held-out pixels", async () => /\d+\.\d+ dB/.test(await p.text("#figure-held-out").catch(() => "")));
+  await until("held-out pixels", async () => /\d+\.\d+ dB/.test(await p.text("dd[data-figure=val_psnr]").catch(() => "")));
   check("training shows held-out beside training PSNR, and how many views are behind fog", (await p.data("fog")) !== undefined);
   check("training shows its steps and views by itself", true, `(steps ${early} to ${later})`);
-  const points = () => p.page.evaluate(() => document.querySelector("#curve-lines .psnr")?.getAttribute("points").split(" ").length ?? 0);
+  const points = () => p.page.evaluate(() => document.querySelector("#charts polyline[data-figure=psnr]")?.getAttribute("points").split(" ").length ?? 0);
   const some = await points();
   await until("a longer curve", async () => (await points()) > some);
   check("training draws its curve and how much is done", (await p.shown("#training-progress")) && /^\d+ %$/.test(await p.text("#training-state")), `(${await points()} points, ${await p.text("#training-state")})`);

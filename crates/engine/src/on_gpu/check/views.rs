@@ -1,4 +1,4 @@
-//! Views by the device and by the CPU.
+//! Checks of rendering: views of the device compared with the CPU's.
 
 use super::*;
 
@@ -28,19 +28,11 @@ pub(super) fn views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let occupancy = Occupancy::new(16, 1, false);
         for (quality, room) in [(Quality::Full, 1 << 17), (Quality::Full, 4096), (Quality::Fast, 1 << 17)] {
             let on_cpu = Tracer {
-                field: &f,
-                sampling: Sampling::Occupancy { grid: &occupancy, max_samples: 4096 },
+                occupancy: Some(&occupancy),
                 backdrop: volume::Backdrop::Color([0.2, 0.5, 0.9]),
                 near: 0.1,
-                cube: (0.0, 1.0),
-                clip: None,
-                crop: None,
-                is_linear: false,
-                pruning: quality.pruning(),
                 shared_weight: 0.0,
-                appearance: None,
-                tolerance: 0.0,
-                accelerator: None,
+                ..Tracer::new(&f, Placement::occupied(&occupancy, 4096, quality.pruning()), (0.0, 1.0))
             };
             let device = GpuTracer::new(gpu.clone(), &f, None, Some(&occupancy)).with_room(room);
             let want = on_cpu.view(&camera, &mut |_| {});
@@ -62,25 +54,12 @@ pub(super) fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> 
         (fields::nerf(contraction::Space::Cube(1.0), 1e-3, 2, 4, 1, 1), fields::nerf(contraction::Space::Cube(1.0), 1e-3, 2, 4, 1, 0));
     let plain = fields::baseline(contraction::Space::Cube(2.0), 1e-3, 3);
     for (name, field, guide) in [("nerf", &fine, Some(&coarse)), ("baseline", &plain, None)] {
-        let sampling = match guide {
-            Some(coarse) => Sampling::Hierarchical { coarse, samples: 8, more: 8 },
-            None => Sampling::Stratified { samples: 16 },
+        let placement = match guide {
+            Some(_) => Placement::Hierarchical { samples: 8, more: 8, noise: None },
+            None => Placement::Stratified { samples: 16, noise: None },
         };
-        let on_cpu = Tracer {
-            field,
-            sampling,
-            backdrop: volume::Backdrop::Color([0.2, 0.5, 0.9]),
-            near: 0.1,
-            cube: (0.0, 1.0),
-            clip: None,
-            crop: None,
-            is_linear: false,
-            pruning: Quality::Full.pruning(),
-            shared_weight: 0.0,
-            appearance: None,
-            tolerance: 0.0,
-            accelerator: None,
-        };
+        let backdrop = volume::Backdrop::Color([0.2, 0.5, 0.9]);
+        let on_cpu = Tracer { coarse: guide, backdrop, near: 0.1, ..Tracer::new(field, placement, (0.0, 1.0)) };
         // Room for all rays at once, and for some.
         for room in [1 << 10, 100] {
             let tracer = || GpuTracer::new(gpu.clone(), field, guide, None).with_room(room);
@@ -111,9 +90,8 @@ fn unit(v: &[f32]) -> [f32; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fields::Pruning;
     use crate::renderers::supervised::Unserved;
-    use crate::renderers::volume::{Placement, Traced};
+    use crate::renderers::volume::Traced;
     use crate::samplers::RayBatch;
 
     /// Evaluates densities where it works.
@@ -122,7 +100,7 @@ mod tests {
     }
 
     impl Accelerator for Device {
-        fn trace(&self, _: &RayBatch, _: &Placement, _: Pruning, _: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
+        fn trace(&self, _: &RayBatch, _: &Placement, _: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
             Err(Unserved::Failed("unplugged".into()))
         }
         fn density(&self, model: &[f32]) -> Result<Vec<f32>, Unserved> {

@@ -79,8 +79,8 @@ impl FieldNet {
 
 /// How positions reach the network.
 pub enum Positions<'a> {
-    /// Level-major features `[L, S, F]` of a hash grid; replaced by their gradients in a backward pass.
-    Features { data: &'a mut [f32], levels: usize, width: usize },
+    /// Level-major features `[L, S, F]` of a hash grid; in a backward pass they are replaced by their gradients if those are `wanted`.
+    Features { data: &'a mut [f32], levels: usize, width: usize, wanted: bool },
     /// Positions `[S, 3]`, encoded in the block. Gradients `[S, 3]` are written where asked for.
     Encoded { encoding: BlockEncoding, points: &'a [f32], d_points: Option<&'a mut [f32]> },
 }

@@ -81,7 +81,8 @@ impl StepOutput {
 
 /// Per-ray and per-sample arrays that blocks write to.
 struct Shared<'a> {
-    features: Option<(Disjoint<'a>, usize, usize)>,
+    /// Features, levels, width, and whether gradients are wanted.
+    features: Option<(Disjoint<'a>, usize, usize, bool)>,
     encoded: Option<(BlockEncoding, &'a [f32], Option<Disjoint<'a>>)>,
     codes: Vec<(&'a [f32], usize, Option<Disjoint<'a>>)>,
     values: Disjoint<'a>,
@@ -127,9 +128,9 @@ pub fn run(
         d_background: Disjoint::new(&mut out.d_background),
     };
     let shared = match positions {
-        Positions::Features { data, levels, width } => {
+        Positions::Features { data, levels, width, wanted } => {
             assert_eq!(data.len(), levels * s * width, "field: features");
-            Shared { features: Some((Disjoint::new(data), levels, width)), ..shared }
+            Shared { features: Some((Disjoint::new(data), levels, width, wanted)), ..shared }
         }
         Positions::Encoded { encoding, points, d_points } => {
             assert_eq!(points.len(), s * 3, "field: points");
@@ -302,7 +303,7 @@ fn gather_inputs(input: &StepInput, shared: &Shared, rays: std::ops::Range<usize
         v.resize(n * w, 0.0);
     }
     let total = input.samples.samples();
-    if let Some((features, levels, width)) = &shared.features {
+    if let Some((features, levels, width, _)) = &shared.features {
         for l in 0..*levels {
             let at = (l * total + s0) * width;
             // SAFETY: this block's samples.
@@ -374,7 +375,7 @@ fn backward(input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::
         v.resize(n * w, 0.0);
     }
     let wanted = |i: usize| match i {
-        0 => shared.features.is_some() || shared.encoded.as_ref().is_some_and(|e| e.2.is_some()),
+        0 => shared.features.as_ref().is_some_and(|f| f.3) || shared.encoded.as_ref().is_some_and(|e| e.2.is_some()),
         i => shared.codes[i - 1].2.is_some(),
     };
     let inputs: Vec<&[f32]> = group.inputs.iter().map(|v| &v[..]).collect();
@@ -382,7 +383,7 @@ fn backward(input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::
         group.d_inputs.iter_mut().enumerate().map(|(i, v)| wanted(i).then_some(&mut v[..])).collect();
     backward_block(&net.mlp, prepared, &inputs, n, &mut group.acts, &mut group.d_params, &mut d_inputs);
     let total = input.samples.samples();
-    if let Some((features, levels, width)) = &shared.features {
+    if let Some((features, levels, width, true)) = &shared.features {
         for l in 0..*levels {
             let at = (l * total + s0) * width;
             // SAFETY: this block's samples.

@@ -63,7 +63,7 @@ fn fused_equals_composed_with_features_codes_and_all_gradients() {
             RayCode { values: &c.codes[1], width: second, gradient: Some(&mut d_second) },
         ];
         let (levels, width) = cases::LEVELS;
-        let positions = Positions::Features { data: &mut features, levels, width };
+        let positions = Positions::Features { data: &mut features, levels, width, wanted: true };
         run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
         let want = c.want();
         assert_eq!(out.values.len(), c.rays * channels);
@@ -120,7 +120,7 @@ fn the_result_does_not_depend_on_the_thread_count() {
             let mut out = StepOutput::default();
             let input = StepInput { net: &net, params: &params, samples: s.packed(), background: &bg, near_scaling: 0.0 };
             let mut codes = [RayCode { values: &sh, width: 16, gradient: None }, RayCode { values: &emb, width: 5, gradient: None }];
-            let positions = Positions::Features { data: &mut features, levels: 4, width: 2 };
+            let positions = Positions::Features { data: &mut features, levels: 4, width: 2, wanted: true };
             run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
             (d_params, out.values, out.loss.to_bits())
         })

@@ -9,7 +9,7 @@ use diorama_kernels::probe;
 use serde::Serialize;
 use std::time::Instant;
 
-/// What was measured, and the machine's own limit.
+/// Measurements, and the machine's own limit.
 #[derive(Clone, Debug, Serialize)]
 pub struct NetsReport {
     pub threads: usize,

@@ -1,4 +1,4 @@
-//! What of a photograph is the thing itself: GrabCut that starts from the points of structure from motion, or a network of the user's.
+//! Foreground masks of photographs: GrabCut that starts from the points of structure from motion, or a network of the user's.
 
 use super::grab_cut::{Seed, grab_cut};
 use diorama_data::colmap::Observed;
@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use std::collections::HashMap;
 use std::path::PathBuf;
 
-/// How the background is told.
+/// Method that separates foreground and background.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Background {
     Keep,

@@ -1,4 +1,4 @@
-//! What is done to photographs once their poses are known: some are left out, exposures made equal, noise and background removed,
+//! Finishing of photographs once their poses are known: some are left out, exposures made equal, noise and background removed,
 //! edges cut off. COLMAP has seen the originals, which stay; what training sees is written beside them.
 
 pub mod background;

@@ -1,5 +1,6 @@
-//! A data set, or a file of points or Gaussian splats, as the viewer sees it: no field yet, only what was there before.
+//! Source of the viewer for data sets and for files of points or Gaussian splats, of which there is no field yet.
 
+use super::viewing::THUMBNAIL;
 use crate::error::Result;
 use diorama_data::{colmap, json, photo, splat_ply};
 use diorama_engine::renderers::splat;
@@ -12,8 +13,6 @@ use diorama_geom::view_source::{MeasuredLength, MeshRequest, ViewFrame, ViewRequ
 use diorama_geom::{Camera, Capture, Image, ImageU8, Pose, Similarity};
 use std::path::{Path, PathBuf};
 
-/// Longest side of a small photograph.
-const THUMBNAIL: usize = 160;
 /// Views around a file that has no photographs, in degrees of field of view.
 const AROUND: usize = 8;
 const FOV_DEG: f64 = 50.0;
@@ -102,7 +101,7 @@ impl PointsView {
         PointsView { scene, photos, splats }
     }
 
-    /// How many there are.
+    /// Number of points.
     pub fn points(&self) -> usize {
         self.splats.len()
     }
