@@ -1,6 +1,7 @@
 //! Layers that have kernels of ours on a device against the same layers on the CPU, in burn's graph: outputs, and gradients of all inputs.
 
-use super::{Filter, GridMode, GridSettings, OpError, Outside, Pool, average_pool, grid_sample, resize};
+use super::{Filter, GridMode, GridSettings, Outside, Pool, average_pool, grid_sample, resize};
+use crate::OpError;
 use crate::bridge::{read_values, tensors};
 use burn::tensor::{Device, Tensor, TensorData};
 use diorama_kernels::check::{Row, TOLERANCE, Table};
