@@ -13,7 +13,7 @@ pub const SCORE_PREFIX: &str = "val_";
 /// A named figure of a step or of an evaluation, for example `mse`, `accuracy` or `albedo_psnr`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scalar {
-    /// Lower case with underscores. Its end gives the unit, see [`unit`].
+    /// Lower case with underscores. Its end gives the unit, see [`unit()`].
     pub name: Cow<'static, str>,
     pub value: f64,
     pub over_steps: OverSteps,
