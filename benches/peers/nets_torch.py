@@ -209,7 +209,7 @@ def main():
     arguments.add_argument("--rounds", type=int, default=5)
     arguments.add_argument("--seconds", type=float, default=0.3, help="per figure and round")
     arguments.add_argument("--torch", help="time one layer or network in PyTorch and print JSON")
-    a = arguments.parse_args()
+    a = arguments.parse_intermixed_args()
     if not a.torch:
         return compare(a)
     os.environ["OMP_NUM_THREADS"] = str(a.threads)
