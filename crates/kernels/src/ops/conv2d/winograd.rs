@@ -61,8 +61,9 @@ pub fn run<'a>(c: &Correlation, t: Tensors<'a>) -> Result<(), Tensors<'a>> {
     planes.update(c.input, [2, 1], (0..4).flat_map(|y| [0, 2].map(|x| [low[0] + y, low[1] + x])));
     planes.fit(1, grid.rows, 2 * grid.columns);
     let mut weights = TRANSFORMED.take();
-    weights.resize(c.groups * POINTS * c.features * c.channels, 0.0);
-    transform_weights(c, &taps, t.weights, &mut weights);
+    let pitch = Pitch::of(c);
+    weights.resize(c.groups * POINTS * pitch.point, 0.0);
+    transform_weights(c, &taps, t.weights, pitch, &mut weights);
     let bands = grid.height.div_ceil(grid.rows);
     let features = grid.features(c, bands);
     let parts = c.features.div_ceil(features);
@@ -74,6 +75,7 @@ pub fn run<'a>(c: &Correlation, t: Tensors<'a>) -> Result<(), Tensors<'a>> {
         planes,
         x: t.x,
         weights: &weights,
+        pitch,
         bias: t.bias,
         activation: t.activation,
         out: Shared(t.out.as_mut_ptr()),
@@ -168,6 +170,7 @@ struct Job<'a> {
     x: &'a [f32],
     /// `[groups, POINTS, features, channels]`
     weights: &'a [f32],
+    pitch: Pitch,
     bias: &'a [f32],
     activation: Activation,
     out: Shared,
@@ -195,10 +198,10 @@ impl Job<'_> {
                 let (block, point) = (i / POINTS, i % POINTS);
                 let vectors = (tiles - block * width).min(width).div_ceil(lanes);
                 for f in (0..features).step_by(self.kernel.rows) {
-                    let at = ((part.group * POINTS + point) * c.features + part.features.start + f) * c.channels + first;
+                    let at = (part.group * POINTS + point) * self.pitch.point + (part.features.start + f) * self.pitch.feature + first;
                     let tile = Tile {
                         a: self.weights[at..].as_ptr(),
-                        row: c.channels,
+                        row: self.pitch.feature,
                         b: inputs[i * channels.len() * width..].as_ptr(),
                         offsets,
                         c: products[(i * features + f) * width..].as_mut_ptr(),
@@ -268,17 +271,30 @@ impl Job<'_> {
     }
 }
 
+/// Floats between rows of transformed weights: odd numbers of cache lines, so that rows and points do not meet in one set.
+#[derive(Clone, Copy)]
+struct Pitch {
+    feature: usize,
+    point: usize,
+}
+
+impl Pitch {
+    fn of(c: &Correlation) -> Pitch {
+        let feature = c.channels.div_ceil(32) * 32 + 16;
+        Pitch { feature, point: c.features.div_ceil(2) * 2 * feature + 16 }
+    }
+}
+
 /// `out[group, point, feature, channel] = (G g Gᵀ)[point]`
-fn transform_weights(c: &Correlation, taps: &[usize; 9], weights: &[f32], out: &mut [f32]) {
-    let plane = c.features * c.channels;
+fn transform_weights(c: &Correlation, taps: &[usize; 9], weights: &[f32], pitch: Pitch, out: &mut [f32]) {
     let shared = Shared(out.as_mut_ptr());
     let level = simd::level();
     (0..c.groups * c.features).into_par_iter().for_each(|i| {
         let (group, feature) = (i / c.features, i % c.features);
         let from = &weights[group * c.weight_group + feature * c.weight_feature..];
-        let at = group * POINTS * plane + feature * c.channels;
+        let at = group * POINTS * pitch.point + feature * pitch.feature;
         // SAFETY: of every point, each output channel has its own row.
-        let mut rows = std::array::from_fn(|p| unsafe { std::slice::from_raw_parts_mut(shared.at(at + p * plane), c.channels) });
+        let mut rows = std::array::from_fn(|p| unsafe { std::slice::from_raw_parts_mut(shared.at(at + p * pitch.point), c.channels) });
         simd::with_level(level, || kernels(from, taps, c.weight_channel, &mut rows));
     });
 }
