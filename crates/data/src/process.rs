@@ -123,6 +123,7 @@ pub fn read_output(command: &mut Command, read: &mut dyn FnMut(&mut dyn Read) ->
     let mut errors = child.stderr.take().expect("piped");
     let complaints = std::thread::spawn(move || {
         let mut text = Vec::new();
+        // The exit status says whether the program failed; this is only what it said about it.
         let _ = errors.read_to_end(&mut text);
         String::from_utf8_lossy(&text).into_owned()
     });

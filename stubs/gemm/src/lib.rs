@@ -12,7 +12,7 @@ use std::ops::{Add, Mul};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Parallelism {
     None,
-    /// This many threads of rayon's pool, 0 for all.
+    /// All threads of rayon's pool; the number that the interface asks for is not heeded.
     #[cfg(feature = "rayon")]
     Rayon(usize),
 }

@@ -220,6 +220,7 @@ impl Evaluations {
         let cost = begin.elapsed().as_secs_f64();
         (self.cost, self.spent, self.last) = (Some(cost), self.spent + cost, Some((step, clock.seconds())));
         if let Some(scores) = scores {
+            let scores = Scalars(scores.0.into_iter().map(|s| s.over(1, cost.max(1e-9))).collect());
             events(&Event::Evaluated { step, seconds: clock.seconds(), scores: scores.clone() });
             summary.scores = Some(scores);
         }
@@ -320,7 +321,7 @@ mod tests {
         }
         fn evaluate(&mut self) -> Result<Option<Scores>, ()> {
             std::thread::sleep(self.takes[1]);
-            Ok((!self.nothing_held_out).then(|| Scores::from([Scalar::new("albedo_psnr", 19.0)])))
+            Ok((!self.nothing_held_out).then(|| Scores::from([Scalar::psnr("albedo_psnr", 0.01)])))
         }
         fn evaluation_seconds(&self, seconds: f64) -> f64 {
             self.guess * seconds
@@ -351,7 +352,7 @@ mod tests {
         let s = s.unwrap();
         assert_eq!((s.step, s.scalars.get("words"), s.interrupted), (10, Some(100.0), false));
         assert!((s.scalars.get("psnr").unwrap() - 20.0).abs() < 1e-9);
-        assert_eq!(s.scores.and_then(|s| s.get("albedo_psnr")), Some(19.0));
+        assert_eq!(s.scores.and_then(|s| s.get("albedo_psnr")), Some(20.0));
         assert_eq!(f.saved, [5, 10, 10]);
         let accuracy = |e: &Event| if let Event::Progress { scalars, .. } = e { scalars.get("accuracy") } else { None };
         assert_eq!(log.iter().filter_map(accuracy).collect::<Vec<_>>(), [1.0, 5.0, 8.0], "means of the steps that know it");

@@ -99,7 +99,7 @@ impl Scalar {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scalars(pub Vec<Scalar>);
 
-/// Figures of an evaluation, on data that was held out of training.
+/// Figures of an evaluation, on data that was held out of training. An evaluation counts as one step.
 pub type Scores = Scalars;
 
 impl Scalars {

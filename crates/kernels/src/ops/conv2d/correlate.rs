@@ -75,12 +75,7 @@ impl Correlation {
         if self.channels == 1 && self.features <= 2 {
             return depthwise::run(self, t);
         }
-        let t = if self.is_rounded() {
-            t
-        } else {
-            let Err(t) = winograd::run(self, t) else { return };
-            t
-        };
+        let Err(t) = winograd::run(self, t) else { return };
         let level = simd::level();
         let job = self.job(t, kernel(level));
         let parts = self.features.div_ceil(job.features);
@@ -136,7 +131,8 @@ impl Correlation {
         }
     }
 
-    fn is_rounded(&self) -> bool {
+    /// Whether factors are rounded to bf16.
+    pub(super) fn is_rounded(&self) -> bool {
         self.precision == Precision::Bf16 && has_bf16()
     }
 

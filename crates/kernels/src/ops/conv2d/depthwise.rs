@@ -34,10 +34,6 @@ pub fn run(c: &Correlation, t: Tensors) {
             for (first, feature) in (0..most(0)).step_by(band).flat_map(|first| (0..c.features).map(move |f| (first, f))) {
                 if feature == 0 {
                     planes.fill(source, 0..1, image..image + 1, first, copy);
-                    // What follows in memory is the next band or the next plane.
-                    let read = planes.rows_of(first..(first + band).min(most(0)));
-                    let end = ((image * c.groups + group) * c.input[0] + read.end) * c.input[1];
-                    simd::fetch(&x[end..(end + read.len() * c.input[1]).min(x.len())]);
                 }
                 let channel = group * c.features + feature;
                 let weights = &t.weights[group * c.weight_group + feature * c.weight_feature..];

@@ -50,7 +50,7 @@ fn square(c: &Correlation) -> Option<([usize; 9], [isize; 2])> {
 
 /// Computes all outputs where this takes less time than sums over taps; else gives the tensors back.
 pub fn run<'a>(c: &Correlation, t: Tensors<'a>) -> Result<(), Tensors<'a>> {
-    let Some((taps, low)) = square(c) else { return Err(t) };
+    let Some((taps, low)) = square(c).filter(|_| !c.is_rounded()) else { return Err(t) };
     let level = simd::level();
     let kernel = kernel(level);
     let grid = Grid::plan(c, kernel);
@@ -135,18 +135,23 @@ impl Grid {
 
     /// Whether the products saved outweigh the transforms, in estimated cycles per vector of tiles.
     fn pays(&self, c: &Correlation, kernel: &Kernel) -> bool {
-        let transforms = 60.0 / c.features as f64 + 40.0 / c.channels as f64;
+        let transforms = 60.0 / self.most_features(c) as f64 + 40.0 / c.channels as f64;
         let image = self.vectors_of_image(kernel) as f64 * (8.0 + transforms) + 8.0 * self.height.div_ceil(self.rows) as f64;
         let ours = c.batch as f64 * image + 40.0;
         let direct = 4.5 * (c.batch * (c.output[0] * c.output[1]).div_ceil(kernel.lanes)) as f64;
         c.channels >= 8 && c.features >= 8 && ours < direct
     }
 
+    /// Output channels whose products of a band stay in cache.
+    fn most_features(&self, c: &Correlation) -> usize {
+        (PRODUCTS / (POINTS * self.tiles(self.rows))).clamp(1, c.features)
+    }
+
     /// Output channels per task.
     fn features(&self, c: &Correlation, bands: usize) -> usize {
-        let most = PRODUCTS / (POINTS * self.tiles(self.rows));
+        let most = self.most_features(c);
         let wanted = (3 * rayon::current_num_threads()).div_ceil(c.batch * c.groups * bands);
-        let parts = c.features.div_ceil(most.max(1)).max(wanted.min(c.features.div_ceil(FEWEST_FEATURES)));
+        let parts = c.features.div_ceil(most).max(wanted.min(c.features.div_ceil(FEWEST_FEATURES)));
         c.features.div_ceil(parts).next_multiple_of(8)
     }
 }
