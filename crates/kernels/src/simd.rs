@@ -330,6 +330,19 @@ pub fn fetch(values: &[f32]) {
     let _ = values;
 }
 
+/// Prefetches floats that will be read some thousand cycles later.
+#[inline(always)]
+pub fn fetch_later(first: *const f32, floats: usize) {
+    #[cfg(target_arch = "x86_64")]
+    for line in (0..floats).step_by(16) {
+        use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
+        // SAFETY: as above.
+        unsafe { _mm_prefetch::<_MM_HINT_T1>(first.wrapping_add(line).cast::<i8>()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (first, floats);
+}
+
 /// Prefetches floats that are about to be read and written.
 #[inline(always)]
 pub fn fetch_now(first: *const f32, floats: usize) {

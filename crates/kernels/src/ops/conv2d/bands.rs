@@ -49,6 +49,7 @@ pub struct Scratch {
     pub taps: Vec<f32>,
     pub segments: Vec<crate::tile::Segment>,
     pub offsets: Vec<(u32, u32)>,
+    pub columns: Vec<u32>,
     pub rounded: Rounded,
 }
 

@@ -1,18 +1,30 @@
 //! Layers whose outputs have one input channel each: whole rows at a time, vectors along pixels.
 
 use super::activate;
-use super::bands::{aligned, with_scratch};
+use super::bands::{Scratch, aligned, with_scratch};
 use super::planes::{Planes, Source};
-use super::shapes::{Correlation, Tensors, WeightSums, offset};
+use super::shapes::{Correlation, Tap, Tensors, WeightSums, offset};
 use crate::simd;
-use crate::tile::{Dots, MOST_DOTS, Rows, Shared, kernel};
+use crate::tile::rows::{Dots, Line, MOST_DOTS, Rows};
+use crate::tile::{Kernel, Shared, kernel};
 use rayon::prelude::*;
+use std::ops::Range;
 
+/// Floats from a row to what is asked of memory meanwhile.
+const AHEAD: isize = 2048;
 /// Floats of a band's copy.
 const BAND: usize = 6 << 10;
 
 /// A correlation with one input channel per group.
 pub fn run(c: &Correlation, t: Tensors) {
+    match Inner::of(c).filter(|i| i.columns.len() > kernel(simd::level()).lanes) {
+        Some(inner) => inner.run(c, t),
+        None => run_copied(c, t),
+    }
+}
+
+/// The same from copies of the input in which taps are shifts.
+fn run_copied(c: &Correlation, t: Tensors) {
     let level = simd::level();
     let kernel = kernel(level);
     let mut planes = Planes::default();
@@ -85,6 +97,121 @@ pub fn run(c: &Correlation, t: Tensors) {
         None => t.out.par_chunks_mut(size).enumerate().for_each(|(i, out)| {
             simd::with_level(level, || compute(place(i).0, place(i).1, out, None));
         }),
+    }
+}
+
+/// Outputs all of whose taps lie inside a row of the input.
+struct Inner {
+    columns: Range<usize>,
+    low: [isize; 2],
+    /// Rows from the first to the last tap.
+    rows: usize,
+    /// The other columns, each with the taps that lie inside a row.
+    borders: Vec<(usize, Vec<Tap>)>,
+}
+
+/// What one channel is computed from.
+struct Plane<'a> {
+    x: &'a [f32],
+    /// Whether floats follow.
+    goes_on: bool,
+    weights: &'a [f32],
+    start: f32,
+}
+
+impl Inner {
+    /// None where outputs do not share their taps, or steps are long.
+    fn of(c: &Correlation) -> Option<Inner> {
+        let [phase] = &c.phases[..] else { return None };
+        if c.spread != [1; 2] || phase.size != c.output || phase.taps.is_empty() || c.step[1] > 2 {
+            return None;
+        }
+        let of = |i: usize| phase.taps.iter().map(move |t| t.at[i]);
+        let low = [of(0).min()?, of(1).min()?];
+        let (step, last) = (c.step[1] as isize, of(1).max()?);
+        let width = c.input[1] as isize;
+        let first = ((-low[1]).max(0) + step - 1) / step;
+        let end = ((width - last).max(0) + step - 1) / step;
+        let columns = first as usize..(end as usize).min(c.output[1]);
+        let inside = |x: usize| {
+            let taps = phase.taps.iter().filter(move |t| (0..width).contains(&(x as isize * step + t.at[1])));
+            (x, taps.copied().collect())
+        };
+        // The last inner one is there as well: vectors of every second float read one more than there are.
+        let borders = (0..columns.start).chain(columns.end.saturating_sub(1)..c.output[1]).map(inside).collect();
+        Some(Inner { columns, low, rows: (of(0).max()? - low[0] + 1) as usize, borders })
+    }
+
+    /// Computes all outputs.
+    fn run(&self, c: &Correlation, t: Tensors) {
+        let level = simd::level();
+        let kernel = kernel(level);
+        let (size, pixels) = (c.input[0] * c.input[1], c.output[0] * c.output[1]);
+        let (x, bias) = (t.x, t.bias);
+        let compute = |i: usize, out: &mut [f32]| {
+            let channel = i % (c.groups * c.features);
+            let (group, feature) = (channel / c.features, channel % c.features);
+            let (plane, rest) = x[i / c.features * size..].split_at(size);
+            let weights = &t.weights[group * c.weight_group + feature * c.weight_feature..];
+            let plane = Plane { x: plane, goes_on: !rest.is_empty(), weights, start: bias.get(channel).copied().unwrap_or(0.0) };
+            with_scratch(|scratch| self.compute(c, kernel, plane, out, scratch));
+        };
+        match t.before {
+            Some(before) => t.out.par_chunks_mut(pixels).zip(before.par_chunks_mut(pixels)).enumerate().for_each(|(i, (out, before))| {
+                simd::with_level(level, || {
+                    compute(i, before);
+                    out.copy_from_slice(before);
+                    activate(t.activation, out);
+                });
+            }),
+            None => t.out.par_chunks_mut(pixels).enumerate().for_each(|(i, out)| {
+                simd::with_level(level, || {
+                    compute(i, out);
+                    activate(t.activation, out);
+                });
+            }),
+        }
+    }
+
+    /// All outputs of one channel: vectors of the inner columns, one after the other at the borders.
+    fn compute(&self, c: &Correlation, kernel: &Kernel, p: Plane, out: &mut [f32], scratch: &mut Scratch) {
+        let ([height, width], taps) = (c.input.map(|n| n as isize), &c.phases[0].taps);
+        let Scratch { taps: weights, columns: offsets, .. } = scratch;
+        let mut inside = false;
+        for (y, out) in out.chunks_exact_mut(c.output[1]).enumerate() {
+            let top = (y * c.step[0]) as isize + self.low[0];
+            let was_inside = std::mem::replace(&mut inside, top >= 0 && top + self.rows as isize <= height);
+            if !(inside && was_inside) {
+                let rows = taps.iter().filter(|t| (0..height).contains(&(top + t.at[0] - self.low[0])));
+                weights.clear();
+                weights.extend(rows.clone().map(|t| p.weights[t.weight]));
+                offsets.clear();
+                offsets.extend(rows.map(|t| offset(((t.at[0] - self.low[0]) * width + t.at[1] - self.low[1]) as usize)));
+            }
+            let first = top * width + (self.columns.start * c.step[1]) as isize + self.low[1];
+            let rest = (c.step[1] == 2 && !p.goes_on && top + self.rows as isize >= height) as usize;
+            let columns = self.columns.start..self.columns.end - rest;
+            let line = Line {
+                weights,
+                offsets,
+                from: p.x.as_ptr().wrapping_offset(first),
+                step: c.step[1],
+                columns: columns.len(),
+                start: p.start,
+                c: out[columns.clone()].as_mut_ptr(),
+            };
+            simd::fetch_later(p.x.as_ptr().wrapping_offset(first + AHEAD), c.step[0] * c.input[1]);
+            // SAFETY: taps of rows inside the input are listed, and columns all of whose taps are inside.
+            unsafe { kernel.line(&line) };
+            for (x, taps) in self.borders.iter().filter(|(x, _)| !columns.contains(x)) {
+                let at = [(y * c.step[0]) as isize, (x * c.step[1]) as isize];
+                let mut sum = p.start;
+                for t in taps.iter().filter(|t| inside || (0..height).contains(&(at[0] + t.at[0]))) {
+                    sum += p.weights[t.weight] * p.x[((at[0] + t.at[0]) * width + at[1] + t.at[1]) as usize];
+                }
+                out[*x] = sum;
+            }
+        }
     }
 }
 

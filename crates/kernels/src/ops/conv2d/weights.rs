@@ -7,7 +7,7 @@ use super::bands::{Bands, Scratch, aligned, with_scratch};
 use super::depthwise;
 use super::shapes::{WeightSums, offset};
 use crate::simd;
-use crate::tile::{Kernel, MOST_VECTORS, Shared, Start, Tile, kernel};
+use crate::tile::{Ahead, Kernel, MOST_VECTORS, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
 use std::cell::Cell;
 use std::ops::Range;
@@ -166,6 +166,7 @@ impl Task<'_> {
                             c_row: runs * length,
                             c_vector: self.kernel.lanes,
                             start: Start::Accumulate,
+                            ahead: Ahead::none(planes.as_ptr()),
                         };
                         // SAFETY: `height` rows of d exist from there, `list_pixels` names pixels of d and of the copy, sums have all rows.
                         unsafe { self.kernel.run(height, each.min(l.vectors - v), &tile) };

@@ -9,7 +9,7 @@ use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Tensors};
 use crate::ops::activation::Activation;
 use crate::simd;
-use crate::tile::{Kernel, Shared, Start, Tile, kernel};
+use crate::tile::{Ahead, Kernel, Shared, Start, Tile, kernel};
 use crate::vector::{by_lanes, vectorized};
 use rayon::prelude::*;
 use std::cell::Cell;
@@ -213,6 +213,7 @@ impl Job<'_> {
                         c_row: width,
                         c_vector: lanes,
                         start,
+                        ahead: Ahead::none(inputs.as_ptr()),
                     };
                     // SAFETY: weights of that many output channels exist from there, inputs of all channels, and their products.
                     unsafe { self.kernel.run(self.kernel.rows.min(features - f), vectors, &tile) };

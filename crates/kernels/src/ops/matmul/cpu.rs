@@ -5,7 +5,7 @@ use crate::gemm::{Gemm, Init, Precision, View, has_bf16};
 use crate::ops::conv2d::bands::{Scratch, aligned, with_scratch};
 use crate::ops::conv2d::weights::interleave;
 use crate::simd;
-use crate::tile::{Kernel, Shared, Start, Tile, kernel};
+use crate::tile::{Ahead, Kernel, Shared, Start, Tile, kernel};
 use crate::vector::vectorized;
 use rayon::prelude::*;
 use std::cell::Cell;
@@ -193,7 +193,10 @@ impl<'a> Job<'a> {
             for j in part.columns.clone().step_by(width) {
                 let count = width.min(part.columns.end - j);
                 self.pack(b, terms.clone(), j..j + count, panel);
-                for i in part.rows.clone().step_by(height) {
+                let next = self.after(part, &terms, j);
+                for (tile, i) in part.rows.clone().step_by(height).enumerate() {
+                    let first = tile * Ahead::rows(terms.len()) * s.n;
+                    let ahead = next.filter(|b| first < b.len()).map(|b| Ahead { from: b[first..].as_ptr(), step: s.n });
                     let a = if s.a_transposed { &rows[(i - part.rows.start) * terms.len()..] } else { &a[i * s.k + terms.start..] };
                     let tall = height.min(part.rows.end - i);
                     let to = (part.batch * s.m + i) * s.n + j;
@@ -206,6 +209,7 @@ impl<'a> Job<'a> {
                         c_row: width,
                         c_vector: self.kernel.lanes,
                         start: Start::Zero,
+                        ahead: ahead.unwrap_or(Ahead::none(panel.as_ptr())),
                     };
                     let vectors = count.div_ceil(self.kernel.lanes);
                     // SAFETY: the blocks of A and the panel hold all terms; C's columns are this task's own.
@@ -226,6 +230,13 @@ impl<'a> Job<'a> {
                 }
             }
         }
+    }
+
+    /// B from the first term and column of the panel that is copied after the one of column `j`, if its rows can be read in turn.
+    fn after(&self, part: &Part, terms: &Range<usize>, j: usize) -> Option<&[f32]> {
+        let (s, width) = (&self.s, self.kernel.width());
+        let (term, column) = if j + width < part.columns.end { (terms.start, j + width) } else { (terms.end, part.columns.start) };
+        (!s.b_transposed && term < part.terms.end).then(|| &self.b[(part.batch * s.k + term) * s.n + column..])
     }
 
     /// The same on factors rounded to bf16.

@@ -1,6 +1,9 @@
 //! Sums over channels and taps for every pixel of the output, vectors along pixels: forward passes and gradients of inputs.
 
-use super::activate;
+mod factors;
+mod later;
+mod outputs;
+
 use super::bands::{Bands, Scratch, aligned, with_scratch};
 use super::depthwise;
 use super::planes::{Planes, Source};
@@ -9,7 +12,9 @@ use super::winograd;
 use crate::gemm::{Gemm, Init, Precision, Rounded, View, has_bf16};
 use crate::ops::activation::Activation;
 use crate::simd;
-use crate::tile::{Kernel, Pack, Segment, Shared, Start, Tile, kernel};
+use crate::tile::{Ahead, Kernel, Pack, Segment, Shared, Start, Tile, kernel};
+use factors::Factors;
+use later::Later;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -19,8 +24,6 @@ const DIRECT: usize = 6 << 10;
 const TERMS: usize = 192;
 /// Floats of sums that a band keeps between passes.
 const SUMS: usize = 96 << 10;
-/// Portions in which the input of a later pass is asked of memory.
-const FETCHES: usize = 1 << 16;
 /// Fewest pixels that a band is cut into to keep all threads busy.
 const FEWEST: usize = 192;
 
@@ -29,6 +32,8 @@ const FEWEST: usize = 192;
 struct Terms {
     planes: Vec<(u32, u32)>,
     panel: Vec<(u32, u32)>,
+    /// Floats from the weights of a block of channels to those of the next.
+    to_block: usize,
 }
 
 /// A correlation on its way, as all threads see it.
@@ -46,8 +51,12 @@ struct Job<'a> {
     direct: bool,
     /// Whether the input itself serves as planes.
     in_place: bool,
+    /// Phases that are computed in turns: all, where their pixels alternate in rows and are written together, else 1.
+    joined: usize,
+    /// Per phase, whether its panels equal those of the phase before.
+    repeats: Vec<bool>,
     x: &'a [f32],
-    weights: &'a [f32],
+    weights: Factors<'a>,
     bias: &'a [f32],
     activation: Activation,
     out: Shared,
@@ -76,8 +85,13 @@ impl Correlation {
             return depthwise::run(self, t);
         }
         let Err(t) = winograd::run(self, t) else { return };
+        self.with_factors(t.weights, |weights| self.run_tiles(weights, t));
+    }
+
+    /// Computes all outputs in tiles of output channels and pixels.
+    fn run_tiles(&self, weights: Factors, t: Tensors) {
         let level = simd::level();
-        let job = self.job(t, kernel(level));
+        let job = self.job(weights, t, kernel(level));
         let parts = self.features.div_ceil(job.features);
         let tasks = self.groups * job.bands.len() * parts;
         let part = |i: usize| {
@@ -93,7 +107,7 @@ impl Correlation {
         });
     }
 
-    fn job<'a>(&'a self, t: Tensors<'a>, kernel: &'static Kernel) -> Job<'a> {
+    fn job<'a>(&'a self, weights: Factors<'a>, t: Tensors<'a>, kernel: &'static Kernel) -> Job<'a> {
         let mut planes = Planes::default();
         planes.update(self.input, self.step, self.phases.iter().flat_map(|p| &p.taps).map(|t| t.at));
         let most = |i: usize| self.phases.iter().map(|p| p.size[i]).max().unwrap_or(0);
@@ -111,7 +125,11 @@ impl Correlation {
         let blocks = self.channels.div_ceil(block.max(1)).max(1);
         let block = self.channels.div_ceil(blocks);
         let channel = if in_place { self.input[0] * self.input[1] } else { planes.channel };
-        let terms = self.phases.iter().map(|p| self.terms(p, &planes, block, channel, kernel.width())).collect();
+        let first = |i: usize| self.phases[..i].iter().map(|p| p.taps.len()).sum();
+        let phases = self.phases.iter().enumerate();
+        let terms = phases
+            .map(|(i, p)| self.terms(p, |c, t| weights.offset(self, first(i), p, c, t), &planes, [block, channel, kernel.width()]))
+            .collect();
         Job {
             c: self,
             kernel,
@@ -122,8 +140,10 @@ impl Correlation {
             features,
             direct,
             in_place,
+            joined: if self.alternates() { self.phases.len() } else { 1 },
+            repeats: (0..self.phases.len()).map(|i| i > 0 && self.reads_the_same(i - 1, i)).collect(),
             x: t.x,
-            weights: t.weights,
+            weights,
             bias: t.bias,
             activation: t.activation,
             out: Shared(t.out.as_mut_ptr()),
@@ -143,6 +163,20 @@ impl Correlation {
         tap.at == [0; 2] && self.step == [1; 2] && self.spread == [1; 2] && self.input == self.output && p.size == self.output
     }
 
+    /// Whether phases are equally large and every two of them have the even and the odd pixels of rows.
+    fn alternates(&self) -> bool {
+        let alternate = |p: &[Phase]| matches!(p, [a, b] if a.start[0] == b.start[0] && [a.start[1], b.start[1]] == [0, 1]);
+        let size = self.phases.first().map(|p| p.size);
+        self.spread[1] == 2
+            && !self.is_rounded()
+            && self.phases.iter().all(|p| Some(p.size) == size)
+            && self.phases.chunks(2).all(alternate)
+    }
+
+    fn reads_the_same(&self, a: usize, b: usize) -> bool {
+        self.phases[a].taps.iter().map(|t| t.at).eq(self.phases[b].taps.iter().map(|t| t.at))
+    }
+
     /// Output channels and pixels per task. Cut by channels where weights outweigh pixels, as each task reads all of its own of both.
     fn divide(&self, rows: usize, columns: usize, kernel: &Kernel) -> (usize, usize) {
         let taps: usize = self.phases.iter().map(|p| p.taps.len()).sum();
@@ -160,11 +194,12 @@ impl Correlation {
         (features, budget(features).min(share.max(FEWEST)).max(1))
     }
 
-    fn terms(&self, phase: &Phase, planes: &Planes, block: usize, channel: usize, width: usize) -> Terms {
-        let mut terms = Terms::default();
+    /// Terms of a block of channels, whose weights stand at `weight(channel, tap)`, pixels of a channel so many floats apart.
+    fn terms(&self, phase: &Phase, weight: impl Fn(usize, usize) -> usize, planes: &Planes, [block, channel, width]: [usize; 3]) -> Terms {
+        let mut terms = Terms { to_block: weight(block, 0) - weight(0, 0), ..Terms::default() };
         for c in 0..block {
-            for tap in &phase.taps {
-                let weight = offset(c * self.weight_channel + tap.weight);
+            for (t, tap) in phase.taps.iter().enumerate() {
+                let weight = offset(weight(c, t));
                 terms.panel.push((weight, offset(terms.panel.len() * width)));
                 terms.planes.push((weight, offset(c * channel + planes.offset(tap.at))));
             }
@@ -191,7 +226,7 @@ impl Job<'_> {
         let planes = aligned(planes, if self.in_place { 0 } else { self.block * self.planes.channel + self.planes.image + 2 * width });
         let most = self.terms.iter().map(|t| t.panel.len()).max().unwrap_or(0);
         let panel = aligned(panel, if self.direct { 0 } else { (most + 1) * width });
-        let kept = if passes > 1 { tiles } else { 1 };
+        let kept = if passes > 1 { tiles } else { self.joined };
         let sums = aligned(sums, kept * part.features.len() * width);
         for pass in 0..passes {
             let channels = pass * self.block..((pass + 1) * self.block).min(c.channels);
@@ -201,40 +236,76 @@ impl Job<'_> {
                 self.planes.fill(source, channels.clone(), part.images.clone(), part.rows.start, planes);
             }
             let ahead = if pass + 1 < passes { Some((part, pass + 1)) } else { next.map(|n| (n, 0)) };
-            let ahead = ahead.filter(|_| !self.in_place);
+            let blocks = part.features.len().div_ceil(self.kernel.rows);
+            let mut later = ahead.filter(|_| !self.in_place).map(|next| self.input_of(next, tiles * blocks));
             let mut tile = 0;
-            for (phase, terms) in c.phases.iter().zip(&self.terms) {
-                let cells = self.clip(phase, part);
-                if self.c.is_rounded() {
-                    self.pack_weights(part, &channels, &terms.panel[..channels.len() * phase.taps.len()], taps, rounded);
+            for ((phases, terms), repeats) in
+                c.phases.chunks(self.joined).zip(self.terms.chunks(self.joined)).zip(self.repeats.chunks(self.joined))
+            {
+                let cells = self.clip(&phases[0], part);
+                if c.is_rounded() {
+                    self.pack_weights(part, pass, &terms[0], channels.len() * phases[0].taps.len(), taps, rounded);
                 }
                 for first in (0..self.cells(&cells)).step_by(width) {
                     self.segments(&cells, first, segments);
                     let at = if passes > 1 { tile * part.features.len() * width } else { 0 };
-                    let sums = &mut sums[at..at + part.features.len() * width];
-                    let step =
-                        Step { part, channels: channels.clone(), taps: phase.taps.len(), terms, first, segments, last: pass + 1 == passes };
-                    if let Some((part, pass)) = ahead {
-                        self.fetch(part, pass, tile * FETCHES / tiles..(tile + 1) * FETCHES / tiles);
+                    let sums = &mut sums[at..at + phases.len() * part.features.len() * width];
+                    for ((i, phase), terms) in phases.iter().enumerate().zip(terms) {
+                        let step = Step {
+                            part,
+                            channels: channels.clone(),
+                            taps: phase.taps.len(),
+                            terms,
+                            first,
+                            segments,
+                            pass,
+                            last: pass + 1 == passes,
+                            share: if phases.len() > 1 { (i % 2, 2) } else { (0, 1) },
+                            to: (phase.start[0] - phases[0].start[0]) * c.output[1],
+                            repeats: i > 0 && repeats[i],
+                        };
+                        self.tile(&step, (planes, panel), &mut sums[i * part.features.len() * width..], rounded, &mut later);
+                        tile += 1;
                     }
-                    self.tile(&step, planes, panel, sums, rounded);
-                    tile += 1;
+                    if pass + 1 == passes && self.joined > 1 {
+                        for (phases, sums) in phases.chunks(2).zip(sums.chunks_mut(2 * part.features.len() * width)) {
+                            self.finish_both(segments, phases[0].start[0] * c.output[1], part, sums);
+                        }
+                    }
                 }
             }
         }
     }
 
-    /// Asks memory for a part, in `FETCHES`, of what a later pass copies.
-    fn fetch(&self, part: &Part, pass: usize, share: Range<usize>) {
+    /// What a pass copies, to be asked for by that many tiles.
+    fn input_of(&self, (part, pass): (&Part, usize), tiles: usize) -> Later {
         let c = self.c;
         let channels = pass * self.block..((pass + 1) * self.block).min(c.channels);
-        let planes = part.images.len() * channels.len();
-        for i in share.start * planes / FETCHES..share.end * planes / FETCHES {
-            let (image, channel) = (part.images.start + i / channels.len(), channels.start + i % channels.len());
-            let plane = (image * c.groups + part.group) * c.channels + channel;
-            let rows = self.planes.rows_of(part.rows.clone());
-            simd::fetch(&self.x[(plane * c.input[0] + rows.start) * c.input[1]..(plane * c.input[0] + rows.end) * c.input[1]]);
+        let read = self.planes.rows_of(part.rows.clone());
+        let (size, len) = (c.input[0] * c.input[1], read.len() * c.input[1]);
+        let first = part.images.start * c.groups * c.channels + part.group * c.channels + channels.start;
+        let planes = if len > 0 { part.images.len() * channels.len() } else { 0 };
+        Later {
+            from: self.x.as_ptr().wrapping_add(first * size + read.start * c.input[1]),
+            at: 0,
+            len,
+            per_tile: (planes * len).div_ceil(tiles.max(1)),
+            planes,
+            channels: channels.len(),
+            to_channel: size,
+            to_image: (c.groups * c.channels - channels.len() + 1) * size,
         }
+    }
+
+    /// Channels of the pixels after a tile's, where the input is read in place: the share of the tile's `i`th block of output channels.
+    fn pixels_ahead(&self, s: &Step, channels: usize, i: usize) -> Option<Ahead> {
+        let (last, first) = (s.segments.last()?, i * Ahead::rows(channels));
+        if !self.in_place || first >= channels {
+            return None;
+        }
+        let size = self.c.input[0] * self.c.input[1];
+        let channel = s.part.group * self.c.channels + s.channels.start + first;
+        Some(Ahead { from: self.x.as_ptr().wrapping_add(channel * size + last.from + last.len), step: size })
     }
 
     fn clip<'a>(&self, phase: &'a Phase, part: &Part) -> Cells<'a> {
@@ -284,7 +355,8 @@ impl Job<'_> {
     }
 
     /// One tile of pixels for all output channels of the part.
-    fn tile(&self, s: &Step, planes: &[f32], panel: &mut [f32], sums: &mut [f32], rounded: &mut Rounded) {
+    fn tile(&self, s: &Step, memory: (&[f32], &mut [f32]), sums: &mut [f32], rounded: &mut Rounded, later: &mut Option<Later>) {
+        let (planes, panel) = memory;
         let Some(last) = s.segments.last() else { return };
         let (c, width, lanes) = (self.c, self.kernel.width(), self.kernel.lanes);
         let vectors = (last.at + last.len).div_ceil(lanes);
@@ -305,8 +377,10 @@ impl Job<'_> {
                 width,
                 exact: self.in_place,
             };
-            // SAFETY: segments lie inside the input or the planes, which go on for more than a vector; the panel has a row more.
-            unsafe { self.kernel.pack(&pack) };
+            if !s.repeats {
+                // SAFETY: segments lie inside the input or the planes, which go on for more than a vector; the panel has a row more.
+                unsafe { self.kernel.pack(&pack) };
+            }
             (panel.as_ptr(), &s.terms.panel[..count])
         };
         if self.c.is_rounded() {
@@ -314,7 +388,12 @@ impl Job<'_> {
         }
         for (i, feature) in s.part.features.clone().enumerate().step_by(self.kernel.rows) {
             let rows = self.kernel.rows.min(s.part.features.end - feature);
-            let weights = s.part.group * c.weight_group + feature * c.weight_feature + s.channels.start * c.weight_channel;
+            let ahead = match later {
+                Some(later) => later.next(Ahead::rows(count)),
+                None => self.pixels_ahead(s, count, i / self.kernel.rows),
+            };
+            let ahead = ahead.unwrap_or(Ahead::none(b));
+            let weights = s.part.group * self.weights.group + feature * self.weights.feature + s.pass * s.terms.to_block;
             let global = s.part.group * c.features + feature;
             let start = match s.channels.start {
                 0 if self.bias.is_empty() => Start::Zero,
@@ -322,36 +401,36 @@ impl Job<'_> {
                 _ => Start::Accumulate,
             };
             if s.last {
-                self.fetch_outputs(s.segments, global, rows);
+                self.fetch_outputs(s, global, rows);
             }
             let sums = &mut sums[i * width..(i + rows) * width];
             let tile = Tile {
-                a: self.weights[weights..].as_ptr(),
-                row: c.weight_feature,
+                a: self.weights.data[weights..].as_ptr(),
+                row: self.weights.feature,
                 b,
                 offsets,
                 c: sums.as_mut_ptr(),
                 c_row: width,
                 c_vector: lanes,
                 start,
+                ahead,
             };
             // SAFETY: weights of `rows` features exist from there; planes and panel hold all offsets; sums have rows · width floats.
             unsafe { self.kernel.run(rows, vectors, &tile) };
-            if s.last {
+            if s.last && self.joined == 1 {
                 self.finish(s.segments, global, rows, sums);
             }
         }
     }
 
     /// Rounds the weights of a pass: `[features, terms]`, gathered where their channels do not follow one another.
-    fn pack_weights(&self, part: &Part, channels: &Range<usize>, terms: &[(u32, u32)], gathered: &mut Vec<f32>, rounded: &mut Rounded) {
-        let c = self.c;
+    fn pack_weights(&self, part: &Part, pass: usize, terms: &Terms, count: usize, gathered: &mut Vec<f32>, rounded: &mut Rounded) {
         gathered.clear();
         for feature in part.features.clone() {
-            let first = part.group * c.weight_group + feature * c.weight_feature + channels.start * c.weight_channel;
-            gathered.extend(terms.iter().map(|t| self.weights[first + t.0 as usize]));
+            let first = part.group * self.weights.group + feature * self.weights.feature + pass * terms.to_block;
+            gathered.extend(terms.panel[..count].iter().map(|t| self.weights.data[first + t.0 as usize]));
         }
-        rounded.pack(&product_of(part.features.len(), terms.len(), 0, View::rows(gathered, terms.len()), &[], 0));
+        rounded.pack(&product_of(part.features.len(), count, 0, View::rows(gathered, count), &[], 0));
     }
 
     /// One tile on factors rounded to bf16, from its panel.
@@ -372,45 +451,6 @@ impl Job<'_> {
             }
         }
     }
-
-    /// Asks memory for the outputs that a tile will write.
-    fn fetch_outputs(&self, segments: &[Segment], channel: usize, rows: usize) {
-        let (pixels, spread) = (self.c.output[0] * self.c.output[1], self.c.spread[1]);
-        for r in 0..rows {
-            for s in segments {
-                simd::fetch_to_write(self.out.0.wrapping_add((channel + r) * pixels + s.to), s.len * spread);
-            }
-        }
-    }
-
-    /// Writes the outputs of some channels from their sums.
-    fn finish(&self, segments: &[Segment], channel: usize, rows: usize, sums: &mut [f32]) {
-        if let Some(before) = self.before {
-            self.store(segments, channel, rows, sums, before);
-        }
-        activate(self.activation, sums);
-        self.store(segments, channel, rows, sums, self.out);
-    }
-
-    fn store(&self, segments: &[Segment], channel: usize, rows: usize, sums: &[f32], out: Shared) {
-        let (width, pixels, spread) = (self.kernel.width(), self.c.output[0] * self.c.output[1], self.c.spread[1]);
-        for (r, sums) in sums.chunks_exact(width).enumerate().take(rows) {
-            for s in segments {
-                let from = &sums[s.at..s.at + s.len];
-                // SAFETY: the pixels of a segment are this task's own, and lie inside the output, whose length `run` checked.
-                unsafe {
-                    let to = out.at((channel + r) * pixels + s.to);
-                    if spread == 1 {
-                        std::ptr::copy_nonoverlapping(from.as_ptr(), to, s.len);
-                    } else {
-                        for (i, v) in from.iter().enumerate() {
-                            *to.add(i * spread) = *v;
-                        }
-                    }
-                }
-            }
-        }
-    }
 }
 
 /// `c += a b` with rows of B and C as far apart as those of a panel.
@@ -426,5 +466,12 @@ struct Step<'a> {
     terms: &'a Terms,
     first: usize,
     segments: &'a [Segment],
+    pass: usize,
     last: bool,
+    /// Which rows, and one of how many, it asks memory for: two phases write to the same ones.
+    share: (usize, usize),
+    /// Floats from the pixels of the segments to this phase's.
+    to: usize,
+    /// Whether the panel is there already.
+    repeats: bool,
 }

@@ -3,7 +3,10 @@
 //! Convolutions and large matrix products compute their outputs in such tiles. The loops over tiles are ordinary code: only
 //! the tile, and the copies that feed it, are compiled per instruction set and reached through [`Kernel`].
 
+pub mod rows;
+
 use crate::simd::{self, Lane, Level, Plain};
+use rows::{Dots, Line, Rows};
 
 /// Initial values of a tile's sums.
 #[derive(Clone, Copy)]
@@ -27,7 +30,32 @@ pub struct Tile<'a> {
     pub c_row: usize,
     pub c_vector: usize,
     pub start: Start,
+    /// What is asked of memory meanwhile.
+    pub ahead: Ahead,
 }
+
+/// Rows as wide as a tile, one of which is asked of memory with every eighth term of a sum, as fast as memory answers.
+#[derive(Clone, Copy)]
+pub struct Ahead {
+    pub from: *const f32,
+    /// Floats between rows.
+    pub step: usize,
+}
+
+impl Ahead {
+    /// Nothing but what is in cache.
+    pub fn none(cached: *const f32) -> Ahead {
+        Ahead { from: cached, step: 0 }
+    }
+
+    /// Rows that a tile asks for whose sums have so many terms.
+    pub fn rows(terms: usize) -> usize {
+        terms.div_ceil(TERMS_PER_FETCH)
+    }
+}
+
+/// Terms of a sum per row that is asked of memory.
+const TERMS_PER_FETCH: usize = 8;
 
 /// A run of pixels that is contiguous in the input, in a tile and in the output.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -51,37 +79,6 @@ pub struct Pack<'a> {
     pub exact: bool,
 }
 
-/// Rows of outputs of one channel: `c[i] = start + Σ_t weights[t] b[offsets[t] + i]`, whole vectors of each.
-pub struct Rows<'a> {
-    pub weights: &'a [f32],
-    pub offsets: &'a [(u32, u32)],
-    pub b: *const f32,
-    pub b_pitch: usize,
-    pub rows: usize,
-    pub columns: usize,
-    pub start: f32,
-    pub c: *mut f32,
-    pub c_pitch: usize,
-}
-
-/// Products of a gradient's rows with shifted rows of an input: `sums[t, i mod lanes] += Σ_rows Σ_i d[i] b[offsets[t] + i]`.
-pub struct Dots<'a> {
-    pub d: *const f32,
-    pub d_pitch: usize,
-    pub b: *const f32,
-    pub b_pitch: usize,
-    pub rows: usize,
-    /// Columns of a row, a multiple of the lanes.
-    pub columns: usize,
-    /// At most [`MOST_DOTS`].
-    pub offsets: &'a [(u32, u32)],
-    /// `[offsets.len(), lanes]`
-    pub sums: *mut f32,
-}
-
-/// Taps of one [`Dots`].
-pub const MOST_DOTS: usize = 9;
-
 type TileFn = unsafe fn(&Tile);
 
 /// Most rows and vectors of any level's tile.
@@ -104,6 +101,7 @@ pub struct Kernel {
     tiles: [[TileFn; MOST_VECTORS]; MOST_ROWS],
     pack: unsafe fn(&Pack),
     rows_of: unsafe fn(&Rows),
+    line: unsafe fn(&Line),
     dots: unsafe fn(&Dots),
 }
 
@@ -145,12 +143,22 @@ impl Kernel {
         unsafe { (self.rows_of)(rows) }
     }
 
+    /// Computes a line of a depthwise convolution.
+    ///
+    /// # Safety
+    /// Inputs of all columns exist at every tap, with `step` 2 one float more; so do the outputs.
+    pub unsafe fn line(&self, line: &Line) {
+        assert!(line.columns >= self.lanes && matches!(line.step, 1 | 2), "a line of {} columns", line.columns);
+        // SAFETY: as the caller vouches.
+        unsafe { (self.line)(line) }
+    }
+
     /// Adds the products of rows to sums per tap.
     ///
     /// # Safety
     /// All that the operands address must exist.
     pub unsafe fn dots(&self, dots: &Dots) {
-        assert!(dots.offsets.len() <= MOST_DOTS && dots.columns.is_multiple_of(self.lanes), "dots: {} taps", dots.offsets.len());
+        assert!(dots.offsets.len() <= rows::MOST_DOTS && dots.columns.is_multiple_of(self.lanes), "dots: {} taps", dots.offsets.len());
         // SAFETY: as the caller vouches.
         unsafe { (self.dots)(dots) }
     }
@@ -174,16 +182,21 @@ unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(t: &Tile) {
                 }
             }
         }
-        // Unrolled: scalar instructions share ports with the multiply-adds.
-        let mut fours = t.offsets.chunks_exact(4);
-        for four in &mut fours {
-            add::<L, MR, NR>(t, four[0], &mut acc);
-            add::<L, MR, NR>(t, four[1], &mut acc);
-            add::<L, MR, NR>(t, four[2], &mut acc);
-            add::<L, MR, NR>(t, four[3], &mut acc);
-        }
-        for &one in fours.remainder() {
-            add::<L, MR, NR>(t, one, &mut acc);
+        let mut ahead = t.ahead.from;
+        for block in t.offsets.chunks(TERMS_PER_FETCH) {
+            simd::fetch_later(ahead, NR * L::N);
+            ahead = ahead.wrapping_add(t.ahead.step);
+            // Unrolled: scalar instructions share ports with the multiply-adds.
+            let mut fours = block.chunks_exact(4);
+            for four in &mut fours {
+                add::<L, MR, NR>(t, four[0], &mut acc);
+                add::<L, MR, NR>(t, four[1], &mut acc);
+                add::<L, MR, NR>(t, four[2], &mut acc);
+                add::<L, MR, NR>(t, four[3], &mut acc);
+            }
+            for &one in fours.remainder() {
+                add::<L, MR, NR>(t, one, &mut acc);
+            }
         }
         let one = L::splat(1.0);
         for (r, sums) in acc.iter().enumerate() {
@@ -244,70 +257,6 @@ unsafe fn pack<L: Lane>(p: &Pack) {
     }
 }
 
-#[inline(always)]
-unsafe fn rows_of<L: Lane>(r: &Rows) {
-    const VECTORS: usize = 4;
-    // SAFETY: `Kernel::depthwise` states what must exist.
-    unsafe {
-        for y in 0..r.rows {
-            let (from, to) = (r.b.add(y * r.b_pitch), r.c.add(y * r.c_pitch));
-            let mut i = 0;
-            while i < r.columns {
-                let mut acc = [L::splat(r.start); VECTORS];
-                for (w, &(_, offset)) in r.weights.iter().zip(r.offsets) {
-                    let (w, b) = (L::splat(*w), from.add(offset as usize + i));
-                    for (q, v) in acc.iter_mut().enumerate() {
-                        *v = L::fma(w, L::load(b.add(q * L::N)), *v);
-                    }
-                }
-                for (q, v) in acc.iter().enumerate() {
-                    L::store(to.add(i + q * L::N), *v);
-                }
-                i += VECTORS * L::N;
-            }
-        }
-    }
-}
-
-#[inline(always)]
-unsafe fn dots<L: Lane>(s: &Dots) {
-    // SAFETY: `Kernel::dots` states what must exist.
-    unsafe {
-        match s.offsets.len() {
-            9 => dots_of::<L, 9>(s, s.offsets, s.sums),
-            _ => {
-                for (t, offset) in s.offsets.iter().enumerate() {
-                    dots_of::<L, 1>(s, std::slice::from_ref(offset), s.sums.add(t * L::N));
-                }
-            }
-        }
-    }
-}
-
-#[inline(always)]
-unsafe fn dots_of<L: Lane, const T: usize>(s: &Dots, offsets: &[(u32, u32)], sums: *mut f32) {
-    // SAFETY: `Kernel::dots` states what must exist.
-    unsafe {
-        let mut acc = [L::splat(0.0); T];
-        for y in 0..s.rows {
-            let (d, b) = (s.d.add(y * s.d_pitch), s.b.add(y * s.b_pitch));
-            let mut i = 0;
-            while i < s.columns {
-                let v = L::load(d.add(i));
-                for (t, sum) in acc.iter_mut().enumerate() {
-                    *sum = L::fma(v, L::load(b.add(offsets[t].1 as usize + i)), *sum);
-                }
-                i += L::N;
-            }
-        }
-        let one = L::splat(1.0);
-        for (t, sum) in acc.iter().enumerate() {
-            let to = sums.add(t * L::N);
-            L::store(to, L::fma(*sum, one, L::load(to)));
-        }
-    }
-}
-
 macro_rules! kernel {
     ($name:ident, $lane:ty, $rows:literal, $vectors:literal, [$($m:literal)*], $(#[$target:meta])*) => {
         mod $name {
@@ -326,15 +275,21 @@ macro_rules! kernel {
             }
 
             $(#[$target])*
-            unsafe fn rows(r: &Rows) {
+            unsafe fn depthwise(r: &Rows) {
                 // SAFETY: compiled for the set; the rest as `Kernel::depthwise` states.
-                unsafe { rows_of::<$lane>(r) }
+                unsafe { rows::rows_of::<$lane>(r) }
+            }
+
+            $(#[$target])*
+            unsafe fn part(l: &Line) {
+                // SAFETY: compiled for the set; the rest as `Kernel::line` states.
+                unsafe { if l.step == 1 { rows::line::<$lane, 1>(l) } else { rows::line::<$lane, 2>(l) } }
             }
 
             $(#[$target])*
             unsafe fn products(d: &Dots) {
                 // SAFETY: compiled for the set; the rest as `Kernel::dots` states.
-                unsafe { dots::<$lane>(d) }
+                unsafe { rows::dots::<$lane>(d) }
             }
 
             pub static KERNEL: Kernel = Kernel {
@@ -343,7 +298,8 @@ macro_rules! kernel {
                 vectors: $vectors,
                 tiles: [$([of::<$m, 1>, of::<$m, 2>, of::<$m, 3>]),*],
                 pack: copy,
-                rows_of: rows,
+                rows_of: depthwise,
+                line: part,
                 dots: products,
             };
         }
@@ -409,7 +365,7 @@ mod tests {
     }
 
     fn matches_plain_loops(kernel: &Kernel, rows: usize, vectors: usize) {
-        let (terms, n) = (7, vectors * kernel.lanes);
+        let (terms, n) = (21, vectors * kernel.lanes);
         let (a, b, bias) = (random(rows * terms, 1), random(terms * n, 2), random(rows, 3));
         let offsets: Vec<(u32, u32)> = (0..terms).rev().map(|k| (k as u32, (k * n) as u32)).collect();
         for start in [Start::Zero, Start::Accumulate, Start::Bias(bias.as_ptr())] {
@@ -426,7 +382,17 @@ mod tests {
                 })
                 .collect();
             let (lanes, c_row) = (kernel.lanes, n);
-            let t = Tile { a: a.as_ptr(), row: terms, b: b.as_ptr(), offsets: &offsets, c: c.as_mut_ptr(), c_row, c_vector: lanes, start };
+            let t = Tile {
+                a: a.as_ptr(),
+                row: terms,
+                b: b.as_ptr(),
+                offsets: &offsets,
+                c: c.as_mut_ptr(),
+                c_row,
+                c_vector: lanes,
+                start,
+                ahead: Ahead::none(b.as_ptr()),
+            };
             // SAFETY: all operands have the tile's size.
             unsafe { kernel.run(rows, vectors, &t) };
             assert_close("tile", &c, &want, 1e-5);
