@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use std::ops::Range;
 
 /// Floats from a row to what is asked of memory meanwhile.
-const AHEAD: isize = 2048;
+const AHEAD: isize = 1024;
 /// Floats of a band's copy.
 const BAND: usize = 6 << 10;
 
@@ -200,7 +200,7 @@ impl Inner {
                 start: p.start,
                 c: out[columns.clone()].as_mut_ptr(),
             };
-            simd::fetch_later(p.x.as_ptr().wrapping_offset(first + AHEAD), c.step[0] * c.input[1]);
+            simd::fetch_now(p.x.as_ptr().wrapping_offset(first + AHEAD), c.step[0] * c.input[1]);
             // SAFETY: taps of rows inside the input are listed, and columns all of whose taps are inside.
             unsafe { kernel.line(&line) };
             for (x, taps) in self.borders.iter().filter(|(x, _)| !columns.contains(x)) {

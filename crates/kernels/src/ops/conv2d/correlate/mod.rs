@@ -22,6 +22,8 @@ use std::ops::Range;
 const DIRECT: usize = 6 << 10;
 /// Terms of a sum per pass where it reads a panel.
 const TERMS: usize = 192;
+/// The same where a pixel of the input has one tap.
+const POINTWISE_TERMS: usize = 288;
 /// Floats of sums that a band keeps between passes.
 const SUMS: usize = 96 << 10;
 /// Fewest pixels that a band is cut into to keep all threads busy.
@@ -121,7 +123,13 @@ impl Correlation {
         let direct = direct && bands.images == 1;
         planes.fit(bands.images, bands.rows, columns);
         let taps = self.phases.iter().map(|p| p.taps.len()).max().unwrap_or(0).max(1);
-        let block = if direct { DIRECT / (planes.rows_per_channel() * (kernel.width() + 16)) } else { TERMS / taps };
+        let block = if in_place {
+            POINTWISE_TERMS
+        } else if direct {
+            DIRECT / (planes.rows_per_channel() * (kernel.width() + 16))
+        } else {
+            TERMS / taps
+        };
         let blocks = self.channels.div_ceil(block.max(1)).max(1);
         let block = self.channels.div_ceil(blocks);
         let channel = if in_place { self.input[0] * self.input[1] } else { planes.channel };
