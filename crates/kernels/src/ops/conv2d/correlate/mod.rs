@@ -394,6 +394,7 @@ impl Job<'_> {
         if self.c.is_rounded() {
             return self.rounded_tile(s, &panel[..count * width], last.at + last.len, sums, rounded);
         }
+        let (straight, pixels) = (self.straight(s), c.output[0] * c.output[1]);
         for (i, feature) in s.part.features.clone().enumerate().step_by(self.kernel.rows) {
             let rows = self.kernel.rows.min(s.part.features.end - feature);
             let ahead = match later {
@@ -412,21 +413,28 @@ impl Job<'_> {
                 self.fetch_outputs(s, global, rows);
             }
             let sums = &mut sums[i * width..(i + rows) * width];
+            let (to, to_row) = match straight {
+                // SAFETY: the segment lies inside the output.
+                Some(s) => (unsafe { self.out.at(global * pixels + s.to) }, pixels),
+                None => (sums.as_mut_ptr(), width),
+            };
             let tile = Tile {
                 a: self.weights.data[weights..].as_ptr(),
                 row: self.weights.feature,
                 b,
                 offsets,
-                c: sums.as_mut_ptr(),
-                c_row: width,
+                c: to,
+                c_row: to_row,
                 c_vector: lanes,
                 start,
                 ahead,
             };
             // SAFETY: weights of `rows` features exist from there; planes and panel hold all offsets; sums have rows · width floats.
             unsafe { self.kernel.run(rows, vectors, &tile) };
-            if s.last && self.joined == 1 {
-                self.finish(s.segments, global, rows, sums);
+            match straight {
+                Some(segment) => self.activate_outputs(segment, global, rows),
+                None if s.last && self.joined == 1 => self.finish(s.segments, global, rows, sums),
+                None => {}
             }
         }
     }

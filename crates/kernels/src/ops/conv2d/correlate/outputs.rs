@@ -1,6 +1,7 @@
 //! Outputs of tiles, written where they belong.
 
 use super::{Job, Part, Step};
+use crate::ops::activation::Activation;
 use crate::ops::conv2d::activate;
 use crate::simd;
 use crate::tile::{Segment, Shared};
@@ -14,6 +15,27 @@ impl Job<'_> {
             for s in step.segments {
                 simd::fetch_to_write(self.out.0.wrapping_add((channel + r) * pixels + step.to + s.to), s.len * spread);
             }
+        }
+    }
+
+    /// The only segment of a tile whose sums are complete after one pass, and whole vectors of one row: it is written straight away.
+    pub(super) fn straight<'a>(&self, step: &Step<'a>) -> Option<&'a Segment> {
+        let [segment] = step.segments else { return None };
+        let whole = segment.at == 0 && segment.len.is_multiple_of(self.kernel.lanes);
+        let plain = self.c.spread[1] == 1 && self.before.is_none() && self.joined == 1;
+        (whole && plain && step.last && step.channels.start == 0).then_some(segment)
+    }
+
+    /// Applies the activation to outputs that were written straight away.
+    pub(super) fn activate_outputs(&self, segment: &Segment, channel: usize, rows: usize) {
+        if self.activation == Activation::None {
+            return;
+        }
+        let pixels = self.c.output[0] * self.c.output[1];
+        for r in 0..rows {
+            // SAFETY: the pixels of a segment are this task's own, and lie inside the output.
+            let row = unsafe { std::slice::from_raw_parts_mut(self.out.at((channel + r) * pixels + segment.to), segment.len) };
+            activate(self.activation, row);
         }
     }
 
