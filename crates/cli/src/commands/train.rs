@@ -102,7 +102,7 @@ impl Verb for Train {
 
     fn run(&self) -> Result<Outcome> {
         use_threads(self.threads)?;
-        // Runs of other applications are started by the application's own command, but this one can resume them.
+        // Runs of other applications are started and resumed by the application's own command.
         match if self.resume { Application::of_run(&self.out)? } else { Application::Object } {
             Application::Object => self.object(),
         }

@@ -75,7 +75,11 @@ const COARSEST: usize = 4;
 
 impl<'a> Tracer<'a> {
     /// Full quality before black, without bounds besides the outer `cube` (lowest corner and edge, model space).
+    ///
+    /// # Panics
+    /// When the field has other than three channels.
     pub fn new(field: &'a Field, placement: Placement, cube: (f32, f32)) -> Tracer<'a> {
+        assert_eq!(field.net.channels(), 3, "a tracer draws three channels");
         Tracer {
             field,
             coarse: None,

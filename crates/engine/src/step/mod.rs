@@ -200,7 +200,7 @@ pub struct Figures {
     pub rays: u64,
     /// Means over the steps.
     pub loss: f64,
-    /// Squared color error of the rays; not a number without photographs.
+    /// Squared color error of the rays; not a number with a [`BatchLoss`].
     pub mse: f64,
     /// Samples trained and marched, all steps together.
     pub trained: f64,
