@@ -147,3 +147,31 @@ unsafe fn dots_of<L: Lane, const T: usize>(s: &Dots, offsets: &[(u32, u32)], sum
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simd::Level;
+    use crate::tile::kernel;
+    use diorama_testkit::{assert_close, random};
+
+    #[test]
+    fn every_line_of_every_level_matches_plain_loops_and_writes_nothing_else() {
+        for kernel in Level::available().into_iter().map(kernel) {
+            let n = kernel.lanes;
+            for (step, columns) in [1, 2].into_iter().flat_map(|s| [n, n + 1, 4 * n, 4 * n + 3, 9 * n - 1].map(|c| (s, c))) {
+                let (offsets, weights) = ([7, 0, 3], random(3, 1));
+                let from = random(step * columns + 7, 2);
+                let mut out = vec![9.0; columns + 2];
+                let c = out[1..].as_mut_ptr();
+                let line = Line { weights: &weights, offsets: &offsets, from: from.as_ptr(), step, columns, start: 0.5, c };
+                // SAFETY: the input goes on for the last tap, and for a float more if every second one is read.
+                unsafe { kernel.line(&line) };
+                let sum = |i: usize| 0.5 + (0..3).map(|t| weights[t] as f64 * from[offsets[t] as usize + step * i] as f64).sum::<f64>();
+                let want: Vec<f64> = (0..columns).map(sum).collect();
+                assert_close("line", &out[1..=columns], &want, 1e-5);
+                assert_eq!([out[0], out[columns + 1]], [9.0; 2]);
+            }
+        }
+    }
+}

@@ -8,18 +8,19 @@ fn matches_the_reference_both_ways_for_any_channel_count() {
         let (p, c, s) = (case.scene.packed(), case.channels, &case.scene);
         let out = cpu::forward(&p, &s.sigma, &case.features, c, &case.background);
         let (sd, fd, bd) = (wide(&s.sigma), wide(&case.features), wide(&case.background));
+        let of = |what| format!("{what}, R={} C={c}", case.rays);
         let want = reference::forward(&p, &sd, &fd, c, &bd);
-        assert_close("color", &out.color, &want.color, 1e-4);
-        assert_close("depth", &out.depth, &want.depth, 1e-4);
-        assert_close("opacity", &out.opacity, &want.opacity, 1e-4);
-        assert_close("weights", &out.weights, &want.weights, 1e-4);
+        assert_close(&of("color"), &out.color, &want.color, 1e-4);
+        assert_close(&of("depth"), &out.depth, &want.depth, 1e-4);
+        assert_close(&of("opacity"), &out.opacity, &want.opacity, 1e-4);
+        assert_close(&of("weights"), &out.weights, &want.weights, 1e-4);
         let [color, depth, opacity, weights] = case.d.each_ref().map(|v| Some(&v[..]));
         let g = cpu::backward(&p, &s.sigma, &case.features, c, &case.background, &cpu::Upstream { color, depth, opacity, weights });
         let [color, depth, opacity, weights] = case.d.each_ref().map(|v| wide(v));
         let (ds, df, db) = reference::backward(&p, &sd, &fd, c, &bd, &Composited { color, depth, opacity, weights });
-        assert_close("sigma", &g.sigma, &ds, 1e-4);
-        assert_close("features", &g.features, &df, 1e-4);
-        assert_close("background", &g.background, &db, 1e-4);
+        assert_close(&of("sigma"), &g.sigma, &ds, 1e-4);
+        assert_close(&of("features"), &g.features, &df, 1e-4);
+        assert_close(&of("background"), &g.background, &db, 1e-4);
     }
 }
 

@@ -112,8 +112,9 @@ struct Inner {
 
 /// What one channel is computed from.
 struct Plane<'a> {
+    /// The channel, and what follows it in memory.
     x: &'a [f32],
-    /// Whether floats follow.
+    /// Whether anything follows.
     goes_on: bool,
     weights: &'a [f32],
     start: f32,
@@ -151,9 +152,9 @@ impl Inner {
         let compute = |i: usize, out: &mut [f32]| {
             let channel = i % (c.groups * c.features);
             let (group, feature) = (channel / c.features, channel % c.features);
-            let (plane, rest) = x[i / c.features * size..].split_at(size);
+            let x = &x[i / c.features * size..];
             let weights = &t.weights[group * c.weight_group + feature * c.weight_feature..];
-            let plane = Plane { x: plane, goes_on: !rest.is_empty(), weights, start: bias.get(channel).copied().unwrap_or(0.0) };
+            let plane = Plane { x, goes_on: x.len() > size, weights, start: bias.get(channel).copied().unwrap_or(0.0) };
             with_scratch(|scratch| self.compute(c, kernel, plane, out, scratch));
         };
         match t.before {

@@ -52,6 +52,10 @@ impl Planes {
                 rows.push((residue, shift[0]));
             }
         }
+        if self.residues.is_empty() {
+            // Without taps nothing is read, but cells still have a place.
+            self.residues.push([0; 2]);
+        }
         self.rows_per_channel = rows.len().max(1);
         self.residues.sort_unstable();
     }

@@ -38,8 +38,33 @@ fn cases() -> Vec<(Conv2d, Images)> {
         (Conv2d { groups: 3, ..same(conv(12, 9, [3, 3])) }, images(2, 11, 19)),
         (Conv2d { groups: 2, stride: [2, 2], ..same(conv(40, 20, [3, 3])) }, images(1, 16, 15)),
         (Conv2d { groups: 6, ..same(conv(6, 6, [3, 3])) }, images(2, 13, 37)),
+        (conv(300, 9, [1, 1]), images(2, 8, 24)),
+        (Conv2d { groups: 2, ..conv(80, 20, [1, 1]) }, images(3, 6, 32)),
+        (Conv2d { groups: 2, stride: [2, 2], ..same(conv(150, 10, [3, 3])) }, images(2, 20, 31)),
         (Conv2d { groups: 6, ..same(conv(6, 12, [5, 5])) }, images(1, 9, 8)),
+        (Conv2d { groups: 6, ..same(conv(6, 12, [5, 5])) }, images(1, 9, 30)),
+        (Conv2d { groups: 2, stride: [2, 2], ..same(conv(2, 2, [3, 3])) }, images(2, 37, 80)),
+        (Conv2d { groups: 2, stride: [1, 2], ..conv(2, 2, [1, 2]) }, images(1, 3, 64)),
+        (Conv2d { groups: 3, stride: [2, 2], padding: [3, 2], ..conv(3, 3, [2, 3]) }, images(2, 1, 71)),
+        (Conv2d { groups: 2, dilation: [4, 1], padding: [5, 1], ..conv(2, 2, [3, 3]) }, images(2, 2, 40)),
         (Conv2d { groups: 7, stride: [2, 2], ..same(conv(7, 7, [3, 3])) }, images(3, 20, 33)),
+        (Conv2d { groups: 3, stride: [2, 2], ..same(conv(3, 3, [3, 3])) }, images(2, 16, 134)),
+        (Conv2d { groups: 3, stride: [1, 2], ..same(conv(3, 6, [3, 3])) }, images(2, 5, 140)),
+        (Conv2d { groups: 3, ..same(conv(3, 6, [3, 3])) }, images(2, 7, 81)),
+        (Conv2d { groups: 2, padding: [4, 7], ..conv(2, 2, [3, 5]) }, images(1, 2, 50)),
+        (Conv2d { groups: 2, stride: [3, 2], padding: [0, 2], dilation: [2, 3], ..conv(2, 2, [2, 2]) }, images(2, 8, 70)),
+        (conv(300, 10, [1, 1]), images(2, 6, 16)),
+        (Conv2d { groups: 2, ..conv(600, 20, [1, 1]) }, images(2, 4, 24)),
+        (conv(10, 300, [1, 1]), images(2, 3, 17)),
+        (conv(20, 11, [1, 1]), images(3, 8, 48)),
+        (Conv2d { padding: [1, 0], ..conv(5, 19, [3, 1]) }, images(2, 9, 48)),
+        (Conv2d { groups: 2, ..same(conv(8, 100, [3, 3])) }, images(2, 6, 8)),
+        (Conv2d { groups: 2, ..same(conv(20, 120, [5, 3])) }, images(1, 16, 16)),
+        (Conv2d { groups: 2, stride: [2, 2], ..same(conv(20, 220, [3, 3])) }, images(1, 10, 12)),
+        (same(conv(20, 150, [3, 3])), images(1, 4, 6)),
+        (Conv2d { stride: [2, 2], ..same(conv(150, 20, [3, 3])) }, images(2, 4, 6)),
+        (Conv2d { stride: [1, 4], padding: [0, 2], ..conv(4, 2, [1, 1]) }, images(1, 300, 1)),
+        (Conv2d { groups: 3, stride: [1, 4], padding: [0, 2], ..conv(3, 3, [1, 1]) }, images(1, 300, 1)),
         (Conv2d { groups: 4, dilation: [3, 2], padding: [3, 1], ..conv(4, 4, [3, 3]) }, images(1, 15, 40)),
     ]
 }
@@ -61,6 +86,9 @@ fn check(c: &Conv2d, images: &Images, biased: bool) {
     let (mut out, mut before) = (vec![9.0; d.len()], vec![9.0; d.len()]);
     cpu::forward(c, images, &x, &w, &b, &mut out, Some(&mut before));
     assert_close(&format!("out of {what}"), &out, &reference::forward(c, images, &wides[0], &wides[1], &wides[2]), 1e-4);
+    let mut alone = vec![9.0; d.len()];
+    cpu::forward(c, images, &x, &w, &b, &mut alone, None);
+    assert_eq!(alone, out, "out without what was before the activation of {what}");
     let linear = Conv2d { activation: Activation::None, ..*c };
     assert_close(&format!("before of {what}"), &before, &reference::forward(&linear, images, &wides[0], &wides[1], &wides[2]), 1e-4);
     let (rx, rw, rb) = reference::backward(c, images, &wides[0], &wides[1], &wides[2], &wides[3]);
@@ -93,6 +121,9 @@ fn every_activation_matches_the_reference_on_every_level() {
                 check(&c, &Images { batch: 2, height: 9, width: 14 }, false);
                 let c = Conv2d { groups: 5, channels_out: 5, ..c };
                 check(&c, &Images { batch: 2, height: 9, width: 14 }, true);
+                check(&c, &Images { batch: 2, height: 9, width: 37 }, true);
+                let c = Conv2d { activation, ..Conv2d::new(20, 11, 1) };
+                check(&c, &Images { batch: 2, height: 6, width: 32 }, true);
             }
         });
     }
@@ -118,18 +149,22 @@ fn results_do_not_depend_on_the_number_of_threads() {
     let c = Conv2d { padding: [1; 2], ..Conv2d::new(20, 24, 3) };
     let images = Images { batch: 3, height: 21, width: 50 };
     assert!(c.weight_sums(&images).shares() > 1, "pixels of the weights' gradient are summed in parts");
-    let [x, w, b, d] = tensors(&c, &images);
-    let run = |threads: usize| {
-        rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(|| {
-            let (mut out, mut dx, mut dw, mut db) = (vec![0.0; d.len()], vec![0.0; x.len()], vec![0.0; w.len()], vec![0.0; b.len()]);
-            cpu::forward(&c, &images, &x, &w, &b, &mut out, None);
-            let gradients = Gradients { input: Some(&mut dx), weights: Some(&mut dw), bias: Some(&mut db) };
-            cpu::backward(&c, &images, &x, &w, &out, &d, gradients);
-            [out, dx, dw, db].concat().iter().map(|v| v.to_bits()).collect::<Vec<_>>()
-        })
-    };
-    let one = run(1);
-    assert!(one == run(2) && one == run(5));
+    // Few threads would work on several of these small images together.
+    let many = (Conv2d { stride: [2; 2], padding: [1; 2], ..Conv2d::new(20, 20, 3) }, Images { batch: 16, height: 32, width: 32 });
+    for (c, images) in [(c, images), many] {
+        let [x, w, b, d] = tensors(&c, &images);
+        let run = |threads: usize| {
+            rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(|| {
+                let (mut out, mut dx, mut dw, mut db) = (vec![0.0; d.len()], vec![0.0; x.len()], vec![0.0; w.len()], vec![0.0; b.len()]);
+                cpu::forward(&c, &images, &x, &w, &b, &mut out, None);
+                let gradients = Gradients { input: Some(&mut dx), weights: Some(&mut dw), bias: Some(&mut db) };
+                cpu::backward(&c, &images, &x, &w, &out, &d, gradients);
+                [out, dx, dw, db].concat().iter().map(|v| v.to_bits()).collect::<Vec<_>>()
+            })
+        };
+        let one = run(1);
+        assert!(one == run(2) && one == run(5), "{c:?}");
+    }
 }
 
 #[test]

@@ -20,6 +20,20 @@ fn cases() -> Vec<(ConvTranspose2d, Images)> {
         (ConvTranspose2d { padding: [2, 1], dilation: [2, 3], ..layer(4, 4, [3, 3], [2, 1]) }, images(1, 7, 9)),
         (ConvTranspose2d { dilation: [2, 2], output_padding: [1, 0], ..layer(3, 5, [2, 3], [1, 2]) }, images(2, 4, 6)),
         (ConvTranspose2d { groups: 2, padding: [1; 2], ..layer(6, 8, [4, 4], [2, 2]) }, images(2, 7, 6)),
+        (ConvTranspose2d { padding: [1; 2], ..layer(130, 9, [4, 4], [2, 2]) }, images(2, 9, 24)),
+        (ConvTranspose2d { groups: 2, ..layer(500, 6, [2, 2], [2, 2]) }, images(2, 5, 17)),
+        (layer(9, 4, [1, 1], [2, 2]), images(2, 5, 6)),
+        (ConvTranspose2d { padding: [1; 2], ..layer(70, 10, [4, 4], [2, 2]) }, images(1, 6, 7)),
+        (ConvTranspose2d { groups: 2, padding: [1; 2], ..layer(120, 10, [4, 4], [2, 2]) }, images(1, 6, 7)),
+        (ConvTranspose2d { padding: [1; 2], ..layer(6, 9, [4, 4], [2, 2]) }, images(1, 14, 17)),
+        (ConvTranspose2d { padding: [1; 2], ..layer(150, 9, [4, 4], [2, 2]) }, images(1, 14, 17)),
+        (layer(260, 9, [2, 2], [2, 2]), images(1, 5, 7)),
+        (layer(150, 9, [2, 2], [2, 2]), images(1, 14, 17)),
+        (ConvTranspose2d { padding: [1; 2], ..layer(6, 150, [4, 4], [2, 2]) }, images(1, 3, 5)),
+        (ConvTranspose2d { padding: [0, 1], ..layer(6, 9, [3, 4], [3, 2]) }, images(2, 5, 7)),
+        (ConvTranspose2d { output_padding: [0, 1], ..layer(6, 9, [2, 1], [1, 2]) }, images(2, 5, 7)),
+        (ConvTranspose2d { padding: [0, 1], ..layer(6, 9, [2, 4], [1, 2]) }, images(2, 5, 30)),
+        (ConvTranspose2d { padding: [0, 2], ..layer(2, 4, [1, 1], [1, 4]) }, images(1, 300, 2)),
         (ConvTranspose2d { groups: 5, padding: [1; 2], ..layer(5, 5, [4, 4], [2, 2]) }, images(2, 7, 33)),
     ]
 }
@@ -38,6 +52,9 @@ fn check(c: &ConvTranspose2d, images: &Images) {
     let (mut out, mut before) = (vec![9.0; d.len()], vec![9.0; d.len()]);
     cpu::forward(c, images, &x, &w, &b, &mut out, Some(&mut before));
     assert_close(&format!("out of {what}"), &out, &reference::forward(c, images, &wides[0], &wides[1], &wides[2]), 1e-4);
+    let mut alone = vec![9.0; d.len()];
+    cpu::forward(c, images, &x, &w, &b, &mut alone, None);
+    assert_eq!(alone, out, "out without what was before the activation of {what}");
     let (rx, rw, rb) = reference::backward(c, images, &wides[0], &wides[1], &wides[2], &wides[3]);
     let (mut dx, mut dw, mut db) = (vec![9.0; x.len()], vec![9.0; w.len()], vec![9.0; b.len()]);
     let kept = if c.activation.needs_input() { &before } else { &out };

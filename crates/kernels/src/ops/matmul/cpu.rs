@@ -232,11 +232,14 @@ impl<'a> Job<'a> {
         }
     }
 
-    /// B from the first term and column of the panel that is copied after the one of column `j`, if its rows can be read in turn.
+    /// B from the first term and column of the panel that is copied after the one of column `j` to its last term, if B's rows can be
+    /// read in turn.
     fn after(&self, part: &Part, terms: &Range<usize>, j: usize) -> Option<&[f32]> {
         let (s, width) = (&self.s, self.kernel.width());
         let (term, column) = if j + width < part.columns.end { (terms.start, j + width) } else { (terms.end, part.columns.start) };
-        (!s.b_transposed && term < part.terms.end).then(|| &self.b[(part.batch * s.k + term) * s.n + column..])
+        let end = (term + terms.len()).min(part.terms.end);
+        let first = part.batch * s.k;
+        (!s.b_transposed && term < end).then(|| &self.b[(first + term) * s.n + column..(first + end) * s.n])
     }
 
     /// The same on factors rounded to bf16.

@@ -7,8 +7,8 @@ fn check(c: &Case) {
     let (mut out, mut dx) = (vec![9.0; c.d.len()], vec![9.0; c.x.len()]);
     cpu::forward(&c.resample, c.planes, &c.x, &mut out);
     cpu::backward(&c.resample, c.planes, &c.d, &mut dx);
-    assert_close("forward", &out, &reference::forward(&c.resample, c.planes, &wide(&c.x)), 1e-5);
-    assert_close("backward", &dx, &reference::backward(&c.resample, c.planes, &wide(&c.d)), 1e-5);
+    assert_close(&format!("forward, {}", c.name), &out, &reference::forward(&c.resample, c.planes, &wide(&c.x)), 1e-5);
+    assert_close(&format!("backward, {}", c.name), &dx, &reference::backward(&c.resample, c.planes, &wide(&c.d)), 1e-5);
 }
 
 #[test]

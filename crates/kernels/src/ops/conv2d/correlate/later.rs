@@ -2,7 +2,7 @@
 
 use crate::tile::Ahead;
 
-/// Rows of channels, of which every tile asks for a part.
+/// Rows of channels, of which every tile asks for a part; a tile of few terms asks for a sample of its part.
 pub struct Later {
     /// Where the channel whose turn it is begins, and how much of it was asked for.
     pub from: *const f32,

@@ -119,8 +119,9 @@ impl Correlation {
         // Pixels between rows cost time in proportion to the output channels, a panel costs the same for any number.
         let direct = !in_place && !self.is_rounded() && rows * columns > FEWEST && waste * self.features <= 4 * columns;
         let (features, pixels) = self.divide(rows, columns, kernel);
+        // Passes, and with them the order of sums, must not depend on how many threads there are: planes are read for one image at a time.
+        let pixels = if direct { pixels.min(2 * rows * columns - 1) } else { pixels };
         let bands = Bands::plan(self.batch, rows, columns, pixels);
-        let direct = direct && bands.images == 1;
         planes.fit(bands.images, bands.rows, columns);
         let taps = self.phases.iter().map(|p| p.taps.len()).max().unwrap_or(0).max(1);
         let block = if in_place {
@@ -392,6 +393,11 @@ impl Job<'_> {
             (panel.as_ptr(), &s.terms.panel[..count])
         };
         if self.c.is_rounded() {
+            for _ in (0..s.part.features.len()).step_by(self.kernel.rows) {
+                if let Some(part) = later.as_mut().and_then(|l| l.next(1)) {
+                    simd::fetch_later(part.from, part.step);
+                }
+            }
             return self.rounded_tile(s, &panel[..count * width], last.at + last.len, sums, rounded);
         }
         let (straight, pixels) = (self.straight(s), c.output[0] * c.output[1]);
@@ -429,7 +435,8 @@ impl Job<'_> {
                 start,
                 ahead,
             };
-            // SAFETY: weights of `rows` features exist from there; planes and panel hold all offsets; sums have rows · width floats.
+            // SAFETY: weights of `rows` features exist from there; planes and panel hold all offsets; sums have rows · width floats, and
+            // the rows of the output have the segment's whole vectors.
             unsafe { self.kernel.run(rows, vectors, &tile) };
             match straight {
                 Some(segment) => self.activate_outputs(segment, global, rows),
