@@ -1,5 +1,5 @@
-//! Distances of corners in photographs with known poses: a sweep over depths that compares patches of neighboring views by normalized
-//! cross-correlation (plane sweep, Collins 1996; for single corners instead of whole planes).
+//! Estimates the distances of corners in photographs with known poses by a sweep over inverse depths that compares patches of neighboring
+//! views by normalized cross-correlation (plane sweep, Collins 1996; for single corners instead of whole planes).
 
 use super::pixels::{Observation, PixelSource};
 use diorama_geom::Pose;
@@ -8,41 +8,41 @@ use diorama_kernels::ops::ray_generation::PosedCamera;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Photographs are compared at this many pixels along their longer side, or less.
+/// Most pixels along the longer side of the reduced photographs that are compared.
 const LONGEST: u32 = 800;
-/// Brightness of white as it is kept.
+/// Stored value of white.
 const WHITE: f32 = 65535.0;
-/// Corners in all photographs together, and fewest and most in one.
+/// Target number of corners in all photographs together, and its least and greatest value per photograph.
 const CORNERS: usize = 60_000;
 const CORNERS_OF_ONE: (usize, usize) = (200, 2000);
 /// Smallest eigenvalue of the mean structure tensor at a corner, in squared brightness (1: white) per pixel.
 const TEXTURE: f32 = 2e-5;
-/// Pixels beside a patch's middle.
+/// Radius of a patch in pixels.
 const RADIUS: i32 = 3;
 const PATCH: usize = (2 * RADIUS as usize + 1).pow(2);
 
-/// Angles in degrees, at what is looked at, between a photograph and those that it is compared with; and the least and the greatest.
+/// Preferred parallax angles in degrees between a photograph and its neighbors, seen from the viewed point; and the allowed range.
 const ANGLES: [f64; 4] = [6.0, 10.0, 16.0, 24.0];
 const ANGLE_RANGE: (f64, f64) = (1.5, 40.0);
-/// Nearest searched distance, as a share of the viewing distance.
+/// Nearest distance that is searched, as a share of the viewing distance.
 pub const NEAREST: f64 = 0.2;
-/// Most depths of a sweep; neighboring ones are a pixel apart in the first neighbor.
+/// Most depths of a sweep; successive ones are about a pixel apart in the first neighbor.
 const DEPTHS: usize = 400;
-/// Peaks of the sweep that are refined, and sub-steps per step.
+/// Most peaks of the sweep that are refined, and sub-steps per step.
 const PEAKS: usize = 4;
 const PARTS: i32 = 8;
 
-/// Least correlation of a depth that is looked at more closely, of a neighbor that agrees, and of all that agree in the mean.
+/// Least correlation of a peak of the sweep, of a neighbor that agrees, and least mean correlation of the agreeing neighbors.
 const PEAK: f32 = 0.7;
 const AGREES: f32 = 0.75;
 const SURE: f32 = 0.85;
-/// How much worse, in all neighbors, the other refined peaks must be; beyond that many other peaks a pattern repeats.
+/// Least relative lead of the best peak, in the sum of agreeing correlations. More peaks than [`MOST_PEAKS`] indicate a repeating pattern.
 const MARGIN: f32 = 0.06;
 const MOST_PEAKS: usize = 2 * PEAKS;
-/// Neighbors that must agree.
+/// Neighbors that must agree, or all if there are fewer.
 const FEWEST: usize = 3;
 
-/// A photograph's brightness, reduced, with the camera that took it.
+/// Reduced grayscale version of a photograph, with its camera.
 struct Gray {
     width: usize,
     height: usize,
@@ -55,7 +55,7 @@ struct Gray {
 impl Gray {
     fn of(source: &dyn PixelSource, image: usize, posed: &PosedCamera, longest: u32) -> Gray {
         let (w, h) = source.size(image);
-        // Of each stored square one pixel is at hand.
+        // Only one pixel of each `stride` × `stride` square is stored.
         let stride = source.stride().max(1);
         let reduction = w.max(h).div_ceil(longest).max(1).next_multiple_of(stride);
         let (width, height) = ((w / reduction).max(1), (h / reduction).max(1));
@@ -83,12 +83,12 @@ impl Gray {
         self.data[at] as f32 * (1.0 / WHITE)
     }
 
-    /// Where a point in the world is seen, pixel centers at halves.
+    /// Projects a point in the world to pixels, with pixel centers at halves.
     fn project(&self, p: DVec3) -> Option<DVec2> {
         self.posed.camera.project(self.camera_from_world.point(p))
     }
 
-    /// Brightness between pixel centers; the caller stays half a pixel away from the rim.
+    /// Bilinearly interpolated brightness; the caller keeps half a pixel away from the border.
     #[inline(always)]
     fn at(&self, x: f32, y: f32) -> f32 {
         let (x, y) = (x - 0.5, y - 0.5);
@@ -101,7 +101,7 @@ impl Gray {
         top + v * (bottom - top)
     }
 
-    /// The strongest corner of each cell of a grid, away from the rim.
+    /// The strongest corner of each grid cell, away from the image border.
     fn corners(&self, count: usize) -> Vec<(usize, usize)> {
         let rim = RADIUS as usize + 2;
         if self.width <= 2 * rim + 1 || self.height <= 2 * rim + 1 {
@@ -135,7 +135,7 @@ impl Gray {
     }
 }
 
-/// Brightness without its mean, of unit length.
+/// The patch minus its mean, scaled to unit length; none for a uniform patch.
 fn normalized(mut patch: [f32; PATCH]) -> Option<[f32; PATCH]> {
     let mean = patch.iter().sum::<f32>() / PATCH as f32;
     patch.iter_mut().for_each(|v| *v -= mean);
@@ -143,11 +143,11 @@ fn normalized(mut patch: [f32; PATCH]) -> Option<[f32; PATCH]> {
     (length > 1e-3).then(|| patch.map(|v| v / length))
 }
 
-/// A corner of a photograph with the rays through it and beside it.
+/// A corner of a photograph, with its patch, its rays and the neighbors that it is compared with.
 struct Corner<'a> {
     patch: [f32; PATCH],
     eye: DVec3,
-    /// Through the corner's middle, one pixel to the right, one pixel below; on a plane at distance one.
+    /// Rays through the corner, one pixel to the right and one pixel below; the latter two scaled to end on the plane at distance 1.
     rays: [DVec3; 3],
     others: &'a [&'a Gray],
 }
@@ -168,19 +168,19 @@ impl<'a> Corner<'a> {
         Some(Corner { patch: normalized(patch)?, eye: pose.translation, rays, others })
     }
 
-    /// Where a neighbor sees the patch at a distance: its middle, and how it moves with the patch's pixels.
+    /// Affine projection of the patch at a distance into a neighbor: its center, and its shift per pixel in x and in y.
     fn seen(&self, other: usize, distance: f64) -> Option<[DVec2; 3]> {
         let other = self.others[other];
         let [m, x, y] = self.rays.map(|r| other.project(self.eye + r * distance));
         let (m, x, y) = (m?, x? - m?, y? - m?);
         let reach = RADIUS as f64 * (x.abs() + y.abs()) + 1.5;
         let fits = m.x > reach.x && m.y > reach.y && m.x < other.width as f64 - reach.x && m.y < other.height as f64 - reach.y;
-        // A patch that is seen from the side, or much larger, is not the same patch.
+        // Reject patches that appear at a very different size or at a grazing angle.
         let size = x.perp_dot(y);
         (fits && (0.2..5.0).contains(&size)).then_some([m, x, y])
     }
 
-    /// Normalized cross-correlation with a neighbor at a distance; none where it does not see the patch.
+    /// Normalized cross-correlation with a neighbor at a distance; none if the neighbor does not see the patch.
     fn correlation(&self, other: usize, distance: f64) -> Option<f32> {
         let [m, x, y] = self.seen(other, distance)?.map(|v| v.as_vec2());
         let gray = self.others[other];
@@ -193,14 +193,14 @@ impl<'a> Corner<'a> {
         Some(normalized(patch)?.iter().zip(&self.patch).map(|(a, b)| a * b).sum())
     }
 
-    /// How many neighbors agree on a distance, and their mean correlation.
+    /// Number of neighbors that agree on a distance, and their mean correlation.
     fn agreement(&self, distance: f64) -> (usize, f32) {
         let agreeing = (0..self.others.len()).filter_map(|o| self.correlation(o, distance)).filter(|c| *c > AGREES);
         let (n, sum) = agreeing.fold((0, 0.0), |(n, sum), c| (n + 1, sum + c));
         (n, sum / n.max(1) as f32)
     }
 
-    /// The distance at which neighbors show the same patch, if they agree on one.
+    /// The distance at which the neighbors show the same patch; none unless it is unique and enough neighbors agree.
     fn distance(&self, nearest: f64) -> Option<f64> {
         let most = 1.0 / nearest;
         let steps = self.steps(most);
@@ -223,28 +223,28 @@ impl<'a> Corner<'a> {
         found.sort_by(|a, b| strength(b).total_cmp(&strength(a)));
         let best = *found.first()?;
         let is_unique = found[1..].iter().all(|f| (f.1 - best.1).abs() < 2.0 || strength(f) < strength(&best) * (1.0 - MARGIN));
-        // What lies at the end of the sweep may lie beyond it.
+        // A peak at an end of the sweep may belong to a point beyond it.
         let is_within = best.1 > 1.0 && best.1 < steps as f64 - 1.0;
         (is_unique && is_within && best.0.0 >= FEWEST.min(self.others.len()) && best.0.1 > SURE).then(|| 1.0 / inverse(best.1))
     }
 
-    /// Depths from the horizon to the nearest, a pixel apart in the first neighbor.
+    /// Number of sweep steps from infinity to inverse depth `most`, so that they are about a pixel apart in the first neighbor.
     fn steps(&self, most: f64) -> usize {
         let at = |k: f64| self.others[0].project(self.eye + self.rays[0] / (most * k));
-        // The near end may lie behind the neighbor: what the far half moves is doubled.
+        // If the near end lies behind the neighbor, extrapolate from the far half or quarter.
         let moved = [(1.0, 1.0), (0.5, 2.0), (0.25, 4.0)].into_iter().find_map(|(k, by)| Some((at(k)? - at(1e-3)?).length() * by));
         (moved.unwrap_or(DEPTHS as f64) as usize).clamp(16, DEPTHS)
     }
 }
 
-/// Pixels from a patch's middle to its `k`th.
+/// Offset (x, y) of a patch's `k`th pixel from its center.
 #[inline(always)]
 fn offset(k: usize) -> (i32, i32) {
     let side = 2 * RADIUS as usize + 1;
     ((k % side) as i32 - RADIUS, (k / side) as i32 - RADIUS)
 }
 
-/// The photographs that photograph `i` is compared with, the closest first.
+/// The neighbors of photograph `i`: those closest to the preferred angles, by ascending angle.
 fn neighbors(views: &[Gray], i: usize, viewing_distance: f64) -> Vec<&Gray> {
     let own = &views[i];
     let target = own.posed.pose.point(DVec3::Z * viewing_distance);
@@ -264,13 +264,13 @@ fn neighbors(views: &[Gray], i: usize, viewing_distance: f64) -> Vec<&Gray> {
     chosen.into_iter().map(|(_, j)| &views[j]).collect()
 }
 
-/// Bytes that a comparison of photographs of these sizes takes.
+/// Bytes of the reduced photographs for photographs of these (width, height).
 pub fn bytes(sizes: impl Iterator<Item = (u32, u32)>) -> u64 {
     sizes.map(|(w, h)| (w as u64 * h as u64) / (w.max(h).div_ceil(LONGEST).max(1) as u64).pow(2) * 2).sum()
 }
 
-/// Pixels of photographs whose distance neighboring photographs agree on; none where `interrupt` is set. `viewing_distance` is how far
-/// away cameras look, in model space; cameras belong to the photographs, in their order.
+/// Observes the distances of corner pixels that neighboring photographs agree on; returns nothing if `interrupt` is set. `cameras` are in the
+/// order of the photographs; `viewing_distance` is the distance from the cameras to what they view, in model space.
 pub fn observe(source: &dyn PixelSource, cameras: &[PosedCamera], viewing_distance: f64, interrupt: &AtomicBool) -> Vec<Observation> {
     observe_at(source, cameras, viewing_distance, interrupt, LONGEST)
 }
@@ -313,7 +313,7 @@ mod tests {
     use diorama_geom::Camera;
     use diorama_geom::rng::Rng;
 
-    /// The plane z = 0, as bright as `texture` says, before cameras on an arc.
+    /// The plane z = 0 with brightness `texture`, in front of cameras on an arc.
     struct Wall {
         texture: fn(f64, f64) -> f64,
         cameras: Vec<PosedCamera>,
@@ -342,7 +342,7 @@ mod tests {
             (pose.translation + d * t, t)
         }
 
-        /// Observations, and those of them that are wrong by more than two hundredths.
+        /// Number of observations, and how many of them are wrong by more than 2 %.
         fn observed(&self, longest: u32) -> (usize, usize) {
             let all = observe_at(self, &self.cameras, 3.0, &AtomicBool::new(false), longest);
             let is_wrong = |o: &&Observation| {
@@ -370,7 +370,7 @@ mod tests {
         fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4] {
             let (p, _) = self.distance(image, x as f64 + 0.5, y as f64 + 0.5);
             let v = (self.texture)(p.x, p.y) as f32;
-            // Exposure differs.
+            // Each image has its own exposure.
             let v = v * (1.0 + 0.1 * image as f32);
             [v, v, v, 1.0]
         }
@@ -379,7 +379,7 @@ mod tests {
         }
     }
 
-    /// Random brightness between points of a lattice.
+    /// Random brightness at lattice points, interpolated between them.
     fn irregular(x: f64, y: f64) -> f64 {
         let (x, y) = (14.0 * x, 14.0 * y);
         let at = |i: i64, j: i64| Rng::new(3, 0).uniform((((x.floor() as i64 + i) << 20) + y.floor() as i64 + j) as u64) as f64;
@@ -390,7 +390,7 @@ mod tests {
 
     #[test]
     fn distances_of_texture_are_right_and_only_where_pixels_count() {
-        // Photographs as they are; reduced by two and by three, which do not divide their sides; and with one stored pixel in four.
+        // Full size; reduced by two and by three, which do not divide the sides; and with one stored pixel in four.
         for (size, stride, longest) in [((96, 96), 1, 800), ((195, 193), 1, 98), ((290, 289), 1, 97), ((193, 195), 2, 98)] {
             let wall = Wall::sized(irregular, size, stride);
             let (found, wrong) = wall.observed(longest);

@@ -1,4 +1,4 @@
-//! Register tiles: `C += Σ_k A[·, k] B[k, ·]`, both operands read where they lie through a table of offsets.
+//! Register tiles: `C += Σ_k A[·, k] B[k, ·]`, with both operands read in place through a table of offsets.
 //!
 //! Convolutions and large matrix products compute their outputs in such tiles. The loops over tiles are ordinary code: only
 //! the tile, and the copies that feed it, are compiled per instruction set and reached through [`Kernel`].
@@ -24,17 +24,17 @@ pub struct Tile<'a> {
     /// Floats between rows of A.
     pub row: usize,
     pub b: *const f32,
-    /// Per term of the sum, where A and B stand.
+    /// Offsets of A and B per term of the sum.
     pub offsets: &'a [(u32, u32)],
     pub c: *mut f32,
     pub c_row: usize,
     pub c_vector: usize,
     pub start: Start,
-    /// What is asked of memory meanwhile.
+    /// Memory to prefetch meanwhile.
     pub ahead: Ahead,
 }
 
-/// Rows as wide as a tile, one of which is asked of memory with every eighth term of a sum, as fast as memory answers.
+/// Rows to prefetch, each as wide as a tile: one row per eight terms of a sum, which matches the speed of memory.
 #[derive(Clone, Copy)]
 pub struct Ahead {
     pub from: *const f32,
@@ -43,18 +43,18 @@ pub struct Ahead {
 }
 
 impl Ahead {
-    /// Nothing but what is in cache.
+    /// No prefetch: names only memory that is already in cache.
     pub fn none(cached: *const f32) -> Ahead {
         Ahead { from: cached, step: 0 }
     }
 
-    /// Rows that a tile asks for whose sums have so many terms.
+    /// Rows that a tile prefetches if its sums have `terms` terms.
     pub fn rows(terms: usize) -> usize {
         terms.div_ceil(TERMS_PER_FETCH)
     }
 }
 
-/// Terms of a sum per row that is asked of memory.
+/// Terms of a sum per prefetched row.
 const TERMS_PER_FETCH: usize = 8;
 
 /// A run of pixels that is contiguous in the input, in a tile and in the output.
@@ -64,7 +64,7 @@ pub struct Segment {
     /// Offset in the tile.
     pub at: usize,
     pub len: usize,
-    /// Offset in the output of the first channel.
+    /// Offset in the output, for the first channel.
     pub to: usize,
 }
 
@@ -75,13 +75,13 @@ pub struct Pack<'a> {
     pub segments: &'a [Segment],
     pub panel: *mut f32,
     pub width: usize,
-    /// Whether nothing may be read beyond a segment; else whole vectors are, also where they reach beyond.
+    /// Whether reads must not exceed a segment; else whole vectors are read, even beyond its end.
     pub exact: bool,
 }
 
 type TileFn = unsafe fn(&Tile);
 
-/// Most rows and vectors of any level's tile.
+/// Most rows, and most vectors per row, of a tile at any level.
 pub const MOST_ROWS: usize = 8;
 pub const MOST_VECTORS: usize = 3;
 
@@ -111,7 +111,7 @@ impl Kernel {
         self.lanes * self.vectors
     }
 
-    /// Terms of a sum per pass, so that a panel of them stays in the first-level cache beside what streams past it.
+    /// Terms of a sum per pass, so that their panel stays in the L1 cache beside the streamed operands.
     pub fn terms(&self) -> usize {
         (PANEL / self.width()).min(MOST_TERMS)
     }
@@ -119,18 +119,18 @@ impl Kernel {
     /// Computes a tile of `rows` by `vectors`.
     ///
     /// # Safety
-    /// All that the operands address must exist; `rows` and `vectors` are at least 1 and at most the kernel's.
+    /// All memory that the operands address must exist; `rows` and `vectors` are at least 1 and at most the kernel's.
     pub unsafe fn run(&self, rows: usize, vectors: usize, tile: &Tile) {
-        // SAFETY: as the caller vouches.
+        // SAFETY: guaranteed by the caller.
         unsafe { self.tiles[rows - 1][vectors - 1](tile) }
     }
 
-    /// Copies pixels, row after row of the panel.
+    /// Copies pixels into a panel, row by row.
     ///
     /// # Safety
-    /// All that the segments address must exist, and a vector more of it unless `exact`; the panel has room for a vector more.
+    /// All memory that the segments address must exist, plus a vector unless `exact`; the panel has room for an extra vector.
     pub unsafe fn pack(&self, pack: &Pack) {
-        // SAFETY: as the caller vouches.
+        // SAFETY: guaranteed by the caller.
         unsafe { (self.pack)(pack) }
     }
 
@@ -139,27 +139,27 @@ impl Kernel {
     /// # Safety
     /// Inputs and outputs exist up to the next multiple of four vectors in each row.
     pub unsafe fn depthwise(&self, rows: &Rows) {
-        // SAFETY: as the caller vouches.
+        // SAFETY: guaranteed by the caller.
         unsafe { (self.rows_of)(rows) }
     }
 
     /// Computes a line of a depthwise convolution.
     ///
     /// # Safety
-    /// Inputs of all columns exist at every tap, with `step` 2 one float more; so do the outputs.
+    /// The inputs of all columns exist at every tap, with `step` 2 one float beyond the last; the outputs of all columns exist.
     pub unsafe fn line(&self, line: &Line) {
         assert!(line.columns >= self.lanes && matches!(line.step, 1 | 2), "a line of {} columns", line.columns);
-        // SAFETY: as the caller vouches.
+        // SAFETY: guaranteed by the caller.
         unsafe { (self.line)(line) }
     }
 
-    /// Adds the products of rows to sums per tap.
+    /// Adds the products of rows to the sums of each tap.
     ///
     /// # Safety
     /// All that the operands address must exist.
     pub unsafe fn dots(&self, dots: &Dots) {
         assert!(dots.offsets.len() <= rows::MOST_DOTS && dots.columns.is_multiple_of(self.lanes), "dots: {} taps", dots.offsets.len());
-        // SAFETY: as the caller vouches.
+        // SAFETY: guaranteed by the caller.
         unsafe { (self.dots)(dots) }
     }
 }
@@ -186,7 +186,7 @@ unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(t: &Tile) {
         for block in t.offsets.chunks(TERMS_PER_FETCH) {
             simd::fetch_later(ahead, NR * L::N);
             ahead = ahead.wrapping_add(t.ahead.step);
-            // Unrolled: scalar instructions share ports with the multiply-adds.
+            // Unrolled, because scalar instructions compete for ports with the multiply-adds.
             let mut fours = block.chunks_exact(4);
             for four in &mut fours {
                 add::<L, MR, NR>(t, four[0], &mut acc);
@@ -314,7 +314,7 @@ kernel!(avx2, simd::Avx2, 4, 3, [1 2 3 4 4 4 4 4], #[target_feature(enable = "av
 kernel!(neon, simd::Neon, 8, 3, [1 2 3 4 5 6 7 8],);
 kernel!(portable, Plain, 4, 1, [1 2 3 4 4 4 4 4],);
 
-/// The kernel of a level.
+/// The kernel of an instruction set level.
 pub fn kernel(level: Level) -> &'static Kernel {
     match level {
         #[cfg(target_arch = "x86_64")]
@@ -327,22 +327,22 @@ pub fn kernel(level: Level) -> &'static Kernel {
     }
 }
 
-/// A pointer that threads share; each writes only its own part.
+/// A pointer that threads share; each thread writes only its own part.
 #[derive(Clone, Copy)]
 pub struct Shared(pub *mut f32);
 
-// SAFETY: whoever uses it keeps the parts of threads apart.
+// SAFETY: users keep the parts of different threads disjoint.
 unsafe impl Send for Shared {}
 // SAFETY: as above.
 unsafe impl Sync for Shared {}
 
 impl Shared {
-    /// The pointer `offset` floats further on.
+    /// The pointer advanced by `offset` floats.
     ///
     /// # Safety
-    /// It lies inside the slice that the pointer was made of.
+    /// The result lies inside the slice that the pointer was made from.
     pub unsafe fn at(&self, offset: usize) -> *mut f32 {
-        // SAFETY: as the caller vouches.
+        // SAFETY: guaranteed by the caller.
         unsafe { self.0.add(offset) }
     }
 }
@@ -415,7 +415,7 @@ mod tests {
                     width: 25,
                     exact,
                 };
-                // SAFETY: the source goes on for more than a vector after each segment, and so does the panel.
+                // SAFETY: the source and the panel extend by more than a vector after each segment.
                 unsafe { kernel.pack(&pack) };
                 for k in 0..2 {
                     for i in 0..25 {

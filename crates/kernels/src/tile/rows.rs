@@ -1,8 +1,8 @@
-//! Rows of one channel: depthwise convolutions and the sums of their weights' gradients.
+//! Rows of one channel: depthwise convolutions and their weight gradients.
 
 use crate::simd::Lane;
 
-/// Rows of outputs of one channel: `c[i] = start + Σ_t weights[t] b[offsets[t] + i]`, whole vectors of each.
+/// Rows of outputs of one channel: `c[i] = start + Σ_t weights[t] b[offsets[t].1 + i]`, in whole groups of four vectors.
 pub struct Rows<'a> {
     pub weights: &'a [f32],
     pub offsets: &'a [(u32, u32)],
@@ -15,7 +15,7 @@ pub struct Rows<'a> {
     pub c_pitch: usize,
 }
 
-/// A line of outputs of one channel, read where the input lies: `c[i] = start + Σ_t weights[t] from[offsets[t] + step · i]`.
+/// A row of outputs of one channel, read from the input in place: `c[i] = start + Σ_t weights[t] from[offsets[t] + step · i]`.
 pub struct Line<'a> {
     pub weights: &'a [f32],
     pub offsets: &'a [u32],
@@ -28,7 +28,7 @@ pub struct Line<'a> {
     pub c: *mut f32,
 }
 
-/// Products of a gradient's rows with shifted rows of an input: `sums[t, i mod lanes] += Σ_rows Σ_i d[i] b[offsets[t] + i]`.
+/// Products of a gradient's rows with shifted rows of an input: `sums[t, i mod lanes] += Σ_rows Σ_i d[i] b[offsets[t].1 + i]`.
 pub struct Dots<'a> {
     pub d: *const f32,
     pub d_pitch: usize,
@@ -43,7 +43,7 @@ pub struct Dots<'a> {
     pub sums: *mut f32,
 }
 
-/// Taps of one [`Dots`].
+/// Most taps of one [`Dots`].
 pub const MOST_DOTS: usize = 9;
 
 #[inline(always)]
@@ -85,7 +85,7 @@ pub(super) unsafe fn line<L: Lane, const STEP: usize>(l: &Line) {
             i += L::N;
         }
         if i < l.columns {
-            // The last vector computes some outputs again.
+            // The last vector recomputes some outputs.
             part_of_line::<L, STEP, 1>(l, l.columns - L::N);
         }
     }
@@ -165,7 +165,7 @@ mod tests {
                 let mut out = vec![9.0; columns + 2];
                 let c = out[1..].as_mut_ptr();
                 let line = Line { weights: &weights, offsets: &offsets, from: from.as_ptr(), step, columns, start: 0.5, c };
-                // SAFETY: the input goes on for the last tap, and for a float more if every second one is read.
+                // SAFETY: the input extends to the last tap, and by one more float with step 2.
                 unsafe { kernel.line(&line) };
                 let sum = |i: usize| 0.5 + (0..3).map(|t| weights[t] as f64 * from[offsets[t] as usize + step * i] as f64).sum::<f64>();
                 let want: Vec<f64> = (0..columns).map(sum).collect();

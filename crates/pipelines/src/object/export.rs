@@ -1,4 +1,4 @@
-//! From a trained field to a mesh file in the input's scale and frame.
+//! Exports a trained field as a mesh file in the scale and coordinates of the capture.
 
 use super::model::ObjectModel;
 use super::{extent, memory, texture};
@@ -14,7 +14,7 @@ use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// Mesh files.
+/// Mesh file formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
     Glb,
@@ -26,17 +26,17 @@ pub enum Format {
 }
 
 impl Format {
-    /// Whether the format says what a unit is.
+    /// Whether the format defines its unit of length.
     pub fn has_units(self) -> bool {
         matches!(self, Format::Glb | Format::Usdz | Format::Dae)
     }
 
-    /// Whether normal maps are written into the format.
+    /// Whether normal maps are supported.
     pub fn has_normal_map(self) -> bool {
         matches!(self, Format::Glb | Format::Obj)
     }
 
-    /// Whether the format carries a texture.
+    /// Whether textures are supported.
     pub fn has_texture(self) -> bool {
         !matches!(self, Format::Ply | Format::Stl)
     }
@@ -58,7 +58,7 @@ impl std::str::FromStr for Format {
     }
 }
 
-/// How to extract.
+/// Options of [`export`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExportOptions {
     pub format: Format,
@@ -66,30 +66,30 @@ pub struct ExportOptions {
     pub method: extract::Method,
     /// Cells along the box's longest side.
     pub resolution: usize,
-    /// Density of the surface in inverse world units; none: from the field.
+    /// Density at the surface in inverse world units; none: chosen from the field.
     pub level: Option<f32>,
-    /// Most faces; 0: as many as there are; none: [`FACES`] with a texture, [`COLORED_FACES`] without.
+    /// Most faces; 0: no limit; none: [`FACES`] with a texture, [`COLORED_FACES`] without.
     pub faces: Option<usize>,
-    /// Edge of the texture in texels; 0: colours at the vertices; none: [`TEXELS`] where the format has textures.
+    /// Edge of the texture in texels; 0: vertex colors; none: [`TEXELS`] where the format supports textures, else 0.
     pub texture: Option<usize>,
-    /// Bake the field's normals beside the texture.
+    /// Bake the field's normals into a normal map.
     pub normal_map: bool,
-    /// Part and fill what simplification left open, or fail.
+    /// Close the surface after simplification, or fail.
     pub watertight: bool,
     pub size: Size,
-    /// Unit of the coordinates, in metres, of formats that do not tell theirs.
+    /// Unit of the coordinates in meters, for formats that do not define theirs.
     pub unit_m: f64,
-    /// Lowest and highest corner in the world; none: what most cameras look at.
+    /// Lowest and highest corner of the extracted box in world space; none: from the scene, see `extent::of`.
     pub clip: Option<([f32; 3], [f32; 3])>,
-    /// Components with fewer faces than this share of the largest one's are removed.
+    /// Components with fewer faces than this share of the largest component's are removed.
     pub floaters: f32,
-    /// Components that fewer than three training cameras see, or that stand close before one, are kept.
+    /// Keep components that fewer than three training cameras see or that stand close in front of a camera.
     pub keep_unseen: bool,
 }
 
-/// Most training cameras that are asked what they see of the mesh.
+/// Most training cameras that visibility is tested with.
 const CAMERAS: usize = 240;
-/// Attempts at few faces and a closed surface both.
+/// Most attempts to meet the face limit with a closed surface.
 const REDUCTIONS: usize = 4;
 
 /// Defaults of [`ExportOptions`].
@@ -97,20 +97,20 @@ pub const FACES: usize = 60_000;
 pub const COLORED_FACES: usize = 200_000;
 pub const TEXELS: usize = 2048;
 
-/// How large the mesh is made.
+/// Scale of the exported mesh.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Size {
-    /// Nobody measured: a unit of the capture is written as a metre.
+    /// Unknown scale: one unit of the capture becomes one meter.
     Unknown,
-    /// A unit of the capture is so many metres.
+    /// Meters per unit of the capture.
     Scaled(f64),
-    /// The longest side becomes so many metres.
+    /// Length of the longest side in meters.
     Longest(f64),
-    /// Two points of the capture are so many metres apart.
+    /// Distance in meters between two points of the capture.
     Measured { points: [[f64; 3]; 2], metres: f64 },
 }
 
-/// What was written.
+/// Result of [`export`].
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Exported {
     pub file: PathBuf,
@@ -122,30 +122,33 @@ pub struct Exported {
     pub level: f32,
     /// Edge of the texture in texels, 0 without.
     pub texture: usize,
-    /// Extent in metres along x, y, z (z up).
+    /// Extent in meters along x, y, z (z up).
     pub extent_m: [f32; 3],
-    /// Metres per unit of the capture.
+    /// Meters per unit of the capture.
     pub scale: f64,
-    /// Faces that went because they belong to parts that are small, or that the training cameras do not see or see close before
-    /// them.
+    /// Faces of removed components.
     pub removed: Removed,
-    /// What turned out otherwise than asked, one line each.
+    /// Deviations from the options, one line each.
     pub notes: Vec<String>,
 }
 
-/// Faces of parts that were removed before simplification.
+/// Number of faces in components that were removed before simplification, by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Removed {
-    /// In parts smaller than [`ExportOptions::floaters`] allows.
+    /// Components smaller than [`ExportOptions::floaters`] allows.
     pub small: usize,
-    /// In parts that fewer than three training cameras see.
+    /// Components that fewer than three training cameras see.
     pub unseen: usize,
-    /// In parts close before a camera.
+    /// Components close in front of a camera.
     pub before_cameras: usize,
 }
 
-/// Extracts, cleans, simplifies, colours and writes; `note` receives messages for the user, `progress` receives the
-/// stage and (done, of).
+/// Extracts, cleans, simplifies and colors a mesh, and writes it; `note` receives messages for the user, `progress` receives the stage and
+/// (done, total).
+///
+/// # Errors
+/// When options are invalid, memory does not suffice, the device fails, the surface cannot be simplified or closed as asked, or the file
+/// cannot be written.
 pub fn export(
     model: &ObjectModel,
     o: &ExportOptions,
@@ -213,7 +216,7 @@ pub fn export(
     })
 }
 
-/// Removes parts that are no part of the object; `cell` is the error of the surface.
+/// Removes components that do not belong to the object; `cell` is the edge of a grid cell, the scale of the surface's error.
 fn clean(model: &ObjectModel, mesh: &mut Mesh, o: &ExportOptions, cell: f32) -> Removed {
     let small = clean::remove_floaters(mesh, o.floaters);
     if o.keep_unseen {
@@ -226,7 +229,7 @@ fn clean(model: &ObjectModel, mesh: &mut Mesh, o: &ExportOptions, cell: f32) -> 
     Removed { small, unseen: gone.unseen, before_cameras: gone.before }
 }
 
-/// Reduces the mesh to `faces` (0: as many as there are) and closes it where asked; returns whether it is closed.
+/// Reduces the mesh to `faces` (0: no limit) and closes it where asked; returns whether it is watertight.
 fn reduce(mesh: &mut Mesh, faces: usize, o: &ExportOptions, notes: &mut Vec<String>) -> Result<bool> {
     let mut target = faces;
     let mut clustered = false;
@@ -241,7 +244,7 @@ fn reduce(mesh: &mut Mesh, faces: usize, o: &ExportOptions, notes: &mut Vec<Stri
             break;
         }
         repair::close(mesh);
-        // Filling holes takes faces, too.
+        // Filling holes adds faces.
         let more = mesh.faces.len().saturating_sub(faces);
         if faces == 0 || more == 0 {
             break;
@@ -274,7 +277,7 @@ fn check(o: &ExportOptions) -> Result<()> {
 }
 
 impl Size {
-    /// Meters per unit of the capture, where it does not go by the mesh's own extent; else 1.
+    /// Meters per unit of the capture; 1 if unknown or if it depends on the mesh's extent.
     pub fn meters_per_unit(self) -> f64 {
         match self {
             Size::Scaled(s) => s,
@@ -284,7 +287,7 @@ impl Size {
     }
 }
 
-/// Metres per unit of the capture for a mesh in the capture's coordinates.
+/// Meters per unit of the capture for a mesh in the capture's coordinates.
 pub(crate) fn metres_per_unit(mesh: &Mesh, size: Size) -> f64 {
     match size {
         Size::Longest(metres) => {
@@ -295,9 +298,8 @@ pub(crate) fn metres_per_unit(mesh: &Mesh, size: Size) -> f64 {
     }
 }
 
-/// A slab of 1/128 of the longest side lets half the light pass, `σ = ln 2 / slab`, but not more than half of the 99th
-/// percentile of sampled densities. Twice
-/// that shows held-out views of lego 0.1 dB better and of fox 0.4 dB worse, where holes open.
+/// Density at which a slab of 1/128 of the longest side transmits half the light, `σ = ln 2 / slab`, but at most half of the 99th percentile
+/// of sampled densities. Twice that level improves held-out views of lego by 0.1 dB and worsens those of fox by 0.4 dB, because holes open.
 pub(crate) fn automatic_level(model: &ObjectModel, grid: &Grid) -> f32 {
     let coarse = Grid { resolution: 48, ..*grid };
     let [nx, ny, nz] = coarse.points();
@@ -316,7 +318,7 @@ pub(crate) fn automatic_level(model: &ObjectModel, grid: &Grid) -> f32 {
     half_slab.min(0.5 * high).max(1e-6)
 }
 
-/// World coordinates to those of the input.
+/// Transforms a mesh from world coordinates to those of the capture.
 pub(crate) fn to_capture(model: &ObjectModel, mesh: &mut Mesh) {
     let t = model.capture.world_from_capture.inverse();
     let wide = |p: [f32; 3]| DVec3::new(p[0] as f64, p[1] as f64, p[2] as f64);

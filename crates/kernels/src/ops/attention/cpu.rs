@@ -1,4 +1,4 @@
-//! Tiles of 64 queries by some hundred keys, kept transposed, so that all queries of a tile lie side by side in vectors.
+//! Attention on the CPU, in tiles of 64 queries by up to 512 keys. Tiles are transposed, so that vectors run along queries.
 
 use super::Attention;
 use crate::gemm::{Gemm, Init, Precision, View, gemm};
@@ -9,20 +9,20 @@ use crate::vector::{exp, vectorized};
 const QUERIES: usize = 64;
 /// Keys per tile, at most.
 const KEYS: usize = 512;
-/// Tasks backward at least, as long as there are tiles: what few heads leave is cut by queries.
+/// Wanted number of backward tasks: with a smaller batch, queries are split into groups to reach it.
 const TASKS: usize = 8;
 
-/// `c = a b`, or `c += a b`: a `[m, k]`, b `[k, n]`, c `[m, n]`, the latter two row by row.
+/// `c = a b`, or `c += a b` with `add`: a `[m, k]`, b `[k, n]`, c `[m, n]`; b and c are row-major.
 fn product([m, n, k]: [usize; 3], a: View, b: &[f32], c: &mut [f32], add: bool) {
     gemm(Precision::F32, Gemm { m, n, k, a, b, ldb: n, ldc: n, init: if add { Init::Accumulate } else { Init::Zero }, relu: false }, c);
 }
 
-/// The transpose of a tile, for which every query lies in a row of `QUERIES`.
+/// Transposed view of a tile `[keys, QUERIES]`.
 fn turned(tile: &[f32]) -> View<'_> {
     View { data: tile, row: 1, col: QUERIES }
 }
 
-/// `out[c, i] = scale · x[i, c]`, 0 where there are no more rows.
+/// `out[c, i] = scale · x[i, c]` for `i < QUERIES`, 0 beyond the last row of `x`.
 fn transpose(width: usize, scale: f32, x: &[f32], out: &mut [f32]) {
     out.fill(0.0);
     for (i, row) in x.chunks_exact(width).enumerate() {
@@ -33,8 +33,8 @@ fn transpose(width: usize, scale: f32, x: &[f32], out: &mut [f32]) {
 }
 
 vectorized! {
-    /// One step of the softmax of columns: `tile ← e^(tile − most)` with the new largest values; the sums and what is summed so far
-    /// shrink by `shrink`.
+    /// One step of the online softmax of columns: updates the maxima `most`, then `tile ← e^(tile − most)`; `shrink` is the factor that
+    /// rescales earlier sums and outputs to the new maxima.
     fn exponentials<const F>(tile: &mut [f32], most: &mut [f32; QUERIES], sums: &mut [f32; QUERIES], shrink: &mut [f32; QUERIES]) {
         let before = *most;
         let mut top = *most;
@@ -80,7 +80,7 @@ vectorized! {
     }
 }
 
-/// Hides keys behind their query.
+/// Causal mask: sets the scores of keys after their query to −∞.
 fn hide(tile: &mut [f32], first_query: usize, first_key: usize) {
     for (j, row) in tile.chunks_exact_mut(QUERIES).enumerate() {
         let hidden = (first_key + j).saturating_sub(first_query).min(QUERIES);
@@ -107,10 +107,10 @@ impl Attention {
     }
 }
 
-/// Output, and the logarithm of each query's sum of exponentials, which backward needs.
+/// Computes the output, and the logarithm of each query's sum of exponentials, which [`backward`] needs.
 ///
 /// # Shapes
-/// q, out `[batch, queries, width]`, k, v `[batch, keys, width]`, log_sums `[batch, queries]`.
+/// q, out `[batch, queries, width]`; k, v `[batch, keys, width]`; log_sums `[batch, queries]`.
 pub fn forward(a: &Attention, q: &[f32], k: &[f32], v: &[f32], out: &mut [f32], log_sums: &mut [f32]) {
     a.check([q.len(), k.len(), v.len(), out.len()], log_sums.len());
     if out.is_empty() {
@@ -157,7 +157,7 @@ fn forward_tile(a: &Attention, first: usize, q: &[f32], k: &[f32], v: &[f32], ou
     }
 }
 
-/// What [`forward`] read and wrote, with the gradient of its output.
+/// Inputs and outputs of [`forward`], and the gradient `d_out` of its output.
 #[derive(Clone, Copy)]
 pub struct Saved<'a> {
     pub q: &'a [f32],
@@ -168,10 +168,10 @@ pub struct Saved<'a> {
     pub d_out: &'a [f32],
 }
 
-/// Gradients of q, k and v, overwritten. `scratch` grows once.
+/// Overwrites `dq`, `dk` and `dv` with the gradients of q, k and v. `scratch` is resized as needed and can be reused.
 ///
 /// # Shapes
-/// as in [`forward`].
+/// As in [`forward`].
 pub fn backward(a: &Attention, s: &Saved, dq: &mut [f32], dk: &mut [f32], dv: &mut [f32], scratch: &mut Vec<f32>) {
     a.check([s.q.len(), s.k.len(), s.v.len(), s.out.len()], s.log_sums.len());
     a.check([dq.len(), dk.len(), dv.len(), s.d_out.len()], s.log_sums.len());
@@ -183,7 +183,7 @@ pub fn backward(a: &Attention, s: &Saved, dq: &mut [f32], dk: &mut [f32], dv: &m
     let (d, size, tiles) = (a.width, a.keys * a.width, a.queries.div_ceil(QUERIES));
     let groups = TASKS.div_ceil(a.batch).min(tiles);
     let per_group = tiles.div_ceil(groups) * QUERIES;
-    // Groups beyond the first have gradients of keys and values of their own.
+    // Every group except the first accumulates gradients of keys and values in `scratch`.
     let extra = groups - 1;
     scratch.resize(2 * a.batch * extra * size, 0.0);
     scratch.fill(0.0);
@@ -211,13 +211,13 @@ pub fn backward(a: &Attention, s: &Saved, dq: &mut [f32], dk: &mut [f32], dv: &m
     }
 }
 
-/// Gradient of a tile's queries, and what it adds to those of its batch's keys and values.
+/// Computes the gradient of a tile's queries, and adds its contribution to the gradients of keys and values.
 fn backward_tile(a: &Attention, s: &Saved, (batch, first): (usize, usize), dq: &mut [f32], dk: &mut [f32], dv: &mut [f32]) {
     let (d, at) = (a.width, batch * a.queries + first);
     let rows = dq.len() / d;
     let own = at * d..(at + rows) * d;
     let (q, d_out) = (&s.q[own.clone()], &s.d_out[own.clone()]);
-    // Weights of queries that are not there become 0.
+    // Infinite log sums make the weights of missing queries 0.
     let (mut log_sums, mut mean) = ([f32::INFINITY; QUERIES], [0.0; QUERIES]);
     log_sums[..rows].copy_from_slice(&s.log_sums[at..at + rows]);
     for (mean, (o, g)) in mean.iter_mut().zip(s.out[own].chunks_exact(d).zip(d_out.chunks_exact(d))) {

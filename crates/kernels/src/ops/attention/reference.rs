@@ -1,4 +1,4 @@
-//! Query by query in f64.
+//! Reference attention: query by query, in f64.
 
 use super::Attention;
 
@@ -14,7 +14,7 @@ fn weights(a: &Attention, batch: usize, query: usize, q: &[f64], k: &[f64]) -> (
     (scores.iter().map(|s| (s - log_sum).exp()).collect(), log_sum)
 }
 
-/// Output `[batch, queries, width]` and the logarithms of the sums `[batch, queries]`.
+/// Output `[batch, queries, width]`, and the logarithm of each query's sum of exponentials, `[batch, queries]`.
 pub fn forward(a: &Attention, q: &[f64], k: &[f64], v: &[f64]) -> (Vec<f64>, Vec<f64>) {
     let (mut out, mut log_sums) = (vec![0.0; q.len()], Vec::new());
     for batch in 0..a.batch {
@@ -31,7 +31,7 @@ pub fn forward(a: &Attention, q: &[f64], k: &[f64], v: &[f64]) -> (Vec<f64>, Vec
     (out, log_sums)
 }
 
-/// Gradients of q, k and v.
+/// Gradients of q, k and v, given the gradient `d_out` of the output.
 pub fn backward(a: &Attention, q: &[f64], k: &[f64], v: &[f64], d_out: &[f64]) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
     let (mut dq, mut dk, mut dv) = (vec![0.0; q.len()], vec![0.0; k.len()], vec![0.0; v.len()]);
     for batch in 0..a.batch {

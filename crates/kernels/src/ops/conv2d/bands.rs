@@ -1,4 +1,4 @@
-//! Division of a batch of images into bands whose copies stay in the second-level cache, and scratch memory of threads.
+//! Divides a batch of images into bands whose copies fit in the L2 cache, and provides per-thread scratch memory.
 
 use crate::gemm::Rounded;
 use std::cell::RefCell;
@@ -16,7 +16,7 @@ pub struct Bands {
 }
 
 impl Bands {
-    /// Bands of about `pixels` at most, of images of `rows` by `columns`, all of about the same size.
+    /// Divides images of `rows` by `columns` into bands of about equal size, at most about `pixels` each.
     pub fn plan(batch: usize, rows: usize, columns: usize, pixels: usize) -> Self {
         let (rows, columns) = (rows.max(1), columns.max(1));
         if 2 * rows * columns <= pixels {
@@ -27,7 +27,7 @@ impl Bands {
         Bands { batch, height: rows, images: 1, rows: rows.div_ceil(parts) }
     }
 
-    /// How many there are.
+    /// Number of bands.
     pub fn len(&self) -> usize {
         self.batch.div_ceil(self.images) * self.height.div_ceil(self.rows)
     }
@@ -40,7 +40,7 @@ impl Bands {
     }
 }
 
-/// Memory that a thread keeps between calls.
+/// Buffers that a thread keeps between calls.
 #[derive(Default)]
 pub struct Scratch {
     pub planes: Vec<f32>,
@@ -57,7 +57,7 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
-/// Runs `work` with this thread's scratch, or with a new one where the thread's is in use further up.
+/// Runs `work` with this thread's scratch, or with a new one if a caller already uses it.
 pub fn with_scratch<R>(work: impl FnOnce(&mut Scratch) -> R) -> R {
     let mut scratch = SCRATCH.take();
     let result = work(&mut scratch);
@@ -65,7 +65,7 @@ pub fn with_scratch<R>(work: impl FnOnce(&mut Scratch) -> R) -> R {
     result
 }
 
-/// The first `len` floats of a buffer from a cache line's begin, whatever they hold; it grows where it must.
+/// Grows the buffer if necessary and returns `len` of its floats, aligned to a cache line; their values are unspecified.
 pub fn aligned(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
     if buffer.len() < len + 16 {
         buffer.resize(len + 16, 0.0);

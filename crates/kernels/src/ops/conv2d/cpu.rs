@@ -1,4 +1,4 @@
-//! Forward and backward passes: correlations of the input and of the output's gradient, depthwise layers on their own.
+//! Forward and backward passes on the CPU, as correlations of the input and of the output gradient.
 
 use super::shapes::{Correlation, Phase, Tap, Tensors, WeightSums};
 use super::{Conv2d, Gradients, Images};
@@ -10,12 +10,12 @@ use rayon::prelude::*;
 use std::cell::RefCell;
 
 impl Conv2d {
-    /// Weights between output channels.
+    /// Stride of the weights between output channels.
     fn weight_feature(&self) -> usize {
         self.channels_in / self.groups * self.taps()
     }
 
-    /// Every tap with its offset in a kernel, and its distance from the first pixel that the kernel covers on an unpadded image.
+    /// Every tap, with its offset in the kernel and its distance in pixels from `stride · output pixel`.
     pub(crate) fn each_tap(&self) -> impl Iterator<Item = Tap> + Clone {
         let c = *self;
         (0..c.taps()).map(move |t| {
@@ -29,7 +29,7 @@ impl Conv2d {
         self.correlation_to(images, &self.output(images))
     }
 
-    /// From inputs to outputs of a size that may be smaller than what the inputs allow.
+    /// As [`Self::correlation`], for an output size that may be smaller than what the inputs allow.
     pub(crate) fn correlation_to(&self, images: &Images, output: &Images) -> Correlation {
         let output = output.size();
         Correlation {
@@ -49,14 +49,14 @@ impl Conv2d {
         }
     }
 
-    /// From the outputs' gradient to the inputs', or the forward pass of the transposed convolution.
+    /// Correlation from the output gradient to the input gradient, which is also the forward pass of the transposed convolution.
     ///
     /// Input pixel `stride · grid + start` meets output pixel `grid + d` through the taps with `start − at = stride · d`.
     pub(crate) fn transposed(&self, images: &Images) -> Correlation {
         self.transposed_from(images, &self.output(images))
     }
 
-    /// The same with outputs of a size that may be smaller than what the inputs allow.
+    /// As [`Self::transposed`], for an output size that may be smaller than what the inputs allow.
     pub(crate) fn transposed_from(&self, images: &Images, output: &Images) -> Correlation {
         let input = images.size();
         let mut phases = Vec::new();
@@ -89,7 +89,7 @@ impl Conv2d {
         }
     }
 
-    /// Products of the outputs' gradient with the input.
+    /// Sums of products of the output gradient and the input, which give the weight gradient.
     pub(crate) fn weight_sums(&self, images: &Images) -> WeightSums {
         WeightSums {
             batch: images.batch,
@@ -114,20 +114,20 @@ impl Conv2d {
     }
 }
 
-/// `out = act(w ∗ x + bias)`, all of it written; `before` gets the values before the activation.
+/// Overwrites `out` with `act(w ∗ x + bias)`, and `before` with the values before the activation.
 ///
 /// # Shapes
-/// As [`Conv2d`] says; `bias` may be empty, `before` as `out`.
+/// As in [`Conv2d`]; `bias` may be empty; `before` is shaped like `out`.
 pub fn forward(c: &Conv2d, images: &Images, x: &[f32], weights: &[f32], bias: &[f32], out: &mut [f32], before: Option<&mut [f32]>) {
     c.check_tensors(images, x, weights, out.len());
     c.correlation(images).run(Tensors { x, weights, bias, activation: c.activation, out, before });
 }
 
-/// Gradients, given that of the outputs and what the forward pass computed: `kept` is `before` where the activation
-/// needs it, else `out`.
+/// Computes gradients from the output gradient `d_out` and a result of the forward pass: `kept` is `before` if the activation needs its
+/// input, else `out`.
 ///
 /// # Shapes
-/// As [`Conv2d`] says; `kept` and `d_out` as `out`; `kept` is not read without an activation.
+/// As in [`Conv2d`]; `kept` and `d_out` are shaped like `out`; `kept` is not read without an activation.
 pub fn backward(c: &Conv2d, images: &Images, x: &[f32], weights: &[f32], kept: &[f32], d_out: &[f32], gradients: Gradients) {
     c.check_tensors(images, x, weights, d_out.len());
     with_slopes(c.activation, kept, d_out, |d| {
@@ -151,7 +151,7 @@ thread_local! {
 /// Floats per task of an elementwise pass.
 const CHUNK: usize = 1 << 14;
 
-/// Calls `work` with the gradient before an activation.
+/// Calls `work` with the gradient of the values before the activation, `d_out · act′`.
 pub(crate) fn with_slopes(activation: Activation, kept: &[f32], d_out: &[f32], work: impl FnOnce(&[f32])) {
     if activation == Activation::None {
         return work(d_out);
@@ -167,7 +167,7 @@ pub(crate) fn with_slopes(activation: Activation, kept: &[f32], d_out: &[f32], w
     SLOPES.set(d);
 }
 
-/// Sums per channel over images and pixels; `d` is `[batch, out.len(), pixels]`.
+/// Bias gradient: sums of `d` `[batch, out.len(), pixels]` over images and pixels, per channel.
 pub(crate) fn bias_gradient(batch: usize, d: &[f32], out: &mut [f32]) {
     let (channels, level) = (out.len(), simd::level());
     let pixels = d.len() / (batch * channels).max(1);

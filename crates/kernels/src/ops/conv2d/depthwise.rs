@@ -1,4 +1,4 @@
-//! Layers whose outputs have one input channel each: whole rows at a time, vectors along pixels.
+//! Depthwise layers (one input channel per group): whole rows at a time, vectorized along pixels.
 
 use super::activate;
 use super::bands::{Scratch, aligned, with_scratch};
@@ -10,12 +10,12 @@ use crate::tile::{Kernel, Shared, kernel};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Floats from a row to what is asked of memory meanwhile.
+/// Prefetch distance in floats.
 const AHEAD: isize = 1024;
 /// Floats of a band's copy.
 const BAND: usize = 6 << 10;
 
-/// A correlation with one input channel per group.
+/// Computes a correlation with one input channel per group.
 pub fn run(c: &Correlation, t: Tensors) {
     match Inner::of(c).filter(|i| i.columns.len() > kernel(simd::level()).lanes) {
         Some(inner) => inner.run(c, t),
@@ -23,14 +23,14 @@ pub fn run(c: &Correlation, t: Tensors) {
     }
 }
 
-/// The same from copies of the input in which taps are shifts.
+/// As [`run`], from padded copies of the input in which taps are shifts.
 fn run_copied(c: &Correlation, t: Tensors) {
     let level = simd::level();
     let kernel = kernel(level);
     let mut planes = Planes::default();
     planes.update(c.input, c.step, c.phases.iter().flat_map(|p| &p.taps).map(|t| t.at));
     let most = |i: usize| c.phases.iter().map(|p| p.size[i]).max().unwrap_or(0);
-    // Bands whose copy stays in the first-level cache.
+    // Bands whose copy stays in the L1 cache.
     let band = (BAND / planes.floats_per_row(most(1)).max(1)).clamp(1, most(0).max(1));
     planes.fit(1, band, most(1));
     let offsets: Vec<Vec<(u32, u32)>> =
@@ -53,7 +53,7 @@ fn run_copied(c: &Correlation, t: Tensors) {
                     taps.clear();
                     taps.extend(offsets.iter().map(|o| weights[o.0 as usize]));
                     let columns = phase.size[1];
-                    // Whole tiles are written where they belong.
+                    // Rows of whole tiles are written directly.
                     let in_place = before.is_none() && c.spread == [1; 2] && columns.is_multiple_of(4 * kernel.lanes);
                     let rows = first..(first + band).min(phase.size[0]);
                     let place = |y: usize| feature * pixels + (phase.start[0] + y * c.spread[0]) * c.output[1] + phase.start[1];
@@ -70,13 +70,13 @@ fn run_copied(c: &Correlation, t: Tensors) {
                     };
                     if in_place {
                         let out = &mut out[place(rows.start)..];
-                        // SAFETY: the copy goes on for a row more; the rows are whole tiles of the output.
+                        // SAFETY: the copy extends by a row; the rows are whole tiles of the output.
                         unsafe { kernel.depthwise(&of(rows.start, rows.len(), out.as_mut_ptr())) };
                         activate(t.activation, &mut out[..rows.len() * columns]);
                         continue;
                     }
                     for y in rows {
-                        // SAFETY: the copy and the row go on for a row more.
+                        // SAFETY: the copy and `row` extend by a row.
                         unsafe { kernel.depthwise(&of(y, 1, row.as_mut_ptr())) };
                         if let Some(before) = &mut before {
                             spread(&row[..columns], c.spread[1], &mut before[place(y)..]);
@@ -100,19 +100,19 @@ fn run_copied(c: &Correlation, t: Tensors) {
     }
 }
 
-/// Outputs all of whose taps lie inside a row of the input.
+/// Columns whose taps all lie inside an input row, so that the input is read in place.
 struct Inner {
     columns: Range<usize>,
     low: [isize; 2],
     /// Rows from the first to the last tap.
     rows: usize,
-    /// The other columns, each with the taps that lie inside a row.
+    /// The other columns, each with its taps inside a row.
     borders: Vec<(usize, Vec<Tap>)>,
 }
 
-/// What one channel is computed from.
+/// Input of one output channel.
 struct Plane<'a> {
-    /// The channel, and what follows it in memory.
+    /// The input channel, and what follows it in memory.
     x: &'a [f32],
     /// Whether anything follows.
     goes_on: bool,
@@ -121,7 +121,7 @@ struct Plane<'a> {
 }
 
 impl Inner {
-    /// None where outputs do not share their taps, or steps are long.
+    /// None if there are several phases, or the horizontal step exceeds 2.
     fn of(c: &Correlation) -> Option<Inner> {
         let [phase] = &c.phases[..] else { return None };
         if c.spread != [1; 2] || phase.size != c.output || phase.taps.is_empty() || c.step[1] > 2 {
@@ -138,7 +138,7 @@ impl Inner {
             let taps = phase.taps.iter().filter(move |t| (0..width).contains(&(x as isize * step + t.at[1])));
             (x, taps.copied().collect())
         };
-        // The last inner one is there as well: vectors of every second float read one more than there are.
+        // Includes the last inner column: with step 2, vectors read one float past it.
         let borders = (0..columns.start).chain(columns.end.saturating_sub(1)..c.output[1]).map(inside).collect();
         Some(Inner { columns, low, rows: (of(0).max()? - low[0] + 1) as usize, borders })
     }
@@ -174,7 +174,7 @@ impl Inner {
         }
     }
 
-    /// All outputs of one channel: vectors of the inner columns, one after the other at the borders.
+    /// Computes all outputs of one channel: inner columns in vectors, border columns one by one.
     fn compute(&self, c: &Correlation, kernel: &Kernel, p: Plane, out: &mut [f32], scratch: &mut Scratch) {
         let ([height, width], taps) = (c.input.map(|n| n as isize), &c.phases[0].taps);
         let Scratch { taps: weights, columns: offsets, .. } = scratch;
@@ -202,7 +202,7 @@ impl Inner {
                 c: out[columns.clone()].as_mut_ptr(),
             };
             simd::fetch_now(p.x.as_ptr().wrapping_offset(first + AHEAD), c.step[0] * c.input[1]);
-            // SAFETY: taps of rows inside the input are listed, and columns all of whose taps are inside.
+            // SAFETY: only taps in rows inside the input are listed, and only columns whose taps are all inside.
             unsafe { kernel.line(&line) };
             for (x, taps) in self.borders.iter().filter(|(x, _)| !columns.contains(x)) {
                 let at = [(y * c.step[0]) as isize, (x * c.step[1]) as isize];
@@ -225,7 +225,7 @@ fn spread(row: &[f32], step: usize, out: &mut [f32]) {
     }
 }
 
-/// Weight gradients of layers with one input channel and at most a few outputs per group.
+/// Weight gradients of layers with one input channel and few output channels per group.
 pub fn weight_gradient(s: &WeightSums, d: &[f32], x: &[f32], out: &mut [f32]) {
     let level = simd::level();
     let kernel = kernel(level);
@@ -250,7 +250,7 @@ pub fn weight_gradient(s: &WeightSums, d: &[f32], x: &[f32], out: &mut [f32]) {
             for image in 0..s.batch {
                 let source = Source { data: x, image_stride: s.groups * s.input[0] * s.input[1], first_channel: group };
                 planes.fill(source, 0..1, image..image + 1, 0, copy);
-                // Columns beyond the last are multiplied by 0, so they must be numbers.
+                // Columns beyond the last are multiplied by 0, so they must be finite.
                 copy[planes.image..].fill(0.0);
                 for feature in 0..s.rows {
                     let from = &d[((image * s.groups + group) * s.rows + feature) * pixels..][..pixels];
@@ -269,7 +269,7 @@ pub fn weight_gradient(s: &WeightSums, d: &[f32], x: &[f32], out: &mut [f32]) {
                             offsets: &offsets[first..(first + MOST_DOTS).min(taps.len())],
                             sums: sums[(feature * taps.len() + first) * kernel.lanes..].as_mut_ptr(),
                         };
-                        // SAFETY: rows are whole vectors; the copy goes on for a vector beyond its last row.
+                        // SAFETY: rows are whole vectors; the copy extends by a vector beyond its last row.
                         unsafe { kernel.dots(&dots) };
                     }
                 }

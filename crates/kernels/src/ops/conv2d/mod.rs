@@ -1,4 +1,4 @@
-//! Convolution of images, `y = act(w ∗ x + b)`, with stride, padding, dilation and groups.
+//! 2-D convolution, `y = act(w ∗ x + b)`, with stride, padding, dilation and groups.
 
 pub(crate) mod bands;
 pub(crate) mod correlate;
@@ -15,7 +15,7 @@ mod winograd;
 use super::activation::Activation;
 use crate::gemm::Precision;
 
-/// What a convolution is besides its weights; pairs are (vertical, horizontal).
+/// Description of a convolution without its weights; pairs are (vertical, horizontal).
 ///
 /// # Shapes
 /// x `[batch, channels_in, height, width]`; weights `[channels_out, channels_in / groups, kernel, kernel]`; bias empty or
@@ -30,12 +30,11 @@ pub struct Conv2d {
     pub dilation: [usize; 2],
     pub groups: usize,
     pub activation: Activation,
-    /// Arithmetic of inputs, weights and outputs' gradients, of layers with more than one channel per group; sums and gradients of weights
-    /// are f32.
+    /// Precision of inputs, weights and output gradients. Sums, weight gradients and depthwise layers are always f32.
     pub precision: Precision,
 }
 
-/// Images in a batch and their size in pixels.
+/// Number of images in a batch, and their size in pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Images {
     pub batch: usize,
@@ -53,12 +52,12 @@ impl Images {
     }
 }
 
-/// Destinations of a backward pass, overwritten; what is `None` is not computed.
+/// Destinations of a backward pass, which overwrites them; a gradient that is `None` is not computed.
 #[derive(Default)]
 pub struct Gradients<'a> {
-    /// As the input.
+    /// Same shape as the input.
     pub input: Option<&'a mut [f32]>,
-    /// As the weights.
+    /// Same shape as the weights.
     pub weights: Option<&'a mut [f32]>,
     /// `[channels_out]`
     pub bias: Option<&'a mut [f32]>,
@@ -83,7 +82,7 @@ impl Conv2d {
     /// Size of the outputs.
     ///
     /// # Panics
-    /// When the kernel is larger than a padded image, or the description makes no sense.
+    /// When the kernel is larger than a padded image, or the description is invalid.
     pub fn output(&self, images: &Images) -> Images {
         self.check();
         let size = |i: usize, n: usize| {

@@ -1,13 +1,13 @@
-//! Padded copies of input channels, split by stride, in which every tap of a kernel stands at a fixed offset.
+//! Padded copies of input channels, split by stride, in which every tap of a kernel has a fixed offset.
 
 use crate::simd::Lane;
 use crate::vector::by_lanes;
 use std::ops::Range;
 
-/// Where the padded channels of a band stand: `[channel, image, residue, row, column]`.
+/// Layout of the padded channels of a band: `[channel, image, residue, row, column]`.
 ///
 /// A tap reads input pixel `step · grid + d`. With `d − low = step · shift + residue`, the pixels of one residue form a
-/// plane of their own, in which neighbors on the grid are neighbors in memory, and the tap is a shift.
+/// separate plane, in which neighbors on the grid are neighbors in memory, and the tap is a shift.
 #[derive(Clone, Debug, Default)]
 pub struct Planes {
     input: [usize; 2],
@@ -25,7 +25,7 @@ pub struct Planes {
     pub channel: usize,
 }
 
-/// Channels of a tensor that are copied: `data[image_stride · image + channel_stride · channel ..]`.
+/// Channels of a tensor that are copied: `data[image_stride · image + pixels · (first_channel + channel) ..]`.
 #[derive(Clone, Copy)]
 pub struct Source<'a> {
     pub data: &'a [f32],
@@ -34,7 +34,7 @@ pub struct Source<'a> {
 }
 
 impl Planes {
-    /// Planes for taps at distances `taps` of inputs of a size, with `step` input pixels per grid cell.
+    /// Plans the planes for inputs of size `input`, taps at distances `taps`, and `step` input pixels per grid cell.
     pub fn update(&mut self, input: [usize; 2], step: [usize; 2], taps: impl Iterator<Item = [isize; 2]> + Clone) {
         (self.input, self.step) = (input, step);
         let first = taps.clone().next().unwrap_or([0; 2]);
@@ -53,7 +53,7 @@ impl Planes {
             }
         }
         if self.residues.is_empty() {
-            // Without taps nothing is read, but cells still have a place.
+            // Without taps nothing is read, but grid cells still need an offset.
             self.residues.push([0; 2]);
         }
         self.rows_per_channel = rows.len().max(1);
@@ -66,7 +66,7 @@ impl Planes {
         self.pitch = self.pitch_of(columns);
         self.plane = (rows + self.reach[0]) * self.pitch;
         self.image = self.plane * self.residues.len();
-        // An odd number of cache lines, so that channels do not meet in one set.
+        // An odd number of cache lines, so that channels do not map to the same cache set.
         self.channel = (images * self.image).div_ceil(16) / 2 * 32 + 16;
     }
 
@@ -75,12 +75,12 @@ impl Planes {
         self.rows_per_channel
     }
 
-    /// Floats of a copy for each row of a grid with `columns`.
+    /// Floats of a copy per row of a grid with `columns`.
     pub fn floats_per_row(&self, columns: usize) -> usize {
         self.pitch_of(columns) * self.residues.len().max(1)
     }
 
-    /// Floats between rows of a grid with `columns`.
+    /// Floats between rows of a plane, for a grid with `columns`.
     pub fn pitch_of(&self, columns: usize) -> usize {
         columns + self.reach[1]
     }
@@ -98,7 +98,7 @@ impl Planes {
         ([d[0] % self.step[0], d[1] % self.step[1]], [d[0] / self.step[0], d[1] / self.step[1]])
     }
 
-    /// Offset of a tap from a grid cell's place in the first plane.
+    /// Offset of a tap from a grid cell's position in the first plane.
     pub fn offset(&self, tap: [isize; 2]) -> usize {
         let (residue, shift) = self.split(tap);
         let plane = self.residues.iter().position(|r| *r == residue).unwrap_or(0);
@@ -116,7 +116,7 @@ impl Planes {
                 let to = &mut out[at..at + self.image];
                 if self.plane > 0 {
                     for (plane, residue) in to.chunks_exact_mut(self.plane).zip(&self.residues) {
-                        // SAFETY: the slices have the sizes that `self` says.
+                        // SAFETY: the slices have the sizes given by `self`.
                         unsafe { fill_plane(self, from, *residue, first_row, plane) };
                     }
                 }
@@ -129,7 +129,7 @@ by_lanes! {
     /// Copies the pixels of one residue.
     ///
     /// # Safety
-    /// `from` is an image, `plane` the rows of a band.
+    /// `from` holds one channel of an image, `plane` whole rows of `p.pitch`.
     unsafe fn fill_plane<L>(p: &Planes, from: &[f32], residue: [usize; 2], first_row: usize, plane: &mut [f32]) {
         let [height, width] = p.input;
         let start = p.low[1] + residue[1] as isize;
@@ -163,7 +163,7 @@ by_lanes! {
 /// `from` has `2 count − 1` floats, `to` has `count`.
 #[inline(always)]
 unsafe fn every_second<L: Lane>(from: *const f32, to: *mut f32, count: usize) {
-    // SAFETY: as the caller vouches.
+    // SAFETY: guaranteed by the caller.
     unsafe {
         let mut i = 0;
         while i + L::N < count {
@@ -171,7 +171,7 @@ unsafe fn every_second<L: Lane>(from: *const f32, to: *mut f32, count: usize) {
             i += L::N;
         }
         if i > 0 {
-            // The float after the last is not there: the last vector is read from one before its first.
+            // The float after the last one does not exist, so the last vector is loaded one float earlier and takes the odd floats.
             i = count - L::N;
             return L::store(to.add(i), L::load_pairs(from.add(2 * i - 1)).1);
         }

@@ -1,9 +1,9 @@
-//! What is correlated and summed, whichever way it is computed.
+//! Descriptions of correlations and weight gradients, shared by all algorithms that compute them.
 
 use crate::gemm::Precision;
 use crate::ops::activation::Activation;
 
-/// A weight and the input pixel that it multiplies, seen from a grid cell.
+/// A weight, and the input pixel that it multiplies relative to a grid cell.
 #[derive(Clone, Copy, Debug)]
 pub struct Tap {
     /// Offset from the first weight of a channel.
@@ -37,7 +37,7 @@ pub struct Correlation {
     pub step: [usize; 2],
     pub spread: [usize; 2],
     pub phases: Vec<Phase>,
-    /// Weights between groups, output channels and input channels.
+    /// Strides of the weights between groups, output channels and input channels.
     pub weight_group: usize,
     pub weight_feature: usize,
     pub weight_channel: usize,
@@ -56,7 +56,7 @@ pub struct Tensors<'a> {
     pub before: Option<&'a mut [f32]>,
 }
 
-/// Of a term, which tables hold in 32 bits.
+/// Converts an offset to the 32 bits of the offset tables.
 pub(super) fn offset(v: usize) -> u32 {
     u32::try_from(v).expect("an image has less than 2³² floats")
 }

@@ -149,7 +149,7 @@ fn results_do_not_depend_on_the_number_of_threads() {
     let c = Conv2d { padding: [1; 2], ..Conv2d::new(20, 24, 3) };
     let images = Images { batch: 3, height: 21, width: 50 };
     assert!(c.weight_sums(&images).shares() > 1, "pixels of the weights' gradient are summed in parts");
-    // Few threads would work on several of these small images together.
+    // With few threads, several of these small images would share a band.
     let many = (Conv2d { stride: [2; 2], padding: [1; 2], ..Conv2d::new(20, 20, 3) }, Images { batch: 16, height: 32, width: 32 });
     for (c, images) in [(c, images), many] {
         let [x, w, b, d] = tensors(&c, &images);

@@ -1,7 +1,7 @@
-//! Gradients of weights: sums over all pixels of one map's channels times another's, vectors along channels.
+//! Weight gradients: sums over pixels of products of output-gradient and input channels, vectorized along input channels.
 //!
-//! `out[g, m, n, tap] = Σ_pixels d[g, m, pixel] x[g, n, step · pixel + tap]`: the first factor is read where it lies, the
-//! second from a copy with channels innermost, in which neighboring taps of a row are neighboring vectors.
+//! `out[g, m, n, tap] = Σ_pixels d[g, m, pixel] x[g, n, step · pixel + tap]`: `d` is read in place, `x`
+//! from a copy with channels innermost, in which neighboring taps of a row are neighboring vectors.
 
 use super::bands::{Bands, Scratch, aligned, with_scratch};
 use super::depthwise;
@@ -14,19 +14,19 @@ use std::ops::Range;
 
 /// Pixels per pass.
 const PIXELS: usize = 768;
-/// Fewest rows of a task, as each copies its input again.
+/// Fewest rows of a task, because each task copies its input again.
 const FEWEST_ROWS: usize = 32;
-/// Tasks at least, as long as there are pixels: what few channels leave is cut by pixels.
+/// Wanted number of tasks: layers with few channels are also split by pixels to reach it.
 const TASKS: usize = 16;
 
-/// How the copy of a block of channels lies: `[image, row, column, width]`.
+/// Layout of the copy of a block of channels: `[image, row, column, width]`.
 #[derive(Clone, Copy)]
 struct Layout {
     /// Channels of a block.
     channels: usize,
     /// Floats per pixel.
     width: usize,
-    /// Taps whose floats follow one another.
+    /// Taps whose floats are contiguous.
     run: usize,
     /// Vectors of a run.
     vectors: usize,
@@ -34,7 +34,7 @@ struct Layout {
 }
 
 impl WeightSums {
-    /// Writes all of `out`, `[groups · rows, columns, taps]`.
+    /// Computes the weight gradient; overwrites `out`, `[groups · rows, columns, taps]`.
     pub fn run(&self, d: &[f32], x: &[f32], out: &mut [f32]) {
         let taps = self.kernel[0] * self.kernel[1];
         assert_eq!(out.len(), self.groups * self.rows * self.columns * taps, "convolution: gradient of weights");
@@ -74,7 +74,7 @@ impl WeightSums {
                 share: share * bands.len() / shares..(share + 1) * bands.len() / shares,
                 bands,
             };
-            // SAFETY: every share but the first has its own part of the partial sums.
+            // SAFETY: every share except the first has its own part of the partial sums.
             let out = if share == 0 { first } else { Shared(unsafe { others.at((share - 1) * size) }) };
             simd::with_level(level, || with_scratch(|scratch| task.compute(d, x, out, scratch)));
         });
@@ -84,7 +84,7 @@ impl WeightSums {
         PARTIAL.set(partial);
     }
 
-    /// Parts of the pixels that are summed apart, by shapes alone, as it says in which order sums are added.
+    /// Number of parts of the pixels that are summed separately; it fixes the order of summation, so it must not depend on the thread count.
     pub(super) fn shares(&self) -> usize {
         let blocks = self.columns.div_ceil(self.layout(kernel(simd::level())).channels);
         let bands = Bands::plan(self.batch, self.grid[0], self.grid[1], PIXELS);
@@ -111,7 +111,7 @@ thread_local! {
     static PARTIAL: Cell<Vec<f32>> = const { Cell::new(Vec::new()) };
 }
 
-/// Some rows times a block of channels.
+/// One task: some rows times a block of channels, over a share of the bands.
 struct Task<'a> {
     s: &'a WeightSums,
     kernel: &'static Kernel,
@@ -168,7 +168,7 @@ impl Task<'_> {
                             start: Start::Accumulate,
                             ahead: Ahead::none(planes.as_ptr()),
                         };
-                        // SAFETY: `height` rows of d exist from there, `list_pixels` names pixels of d and of the copy, sums have all rows.
+                        // SAFETY: `height` rows of d exist from there, `list_pixels` lists only pixels of d and of the copy, sums have all rows.
                         unsafe { self.kernel.run(height, each.min(l.vectors - v), &tile) };
                     }
                 }
@@ -177,7 +177,7 @@ impl Task<'_> {
         self.write(sums, runs, length, out);
     }
 
-    /// Where each pixel of a band stands in both factors.
+    /// Lists the offsets of each pixel of a band in `d` and in the copy of `x`.
     fn list_pixels(&self, (images, rows): (usize, usize), image: usize, offsets: &mut Vec<(u32, u32)>) {
         let s = self.s;
         offsets.clear();
@@ -192,7 +192,7 @@ impl Task<'_> {
         }
     }
 
-    /// Copies the block's channels of an image, channels innermost, for a grid of `rows` from `first` on.
+    /// Copies the block's channels of an image, channels innermost, for `rows` grid rows starting at `first`.
     fn fill(&self, x: &[f32], image: usize, first: usize, rows: usize, out: &mut [f32]) {
         let (s, l) = (self.s, self.layout);
         let [height, width] = s.input;
@@ -230,7 +230,7 @@ impl Task<'_> {
     }
 }
 
-/// `out[i, c] = from[c · stride + i]` for `channels`; others are left as they are.
+/// `out[i, c] = from[c · stride + i]` for `c < channels`; the other floats of `out`, whose rows have `width`, are unchanged.
 pub fn interleave(from: &[f32], stride: usize, channels: usize, width: usize, out: &mut [f32]) {
     let pixels = out.len() / width;
     let mut done = 0;
@@ -239,7 +239,7 @@ pub fn interleave(from: &[f32], stride: usize, channels: usize, width: usize, ou
         let whole = channels / 16 * 16;
         assert!(pixels == 0 || whole == 0 || from.len() >= (whole - 1) * stride + pixels);
         for c in (0..whole).step_by(16) {
-            // SAFETY: the level says what the CPU has; the assertion says what exists.
+            // SAFETY: the level guarantees AVX-512; the assertion checks the source's length.
             unsafe { interleave16(from[c * stride..].as_ptr(), stride, pixels, out[c..].as_mut_ptr(), width) };
         }
         done = whole;
@@ -252,12 +252,12 @@ pub fn interleave(from: &[f32], stride: usize, channels: usize, width: usize, ou
     }
 }
 
-/// Sixteen channels, sixteen pixels at a time.
+/// Interleaves sixteen channels, sixteen pixels at a time.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx512f")]
 unsafe fn interleave16(from: *const f32, stride: usize, pixels: usize, out: *mut f32, width: usize) {
     use std::arch::x86_64::*;
-    // SAFETY: loads and stores are cut to the pixels, whose sixteen channels the caller vouches for.
+    // SAFETY: loads and stores are limited to the pixels, whose sixteen channels the caller guarantees.
     unsafe {
         for i in (0..pixels).step_by(16) {
             let count = (pixels - i).min(16);

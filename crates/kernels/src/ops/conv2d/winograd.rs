@@ -19,18 +19,18 @@ use std::ops::Range;
 const POINTS: usize = 16;
 /// Input channels per pass.
 const CHANNELS: usize = 64;
-/// Floats of products that a task keeps, in the second-level cache.
+/// Floats of products that a task keeps, so that they fit in the L2 cache.
 const PRODUCTS: usize = 192 << 10;
-/// Tiles of a band, as long as it has rows to leave out.
+/// Most tiles of a band, unless a single row has more.
 const TILES: usize = 160;
-/// Fewest output channels of a task, as each transforms its inputs again.
+/// Fewest output channels of a task, because each task transforms its inputs again.
 const FEWEST_FEATURES: usize = 32;
 
 thread_local! {
     static TRANSFORMED: Cell<Vec<f32>> = const { Cell::new(Vec::new()) };
 }
 
-/// Where the taps of a 3×3 kernel stand: offsets of their weights, row by row, and the distance of the first.
+/// Weight offsets of a dense 3×3 kernel with stride 1, row by row, and the distance of its first tap; none for other correlations.
 fn square(c: &Correlation) -> Option<([usize; 9], [isize; 2])> {
     let [phase] = &c.phases[..] else { return None };
     if c.step != [1; 2] || c.spread != [1; 2] || phase.taps.len() != 9 || phase.size != c.output {
@@ -48,7 +48,7 @@ fn square(c: &Correlation) -> Option<([usize; 9], [isize; 2])> {
     weights.iter().all(|w| *w != usize::MAX).then_some((weights, low))
 }
 
-/// Computes all outputs where this takes less time than sums over taps; else gives the tensors back.
+/// Computes all outputs if this is estimated to be faster than sums over taps; else returns the tensors.
 pub fn run<'a>(c: &Correlation, t: Tensors<'a>) -> Result<(), Tensors<'a>> {
     let Some((taps, low)) = square(c).filter(|_| !c.is_rounded()) else { return Err(t) };
     let level = simd::level();
@@ -97,7 +97,7 @@ pub fn run<'a>(c: &Correlation, t: Tensors<'a>) -> Result<(), Tensors<'a>> {
     Ok(())
 }
 
-/// How an image is cut into 2×2 tiles of outputs, and these into bands of whole rows.
+/// Division of an image into 2×2 tiles of outputs, and of these into bands of whole rows.
 #[derive(Clone, Copy)]
 struct Grid {
     /// Tiles of an image.
@@ -108,7 +108,7 @@ struct Grid {
 }
 
 impl Grid {
-    /// The bands in which vectors are best filled.
+    /// Chooses the band height of least estimated cost, in vectors and reads of the weights.
     fn plan(c: &Correlation, kernel: &Kernel) -> Grid {
         let [height, columns] = c.output.map(|n| n.div_ceil(2).max(1));
         let of = |rows| Grid { height, columns, rows };
@@ -118,13 +118,13 @@ impl Grid {
         of((1..=most).min_by_key(|&rows| cost(rows)).unwrap_or(1))
     }
 
-    /// Vectors of all bands.
+    /// Vectors of tiles in all bands of an image.
     fn vectors_of_image(&self, kernel: &Kernel) -> usize {
         let (bands, rest) = (self.height / self.rows, self.height % self.rows);
         bands * self.vectors(self.rows, kernel) + if rest > 0 { self.vectors(rest, kernel) } else { 0 }
     }
 
-    /// Tiles of some rows, with one between rows.
+    /// Tiles of some rows, with one tile of padding between rows.
     fn tiles(&self, rows: usize) -> usize {
         rows * (self.columns + 1) - 1
     }
@@ -133,7 +133,7 @@ impl Grid {
         self.tiles(rows).div_ceil(kernel.lanes)
     }
 
-    /// Whether the products saved outweigh the transforms, in estimated cycles per vector of tiles.
+    /// Whether the saved products outweigh the transforms, in estimated cycles.
     fn pays(&self, c: &Correlation, kernel: &Kernel) -> bool {
         let transforms = 60.0 / self.most_features(c) as f64 + 40.0 / c.channels as f64;
         let image = self.vectors_of_image(kernel) as f64 * (8.0 + transforms) + 8.0 * self.height.div_ceil(self.rows) as f64;
@@ -156,7 +156,7 @@ impl Grid {
     }
 }
 
-/// What a task computes.
+/// Outputs that one task computes.
 struct Part {
     image: usize,
     group: usize,
@@ -164,13 +164,13 @@ struct Part {
     features: Range<usize>,
 }
 
-/// A correlation on its way, as all threads see it.
+/// A correlation in progress, shared by all threads.
 struct Job<'a> {
     c: &'a Correlation,
     kernel: &'static Kernel,
     grid: Grid,
     planes: Planes,
-    /// Where the four rows of a tile stand in the copy.
+    /// Offsets of a tile's four rows in the copy.
     rows: [usize; 4],
     x: &'a [f32],
     /// `[groups, POINTS, features, channels]`
@@ -188,7 +188,7 @@ impl Job<'_> {
         let tiles = self.grid.tiles(part.rows.len());
         let (blocks, features) = (tiles.div_ceil(width), part.features.len());
         let Scratch { planes, panel, sums, offsets, .. } = scratch;
-        // Whole vectors of tiles are read, also where they reach beyond the last.
+        // Whole vectors of tiles are read, even beyond the last tile.
         let copy = aligned(planes, self.planes.channel + 4 * lanes);
         let inputs = aligned(panel, POINTS * CHANNELS.min(c.channels) * blocks * width);
         let products = aligned(sums, POINTS * features * blocks * width + 4 * tiles.next_multiple_of(lanes));
@@ -238,12 +238,12 @@ impl Job<'_> {
             }
             self.planes.fill(source, channel..channel + 1, part.image..part.image + 1, part.rows.start, copy);
             let to = Strides { block: self.kernel.width(), point: count * self.kernel.width(), tiles };
-            // SAFETY: the copy goes on for four vectors; `out` holds blocks of whole vectors of every channel.
+            // SAFETY: the copy extends by four vectors; `out` holds blocks of whole vectors of every channel.
             unsafe { transform(self.rows.map(|r| copy[r..].as_ptr()), &to, out[i * self.kernel.width()..].as_mut_ptr()) };
         }
     }
 
-    /// Outputs of one channel from its products, of which the first is `products[0]`.
+    /// Computes and stores the outputs of one channel from its products, which start at `products[0]`.
     fn finish(&self, part: &Part, feature: usize, products: &[f32], features: usize, pixels: &mut [f32]) {
         let (c, width) = (self.c, self.kernel.width());
         let channel = part.group * c.features + feature;
@@ -262,7 +262,7 @@ impl Job<'_> {
         self.store(part, channel, [top, bottom], self.out);
     }
 
-    /// Copies rows of outputs to where they belong.
+    /// Copies rows of outputs to `out`.
     fn store(&self, part: &Part, channel: usize, pixels: [&[f32]; 2], out: Shared) {
         let c = self.c;
         let [height, width] = c.output;
@@ -277,7 +277,7 @@ impl Job<'_> {
     }
 }
 
-/// Floats between rows of transformed weights: odd numbers of cache lines, so that rows and points do not meet in one set.
+/// Floats between rows of transformed weights: odd numbers of cache lines, so that rows and points do not map to the same cache set.
 #[derive(Clone, Copy)]
 struct Pitch {
     feature: usize,
@@ -299,13 +299,13 @@ fn transform_weights(c: &Correlation, taps: &[usize; 9], weights: &[f32], pitch:
         let (group, feature) = (i / c.features, i % c.features);
         let from = &weights[group * c.weight_group + feature * c.weight_feature..];
         let at = group * POINTS * pitch.point + feature * pitch.feature;
-        // SAFETY: of every point, each output channel has its own row.
+        // SAFETY: each output channel has its own row of every point.
         let mut rows = std::array::from_fn(|p| unsafe { std::slice::from_raw_parts_mut(shared.at(at + p * pitch.point), c.channels) });
         simd::with_level(level, || kernels(from, taps, c.weight_channel, &mut rows));
     });
 }
 
-/// Where elements of transformed tiles stand: `block · (tile / width) · POINTS … + point · p + tile % width`.
+/// Layout of transformed tiles: element `p` is at `⌊tile / block⌋ · POINTS · point + p · point + tile mod block`.
 struct Strides {
     /// Tiles of a block.
     block: usize,
@@ -315,7 +315,7 @@ struct Strides {
 }
 
 impl Strides {
-    /// The first element of a tile.
+    /// Offset of a tile's first element.
     #[inline(always)]
     fn at(&self, tile: usize) -> usize {
         tile / self.block * POINTS * self.point + tile % self.block
@@ -326,7 +326,7 @@ by_lanes! {
     /// The 16 elements of `Bᵀ d B` of tiles that lie two floats apart in their rows.
     ///
     /// # Safety
-    /// The rows go on for two vectors and two floats from the last tile; `out` holds whole vectors of all tiles.
+    /// The rows extend by two vectors and two floats from the last tile; `out` holds whole vectors of all tiles.
     unsafe fn transform<L>(rows: [*const f32; 4], to: &Strides, out: *mut f32) {
         for tile in (0..to.tiles).step_by(L::N) {
             let mut b = [[L::splat(0.0); 4]; 4];

@@ -1,4 +1,4 @@
-//! The passes of the adjoint convolution, exchanged.
+//! Forward and backward passes on the CPU: those of the adjoint convolution, exchanged.
 
 use super::{ConvTranspose2d, Gradients, Images};
 use crate::ops::activation::Activation;
@@ -13,10 +13,10 @@ fn check(c: &ConvTranspose2d, images: &Images, x: &[f32], weights: &[f32], out: 
     output
 }
 
-/// `out = act(wᵀ ∗ x + bias)`, all of it written; `before` gets the values before the activation.
+/// Overwrites `out` with `act(wᵀ ∗ x + bias)`, and `before` with the values before the activation.
 ///
 /// # Shapes
-/// As [`ConvTranspose2d`] says; `bias` may be empty, `before` as `out`.
+/// As in [`ConvTranspose2d`]; `bias` may be empty; `before` is shaped like `out`.
 pub fn forward(
     c: &ConvTranspose2d,
     images: &Images,
@@ -30,11 +30,11 @@ pub fn forward(
     c.adjoint().transposed_from(&output, images).run(Tensors { x, weights, bias, activation: c.activation, out, before });
 }
 
-/// Gradients, given that of the outputs and what the forward pass computed: `kept` is `before` where the activation
-/// needs it, else `out`.
+/// Computes gradients from the output gradient `d_out` and a result of the forward pass: `kept` is `before` if the activation needs its
+/// input, else `out`.
 ///
 /// # Shapes
-/// As [`ConvTranspose2d`] says; `kept` and `d_out` as `out`; `kept` is not read without an activation.
+/// As in [`ConvTranspose2d`]; `kept` and `d_out` are shaped like `out`; `kept` is not read without an activation.
 pub fn backward(c: &ConvTranspose2d, images: &Images, x: &[f32], weights: &[f32], kept: &[f32], d_out: &[f32], gradients: Gradients) {
     let output = check(c, images, x, weights, d_out.len());
     let adjoint = c.adjoint();

@@ -1,4 +1,4 @@
-//! Transposed convolution of images, `y = act(wᵀ ∗ x + b)`: the adjoint of `conv2d`, which enlarges by its stride.
+//! 2-D transposed convolution, `y = act(wᵀ ∗ x + b)`: the adjoint of `conv2d`, which upsamples by its stride.
 
 pub mod cpu;
 pub mod reference;
@@ -10,7 +10,7 @@ use super::conv2d::Conv2d;
 pub use super::conv2d::{Gradients, Images};
 use crate::gemm::Precision;
 
-/// What a transposed convolution is besides its weights; pairs are (vertical, horizontal).
+/// Description of a transposed convolution without its weights; pairs are (vertical, horizontal).
 ///
 /// # Shapes
 /// x `[batch, channels_in, height, width]`; weights `[channels_in, channels_out / groups, kernel, kernel]`; bias empty or
@@ -23,12 +23,12 @@ pub struct ConvTranspose2d {
     pub kernel: [usize; 2],
     pub stride: [usize; 2],
     pub padding: [usize; 2],
-    /// Rows and columns more at the end, less than the stride or the dilation.
+    /// Extra rows and columns at the end, fewer than the stride or the dilation.
     pub output_padding: [usize; 2],
     pub dilation: [usize; 2],
     pub groups: usize,
     pub activation: Activation,
-    /// As that of a convolution.
+    /// As [`Conv2d::precision`].
     pub precision: Precision,
 }
 
@@ -49,7 +49,7 @@ impl ConvTranspose2d {
         }
     }
 
-    /// The convolution from outputs to inputs with the same weights, without activation.
+    /// The convolution from outputs to inputs with the same weights and no activation.
     pub(crate) fn adjoint(&self) -> Conv2d {
         Conv2d {
             channels_in: self.channels_out,
@@ -67,7 +67,7 @@ impl ConvTranspose2d {
     /// Size of the outputs.
     ///
     /// # Panics
-    /// When padding leaves nothing, or the description makes no sense.
+    /// When padding leaves nothing, or the description is invalid.
     pub fn output(&self, images: &Images) -> Images {
         self.adjoint().check();
         let size = |i: usize, n: usize| {

@@ -1,4 +1,4 @@
-//! Plain loops in f64: every input pixel adds its kernel to the output.
+//! Reference transposed convolution: plain loops in f64, in which every input pixel adds its kernel to the output.
 
 use super::{ConvTranspose2d, Images};
 use crate::ops::activation::reference as activation;
@@ -40,12 +40,12 @@ fn linear(c: &ConvTranspose2d, images: &Images, x: &[f64], w: &[f64], bias: &[f6
     out
 }
 
-/// `y`, with an empty bias for none.
+/// `y = act(wᵀ ∗ x + b)`; an empty bias is zero.
 pub fn forward(c: &ConvTranspose2d, images: &Images, x: &[f64], w: &[f64], bias: &[f64]) -> Vec<f64> {
     linear(c, images, x, w, bias).into_iter().map(|v| activation::value(c.activation, v)).collect()
 }
 
-/// Gradients of x, w and the bias, given that of y.
+/// Gradients of x, w and the bias, given the gradient `d` of y.
 pub fn backward(c: &ConvTranspose2d, images: &Images, x: &[f64], w: &[f64], bias: &[f64], d: &[f64]) -> (Vec<f64>, Vec<f64>, Vec<f64>) {
     let before = linear(c, images, x, w, bias);
     let g: Vec<f64> = d.iter().zip(&before).map(|(d, v)| d * activation::slope(c.activation, *v)).collect();

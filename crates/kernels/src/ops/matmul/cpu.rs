@@ -1,4 +1,4 @@
-//! Blocks of rows times panels of columns, which are copied to stay in the first-level cache.
+//! Matrix products on the CPU: blocks of rows of A times panels of columns of B, copied to stay in the L1 cache.
 
 use super::Matmul;
 use crate::gemm::{Gemm, Init, Precision, View, has_bf16};
@@ -11,22 +11,22 @@ use rayon::prelude::*;
 use std::cell::Cell;
 use std::ops::Range;
 
-/// Most rows of a task, whose part of A stays in the second-level cache.
+/// Most rows of a task, so that its part of A stays in the L2 cache.
 const ROWS: usize = 384;
-/// Fewest rows of a task, which share the copy of a panel.
+/// Fewest rows of a task, because they share the cost of copying a panel.
 const FEWEST_ROWS: usize = 96;
-/// Terms of a sum per pass on factors rounded to bf16.
+/// Terms of a sum per pass in bf16.
 const ROUNDED_TERMS: usize = 256;
-/// Parts that a long sum over few outputs is cut into at most, and terms that one has at least.
+/// Most groups that a long sum over few outputs is split into, and fewest terms per group.
 const GROUPS: usize = 16;
 const GROUP_TERMS: usize = 2048;
-/// Most outputs of which each part has its own.
+/// Most outputs of a product whose sums are split: each group has its own copy.
 const GROUP_OUTPUTS: usize = 1 << 19;
 
-/// Turns finished sums into outputs, given their row and their first column.
+/// Function that turns finished sums into outputs in place, given (row, first column, sums).
 pub type Finish<'a> = &'a (dyn Fn(usize, usize, &mut [f32]) + Sync);
 
-/// One product of a batch, as all threads see it.
+/// A batch of products in progress, shared by all threads.
 struct Job<'a> {
     s: Matmul,
     kernel: &'static Kernel,
@@ -35,7 +35,7 @@ struct Job<'a> {
     finish: Option<Finish<'a>>,
 }
 
-/// What a task computes, and where that goes.
+/// Part of the outputs that one task computes, and its destination.
 struct Part {
     batch: usize,
     rows: Range<usize>,
@@ -45,15 +45,15 @@ struct Part {
     accumulate: bool,
 }
 
-/// `c = a b`, or `c += a b` where the description says so.
+/// `c = a b`, or `c += a b` with [`Matmul::accumulate`]. Results do not depend on the number of threads.
 ///
 /// # Shapes
-/// As [`Matmul`] says. Sums run over `k` in blocks that depend on the shape alone, so results do not depend on the number of threads.
+/// As in [`Matmul`].
 pub fn matmul(s: &Matmul, a: &[f32], b: &[f32], c: &mut [f32]) {
     matmul_with(s, a, b, c, None);
 }
 
-/// The same with a bias or an activation, while the outputs are in cache.
+/// As [`matmul`], then applies `finish`, such as a bias or an activation, while the outputs are in cache.
 pub fn matmul_with(s: &Matmul, a: &[f32], b: &[f32], c: &mut [f32], finish: Option<Finish>) {
     let Some(job) = Job::new(s, a, b, c, finish) else { return };
     let groups = groups(s);
@@ -78,7 +78,7 @@ pub fn matmul_with(s: &Matmul, a: &[f32], b: &[f32], c: &mut [f32], finish: Opti
     });
 }
 
-/// The same on this thread, for tasks that cut a larger problem.
+/// As [`matmul`], on the current thread only, for tasks of a larger parallel problem.
 pub(crate) fn matmul_here(s: &Matmul, a: &[f32], b: &[f32], c: &mut [f32]) {
     let Some(job) = Job::new(s, a, b, c, None) else { return };
     let c = Shared(c.as_mut_ptr());
@@ -98,7 +98,7 @@ fn divide(s: &Matmul, kernel: &Kernel) -> (usize, usize) {
     (rows, s.n.div_ceil(across).next_multiple_of(kernel.width()))
 }
 
-/// Parts that sums are cut into: one, but where there are few outputs and many terms.
+/// Number of groups that sums are split into: more than one only with few outputs and many terms.
 fn groups(s: &Matmul) -> usize {
     if s.batch == 1 && s.m * s.n <= GROUP_OUTPUTS { (s.k / GROUP_TERMS).clamp(1, GROUPS) } else { 1 }
 }
@@ -114,7 +114,7 @@ vectorized! {
 }
 
 impl<'a> Job<'a> {
-    /// None where there is nothing to multiply; outputs of empty sums are written.
+    /// Returns none if there is nothing to multiply; then the outputs of empty sums are already written.
     fn new(s: &Matmul, a: &'a [f32], b: &'a [f32], c: &mut [f32], finish: Option<Finish<'a>>) -> Option<Job<'a>> {
         assert_eq!(a.len(), s.batch * s.m * s.k, "matmul: a");
         assert_eq!(b.len(), s.batch * s.k * s.n, "matmul: b");
@@ -134,7 +134,7 @@ impl<'a> Job<'a> {
         Some(Job { s: *s, kernel: kernel(simd::level()), a, b, finish })
     }
 
-    /// Sums of parts of the terms, added in order.
+    /// Computes groups of the terms in parallel and adds their sums in order.
     fn in_groups(&self, groups: usize, c: &mut [f32]) {
         let (s, level) = (&self.s, simd::level());
         let per = s.k.div_ceil(groups);
@@ -145,7 +145,7 @@ impl<'a> Job<'a> {
         let down = s.m.div_ceil(ROWS);
         (0..groups * down).into_par_iter().for_each(|i| {
             let (group, row) = (i / down, i % down * ROWS);
-            // SAFETY: every group but the first has its own part of the partial sums.
+            // SAFETY: every group except the first has its own part of the partial sums.
             let c = if group == 0 { first } else { Shared(unsafe { others.at((group - 1) * size) }) };
             let part = Part {
                 batch: 0,
@@ -232,8 +232,7 @@ impl<'a> Job<'a> {
         }
     }
 
-    /// B from the first term and column of the panel that is copied after the one of column `j` to its last term, if B's rows can be
-    /// read in turn.
+    /// Part of B that the panel after the one of column `j` is copied from, for prefetching; none if B is transposed or no panel follows.
     fn after(&self, part: &Part, terms: &Range<usize>, j: usize) -> Option<&[f32]> {
         let (s, width) = (&self.s, self.kernel.width());
         let (term, column) = if j + width < part.columns.end { (terms.start, j + width) } else { (terms.end, part.columns.start) };
@@ -242,7 +241,7 @@ impl<'a> Job<'a> {
         (!s.b_transposed && term < end).then(|| &self.b[(first + term) * s.n + column..(first + end) * s.n])
     }
 
-    /// The same on factors rounded to bf16.
+    /// As [`Self::compute`], with factors rounded to bf16.
     fn compute_rounded(&self, part: &Part, scratch: &mut Scratch) {
         let (s, width) = (&self.s, self.kernel.width());
         let a = &self.a[part.batch * s.m * s.k..][..s.m * s.k];
@@ -282,7 +281,7 @@ impl<'a> Job<'a> {
         }
     }
 
-    /// Copies some terms of some rows of a transposed A: blocks of as many rows as a tile has, `[terms, rows]` each.
+    /// Copies some terms of some rows of a transposed A into blocks of a tile's rows, `[terms, rows]` each.
     fn pack_rows(&self, a: &[f32], rows: Range<usize>, terms: Range<usize>, out: &mut [f32]) {
         let (s, height) = (&self.s, self.kernel.rows);
         for (i, block) in rows.clone().step_by(height).zip(out.chunks_exact_mut(height * terms.len())) {
@@ -293,7 +292,7 @@ impl<'a> Job<'a> {
         }
     }
 
-    /// Copies some columns of some terms of B, row after row of the panel.
+    /// Copies some columns and terms of B into a panel, `[terms, width]`.
     fn pack(&self, b: &[f32], terms: Range<usize>, columns: Range<usize>, panel: &mut [f32]) {
         let (s, width) = (&self.s, self.kernel.width());
         if s.b_transposed {
@@ -304,7 +303,7 @@ impl<'a> Job<'a> {
     }
 }
 
-/// Rows ahead of a copy that are asked of memory.
+/// Prefetch distance of a copy, in rows.
 const AHEAD: usize = 12;
 
 vectorized! {
@@ -314,12 +313,12 @@ vectorized! {
             #[cfg(target_arch = "x86_64")]
             for line in (0..count).step_by(16) {
                 use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-                // SAFETY: a hint, which may name any address.
+                // SAFETY: prefetching is a hint and accepts any address.
                 unsafe { _mm_prefetch::<_MM_HINT_T0>(from.as_ptr().wrapping_add((p + AHEAD) * stride + line).cast()) };
             }
             let from = &from[p * stride..p * stride + count];
             if count == 48 && width == 48 {
-                // A known size becomes a few vectors.
+                // A constant size compiles to a few vector moves.
                 to[..48].copy_from_slice(&from[..48]);
             } else {
                 to[..count].copy_from_slice(from);
@@ -328,13 +327,13 @@ vectorized! {
     }
 }
 
-/// Writes the first `count` columns of a tile.
+/// Writes the first `count` columns of a tile to C, or adds them.
 ///
 /// # Safety
-/// The rows of C, `stride` apart, have as many columns.
+/// The rows of C, `stride` floats apart, have at least `count` columns.
 unsafe fn store(tile: &[f32], width: usize, count: usize, to: *mut f32, stride: usize, add: bool) {
     for (r, row) in tile.chunks_exact(width).enumerate() {
-        // SAFETY: the caller vouches for the rows of C.
+        // SAFETY: the caller guarantees the rows of C.
         let out = unsafe { std::slice::from_raw_parts_mut(to.add(r * stride), count) };
         for (o, v) in out.iter_mut().zip(row) {
             *o = if add { *o + v } else { *v };

@@ -1,4 +1,4 @@
-//! Batched matrix products, `C = A B (+ C)`, of operands that may be transposed: attention, linear layers and their gradients.
+//! Batched matrix products, `C = A B (+ C)`, with optionally transposed operands, for attention, linear layers and their gradients.
 
 pub mod cpu;
 pub mod reference;
@@ -7,10 +7,10 @@ mod tests;
 
 use crate::gemm::Precision;
 
-/// Shapes of a batch of products.
+/// Description of a batch of matrix products.
 ///
 /// # Shapes
-/// a `[batch, m, k]`, or `[batch, k, m]` where transposed; b `[batch, k, n]`, or `[batch, n, k]` where transposed; c `[batch, m, n]`.
+/// a `[batch, m, k]`, or `[batch, k, m]` if transposed; b `[batch, k, n]`, or `[batch, n, k]` if transposed; c `[batch, m, n]`.
 /// All row-major.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Matmul {
@@ -20,19 +20,19 @@ pub struct Matmul {
     pub k: usize,
     pub a_transposed: bool,
     pub b_transposed: bool,
-    /// Whether products are added to `c`; else they overwrite it.
+    /// Whether products are added to `c` instead of overwriting it.
     pub accumulate: bool,
-    /// Arithmetic of the factors; sums are f32.
+    /// Precision of the factors; sums are f32.
     pub precision: Precision,
 }
 
 impl Matmul {
-    /// `[m, k] · [k, n]`, none transposed.
+    /// One product `[m, k] · [k, n]` in f32, without transposes, that overwrites `c`.
     pub fn new(m: usize, n: usize, k: usize) -> Self {
         Matmul { batch: 1, m, n, k, a_transposed: false, b_transposed: false, accumulate: false, precision: Precision::F32 }
     }
 
-    /// The product that gives A's gradient from C's and B: as `matmul(d_c, b)`, or `matmul(b, d_c)` where A is transposed.
+    /// The product that gives the gradient of A: of (d_c, b), or of (b, d_c) if A is transposed.
     pub fn gradient_a(&self) -> Matmul {
         let (m, n, k) = (self.m, self.n, self.k);
         if self.a_transposed {
@@ -41,7 +41,7 @@ impl Matmul {
         Matmul { m, n: k, k: n, a_transposed: false, b_transposed: !self.b_transposed, accumulate: false, ..*self }
     }
 
-    /// The product that gives B's gradient from A and C's: as `matmul(a, d_c)`, or `matmul(d_c, a)` where B is transposed.
+    /// The product that gives the gradient of B: of (a, d_c), or of (d_c, a) if B is transposed.
     pub fn gradient_b(&self) -> Matmul {
         let (m, n, k) = (self.m, self.n, self.k);
         if self.b_transposed {

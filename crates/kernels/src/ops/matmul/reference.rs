@@ -1,4 +1,4 @@
-//! Plain loops in f64.
+//! Reference matrix product: plain loops in f64.
 
 use super::Matmul;
 
@@ -22,7 +22,7 @@ fn products(s: &Matmul, mut visit: impl FnMut(usize, usize, usize)) {
     }
 }
 
-/// Adds to `c`, or overwrites it.
+/// `c = a b`, or `c += a b` with [`Matmul::accumulate`].
 pub fn forward(s: &Matmul, a: &[f64], b: &[f64], c: &mut [f64]) {
     if !s.accumulate {
         c.fill(0.0);
@@ -30,7 +30,7 @@ pub fn forward(s: &Matmul, a: &[f64], b: &[f64], c: &mut [f64]) {
     products(s, |i, j, to| c[to] += a[i] * b[j]);
 }
 
-/// Gradients of a and b, given that of c.
+/// Gradients of a and b, given the gradient `d` of c.
 pub fn backward(s: &Matmul, a: &[f64], b: &[f64], d: &[f64]) -> (Vec<f64>, Vec<f64>) {
     let (mut da, mut db) = (vec![0.0; a.len()], vec![0.0; b.len()]);
     products(s, |i, j, to| {

@@ -1,5 +1,5 @@
-//! Photographs or a video become a data set: sharp frames, poses from COLMAP or as they were given, the world upright and of useful size,
-//! photographs finished as wished, a division into training and held-out views, and a sheet that shows it all.
+//! Prepares a data set from photographs or a video: selects sharp frames, takes poses from COLMAP or from the input, orients and scales the
+//! world, post-processes photographs, splits them into training and held-out views, and draws a contact sheet.
 
 pub mod finish;
 mod posed;
@@ -22,11 +22,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub use finish::Finish;
 pub use sfm::Matcher;
 
-/// Where poses come from.
+/// Source of the camera poses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sfm {
     Colmap,
-    /// They are part of the input.
+    /// No structure from motion: the input has poses.
     None,
 }
 
@@ -42,43 +42,43 @@ impl std::str::FromStr for Sfm {
     }
 }
 
-/// What to make a data set of, and how.
+/// Input, output and settings of [`prepare`].
 #[derive(Clone, Debug)]
 pub struct PrepareOptions {
-    /// A folder of photographs or a video; without structure from motion a posed capture.
+    /// A folder of photographs or a video; a posed capture with [`Sfm::None`].
     pub input: PathBuf,
     pub out: PathBuf,
     pub sfm: Sfm,
-    /// Of a posed capture that holds several.
+    /// Which format to read from a posed capture that holds several.
     pub format: Option<import::Format>,
-    /// Of a posed capture.
+    /// How the masks of a posed capture are read.
     pub masks: MaskOptions,
-    /// Most frames of a video.
+    /// Which frames of a video are extracted.
     pub choice: Choice,
     /// Take every n-th photograph.
     pub every: usize,
-    /// Longest side; larger photographs are reduced.
+    /// Longest side in pixels; larger photographs are downsampled.
     pub max_side: u32,
     pub matcher: Matcher,
     /// Most features per photograph.
     pub features: usize,
-    /// COLMAP's name of the lens.
+    /// COLMAP's name of the camera model, one of `sfm::LENSES`.
     pub lens: String,
     pub finish: Finish,
-    /// [`SplitRule::File`]: a posed capture's own, else every eighth is held out.
+    /// [`SplitRule::File`] keeps the split of a posed capture; without one, every eighth frame is held out.
     pub split: SplitRule,
     pub seed: u64,
-    /// Fewest photographs that need a pose, in percent.
+    /// Least share of the photographs that must get a pose, in percent.
     pub min_registered: f64,
     pub threads: Option<usize>,
-    /// Go on from what an earlier call left.
+    /// Continue an interrupted call.
     pub resume: bool,
     pub force: bool,
     /// Leave out photographs that cannot be decoded.
     pub skip_broken: bool,
 }
 
-/// What was made.
+/// Result of [`prepare`].
 #[derive(Clone, Debug, Serialize)]
 pub struct Prepared {
     pub folder: PathBuf,
@@ -91,7 +91,7 @@ pub struct Prepared {
     pub points: usize,
     /// Mean angle between the cameras' own up directions and the world's, in degrees.
     pub tilt: f64,
-    /// Whether a floor was found, which then lies at the height of the lowest dense plane.
+    /// Whether a floor plane was found; its normal is then the up direction.
     pub floor: bool,
     pub aabb_scale: u32,
     pub held_out: usize,
@@ -107,9 +107,9 @@ const POSED: &str = "posed";
 const MASKS: &str = "masks";
 const POINTS: &str = "points.ply";
 const IMAGES_DONE: &str = "images.done";
-/// Within [`WORK`]: photographs of linear light as COLMAP can read them, PNGs of 8 bits under the same names.
+/// Within [`WORK`]: 8-bit PNGs of linear-light photographs for COLMAP, under the same file names.
 const SEEN: &str = "seen";
-/// Within [`WORK`]: names of the broken photographs that were left out, a line each.
+/// Within [`WORK`]: names of the broken photographs that were left out, one per line.
 const BROKEN: &str = "images.broken";
 
 /// Photographs with poses, before they are finished.
@@ -117,26 +117,26 @@ struct Posed {
     frames: Vec<Frame>,
     scene: SceneBox,
     masks: MaskRule,
-    /// From the frames' world to the one in which they are finished: upright, the origin in the middle, cameras [`world::DISTANCE`] away.
+    /// From the frames' world to the upright world of [`finish::finish`]: the origin is the focus point, the cameras are [`world::DISTANCE`] away.
     finishing_from_world: diorama_geom::Similarity,
     found: finish::Found,
-    /// In the frames' world; seen by frames as they are numbered here.
+    /// Sparse points in the frames' world; their frame numbers index `frames`.
     points: Vec<SparsePoint>,
     images: usize,
     lost: Vec<String>,
     broken: Vec<String>,
     tilt: f64,
     floor: bool,
-    /// Whether frames carry the capture's own division.
+    /// Whether the capture has a split of its own.
     is_divided: bool,
 }
 
-/// Prepares a data set; none when interrupted, after which `resume` goes on. `note` is told what happens.
+/// Prepares a data set; returns none when interrupted, after which `resume` continues. `note` receives progress messages.
 ///
 /// # Errors
-/// When the input is at fault, a program is missing, or too few photographs find a pose.
+/// When the input is invalid, a program is missing, or too few photographs get a pose.
 pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Prepared>> {
-    // Missing programs are told before any work is done.
+    // Report missing programs before any work is done.
     let colmap_program = (o.sfm == Sfm::Colmap).then(sfm::program).transpose()?;
     if !o.input.exists() {
         return Err(DataError::input(&o.input, "does not exist; give a folder of photographs or a video").into());
@@ -154,7 +154,7 @@ pub fn prepare(o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(
     }
 }
 
-/// Finds poses with COLMAP; none when interrupted.
+/// Finds poses with COLMAP; returns none when interrupted.
 fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Posed>> {
     let work = o.out.join(WORK);
     if !work.join(IMAGES_DONE).exists() && !take_images(o, &work, interrupt, note)? {
@@ -207,7 +207,7 @@ fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut d
     }))
 }
 
-/// Finishes photographs and writes the data set; none when interrupted.
+/// Post-processes photographs and writes the data set; returns none when interrupted.
 fn complete(mut p: Posed, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Prepared>> {
     let registered = p.frames.len();
     let to_world = p.finishing_from_world.inverse();
@@ -230,7 +230,7 @@ fn complete(mut p: Posed, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut
     p.points.retain(|p| p.position.as_vec3().is_finite());
     let has_points = !p.points.is_empty();
     if has_points {
-        // Photographs may have been left out since the points were found.
+        // Finishing may have dropped photographs: renumber the frames of the points.
         let now: HashMap<&str, u32> = capture.frames.iter().enumerate().map(|(i, f)| (&f.name[..], i as u32)).collect();
         p.points.iter_mut().for_each(|p| p.frames = p.frames.iter().filter_map(|f| now.get(&before[*f as usize][..]).copied()).collect());
         sparse_ply::write(&o.out.join(POINTS), &p.points, &capture.frames, &o.out)?;
@@ -238,7 +238,7 @@ fn complete(mut p: Posed, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut
     transforms_json::write(&o.out.join("transforms.json"), &o.out, &capture, has_points.then_some(POINTS))?;
     let sheet = o.out.join("sheet.png");
     sheet::draw(&sheet, &capture, &p.points)?;
-    // What was written reads back as a capture.
+    // Check that the written data set can be read.
     let options = import::ImportOptions { format: Some(import::Format::Transforms), ..Default::default() };
     import::import(&o.out, &options)?;
     Ok(Some(Prepared {
@@ -257,7 +257,7 @@ fn complete(mut p: Posed, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut
     }))
 }
 
-/// Makes the folder ready and locks it, or refuses.
+/// Creates or clears the output folder and locks it; fails if the folder holds anything but an earlier data set.
 fn begin(o: &PrepareOptions) -> Result<std::fs::File> {
     let work = o.out.join(if o.sfm == Sfm::Colmap { WORK } else { POSED });
     let existed = o.out.is_dir();
@@ -267,7 +267,7 @@ fn begin(o: &PrepareOptions) -> Result<std::fs::File> {
     if o.out.is_file() {
         return Err(DataError::input(&o.out, "is a file; --out must name a folder").into());
     }
-    // Somebody else's folder is left as it is.
+    // Never touch a folder that is not an earlier data set.
     let names = |p: &Path| -> Result<Vec<std::ffi::OsString>> {
         Ok(std::fs::read_dir(p).map_err(DataError::io(p, "read"))?.flatten().map(|e| e.file_name()).filter(|n| n != lock::NAME).collect())
     };
@@ -308,7 +308,7 @@ fn begin(o: &PrepareOptions) -> Result<std::fs::File> {
     Ok(lock)
 }
 
-/// Whether all photographs have as many pixels.
+/// Whether all photographs have the same size.
 fn one_size(images: &[PathBuf]) -> Result<bool> {
     let first = photo::size(&images[0])?;
     for i in images {
@@ -319,12 +319,12 @@ fn one_size(images: &[PathBuf]) -> Result<bool> {
     Ok(true)
 }
 
-/// What [`take_images`] has kept of the photographs' metadata.
+/// Focal ratio that [`take_images`] has stored, if any.
 fn read_focal_ratio(work: &Path) -> Option<f64> {
     std::fs::read_to_string(work.join(IMAGES_DONE)).ok()?.trim().parse().ok()
 }
 
-/// The focal length that photographs agree on, over the longer side.
+/// Median focal length over the longer side; none unless 90 % of the photographs agree with it within 2 %.
 fn common_focal_ratio(all: &[PathBuf]) -> Option<f64> {
     let mut found: Vec<f64> = all.iter().filter_map(|p| photo_import::focal_ratio(p)).collect();
     found.sort_by(f64::total_cmp);
@@ -333,7 +333,7 @@ fn common_focal_ratio(all: &[PathBuf]) -> Option<f64> {
     (agree * 10 >= all.len() * 9).then_some(middle)
 }
 
-/// Names of the photographs that were left out; none where an earlier version took them, which kept no list.
+/// Names of the photographs that were left out; empty if there is no list.
 fn left_out(file: &Path) -> Result<Vec<String>> {
     match std::fs::read_to_string(file) {
         Ok(names) => Ok(names.lines().map(String::from).collect()),
@@ -342,7 +342,7 @@ fn left_out(file: &Path) -> Result<Vec<String>> {
     }
 }
 
-/// Fills the folder of images; false when interrupted.
+/// Fills the image folder; returns false when interrupted.
 fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<bool> {
     let folder = o.out.join(IMAGES);
     let mut focal_ratio = None;
@@ -391,7 +391,7 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
     Ok(true)
 }
 
-/// Names for files, each its own.
+/// Unique file stems, one per file.
 fn stems(files: &[PathBuf]) -> Vec<String> {
     let mut taken = HashSet::new();
     let stem = |(i, f): (usize, &PathBuf)| {
@@ -403,7 +403,7 @@ fn stems(files: &[PathBuf]) -> Vec<String> {
     files.iter().enumerate().map(stem).collect()
 }
 
-/// Makes a picture that COLMAP can read of a photograph of linear light.
+/// Saves an 8-bit version of a linear-light photograph for COLMAP.
 fn see(taken: &Path, work: &Path) -> Result<()> {
     if photo::header(taken)?.depth == photo::Depth::Linear {
         let folder = work.join(SEEN);

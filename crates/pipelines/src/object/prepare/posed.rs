@@ -1,4 +1,4 @@
-//! Photographs whose poses are known already: copied as COLMAP's would be, poses and world as given.
+//! Photographs with known poses: copies the photographs and masks, keeps the poses and the world.
 
 use super::{IMAGES, IMAGES_DONE, MASKS, POSED, Posed, PrepareOptions, finish, stems, world};
 use crate::error::{PipelineError, Result};
@@ -13,13 +13,13 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Images that a point counts for where nobody says which show it: as many as make it firm.
+/// Assumed number of images per point where visibility is unknown: the least that makes a point reliable.
 const UNTOLD: usize = 3;
 
 /// Reads the posed capture.
 ///
 /// # Errors
-/// When it cannot be read, has a lens that `transforms.json` has no words for, or lacks what is asked of it.
+/// When it cannot be read, has a lens that `transforms.json` cannot express, or lacks data that the options need.
 pub fn read(o: &PrepareOptions) -> Result<Capture> {
     let options = ImportOptions { format: o.format, seed: o.seed, masks: o.masks, skip_broken: o.skip_broken, ..ImportOptions::default() };
     let mut capture = import::import(&o.input, &options)?;
@@ -51,7 +51,10 @@ pub fn read(o: &PrepareOptions) -> Result<Capture> {
     Ok(capture)
 }
 
-/// Takes the photographs and masks of a capture; none when interrupted.
+/// Copies the photographs and masks of a capture into the data set; returns none when interrupted.
+///
+/// # Errors
+/// When a photograph or mask cannot be read or copied, or its size contradicts its camera.
 pub fn take(capture: Capture, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Posed>> {
     capture.notes.iter().for_each(|n| note(n));
     let is_divided = !divided_by_default(&capture.frames);
@@ -88,7 +91,7 @@ pub fn take(capture: Capture, o: &PrepareOptions, interrupt: &AtomicBool, note: 
     Ok(Some(Posed {
         images: frames.len(),
         scene: capture.scene,
-        // Copies of masks are the right way round.
+        // The copied masks are already inverted where needed.
         masks: diorama_geom::capture::MaskRule { inverted: false, ..capture.masks },
         finishing_from_world,
         found,
@@ -106,14 +109,14 @@ fn mask_file(out: &Path, stem: &str) -> PathBuf {
     out.join(MASKS).join(format!("{stem}.png"))
 }
 
-/// Whether frames are divided as those of a capture that says nothing.
+/// Whether the frames have the default split, that of a capture without a split of its own.
 fn divided_by_default(frames: &[Frame]) -> bool {
     let mut other = frames.to_vec();
     split::apply(&SplitRule::File, &mut other, false, 0);
     frames.iter().zip(&other).all(|(a, b)| a.split == b.split)
 }
 
-/// Copies photographs without metadata, and masks; false when interrupted.
+/// Copies photographs without metadata, and masks; returns false when interrupted.
 fn copy(
     capture: &Capture,
     frames: &[Frame],
@@ -147,13 +150,13 @@ fn copy(
     Ok(true)
 }
 
-/// The points, with the frames that were chosen among those that see them, by their new numbers.
+/// The points with their frame lists restricted to the `chosen` frames and renumbered.
 fn seen_by(points: &[SparsePoint], chosen: &[usize]) -> Vec<SparsePoint> {
     let place: HashMap<u32, u32> = chosen.iter().enumerate().map(|(k, i)| (*i as u32, k as u32)).collect();
     points.iter().map(|p| SparsePoint { frames: p.frames.iter().filter_map(|f| place.get(f).copied()).collect(), ..p.clone() }).collect()
 }
 
-/// The capture's points as those that finish photographs need them; `chosen` are the numbers that `frames` had in the capture.
+/// The capture's points as [`finish::finish`] needs them; `chosen` holds the indices of `frames` in the capture.
 fn found(capture: &Capture, chosen: &[usize], frames: &[Frame], finishing_from_world: &Similarity, o: &PrepareOptions) -> finish::Found {
     if !o.finish.touches_pixels() || capture.points.is_empty() {
         return finish::Found::default();

@@ -1,4 +1,4 @@
-//! COLMAP, driven step by step; each finished step is marked, so that an interrupted run goes on.
+//! Runs COLMAP (Schönberger and Frahm, CVPR 2016) step by step; marks each finished step, so that an interrupted run can resume.
 
 use super::{IMAGES, PrepareOptions, SEEN, WORK};
 use crate::error::{PipelineError, Result};
@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
-/// Which pairs of photographs are compared.
+/// Which pairs of photographs are matched.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Matcher {
-    /// Neighbours for videos and for very many photographs, else all.
+    /// Sequential for videos and for very many photographs, then exhaustive if too few of them get a pose; else exhaustive.
     Auto,
     Exhaustive,
     Sequential,
@@ -30,31 +30,34 @@ impl std::str::FromStr for Matcher {
     }
 }
 
-/// More photographs than this are compared with their neighbours only.
+/// Most photographs that [`Matcher::Auto`] matches exhaustively from the start.
 const EXHAUSTIVE: usize = 400;
-/// A model with less than this share of the photographs is tried again with all pairs.
+/// [`Matcher::Auto`] repeats sequential matching with all pairs if the model has less than this share of the photographs.
 const FEW: f64 = 0.9;
-/// The photographs as COLMAP reads them.
+/// Folder of the photographs that COLMAP reads.
 fn seen_images(o: &PrepareOptions) -> std::path::PathBuf {
     let own = o.out.join(WORK).join(SEEN);
     if own.is_dir() { own } else { o.out.join(IMAGES) }
 }
 
-/// COLMAP's names of lenses that are understood here.
+/// Supported COLMAP camera models.
 pub const LENSES: [&str; 6] = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"];
 
-/// COLMAP's path.
+/// Path of COLMAP.
+///
+/// # Errors
+/// If it is not installed.
 pub fn program() -> Result<PathBuf> {
     Ok(process::find("colmap", "DIORAMA_COLMAP", "Debian: apt install colmap; others: colmap.github.io/install.html")?)
 }
 
-/// What is to be posed.
+/// Photographs that need poses.
 pub struct Photographs<'a> {
     pub names: &'a [String],
     pub is_video: bool,
-    /// All have as many pixels, so one lens serves all.
+    /// Whether all have the same size, so that they share one camera.
     pub one_size: bool,
-    /// Focal length over the longer side, where the photographs tell.
+    /// Focal length over the longer side, if the EXIF data has it.
     pub focal_ratio: Option<f64>,
 }
 
@@ -67,7 +70,10 @@ struct Sfm<'a> {
     interrupt: &'a AtomicBool,
 }
 
-/// The folder of the largest model, copied to `sparse/0`; none when interrupted.
+/// Reconstructs the poses and copies the largest model to `sparse/0`; returns that folder, or none when interrupted.
+///
+/// # Errors
+/// When the lens is unknown, a COLMAP step fails, or no model is found.
 pub fn reconstruct(
     program: &Path,
     o: &PrepareOptions,
@@ -115,7 +121,7 @@ impl Sfm<'_> {
         Ok(atomic::write(&self.work.join(format!("{step}.done")), b"")?)
     }
 
-    /// Runs a step; false when interrupted.
+    /// Runs a COLMAP command; returns false when interrupted.
     fn run(&self, arguments: &[(&str, String)], command: &str, on_line: &mut dyn FnMut(&str)) -> Result<bool> {
         let mut c = Command::new(self.program);
         c.arg(command);
@@ -127,7 +133,7 @@ impl Sfm<'_> {
         Ok(process::run(&mut c, &self.work.join("colmap.log"), self.interrupt, on_line)? == Ended::Done)
     }
 
-    /// The name that this version gives to an option: newer ones have moved them.
+    /// The name of an option in the installed version of COLMAP: `names` is (new, old).
     fn option(&self, command: &str, names: [&'static str; 2]) -> &'static str {
         let help = Command::new(self.program).args([command, "-h"]).env("QT_QPA_PLATFORM", "offscreen").output();
         let text = help.map(|o| [o.stdout, o.stderr].concat()).unwrap_or_default();
@@ -140,7 +146,7 @@ impl Sfm<'_> {
         if self.is_done("features") {
             return Ok(true);
         }
-        // A database that an interrupted run left half full is begun anew.
+        // Discard the incomplete database of an interrupted run.
         let _ = std::fs::remove_file(self.database());
         let gpu = self.option("feature_extractor", ["FeatureExtraction.use_gpu", "SiftExtraction.use_gpu"]);
         let threads = self.option("feature_extractor", ["FeatureExtraction.num_threads", "SiftExtraction.num_threads"]);
@@ -167,7 +173,7 @@ impl Sfm<'_> {
         Ok(done)
     }
 
-    /// Matches and maps; the largest model and how many photographs it holds.
+    /// Matches and maps; returns the largest model and its number of photographs, or none when interrupted.
     fn attempt(&self, neighbours: bool, n: usize, note: &mut dyn FnMut(&str)) -> Result<Option<(PathBuf, f64)>> {
         let (command, label) = if neighbours { ("sequential_matcher", "sequential") } else { ("exhaustive_matcher", "exhaustive") };
         if !self.is_done(label) {
@@ -181,7 +187,7 @@ impl Sfm<'_> {
             if neighbours {
                 arguments.push(("SequentialMatching.overlap", "15".into()));
             } else {
-                // Small blocks, so that there is progress to show; the pairs are the same.
+                // Small blocks report progress more often; the pairs are the same.
                 arguments.push(("ExhaustiveMatching.block_size", "10".into()));
             }
             note(&format!("matching ({label})"));
@@ -217,7 +223,7 @@ impl Sfm<'_> {
             match ended {
                 Ok(true) => self.mark(&mapped)?,
                 Ok(false) => return Ok(None),
-                // COLMAP fails where no pair is good enough to begin with: that is a model of nothing.
+                // COLMAP fails if no pair is good enough to initialize a model.
                 Err(e) if largest(&models).is_none() => {
                     let why = "no two photographs show enough of the same thing to begin with; take them with more overlap, sharper, and with more texture in view";
                     return Err(DataError::failed(&models, format!("{why} ({e})")).into());
@@ -236,7 +242,7 @@ impl Sfm<'_> {
     }
 }
 
-/// Of several models the one that holds most photographs.
+/// The model with the most photographs, and their number.
 fn largest(models: &Path) -> Option<(PathBuf, usize)> {
     let folders = models.read_dir().ok()?.flatten().map(|e| e.path());
     let counted = folders.filter_map(|p| colmap::registered(&p).ok().map(|r| (p, r.len())));

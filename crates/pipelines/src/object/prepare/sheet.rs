@@ -1,4 +1,4 @@
-//! A contact sheet: every photograph small, and the cameras with their frusta over the points, from above and from the side.
+//! Contact sheet of a data set: thumbnails of the photographs, and plots of the camera frusta and the points from above and from the side.
 
 use crate::error::Result;
 use diorama_data::photo;
@@ -8,16 +8,19 @@ use diorama_geom::{Capture, ImageU8, SparsePoint};
 use rayon::prelude::*;
 use std::path::Path;
 
-/// Longest side of a small photograph, photographs side by side, edge of the plans.
+/// Longest side of a thumbnail in pixels, thumbnails per row, and edge of the plots in pixels.
 const THUMB: usize = 128;
 const COLUMNS: usize = 10;
 const PLAN: usize = COLUMNS * THUMB / 2;
-/// Most photographs shown.
+/// Most thumbnails.
 const SHOWN: usize = 200;
 const TRAIN: [u8; 3] = [40, 90, 200];
 const HELD_OUT: [u8; 3] = [220, 60, 40];
 
-/// Draws the sheet.
+/// Draws the contact sheet and saves it as PNG.
+///
+/// # Errors
+/// When a photograph cannot be read or the sheet cannot be written.
 pub fn draw(path: &Path, capture: &Capture, points: &[SparsePoint]) -> Result<()> {
     let n = capture.frames.len();
     let shown: Vec<usize> = (0..n.min(SHOWN)).map(|i| i * n / n.min(SHOWN)).collect();
@@ -42,7 +45,7 @@ pub fn draw(path: &Path, capture: &Capture, points: &[SparsePoint]) -> Result<()
     Ok(photo::save_png(path, &sheet)?)
 }
 
-/// Points and frusta seen along one axis, in a square whose left edge is `x0`.
+/// Plots points and frusta, projected by `flat`, into the square with left edge `x0`.
 fn plan(sheet: &mut ImageU8, x0: usize, capture: &Capture, points: &[SparsePoint], flat: impl Fn(DVec3) -> DVec2) {
     let reach = capture.frames.iter().map(|f| flat(f.world_from_camera.translation).abs().max_element()).fold(1e-6, f64::max) * 1.25;
     let place = |p: DVec3| (flat(p) / reach + 1.0) * 0.5 * (PLAN - 1) as f64;

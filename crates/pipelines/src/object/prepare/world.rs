@@ -1,5 +1,5 @@
-//! From COLMAP's world, whose scale and axes mean nothing, to one that is upright and of useful size: up is +z, the origin is what
-//! the cameras look at, and their median distance from it is 4, as colmap2nerf does.
+//! Normalizes COLMAP's world, whose scale and axes are arbitrary: up becomes +z, the origin is the cameras' focus point, and their median
+//! distance from it is 4, as in instant-ngp's `colmap2nerf`.
 
 use diorama_data::colmap::Point;
 use diorama_geom::capture::{Frame, focus_point};
@@ -8,36 +8,36 @@ use diorama_geom::rng::Rng;
 use diorama_geom::transform::rotation_between;
 use diorama_geom::{Pose, SceneBox, Similarity};
 
-/// Median distance of the cameras from what they look at.
+/// Median distance of the cameras from their focus point, in world units.
 pub const DISTANCE: f64 = 4.0;
-/// Half the inner cube: what instant-ngp's scale of 0.33 makes of the unit cube.
+/// Half the edge of the inner cube: the unit cube under instant-ngp's scale of 0.33.
 const HALF: f64 = 0.5 / 0.33;
-/// Share of the points that the outer cube has to hold.
+/// Share of the points that the outer cube must contain.
 const HELD: f64 = 0.95;
-/// A floor lies within this angle (cosine) of the first guess of up and holds at least this share of the points, with at most that share
-/// below it: many with some below, or few with hardly any.
+/// Least cosine between a floor's normal and the first estimate of up. A floor must meet one pair of [`FLOORS`]: more than the first share
+/// of the points on it, less than the second share below it.
 const LEVEL: f64 = 0.9;
 const FLOORS: [(f64, f64); 2] = [(0.12, 0.1), (0.02, 0.01)];
-/// Planes that are tried.
+/// Planes that RANSAC tries.
 const TRIALS: u64 = 20_000;
-/// Least extent of a floor in units of the cameras' distance.
+/// Least extent of a floor, as a share of the cameras' distance.
 const WIDE: f64 = 0.5;
 
-/// What [`place`] found.
+/// Result of [`place`].
 pub struct Placed {
     pub scene: SceneBox,
     /// Mean angle between the cameras' up directions and the world's, in degrees.
     pub tilt: f64,
     pub floor: bool,
-    /// Points in the new world with their colours.
+    /// Points in the new world with their colors.
     pub points: Vec<(DVec3, [u8; 3])>,
 }
 
-/// Moves the cameras into the new world.
+/// Moves the cameras into the normalized world; returns its bounds and the moved points.
 pub fn place(frames: &mut [Frame], points: &[Point]) -> Placed {
     let poses: Vec<Pose> = frames.iter().map(|f| f.world_from_camera).collect();
     let (center, distance) = focus_point(&poses);
-    // Points in few images are often wrong.
+    // Points seen in fewer than three images are often wrong.
     let firm: Vec<DVec3> = points.iter().filter(|p| p.images >= 3).map(|p| p.position).collect();
     let guess = cameras_up(&poses);
     let eyes: Vec<DVec3> = poses.iter().map(|p| p.translation).collect();
@@ -59,8 +59,8 @@ pub fn place(frames: &mut [Frame], points: &[Point]) -> Placed {
     Placed { scene: SceneBox { center: DVec3::ZERO, half: HALF, aabb_scale }, tilt, floor: floor.is_some(), points }
 }
 
-/// Up as those who hold cameras level know it: the direction across all horizontal image axes where these span a plane,
-/// else the mean of the cameras' up directions.
+/// Estimates the up direction from the poses, assuming level cameras: the normal of the plane that the horizontal image axes span; the mean
+/// of the cameras' up directions where these axes span no plane.
 fn cameras_up(poses: &[Pose]) -> DVec3 {
     let mean = poses.iter().map(|p| -p.rotation.y_axis).sum::<DVec3>().normalize_or(DVec3::Z);
     let mut a = DMat3::ZERO;
@@ -69,19 +69,19 @@ fn cameras_up(poses: &[Pose]) -> DVec3 {
         a += DMat3::from_cols(r * r.x, r * r.y, r * r.z);
     }
     a *= 1.0 / poses.len().max(1) as f64;
-    // The smallest axis of a by power iteration on its complement.
+    // Eigenvector of the smallest eigenvalue of `a`, by power iteration on I − a.
     let b = DMat3::IDENTITY - a;
     let mut v = mean;
     (0..200).for_each(|_| v = (b * v).normalize_or(mean));
     let v = if v.dot(mean) < 0.0 { -v } else { v };
     let off_plane = v.dot(a * v);
-    // Spread within the plane: without it, any direction across the one axis would do as well.
+    // Spread within the plane: without it, the axes are parallel and the normal is ambiguous.
     let other = v.cross(poses.first().map_or(DVec3::X, |p| p.rotation.x_axis)).normalize_or(DVec3::X);
     let spread = other.dot(a * other);
     if v.dot(mean) > 0.7 && off_plane < 0.25 * spread { v } else { mean }
 }
 
-/// Normal of the plane that most points lie on, among those that are nearly level and below the cameras.
+/// Normal of the nearly level plane below the cameras with the most points on it (RANSAC); none where no plane qualifies as a floor.
 fn floor_normal(points: &[DVec3], eyes: &[DVec3], up: DVec3, center: DVec3, distance: f64) -> Option<DVec3> {
     let near: Vec<DVec3> = points.iter().copied().filter(|p| (*p - center).length() < 1.5 * distance).collect();
     if near.len() < 200 {
@@ -114,7 +114,7 @@ fn floor_normal(points: &[DVec3], eyes: &[DVec3], up: DVec3, center: DVec3, dist
     best.map(|(_, a, n)| fitted(&near, a, n, slack))
 }
 
-/// Normal of the plane through the points near one, by least squares of their heights.
+/// Refines the plane through `a` with normal `n` by least squares over the points near it; returns the new normal.
 fn fitted(points: &[DVec3], mut a: DVec3, mut n: DVec3, slack: f64) -> DVec3 {
     for within in [slack, 0.5 * slack, 0.5 * slack] {
         let u = n.any_orthonormal_vector();
@@ -135,7 +135,7 @@ fn fitted(points: &[DVec3], mut a: DVec3, mut n: DVec3, slack: f64) -> DVec3 {
     n
 }
 
-/// How far the points on a plane reach across, in their narrower direction of two.
+/// Extent of the points on a plane along two orthogonal directions, whichever is less; ignores 5 % of the points at either end.
 fn extent(points: &[DVec3], a: DVec3, n: DVec3, slack: f64) -> f64 {
     let u = n.any_orthonormal_vector();
     let v = n.cross(u);
@@ -153,7 +153,7 @@ mod tests {
     use super::*;
     use diorama_geom::Camera;
 
-    /// Cameras around a cube that stands on a floor, in a world that is turned and scaled at will.
+    /// Cameras around a cube on a floor, in a world that is scaled, rotated by `turn` and shifted.
     fn scene(turn: DMat3) -> (Vec<Frame>, Vec<Point>) {
         let s = Similarity { scale: 0.37, rotation: turn, translation: DVec3::new(5.0, -2.0, 9.0) };
         let frames = (0..24)
@@ -185,7 +185,7 @@ mod tests {
             let (mut frames, points) = scene(turn);
             let placed = place(&mut frames, &points);
             assert!(placed.floor && placed.scene.aabb_scale <= 4);
-            // The floor is level, half a unit of the old world below the centre.
+            // The floor is level, half a unit of the old world below the center.
             let scale = 4.0 / (3.0f64 * 3.0 + 1.5 * 1.5).sqrt();
             for (p, _) in placed.points.iter().step_by(2) {
                 assert!((p.z + 0.5 * scale).abs() < 0.02, "{p}");

@@ -1,4 +1,4 @@
-//! Weights in the order in which tiles read them.
+//! Weights in the order that tiles read them in.
 
 use crate::ops::conv2d::shapes::{Correlation, Phase};
 use crate::tile::Shared;
@@ -12,7 +12,7 @@ thread_local! {
     static COPY: Cell<Vec<f32>> = const { Cell::new(Vec::new()) };
 }
 
-/// Where the weights of each output channel stand.
+/// Weights of a correlation, and their strides.
 #[derive(Clone, Copy)]
 pub struct Factors<'a> {
     pub data: &'a [f32],
@@ -23,7 +23,7 @@ pub struct Factors<'a> {
 }
 
 impl Factors<'_> {
-    /// Offset of a phase's weights of an input channel, and of a tap's from there; `first` is the number of taps before the phase.
+    /// Offset of the weight of an input channel and a tap from the output channel's first; `first` is the number of taps before the phase.
     pub fn offset(&self, c: &Correlation, first: usize, phase: &Phase, channel: usize, tap: usize) -> usize {
         if self.is_copied {
             c.channels * first + channel * phase.taps.len() + tap
@@ -34,7 +34,7 @@ impl Factors<'_> {
 }
 
 impl Correlation {
-    /// Weights as they are, or copied so that those of an output channel and a phase follow one another.
+    /// Calls `work` with the weights in place, or with a copy in which those of an output channel and a phase are contiguous.
     pub fn with_factors<R>(&self, weights: &[f32], work: impl FnOnce(Factors) -> R) -> R {
         let taps: usize = self.phases.iter().map(|p| p.taps.len()).sum();
         if self.weight_channel <= self.weight_feature || self.weight_feature == 1 {

@@ -1,10 +1,10 @@
-//! What a later pass reads, asked of memory while tiles are computed.
+//! Prefetches the input of the next pass while tiles are computed.
 
 use crate::tile::Ahead;
 
-/// Rows of channels, of which every tile asks for a part; a tile of few terms asks for a sample of its part.
+/// Channel rows to prefetch, a part per tile; a tile with few terms prefetches only a sample of its part.
 pub struct Later {
-    /// Where the channel whose turn it is begins, and how much of it was asked for.
+    /// Start of the current channel, and how many of its floats were requested.
     pub from: *const f32,
     pub at: usize,
     /// Floats of a channel.
@@ -19,7 +19,7 @@ pub struct Later {
 }
 
 impl Later {
-    /// The part of the next tile, in so many rows.
+    /// The part that the next tile prefetches, in `rows` rows; none when all is requested.
     pub fn next(&mut self, rows: usize) -> Option<Ahead> {
         if self.planes == 0 {
             return None;

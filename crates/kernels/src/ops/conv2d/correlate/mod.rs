@@ -1,4 +1,4 @@
-//! Sums over channels and taps for every pixel of the output, vectors along pixels: forward passes and gradients of inputs.
+//! Computes correlations (forward passes and input gradients) as sums over channels and taps, vectorized along output pixels.
 
 mod factors;
 mod later;
@@ -18,18 +18,18 @@ use later::Later;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Floats of the input that a tile reads per pass where it reads the copy itself, so that they stay in the first-level cache.
+/// Floats of the input that a tile reads per pass without a panel, so that they stay in the L1 cache.
 const DIRECT: usize = 6 << 10;
-/// Terms of a sum per pass where it reads a panel.
+/// Terms of a sum per pass with a panel.
 const TERMS: usize = 192;
-/// The same where a pixel of the input has one tap.
+/// Terms of a sum per pass of a pointwise (1 × 1) convolution.
 const POINTWISE_TERMS: usize = 288;
 /// Floats of sums that a band keeps between passes.
 const SUMS: usize = 96 << 10;
-/// Fewest pixels that a band is cut into to keep all threads busy.
+/// Fewest pixels of a band that is cut to keep all threads busy.
 const FEWEST: usize = 192;
 
-/// Per term of a pass, where weight and input stand: in the input's planes, and in a panel.
+/// Per term of a pass, the offsets of (weight, input): in the planes, and in a panel.
 #[derive(Clone, Debug, Default)]
 struct Terms {
     planes: Vec<(u32, u32)>,
@@ -38,7 +38,7 @@ struct Terms {
     to_block: usize,
 }
 
-/// A correlation on its way, as all threads see it.
+/// A correlation in progress, shared by all threads.
 struct Job<'a> {
     c: &'a Correlation,
     kernel: &'static Kernel,
@@ -49,13 +49,13 @@ struct Job<'a> {
     block: usize,
     /// Output channels per task.
     features: usize,
-    /// Whether tiles read the planes themselves, with the pixels between rows among theirs.
+    /// Whether tiles read the planes without a panel, and also compute the padding pixels between rows.
     direct: bool,
-    /// Whether the input itself serves as planes.
+    /// Whether tiles read the input in place of planes.
     in_place: bool,
-    /// Phases that are computed in turns: all, where their pixels alternate in rows and are written together, else 1.
+    /// Phases computed together per tile: all if their pixels alternate within rows and are written together, else 1.
     joined: usize,
-    /// Per phase, whether its panels equal those of the phase before.
+    /// Per phase, whether it reads the same panels as the previous phase.
     repeats: Vec<bool>,
     x: &'a [f32],
     weights: Factors<'a>,
@@ -65,7 +65,7 @@ struct Job<'a> {
     before: Option<Shared>,
 }
 
-/// What a task works on.
+/// Part of the output that one task computes.
 struct Part {
     group: usize,
     images: Range<usize>,
@@ -103,7 +103,7 @@ impl Correlation {
             Part { group: i / parts / job.bands.len(), images, rows, features }
         };
         (0..tasks).into_par_iter().for_each(|i| {
-            // The task that this thread most likely does next, unless it reads the same.
+            // The likely next task of this thread, unless it reads the same input.
             let next = (i + 1 < tasks).then(|| part(i + 1)).filter(|_| (i + 1).is_multiple_of(parts));
             simd::with_level(level, || with_scratch(|scratch| job.compute(&part(i), next.as_ref(), scratch)));
         });
@@ -116,10 +116,10 @@ impl Correlation {
         let (rows, columns) = (most(0), most(1));
         let in_place = self.is_pointwise();
         let waste = planes.pitch_of(columns) - columns;
-        // Pixels between rows cost time in proportion to the output channels, a panel costs the same for any number.
+        // Computing padding pixels costs time per output channel; packing a panel costs the same for any number of channels.
         let direct = !in_place && !self.is_rounded() && rows * columns > FEWEST && waste * self.features <= 4 * columns;
         let (features, pixels) = self.divide(rows, columns, kernel);
-        // Passes, and with them the order of sums, must not depend on how many threads there are: planes are read for one image at a time.
+        // The passes fix the order of sums, so they must not depend on the thread count: direct reads handle one image at a time.
         let pixels = if direct { pixels.min(2 * rows * columns - 1) } else { pixels };
         let bands = Bands::plan(self.batch, rows, columns, pixels);
         planes.fit(bands.images, bands.rows, columns);
@@ -165,14 +165,14 @@ impl Correlation {
         self.precision == Precision::Bf16 && has_bf16()
     }
 
-    /// Whether every output pixel has one tap: the input pixel at its place.
+    /// Whether every output pixel has one tap, at the same input pixel.
     fn is_pointwise(&self) -> bool {
         let [p] = &self.phases[..] else { return false };
         let [tap] = &p.taps[..] else { return false };
         tap.at == [0; 2] && self.step == [1; 2] && self.spread == [1; 2] && self.input == self.output && p.size == self.output
     }
 
-    /// Whether phases are equally large and every two of them have the even and the odd pixels of rows.
+    /// Whether phases have equal sizes and each pair holds the even and the odd pixels of the same rows.
     fn alternates(&self) -> bool {
         let alternate = |p: &[Phase]| matches!(p, [a, b] if a.start[0] == b.start[0] && [a.start[1], b.start[1]] == [0, 1]);
         let size = self.phases.first().map(|p| p.size);
@@ -186,7 +186,7 @@ impl Correlation {
         self.phases[a].taps.iter().map(|t| t.at).eq(self.phases[b].taps.iter().map(|t| t.at))
     }
 
-    /// Output channels and pixels per task. Cut by channels where weights outweigh pixels, as each task reads all of its own of both.
+    /// Output channels and pixels per task; splits channels only if there are more weights per input channel than pixels.
     fn divide(&self, rows: usize, columns: usize, kernel: &Kernel) -> (usize, usize) {
         let taps: usize = self.phases.iter().map(|p| p.taps.len()).sum();
         let all = self.batch * rows * columns;
@@ -203,7 +203,7 @@ impl Correlation {
         (features, budget(features).min(share.max(FEWEST)).max(1))
     }
 
-    /// Terms of a block of channels, whose weights stand at `weight(channel, tap)`, pixels of a channel so many floats apart.
+    /// Terms of `block` channels that are `channel` floats apart, with weights at `weight(channel, tap)`; `width` is that of a panel.
     fn terms(&self, phase: &Phase, weight: impl Fn(usize, usize) -> usize, planes: &Planes, [block, channel, width]: [usize; 3]) -> Terms {
         let mut terms = Terms { to_block: weight(block, 0) - weight(0, 0), ..Terms::default() };
         for c in 0..block {
@@ -217,7 +217,7 @@ impl Correlation {
     }
 }
 
-/// Pixels of a tile's phase and band.
+/// Grid cells of a phase within a band.
 struct Cells<'a> {
     phase: &'a Phase,
     images: Range<usize>,
@@ -231,7 +231,7 @@ impl Job<'_> {
         let passes = c.channels.div_ceil(self.block.max(1)).max(1);
         let tiles: usize = c.phases.iter().map(|p| self.cells(&self.clip(p, part)).div_ceil(width)).sum();
         let Scratch { planes, panel, sums, segments, taps, rounded, .. } = scratch;
-        // What lies beyond the last channel is read by whole vectors, and dropped.
+        // Whole vectors also read beyond the last channel; those values are dropped.
         let planes = aligned(planes, if self.in_place { 0 } else { self.block * self.planes.channel + self.planes.image + 2 * width });
         let most = self.terms.iter().map(|t| t.panel.len()).max().unwrap_or(0);
         let panel = aligned(panel, if self.direct { 0 } else { (most + 1) * width });
@@ -286,7 +286,7 @@ impl Job<'_> {
         }
     }
 
-    /// What a pass copies, to be asked for by that many tiles.
+    /// Input that a pass copies, to be prefetched by `tiles` tiles.
     fn input_of(&self, (part, pass): (&Part, usize), tiles: usize) -> Later {
         let c = self.c;
         let channels = pass * self.block..((pass + 1) * self.block).min(c.channels);
@@ -306,7 +306,7 @@ impl Job<'_> {
         }
     }
 
-    /// Channels of the pixels after a tile's, where the input is read in place: the share of the tile's `i`th block of output channels.
+    /// Prefetch of the pixels after a tile's, if the input is read in place: the share of the tile's `i`th block of output channels.
     fn pixels_ahead(&self, s: &Step, channels: usize, i: usize) -> Option<Ahead> {
         let (last, first) = (s.segments.last()?, i * Ahead::rows(channels));
         if !self.in_place || first >= channels {
@@ -322,7 +322,7 @@ impl Job<'_> {
         Cells { phase, images: part.images.clone(), rows: part.rows.start.min(end)..end }
     }
 
-    /// How many cells there are, with those between rows where they are computed too.
+    /// Number of cells, including the padding between rows with direct reads.
     fn cells(&self, cells: &Cells) -> usize {
         let columns = cells.phase.size[1];
         match cells.rows.len() {
@@ -332,7 +332,7 @@ impl Job<'_> {
         }
     }
 
-    /// The runs of pixels that a tile has from cell `first` on.
+    /// Lists the contiguous runs of pixels of the tile that starts at cell `first`.
     fn segments(&self, cells: &Cells, first: usize, out: &mut Vec<Segment>) {
         let c = self.c;
         let columns = cells.phase.size[1];
@@ -363,7 +363,7 @@ impl Job<'_> {
         }
     }
 
-    /// One tile of pixels for all output channels of the part.
+    /// Computes one tile of pixels for all output channels of the part.
     fn tile(&self, s: &Step, memory: (&[f32], &mut [f32]), sums: &mut [f32], rounded: &mut Rounded, later: &mut Option<Later>) {
         let (planes, panel) = memory;
         let Some(last) = s.segments.last() else { return };
@@ -387,7 +387,7 @@ impl Job<'_> {
                 exact: self.in_place,
             };
             if !s.repeats {
-                // SAFETY: segments lie inside the input or the planes, which go on for more than a vector; the panel has a row more.
+                // SAFETY: segments lie inside the input or the planes, which extend by more than a vector; the panel has an extra row.
                 unsafe { self.kernel.pack(&pack) };
             }
             (panel.as_ptr(), &s.terms.panel[..count])
@@ -446,7 +446,7 @@ impl Job<'_> {
         }
     }
 
-    /// Rounds the weights of a pass: `[features, terms]`, gathered where their channels do not follow one another.
+    /// Gathers the weights of a pass, `[features, terms]`, and rounds them to bf16.
     fn pack_weights(&self, part: &Part, pass: usize, terms: &Terms, count: usize, gathered: &mut Vec<f32>, rounded: &mut Rounded) {
         gathered.clear();
         for feature in part.features.clone() {
@@ -456,7 +456,7 @@ impl Job<'_> {
         rounded.pack(&product_of(part.features.len(), count, 0, View::rows(gathered, count), &[], 0));
     }
 
-    /// One tile on factors rounded to bf16, from its panel.
+    /// Computes one tile from its panel with factors rounded to bf16.
     fn rounded_tile(&self, s: &Step, panel: &[f32], cells: usize, sums: &mut [f32], rounded: &mut Rounded) {
         let (width, rows) = (self.kernel.width(), self.kernel.rows);
         let first = s.part.group * self.c.features + s.part.features.start;
@@ -476,7 +476,7 @@ impl Job<'_> {
     }
 }
 
-/// `c += a b` with rows of B and C as far apart as those of a panel.
+/// `c += a b`, where the rows of B and C are `width` floats apart.
 fn product_of<'a>(m: usize, k: usize, n: usize, a: View<'a>, b: &'a [f32], width: usize) -> Gemm<'a> {
     Gemm { m, n, k, a, b, ldb: width, ldc: width, init: Init::Accumulate, relu: false }
 }
@@ -491,10 +491,10 @@ struct Step<'a> {
     segments: &'a [Segment],
     pass: usize,
     last: bool,
-    /// Which rows, and one of how many, it asks memory for: two phases write to the same ones.
+    /// (First row, stride) of the output rows that it prefetches: paired phases write to the same rows.
     share: (usize, usize),
-    /// Floats from the pixels of the segments to this phase's.
+    /// Floats from the outputs of the segments to those of this phase.
     to: usize,
-    /// Whether the panel is there already.
+    /// Whether the panel is already packed.
     repeats: bool,
 }

@@ -1,4 +1,4 @@
-//! Outputs of tiles, written where they belong.
+//! Applies the activation to tiles and writes them to the output tensor.
 
 use super::{Job, Part, Step};
 use crate::ops::activation::Activation;
@@ -8,7 +8,7 @@ use crate::tile::{Segment, Shared};
 use crate::vector::by_lanes;
 
 impl Job<'_> {
-    /// Asks memory for the outputs that a tile will write.
+    /// Prefetches the outputs that a tile will write.
     pub(super) fn fetch_outputs(&self, step: &Step, channel: usize, rows: usize) {
         let (pixels, spread) = (self.c.output[0] * self.c.output[1], self.c.spread[1]);
         for r in (step.share.0..rows).step_by(step.share.1) {
@@ -18,7 +18,7 @@ impl Job<'_> {
         }
     }
 
-    /// The only segment of a tile whose sums are complete after one pass, and whole vectors of one row: it is written straight away.
+    /// The segment of a tile that can be written directly: the only one, whole vectors, and complete after one pass.
     pub(super) fn straight<'a>(&self, step: &Step<'a>) -> Option<&'a Segment> {
         let [segment] = step.segments else { return None };
         let whole = segment.at == 0 && segment.len.is_multiple_of(self.kernel.lanes);
@@ -26,7 +26,7 @@ impl Job<'_> {
         (whole && plain && step.last && step.channels.start == 0).then_some(segment)
     }
 
-    /// Applies the activation to outputs that were written straight away.
+    /// Applies the activation to outputs that were written directly.
     pub(super) fn activate_outputs(&self, segment: &Segment, channel: usize, rows: usize) {
         if self.activation == Activation::None {
             return;
@@ -48,7 +48,7 @@ impl Job<'_> {
         self.store(segments, channel, rows, sums, self.out);
     }
 
-    /// Writes the outputs of all channels of a part from the sums of even pixels, then odd ones.
+    /// Writes the outputs of all channels of a part; `sums` holds those of even pixels, then those of odd ones.
     pub(super) fn finish_both(&self, segments: &[Segment], to: usize, part: &Part, sums: &mut [f32]) {
         if let Some(before) = self.before {
             self.store_both(segments, to, part, sums, before);
@@ -87,7 +87,7 @@ impl Job<'_> {
 }
 
 by_lanes! {
-    /// `out[row · stride + to + 2 i] = even[row, at + i]`, and odd ones after them, for all segments of rows of `width`.
+    /// Interleaves: `out[row · stride + to + 2 i] = even[row, at + i]`, and `odd` one float later, for all segments of rows of `width`.
     ///
     /// # Safety
     /// The rows of `out` have the pixels of all segments.

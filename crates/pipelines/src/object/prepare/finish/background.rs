@@ -1,4 +1,4 @@
-//! Foreground masks of photographs: GrabCut that starts from the points of structure from motion, or a network of the user's.
+//! Foreground masks of photographs: GrabCut seeded with the points of structure from motion, or a segmentation network that the user gives.
 
 use super::grab_cut::{Seed, grab_cut};
 use diorama_data::colmap::Observed;
@@ -13,9 +13,9 @@ use std::path::PathBuf;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Background {
     Keep,
-    /// From the points of structure from motion.
+    /// GrabCut, seeded with the points of structure from motion.
     Auto,
-    /// An ONNX network, `[1, 3, S, S]` to a mask.
+    /// An ONNX network from an image `[1, 3, S, S]` to a mask.
     Network(PathBuf),
 }
 
@@ -32,31 +32,31 @@ impl std::str::FromStr for Background {
     }
 }
 
-/// Longest side at which the cut is made.
+/// Longest side in pixels of the image that GrabCut runs on.
 const CUT_PX: usize = 360;
-/// A point in fewer cameras' views than this share of the most is surroundings.
+/// Least number of cameras that have an object point in view, as a share of the most that have any point in view.
 const SEEN: f64 = 0.6;
-/// Points farther from the middle than so many medians of the distance are surroundings.
+/// Greatest distance of an object point from the median center, in median distances.
 const REACH: f64 = 2.5;
-/// A table, floor or wall: its thickness in units of the cameras' distance, the least share of the points that lie on it, and the largest
-/// share that lies behind it.
+/// A supporting plane (table, floor or wall): its thickness as a share of the cameras' distance, the least share of the points on it, and
+/// the largest share behind it.
 const LAYER: f64 = 0.012;
 const ON_SUPPORT: f64 = 0.1;
 const BEHIND: f64 = 0.06;
-/// Supports that are looked for, and planes that are tried for each.
+/// Supporting planes that are removed, and planes that RANSAC tries for each.
 const SUPPORTS: usize = 3;
 const TRIALS: u64 = 600;
-/// Width of the zone around the thing's outline that may be either, as a share of its extent in the picture.
+/// Width of the undecided zone around the object's outline, as a share of the outline's extent in the image.
 const ZONE: f64 = 0.2;
 
-/// Points by number: where they are, and whether they are the thing's.
+/// Points by number, with their positions and whether they belong to the object.
 pub struct Subject {
     points: HashMap<u64, (DVec3, bool)>,
 }
 
 impl Subject {
-    /// Tells the thing from its surroundings: the thing is what nearly all cameras look at, before the planes that it stands on or hangs
-    /// at. `points` are (number, place, images) in the world of `frames`.
+    /// Separates the object from its surroundings: the object is what most cameras have in view, in front of the planes that support it.
+    /// `points` are (number, position, images) in the world of `frames`.
     pub fn find(frames: &[Frame], points: &[(u64, DVec3, usize)]) -> Subject {
         let views: Vec<_> = frames.iter().map(|f| (f.world_from_camera.inverse(), &f.camera)).collect();
         let firm: Vec<&(u64, DVec3, usize)> = points.iter().filter(|p| p.2 >= 3).collect();
@@ -92,17 +92,17 @@ impl Subject {
         Subject { points: points.iter().filter(|p| p.2 >= 3).map(|p| (p.0, (p.1, own.contains(&p.0)))).collect() }
     }
 
-    /// Whether a point is the thing's.
+    /// Whether a point belongs to the object.
     pub fn is_own(&self, id: u64) -> bool {
         self.points.get(&id).is_some_and(|p| p.1)
     }
 
-    /// Points that are the thing's.
+    /// Number of the object's points.
     pub fn size(&self) -> usize {
         self.points.values().filter(|p| p.1).count()
     }
 
-    /// Opacity of each pixel of a photograph, 0 for background, `[H × W]`.
+    /// Opacity of each pixel of a photograph, `[height, width]`; 0 is background.
     pub fn alpha(&self, image: &ImageU8, frame: &Frame, observed: Option<&Observed>) -> Vec<u8> {
         let by = (CUT_PX as f64 / image.width.max(image.height) as f64).min(1.0);
         let (w, h) = (((image.width as f64 * by) as usize).max(1), ((image.height as f64 * by) as usize).max(1));
@@ -112,8 +112,8 @@ impl Subject {
         enlarge(&mask, &small, image)
     }
 
-    /// Seeds at `w × h`: the outline of the thing's points is the most that may be foreground, their places are foreground, those of
-    /// other points that were matched here are background.
+    /// GrabCut seeds at `w × h`: inside the convex hull of the object's points, probably foreground; in a zone around it, probably background;
+    /// outside, background. Pixels of observed points are foreground for the object's, background for others.
     fn seeds(&self, frame: &Frame, observed: Option<&Observed>, w: usize, h: usize) -> Vec<Seed> {
         let camera_from_world = frame.world_from_camera.inverse();
         let (sx, sy) = (w as f64 / frame.camera.width as f64, h as f64 / frame.camera.height as f64);
@@ -140,14 +140,14 @@ impl Subject {
             if x < 0 || y < 0 || x >= w as i64 || y >= h as i64 {
                 continue;
             }
-            // A wrong point leaves a hole of one pixel, which is filled later.
+            // `keep_large` fills the one-pixel hole that a wrong point leaves.
             seeds[y as usize * w + x as usize] = if *own { Seed::Foreground } else { Seed::Background };
         }
         seeds
     }
 }
 
-/// The plane (normal, offset) on which most points lie, of those that have all cameras on one side and hardly a point on the other.
+/// The plane (normal, offset) with the most points on it that has all cameras in front and almost no points behind (RANSAC).
 fn support(points: &[&(u64, DVec3, usize)], eyes: &[DVec3], layer: f64, round: u64) -> Option<(DVec3, f64)> {
     let total = points.len() as f64;
     let rng = diorama_geom::rng::Rng::new(round, 41);
@@ -171,7 +171,7 @@ fn support(points: &[&(u64, DVec3, usize)], eyes: &[DVec3], layer: f64, round: u
     found.into_iter().flatten().max_by_key(|f| f.0).map(|f| (f.1, f.2))
 }
 
-/// Convex hull, counter-clockwise; Andrew's monotone chain.
+/// Convex hull, counter-clockwise (Andrew's monotone chain).
 fn hull(mut p: Vec<DVec2>) -> Vec<DVec2> {
     p.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
     let chain = |points: &mut dyn Iterator<Item = &DVec2>| {
@@ -190,7 +190,7 @@ fn hull(mut p: Vec<DVec2>) -> Vec<DVec2> {
     out
 }
 
-/// Distance of a point from a hull, below or equal 0 within.
+/// Distance from a point to a convex hull: 0 inside, infinite for a hull of fewer than three points.
 fn outside(hull: &[DVec2], p: DVec2) -> f64 {
     let n = hull.len();
     if n < 3 {
@@ -211,7 +211,7 @@ fn outside(hull: &[DVec2], p: DVec2) -> f64 {
     (0..n).map(to_edge).fold(f64::INFINITY, f64::min)
 }
 
-/// Foreground parts of at least a tenth of the largest one's size, without holes smaller than a five-hundredth of the picture.
+/// Removes foreground components smaller than a tenth of the largest one, then fills holes smaller than 1/500 of the image.
 fn keep_large(mask: &[bool], w: usize, h: usize) -> Vec<bool> {
     let drop_small = |mask: &[bool], value: bool, smallest: &dyn Fn(usize) -> usize| {
         let mut part = vec![usize::MAX; w * h];
@@ -244,10 +244,10 @@ fn keep_large(mask: &[bool], w: usize, h: usize) -> Vec<bool> {
     drop_small(&without_specks, false, &|_| w * h / 500)
 }
 
-/// A small mask at full size, its border along that of the colours: guided filter with linear coefficients computed small and applied
-/// large. He and Sun, "Fast guided filter", 2015.
+/// Upsamples a mask along image edges with a guided filter, whose linear coefficients are computed at low resolution and applied at full
+/// resolution (He and Sun, "Fast guided filter", 2015).
 fn enlarge(mask: &[f32], small: &ImageU8, full: &ImageU8) -> Vec<u8> {
-    /// Pixels to each side, and the variance below which there is no border.
+    /// Window radius in pixels, and the regularizer ε: the brightness variance of flat regions.
     const RADIUS: usize = 3;
     const FLAT: f32 = 1e-3;
     let (w, h) = (small.width, small.height);
@@ -285,7 +285,7 @@ fn enlarge(mask: &[f32], small: &ImageU8, full: &ImageU8) -> Vec<u8> {
     let pixel = |(i, p): (usize, &[u8])| {
         let (x, y) = (((i % full.width) as f32 + 0.5) * sx - 0.5, ((i / full.width) as f32 + 0.5) * sy - 0.5);
         let a = at(&slope, x, y) * gray(p) + at(&offset, x, y);
-        // A soft border one pixel of the small picture wide; halos of the filter go.
+        // Steepen the border to suppress the filter's halos.
         (((a - 0.5) * 3.0 + 0.5).clamp(0.0, 1.0) * 255.0 + 0.5) as u8
     };
     full.data.par_chunks_exact(full.channels).enumerate().map(pixel).collect()
@@ -304,7 +304,7 @@ mod tests {
     use diorama_geom::{Camera, Pose, Ray};
     use diorama_scenes::ray_caster::{Object, Scene, Shape, Texture};
 
-    /// A striped box and ball on a checkered floor before a wall, 4 units from the cameras.
+    /// A dotted box and ball on a dotted floor; also returns how many of the first objects belong to the subject.
     fn scene() -> (Scene, usize) {
         let object = |shape, a: [f64; 3], b: [f64; 3], size| Object {
             shape,
@@ -334,7 +334,7 @@ mod tests {
             })
             .collect();
         let alone = Scene { objects: scene.objects[..things].to_vec(), ..scene.clone() };
-        // Points as structure from motion finds them: on what random rays of random views hit.
+        // Points like those of structure from motion: hits of random rays from random views.
         let rng = Rng::new(4, 0);
         let mut points = Vec::new();
         let mut observed: Vec<Observed> = frames.iter().map(|f| Observed { image: f.name.clone(), points: Vec::new() }).collect();

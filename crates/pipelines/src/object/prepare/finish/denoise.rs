@@ -1,26 +1,26 @@
-//! Non-local means: a pixel becomes the mean of those around it whose neighbourhoods look alike. Buades, Coll and Morel, "Non-local means
-//! denoising", Image Processing On Line, 2011.
+//! Non-local means: each pixel becomes the mean of nearby pixels, weighted by the similarity of the patches around them (Buades, Coll and
+//! Morel, "Non-local means denoising", Image Processing On Line, 2011).
 
 use diorama_geom::ImageU8;
 use rayon::prelude::*;
 
-/// Pixels to each side of the patches that are compared, and of the window in which they are looked for.
+/// Radius in pixels of the compared patches, and of the search window.
 const PATCH: usize = 1;
 const WINDOW: i32 = 7;
-/// Filtering parameter over the noise's standard deviation, for small colour patches.
+/// Filter strength h over the noise's standard deviation, for small color patches.
 const STRENGTH: f32 = 0.55;
-/// Rows that are filtered at once.
+/// Rows per parallel task.
 const ROWS: usize = 64;
 
-/// Standard deviation of the noise in steps of 8 bits, from the median of what a Laplacian difference leaves: Immerkær, "Fast noise
-/// variance estimation", 1996, made robust against edges.
+/// Estimates the standard deviation of the noise in 8-bit steps from the response to a Laplacian-difference mask (Immerkær, "Fast noise
+/// variance estimation", 1996); the median in place of the mean makes it robust against edges.
 pub fn noise(im: &ImageU8) -> f32 {
     if im.width < 3 || im.height < 3 {
         return 0.0;
     }
     const MASK: [[i32; 3]; 3] = [[1, -2, 1], [-2, 4, -2], [1, -2, 1]];
     let gray = |x: usize, y: usize| im.pixel(x, y)[im.channels.min(3) / 2] as i32;
-    // Responses of a mask whose squares sum to 36, at most a million.
+    // Subsampled to about a million responses; the mask's squared norm is 36, hence σ = median / 0.6745 / 6.
     let step = ((im.width * im.height) as f64 / 1e6).sqrt().ceil().max(1.0) as usize;
     let mut counts = vec![0usize; 8 * 255 + 1];
     for y in (1..im.height - 1).step_by(step) {
@@ -35,14 +35,14 @@ pub fn noise(im: &ImageU8) -> f32 {
         below += c;
         below > half
     });
-    // Between steps the median is interpolated, else little noise would be none.
+    // Interpolate the median within its bin, so that weak noise does not round to 0.
     let at = at.unwrap_or(0);
     let within = 1.0 - (below - half) as f32 / counts[at].max(1) as f32;
     let median = (at as f32 - 0.5 + within).max(0.0);
     median / 0.6745 / 6.0
 }
 
-/// The picture without noise of standard deviation `sigma` (steps of 8 bits); alpha stays.
+/// Removes noise of standard deviation `sigma` (in 8-bit steps); alpha is unchanged.
 pub fn denoise(im: &ImageU8, sigma: f32) -> ImageU8 {
     if sigma < 0.5 || im.channels < 3 {
         return im.clone();
@@ -56,7 +56,7 @@ pub fn denoise(im: &ImageU8, sigma: f32) -> ImageU8 {
 fn band(im: &ImageU8, first: usize, last: usize, sigma: f32) -> Vec<u8> {
     let (w, rows, c) = (im.width, last - first, im.channels);
     let clamp = |v: i64, n: usize| v.clamp(0, n as i64 - 1) as usize;
-    // Differences of whole pixels are summed over patches along columns, then along rows.
+    // Squared pixel differences are summed over patches: first along rows, then along columns.
     let (margin, side) = (PATCH as i64, 2 * PATCH + 1);
     let scale = 1.0 / (3 * side * side) as f32;
     let fall = 1.0 / (STRENGTH * sigma).powi(2);
@@ -108,7 +108,7 @@ mod tests {
     use super::*;
     use diorama_geom::rng::Rng;
 
-    /// A picture of flat parts, ramps and fine stripes.
+    /// An image of flat regions, ramps and fine stripes.
     fn picture() -> ImageU8 {
         let (w, h) = (160, 120);
         let at = |i: usize| {

@@ -1,20 +1,20 @@
-//! Exposure and white balance of each photograph from the colours of points that several show: log colour = photograph's gain +
-//! point's colour, solved in turn with the median, which strays do not move.
+//! Estimates the exposure and white balance of each photograph from the colors of shared points, with the model log color = photograph's
+//! gain + point's log color. Alternating medians solve it, because outliers do not affect them.
 
 use diorama_data::colmap::Observed;
 use diorama_geom::ImageU8;
 use diorama_geom::color::{linear_from_srgb, srgb_from_linear, u8_from_unit};
 use std::collections::HashMap;
 
-/// Values outside this range are clipped, or too dark to tell.
+/// Range of usable pixel values: brighter ones may be clipped, darker ones are too noisy.
 const DARKEST: u8 = 8;
 const BRIGHTEST: u8 = 247;
-/// Rounds of the solution, fewest points by which a photograph is judged, and the largest gain (natural logarithm).
+/// Alternating rounds, fewest shared points that determine a photograph's gain, and the largest gain (natural logarithm).
 const ROUNDS: usize = 20;
 const FEWEST: usize = 20;
 const LARGEST: f32 = 1.4;
 
-/// Log of linear colour at each observed point of a photograph, with the point's number.
+/// Number and log linear color of each observed point of a photograph, averaged over 3 × 3 pixels; skips clipped and dark pixels.
 pub fn colors(image: &ImageU8, observed: &Observed) -> Vec<(u64, [f32; 3])> {
     let at = |[x, y]: [f64; 2]| {
         let (x, y) = (x as i64, y as i64);
@@ -34,7 +34,7 @@ pub fn colors(image: &ImageU8, observed: &Observed) -> Vec<(u64, [f32; 3])> {
     observed.points.iter().filter_map(|(px, id)| at(*px).map(|c| (*id, c))).collect()
 }
 
-/// Log gains of photographs, `[N][3]`, whose median is zero; a photograph with too few points has none.
+/// Log gains of the photographs, `[N][3]`, relative to the median photograph; not estimated where a photograph shares too few points.
 pub fn gains(colors: &[Vec<(u64, [f32; 3])>]) -> Vec<[f32; 3]> {
     let mut index = HashMap::new();
     for (id, _) in colors.iter().flatten() {
@@ -50,7 +50,7 @@ pub fn gains(colors: &[Vec<(u64, [f32; 3])>]) -> Vec<[f32; 3]> {
         for _ in 0..ROUNDS {
             let points: Vec<f32> = seen.iter().map(|s| median(s.iter().map(|(i, c)| c[k] - gains[*i][k]))).collect();
             for (i, photo) in colors.iter().enumerate() {
-                // A point that one photograph alone shows says nothing.
+                // A point that only one photograph shows carries no information.
                 let shared = photo.iter().filter(|(id, _)| seen[index[id]].len() > 1);
                 let differences: Vec<f32> = shared.map(|(id, c)| c[k] - points[index[id]]).collect();
                 if differences.len() >= FEWEST {
@@ -64,7 +64,7 @@ pub fn gains(colors: &[Vec<(u64, [f32; 3])>]) -> Vec<[f32; 3]> {
     gains.iter().map(|g| g.map(|v| v.clamp(-LARGEST, LARGEST))).collect()
 }
 
-/// Takes a photograph's gain away.
+/// Divides a photograph's linear color by `exp(gain)`.
 pub fn apply(image: &mut ImageU8, gain: [f32; 3]) {
     let table = gain.map(|g| -> [u8; 256] {
         let by = (-g).exp();

@@ -1,11 +1,11 @@
-//! GrabCut: colours of foreground and background as mixtures of Gaussians, borders by a minimum cut, in turn. Rother, Kolmogorov and Blake,
-//! "GrabCut: interactive foreground extraction using iterated graph cuts", 2004.
+//! GrabCut: alternates between fitting Gaussian mixtures to the colors of foreground and background, and a minimum cut (Rother, Kolmogorov
+//! and Blake, "GrabCut: interactive foreground extraction using iterated graph cuts", 2004).
 
 use super::graph_cut::{GridCut, NEIGHBOURS};
 use diorama_geom::ImageU8;
 use diorama_geom::glam::{Mat3, Vec3};
 
-/// What is known of a pixel beforehand.
+/// Prior label of a pixel; the cut may change only the `Maybe` labels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Seed {
     Background,
@@ -14,28 +14,28 @@ pub enum Seed {
     Foreground,
 }
 
-/// Gaussians in a mixture, rounds, and weight of borders.
+/// Gaussians per mixture, rounds, and weight γ of the smoothness term.
 const PARTS: usize = 5;
 const ROUNDS: usize = 4;
 const GAMMA: f32 = 50.0;
-/// Integer units of the cut per unit of energy, and the energy of what is certain.
+/// Integer capacity per unit of energy, and the energy of a certain seed.
 const UNITS: f32 = 64.0;
 const CERTAIN: f32 = 1e4;
-/// Least variance of a Gaussian, in squared steps of 8 bits.
+/// Variance that is added to every Gaussian, in squared 8-bit steps.
 const LEAST_VARIANCE: f32 = 4.0;
 
-/// One Gaussian: share, mean, inverse covariance, log of share over the root of the determinant.
+/// One weighted Gaussian; `log_weight` is `ln(share / √det covariance)`.
 struct Part {
     mean: Vec3,
     inverse: Mat3,
     log_weight: f32,
 }
 
-/// A mixture of colours.
+/// Gaussian mixture over RGB colors in 8-bit steps.
 struct Mixture(Vec<Part>);
 
 impl Mixture {
-    /// Fits to colours that are divided into `PARTS` groups.
+    /// Fits one Gaussian to each of the `PARTS` groups of colors.
     fn fit(colors: &[Vec3], groups: &[u8]) -> Mixture {
         let fit = |k: u8| {
             let of = || colors.iter().zip(groups).filter(|c| *c.1 == k).map(|c| *c.0);
@@ -53,7 +53,7 @@ impl Mixture {
         Mixture((0..PARTS as u8).filter_map(fit).collect())
     }
 
-    /// Energy of a colour under its likeliest part, and which that is.
+    /// Energy of a color under its likeliest Gaussian, and the index of that Gaussian.
     fn energy(&self, c: Vec3) -> (f32, u8) {
         let of = |p: &Part| 0.5 * (c - p.mean).dot(p.inverse * (c - p.mean)) - p.log_weight;
         let mut best = (f32::INFINITY, 0);
@@ -67,7 +67,7 @@ impl Mixture {
     }
 }
 
-/// Groups of like colours: k-means from means spread along brightness.
+/// Groups similar colors by k-means, starting from quantiles of brightness.
 fn groups(colors: &[Vec3]) -> Vec<u8> {
     let mut sorted: Vec<Vec3> = colors.to_vec();
     sorted.sort_by(|a, b| a.element_sum().total_cmp(&b.element_sum()));
@@ -86,7 +86,7 @@ fn groups(colors: &[Vec3]) -> Vec<u8> {
     out
 }
 
-/// Whether each pixel is foreground. All is background where no pixel may be foreground, and the other way round.
+/// Whether each pixel is foreground. If no seed is foreground, all pixels are background, and vice versa.
 pub fn grab_cut(image: &ImageU8, seeds: &[Seed]) -> Vec<bool> {
     let (w, h) = (image.width, image.height);
     let colors: Vec<Vec3> = image.data.chunks_exact(image.channels).map(|p| Vec3::new(p[0] as f32, p[1] as f32, p[2] as f32)).collect();
@@ -100,7 +100,7 @@ pub fn grab_cut(image: &ImageU8, seeds: &[Seed]) -> Vec<bool> {
         }
         let mixture = |colors: &[Vec3]| {
             let first = Mixture::fit(colors, &groups(colors));
-            // Each pixel to its likeliest Gaussian, and these to their pixels once more.
+            // Reassign each pixel to its likeliest Gaussian and refit.
             let again: Vec<u8> = colors.iter().map(|c| first.energy(*c).1).collect();
             Mixture::fit(colors, &again)
         };
@@ -124,7 +124,7 @@ pub fn grab_cut(image: &ImageU8, seeds: &[Seed]) -> Vec<bool> {
     inside
 }
 
-/// Cost of parting neighbours: `γ exp(−β |Δ|²) / distance`, β from the mean contrast.
+/// Capacity between neighbors: `γ exp(−β |Δ|²) / distance`, with `β = 1 / (2 · mean |Δ|²)`.
 fn borders(colors: &[Vec3], w: usize, h: usize) -> Vec<[i32; 8]> {
     let neighbour = |i: usize, d: usize| {
         let (x, y) = ((i % w) as i32 + NEIGHBOURS[d].0, (i / w) as i32 + NEIGHBOURS[d].1);

@@ -1,27 +1,27 @@
-//! Minimum cut of a picture's grid, every pixel bound to its eight neighbours: Boykov and Kolmogorov, "An experimental comparison of
-//! min-cut/max-flow algorithms for energy minimization in vision", 2004.
+//! Minimum cut of an 8-connected pixel grid (Boykov and Kolmogorov, "An experimental comparison of min-cut/max-flow algorithms for energy
+//! minimization in vision", 2004).
 
 use std::collections::VecDeque;
 
-/// Neighbours in turn; the opposite of `d` is `7 - d`.
+/// Offsets of the eight neighbors; the opposite of direction `d` is `7 - d`.
 pub const NEIGHBOURS: [(i32, i32); 8] = [(-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)];
 
-/// Parents of a pixel that are no neighbours.
+/// Values of `parents` that are not directions.
 const TERMINAL: u8 = 8;
 const ORPHAN: u8 = 9;
 const FREE: u8 = 10;
 
-/// A grid of pixels between a source and a sink.
+/// Flow network of a pixel grid with a source and a sink.
 pub struct GridCut {
     width: usize,
     height: usize,
-    /// What the edge from a pixel to each neighbour still carries.
+    /// Residual capacity from a pixel to each neighbor.
     edges: Vec<[i32; 8]>,
-    /// What the edge from the source (above 0) or to the sink (below 0) still carries.
+    /// Residual capacity from the source (positive) or to the sink (negative).
     terminals: Vec<i32>,
     parents: Vec<u8>,
     in_sink_tree: Vec<bool>,
-    /// Steps to the root, true as of a time.
+    /// Steps to the root, valid as of the time in `stamps`.
     distances: Vec<u32>,
     stamps: Vec<u32>,
     time: u32,
@@ -30,8 +30,8 @@ pub struct GridCut {
 }
 
 impl GridCut {
-    /// `edges[i][d]` is the cost of parting pixel `i` from its neighbour `d`, the same from both sides and 0 across the border;
-    /// `terminals[i]` is the cost of calling `i` sink less that of calling it source.
+    /// `edges[i][d]` is the cost of separating pixel `i` from its neighbor `d`: symmetric, and 0 across the image border;
+    /// `terminals[i]` is the cost of assigning `i` to the sink minus that of assigning it to the source.
     pub fn new(width: usize, height: usize, edges: Vec<[i32; 8]>, terminals: Vec<i32>) -> GridCut {
         let n = width * height;
         GridCut {
@@ -49,7 +49,7 @@ impl GridCut {
         }
     }
 
-    /// Whether each pixel lies on the source's side of a smallest cut.
+    /// Whether each pixel lies on the source's side of a minimum cut.
     pub fn solve(mut self) -> Vec<bool> {
         for i in 0..self.terminals.len() {
             if self.terminals[i] != 0 {
@@ -61,7 +61,7 @@ impl GridCut {
         }
         while let Some(&i) = self.active.front() {
             let i = i as usize;
-            // A pixel stays active while it finds the other tree.
+            // A pixel stays active as long as it meets the other tree.
             match (self.parents[i] != FREE).then(|| self.grow(i)).flatten() {
                 Some(meeting) => {
                     self.time += 1;
@@ -81,12 +81,12 @@ impl GridCut {
         (x >= 0 && y >= 0 && x < self.width as i32 && y < self.height as i32).then(|| y as usize * self.width + x as usize)
     }
 
-    /// What can flow along the edge between a pixel and its neighbour, towards the leaves of the source's tree or the root of the sink's.
+    /// Whether a tree can grow from pixel `i` to its neighbor `j`: the edge has residual capacity away from the source or towards the sink.
     fn carries(&self, i: usize, d: usize, j: usize, sink_tree: bool) -> bool {
         if sink_tree { self.edges[j][7 - d] > 0 } else { self.edges[i][d] > 0 }
     }
 
-    /// Takes free neighbours into the pixel's tree; the edge (source's side, direction) where both trees meet.
+    /// Adds free neighbors to the pixel's tree; returns the edge (pixel on the source's side, direction) where both trees meet, if any.
     fn grow(&mut self, i: usize) -> Option<(usize, usize)> {
         let sink_tree = self.in_sink_tree[i];
         for d in 0..8 {
@@ -109,7 +109,7 @@ impl GridCut {
         None
     }
 
-    /// Fills the way through an edge between the trees; what is cut off from its root becomes an orphan.
+    /// Saturates the path from source to sink through an edge between the trees; pixels that lose their parent edge become orphans.
     fn augment(&mut self, (i, d): (usize, usize)) {
         let j = self.neighbour(i, d).expect("trees meet at neighbours");
         let mut flow = self.edges[i][d];
@@ -156,7 +156,7 @@ impl GridCut {
             let mut best: Option<(u32, usize)> = None;
             for d in 0..8 {
                 let Some(j) = self.neighbour(i, d) else { continue };
-                // Flow comes from the source's tree to the orphan, and leaves it into the sink's.
+                // The edge must carry flow from the parent in the source's tree, to the parent in the sink's tree.
                 let open = if sink_tree { self.edges[i][d] > 0 } else { self.edges[j][7 - d] > 0 };
                 if open
                     && self.parents[j] < ORPHAN
@@ -188,7 +188,7 @@ impl GridCut {
         }
     }
 
-    /// Steps from a pixel to its tree's root; none where the way ends at an orphan. Marks the way for the questions to come.
+    /// Steps from a pixel to its tree's root, none where the path ends at an orphan. Caches the distances along the path.
     fn distance_to_root(&mut self, from: usize) -> Option<u32> {
         let (mut at, mut steps) = (from, 0);
         let base = loop {
@@ -221,7 +221,7 @@ mod tests {
     use super::*;
     use diorama_geom::rng::Rng;
 
-    /// Energy of a labelling, by which cuts compare.
+    /// Energy of a labeling.
     fn cost(w: usize, h: usize, edges: &[[i32; 8]], terminals: &[i32], source: &[bool]) -> i64 {
         let cut = GridCut::new(w, h, edges.to_vec(), terminals.to_vec());
         let unary: i64 = (0..w * h).map(|i| if source[i] { (-terminals[i]).max(0) } else { terminals[i].max(0) } as i64).sum();

@@ -1,5 +1,5 @@
-//! Finishing of photographs once their poses are known: some are left out, exposures made equal, noise and background removed,
-//! edges cut off. COLMAP has seen the originals, which stay; what training sees is written beside them.
+//! Post-processing of photographs with known poses: selection, exposure normalization, denoising, background removal, cropping. Results
+//! are written to a separate folder; the originals, from which COLMAP computed the poses, are kept.
 
 pub mod background;
 mod denoise;
@@ -22,10 +22,10 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Which part of a photograph stays.
+/// Part of a photograph that is kept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Crop {
-    /// The largest centred square.
+    /// The largest centered square.
     Square,
     /// x, y, width, height in pixels of the photograph.
     Window([u32; 4]),
@@ -46,11 +46,11 @@ impl std::str::FromStr for Crop {
     }
 }
 
-/// What to do.
+/// Options of [`finish`].
 #[derive(Clone, Debug)]
 pub struct Finish {
     pub crop: Option<Crop>,
-    /// Keep so many photographs, those that differ most.
+    /// Keep only this many photographs, those that differ most.
     pub diverse: Option<usize>,
     pub denoise: bool,
     pub normalize_exposure: bool,
@@ -58,20 +58,20 @@ pub struct Finish {
 }
 
 impl Finish {
-    /// Whether pixels change.
+    /// Whether any option changes pixels.
     pub fn touches_pixels(&self) -> bool {
         self.crop.is_some() || self.denoise || self.normalize_exposure || self.background != Background::Keep
     }
 }
 
-/// What was done.
+/// Result of [`finish`].
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Finished {
     /// Photographs with poses that were left out.
     pub left_out: usize,
-    /// Darkest and brightest photograph before exposures were made equal, in stops from the middle.
+    /// Darkest and brightest photograph before exposure normalization, in stops relative to the median gain.
     pub exposure_stops: Option<[f32; 2]>,
-    /// Median standard deviation of the noise that was removed, in steps of 8 bits.
+    /// Median standard deviation of the removed noise, in 8-bit steps.
     pub noise: Option<f32>,
     /// Mean share of the pixels that are foreground.
     pub foreground: Option<f32>,
@@ -79,26 +79,26 @@ pub struct Finished {
 
 /// Name of the folder of finished photographs within the data set.
 pub const FINISHED: &str = "finished";
-/// Folder of their masks in it, where these are cut with them.
+/// Folder of cropped masks within [`FINISHED`].
 const MASKS: &str = "masks";
-/// Where they are made.
+/// Folder of unfinished work; [`put_in_place`] renames it to [`FINISHED`].
 const PARTIAL: &str = "finished.partial";
 
-/// Points by which photographs are compared and things told from their surroundings.
+/// Sparse points that exposure normalization and background removal rely on.
 #[derive(Default)]
 pub struct Found {
-    /// Where points appear, by the photograph's file name.
+    /// Observations of the points, by the photograph's file name.
     pub observed: HashMap<String, Observed>,
-    /// Numbers, places in the world of the frames that are finished, and how many photographs show them.
+    /// Number, position in the world of the finished frames, and number of photographs of each point.
     pub points: Vec<(u64, DVec3, usize)>,
-    /// Whether `observed` holds what photographs show, rather than all that lies in their direction.
+    /// Whether `observed` lists only visible points, rather than all points that project into the photograph.
     pub is_visibility_known: bool,
 }
 
-/// Takes what [`finish`] has made in place of what an earlier call made, or removes that.
+/// Replaces the results of an earlier call by those of [`finish`], or removes them if there are no new ones.
 ///
 /// # Errors
-/// When the disk refuses.
+/// When a folder cannot be removed or renamed.
 pub fn put_in_place(root: &Path) -> Result<()> {
     let (folder, partial) = (root.join(FINISHED), root.join(PARTIAL));
     if folder.exists() {
@@ -110,16 +110,16 @@ pub fn put_in_place(root: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Removes what a call of [`finish`] that did not end well has made.
+/// Removes the unfinished work of an interrupted or failed [`finish`].
 pub fn discard(root: &Path) {
     let _ = std::fs::remove_dir_all(root.join(PARTIAL));
 }
 
-/// Finishes the photographs of `frames`, whose poses are those of the upright world; none when interrupted. What an earlier call made
-/// stays until [`put_in_place`].
+/// Post-processes the photographs of `frames`, whose poses are in the upright world; returns none when interrupted. Results of an earlier
+/// call stay until [`put_in_place`].
 ///
 /// # Errors
-/// When a photograph cannot be read, a crop leaves it, or the thing cannot be told from its surroundings.
+/// When a photograph cannot be read, a crop exceeds it, or the object cannot be separated from its surroundings.
 pub fn finish(
     o: &Finish,
     root: &Path,
@@ -158,7 +158,7 @@ pub fn finish(
     made.exposure_stops = gains.as_deref().map(stops);
     let finisher = Finisher { options: o, root, folder, found, gains, remover: Remover::open(&o.background, frames, found)? };
     let mut out = Vec::new();
-    // In groups, so that progress shows and Ctrl-C is heard.
+    // In groups, to report progress and to react to an interrupt.
     for first in (0..frames.len()).step_by(4) {
         if interrupt.load(Ordering::Relaxed) {
             return Ok(None);
@@ -185,7 +185,7 @@ fn keep_diverse(frames: &mut Vec<Frame>, n: usize) -> Result<usize> {
     Ok(left_out)
 }
 
-/// Logarithms of the gains that make exposures equal, per photograph and channel.
+/// Log gain of each photograph and channel; [`exposure::apply`] removes it.
 fn exposure_gains(frames: &[Frame], found: &Found) -> Result<Vec<[f32; 3]>> {
     let name = |f: &Frame| f.image.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let of = |f: &Frame| match found.observed.get(&name(f)) {
@@ -195,28 +195,28 @@ fn exposure_gains(frames: &[Frame], found: &Found) -> Result<Vec<[f32; 3]>> {
     Ok(exposure::gains(&frames.par_iter().map(of).collect::<Result<Vec<_>>>()?))
 }
 
-/// Least and greatest gain in stops.
+/// Smallest and largest gain in stops.
 fn stops(gains: &[[f32; 3]]) -> [f32; 2] {
     let stops = gains.iter().map(|g| g.iter().sum::<f32>() / 3.0 / std::f32::consts::LN_2);
     stops.fold([f32::INFINITY, f32::NEG_INFINITY], |[lo, hi], s| [lo.min(s), hi.max(s)])
 }
 
-/// Finishes photographs one by one.
+/// Post-processes single photographs.
 struct Finisher<'a> {
     options: &'a Finish,
     /// The data set.
     root: &'a Path,
-    /// Where finished photographs are made.
+    /// Folder of finished photographs until [`put_in_place`].
     folder: PathBuf,
     found: &'a Found,
     gains: Option<Vec<[f32; 3]>>,
     remover: Remover,
 }
 
-/// A frame whose photograph is finished.
+/// A frame with its post-processed photograph.
 struct FinishedFrame {
     frame: Frame,
-    /// Standard deviation of the noise that was removed.
+    /// Standard deviation of the removed noise, in 8-bit steps.
     noise: f32,
     /// Share of the pixels that are foreground.
     foreground: f32,
@@ -228,7 +228,7 @@ impl Finisher<'_> {
         if let Some(g) = &self.gains {
             exposure::apply(&mut image, g[i]);
         }
-        // A mask is made of what the camera saw, before its noise is gone.
+        // The mask is computed before denoising.
         let alpha = self.remover.alpha(&image, f, self.found)?;
         let noise = if self.options.denoise { denoise::noise(&image) } else { 0.0 };
         image = denoise::denoise(&image, noise);
@@ -255,7 +255,7 @@ impl Finisher<'_> {
     }
 }
 
-/// What tells foreground from background.
+/// Method that separates foreground and background, ready to run.
 enum Remover {
     None,
     Points(Subject),
@@ -295,7 +295,7 @@ impl Remover {
                 let name = frame.image.file_name().unwrap_or_default().to_string_lossy();
                 let mut observed = found.observed.get(&*name).cloned();
                 if let (false, Some(o)) = (found.is_visibility_known, &mut observed) {
-                    // What lies behind the thing is not seen; the thing's own points lie within its outline in any case.
+                    // Points behind the object would seed background on top of it; the object's own points are inside its outline anyway.
                     o.points.retain(|p| subject.is_own(p.1));
                 }
                 Ok(Some(subject.alpha(image, frame, observed.as_ref())))
@@ -306,10 +306,10 @@ impl Remover {
     }
 }
 
-/// Fewest points by which a thing is told from its surroundings.
+/// Fewest points that separate an object from its surroundings.
 const FEWEST_POINTS: usize = 50;
 
-/// Cuts a photograph, and its camera with it.
+/// Crops a photograph and adjusts its camera.
 fn crop_to(crop: Crop, image: diorama_geom::ImageU8, frame: &mut Frame) -> Result<diorama_geom::ImageU8> {
     let (w, h) = (image.width, image.height);
     let [x, y, cw, ch] = match crop {

@@ -1,17 +1,17 @@
-//! A segmentation network of the user's, such as U²-Net: one picture in, a mask of what stands out.
+//! Runs a segmentation network that the user gives, such as U²-Net: from one image to a mask of the salient object.
 
 use crate::error::{PipelineError, Result};
 use diorama_geom::ImageU8;
 use std::path::{Path, PathBuf};
 use tract_onnx::prelude::*;
 
-/// Means and deviations of ImageNet's colours, by which such networks expect theirs.
+/// Mean and standard deviation of ImageNet's RGB values, which normalize the input.
 const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
-/// Edge of the picture where the network leaves it open.
+/// Edge of the input in pixels, if the network does not fix it.
 const EDGE: usize = 320;
 
-/// A network that can be run.
+/// A loaded network.
 pub struct Network {
     file: PathBuf,
     edge: usize,
@@ -22,7 +22,7 @@ impl Network {
     /// Reads a network whose first input is `[1, 3, S, S]`; its first output is the mask.
     ///
     /// # Errors
-    /// When the file is no ONNX network that can be run.
+    /// When the file is not an ONNX network that can run here, or takes another input.
     pub fn open(file: &Path) -> Result<Network> {
         let wrong = |e: TractError| PipelineError::Usage(format!("--remove-background {}: cannot be run ({e:#})", file.display()));
         let model = tract_onnx::onnx().model_for_path(file).map_err(wrong)?;
@@ -46,10 +46,10 @@ impl Network {
         Ok(Network { file: file.to_path_buf(), edge, run: Box::new(run) })
     }
 
-    /// Opacity of each pixel, `[H × W]`.
+    /// Opacity of each pixel, `[height, width]`.
     ///
     /// # Errors
-    /// When the network fails, or its output is no mask.
+    /// When the network fails, or its output is not a mask `[1, 1, H, W]` or `[1, H, W]`.
     pub fn alpha(&self, image: &ImageU8) -> Result<Vec<u8>> {
         let s = self.edge;
         let small = if image.width >= s && image.height >= s { image.downsampled(s, s) } else { enlarged(image, s) };
@@ -73,7 +73,7 @@ impl Network {
         let mask = out.cast_to::<f32>().map_err(failed)?;
         let mask = mask.to_plain_array_view::<f32>().map_err(failed)?;
         let mask: Vec<f32> = mask.iter().copied().collect();
-        // Some end in a sigmoid, some do not; those that do not are told by their range.
+        // Networks without a final sigmoid are recognized by values outside [0, 1].
         let (lo, hi) = mask.iter().fold((f32::MAX, f32::MIN), |(a, b), v| (a.min(*v), b.max(*v)));
         let open = lo < -0.01 || hi > 1.01;
         let unit = |v: f32| if open { 1.0 / (1.0 + (-v).exp()) } else { v };
@@ -94,7 +94,7 @@ impl Network {
     }
 }
 
-/// A small picture at `edge × edge`, nearest neighbours.
+/// Resizes an image to `edge × edge` by nearest neighbor.
 fn enlarged(image: &ImageU8, edge: usize) -> ImageU8 {
     let c = image.channels;
     let data = (0..edge * edge).flat_map(|i| image.pixel(i % edge * image.width / edge, i / edge * image.height / edge)).copied().collect();
@@ -135,7 +135,7 @@ mod tests {
         let network = Network::open(&file).unwrap();
         let data = (0..64 * 48).flat_map(|i| if i % 64 < 32 { [255; 3] } else { [0; 3] }).collect();
         let alpha = network.alpha(&ImageU8 { width: 64, height: 48, channels: 3, data }).unwrap();
-        // Without a sigmoid of its own the network's values lie beyond [0, 1].
+        // Without a final sigmoid, the network's values lie outside [0, 1].
         assert!(alpha[20 * 64 + 8] > 220 && alpha[20 * 64 + 56] < 50, "{} {}", alpha[20 * 64 + 8], alpha[20 * 64 + 56]);
     }
 

@@ -1,21 +1,21 @@
-//! The photographs that differ most from each other: farthest-point sampling over place, direction of view and looks.
+//! Selects the photographs that differ most: farthest-point sampling over camera position, viewing direction and appearance.
 
 use diorama_geom::capture::{Frame, focus_point};
 use diorama_geom::glam::DVec3;
 use diorama_geom::{ImageU8, Pose};
 
-/// Edge of the small pictures by which looks are compared.
+/// Edge in pixels of the thumbnails that appearance is compared on.
 pub const LOOKS: usize = 8;
 
-/// How a photograph looks: a picture of 8 × 8 pixels.
+/// Appearance of a photograph: RGB values in [0, 1] of a thumbnail of at most `LOOKS` × `LOOKS` pixels.
 pub fn looks(image: &ImageU8) -> Vec<f64> {
     let small = image.downsampled(LOOKS.min(image.width), LOOKS.min(image.height));
     let rgb = |p: &[u8]| -> [f64; 3] { std::array::from_fn(|k| p[k.min(p.len() - 1)] as f64 / 255.0) };
     small.data.chunks_exact(small.channels).flat_map(rgb).collect()
 }
 
-/// Indices of the `n` frames that differ most, in order. The first is the one that differs most from all others together; each
-/// next one is farthest from those that are chosen.
+/// Indices of the `n` frames that differ most, ascending. Starts with the frame of the largest total distance to all others, then adds the
+/// frame that is farthest from those chosen.
 pub fn diverse(frames: &[Frame], looks: &[Vec<f64>], n: usize) -> Vec<usize> {
     let poses: Vec<Pose> = frames.iter().map(|f| f.world_from_camera).collect();
     let (_, distance) = focus_point(&poses);
@@ -46,7 +46,7 @@ mod tests {
 
     #[test]
     fn one_of_each_place_is_taken_before_a_second() {
-        // Five places, six photographs at nearly each the same.
+        // Five places with six nearly equal photographs each.
         let frames: Vec<Frame> = (0..30)
             .map(|i| {
                 let a = (i / 6) as f64 * 1.2 + (i % 6) as f64 * 0.002;
