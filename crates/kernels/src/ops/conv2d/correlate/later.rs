@@ -1,5 +1,6 @@
 //! Prefetches the input of the next pass while tiles are computed.
 
+use crate::simd;
 use crate::tile::Ahead;
 
 /// Channel rows to prefetch, a part per tile; a tile with few terms prefetches only a sample of its part.
@@ -33,5 +34,13 @@ impl Later {
             self.from = self.from.wrapping_add(if is_last { self.to_image } else { self.to_channel });
         }
         Some(ahead)
+    }
+    /// Prefetches the parts of several tiles at once.
+    pub fn fetch(&mut self, tiles: usize) {
+        for _ in 0..tiles {
+            if let Some(part) = self.next(1) {
+                simd::fetch_later(part.from, part.step);
+            }
+        }
     }
 }

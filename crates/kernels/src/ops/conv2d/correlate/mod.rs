@@ -393,10 +393,8 @@ impl Job<'_> {
             (panel.as_ptr(), &s.terms.panel[..count])
         };
         if self.c.is_rounded() {
-            for _ in (0..s.part.features.len()).step_by(self.kernel.rows) {
-                if let Some(part) = later.as_mut().and_then(|l| l.next(1)) {
-                    simd::fetch_later(part.from, part.step);
-                }
+            if let Some(later) = later {
+                later.fetch(s.part.features.len().div_ceil(self.kernel.rows));
             }
             return self.rounded_tile(s, &panel[..count * width], last.at + last.len, sums, rounded);
         }
