@@ -317,26 +317,13 @@ mod x86 {
     }
 }
 
-/// Prefetches values that are about to be read; a hint that changes no result.
-#[inline]
-pub fn fetch(values: &[f32]) {
-    #[cfg(target_arch = "x86_64")]
-    for line in values.iter().step_by(16) {
-        use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
-        // SAFETY: a hint, which may name any address; the set belongs to the architecture.
-        unsafe { _mm_prefetch::<_MM_HINT_T1>(std::ptr::from_ref(line).cast()) };
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = values;
-}
-
-/// Prefetches floats that will be read some thousand cycles later.
+/// Prefetches floats that will be read some thousand cycles later; a hint that changes no result.
 #[inline(always)]
 pub fn fetch_later(first: *const f32, floats: usize) {
     #[cfg(target_arch = "x86_64")]
     for line in (0..floats).step_by(16) {
         use std::arch::x86_64::{_MM_HINT_T1, _mm_prefetch};
-        // SAFETY: as above.
+        // SAFETY: a hint, which may name any address; the set belongs to the architecture.
         unsafe { _mm_prefetch::<_MM_HINT_T1>(first.wrapping_add(line).cast::<i8>()) };
     }
     #[cfg(not(target_arch = "x86_64"))]

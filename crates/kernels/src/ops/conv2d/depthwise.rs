@@ -114,8 +114,6 @@ struct Inner {
 struct Plane<'a> {
     /// The input channel, and what follows it in memory.
     x: &'a [f32],
-    /// Whether anything follows.
-    goes_on: bool,
     weights: &'a [f32],
     start: f32,
 }
@@ -154,7 +152,7 @@ impl Inner {
             let (group, feature) = (channel / c.features, channel % c.features);
             let x = &x[i / c.features * size..];
             let weights = &t.weights[group * c.weight_group + feature * c.weight_feature..];
-            let plane = Plane { x, goes_on: x.len() > size, weights, start: bias.get(channel).copied().unwrap_or(0.0) };
+            let plane = Plane { x, weights, start: bias.get(channel).copied().unwrap_or(0.0) };
             with_scratch(|scratch| self.compute(c, kernel, plane, out, scratch));
         };
         match t.before {
@@ -178,6 +176,7 @@ impl Inner {
     fn compute(&self, c: &Correlation, kernel: &Kernel, p: Plane, out: &mut [f32], scratch: &mut Scratch) {
         let ([height, width], taps) = (c.input.map(|n| n as isize), &c.phases[0].taps);
         let Scratch { taps: weights, columns: offsets, .. } = scratch;
+        let goes_on = p.x.len() > c.input[0] * c.input[1];
         let mut inside = false;
         for (y, out) in out.chunks_exact_mut(c.output[1]).enumerate() {
             let top = (y * c.step[0]) as isize + self.low[0];
@@ -190,7 +189,7 @@ impl Inner {
                 offsets.extend(rows.map(|t| offset(((t.at[0] - self.low[0]) * width + t.at[1] - self.low[1]) as usize)));
             }
             let first = top * width + (self.columns.start * c.step[1]) as isize + self.low[1];
-            let rest = (c.step[1] == 2 && !p.goes_on && top + self.rows as isize >= height) as usize;
+            let rest = (c.step[1] == 2 && !goes_on && top + self.rows as isize >= height) as usize;
             let columns = self.columns.start..self.columns.end - rest;
             let line = Line {
                 weights,

@@ -234,7 +234,7 @@ impl Job<'_> {
         for (i, channel) in channels.enumerate() {
             if i + 1 < count {
                 let plane = ((part.image * c.groups + part.group) * c.channels + channel + 1) * height;
-                simd::fetch(&self.x[(plane + read.start) * width..(plane + read.end) * width]);
+                simd::fetch_later(self.x[(plane + read.start) * width..].as_ptr(), read.len() * width);
             }
             self.planes.fill(source, channel..channel + 1, part.image..part.image + 1, part.rows.start, copy);
             let to = Strides { block: self.kernel.width(), point: count * self.kernel.width(), tiles };

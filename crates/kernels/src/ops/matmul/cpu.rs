@@ -310,12 +310,7 @@ vectorized! {
     /// `out[p, ..count] = from[p · stride ..]` for rows of `width`.
     fn copy_columns<const F>(from: &[f32], stride: usize, count: usize, width: usize, out: &mut [f32]) {
         for (p, to) in out.chunks_exact_mut(width).enumerate() {
-            #[cfg(target_arch = "x86_64")]
-            for line in (0..count).step_by(16) {
-                use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-                // SAFETY: prefetching is a hint and accepts any address.
-                unsafe { _mm_prefetch::<_MM_HINT_T0>(from.as_ptr().wrapping_add((p + AHEAD) * stride + line).cast()) };
-            }
+            simd::fetch_now(from.as_ptr().wrapping_add((p + AHEAD) * stride), count);
             let from = &from[p * stride..p * stride + count];
             if count == 48 && width == 48 {
                 // A constant size compiles to a few vector moves.
