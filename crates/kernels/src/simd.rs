@@ -107,6 +107,8 @@ pub unsafe trait Lane: Copy {
     unsafe fn max(a: Self::V, b: Self::V) -> Self::V;
     unsafe fn add(a: Self::V, b: Self::V) -> Self::V;
     unsafe fn sub(a: Self::V, b: Self::V) -> Self::V;
+    /// `v`, computed by now: keeps the compiler from mixing what comes before with what comes after.
+    unsafe fn settle(v: Self::V) -> Self::V;
     /// The even and the odd ones of `2 N` floats.
     unsafe fn load_pairs(p: *const f32) -> (Self::V, Self::V);
     /// `2 N` floats, of `even` and `odd` in turns.
@@ -152,6 +154,10 @@ unsafe impl Lane for Plain {
         std::array::from_fn(|i| a[i] - b[i])
     }
     #[inline(always)]
+    unsafe fn settle(v: [f32; 8]) -> [f32; 8] {
+        v
+    }
+    #[inline(always)]
     unsafe fn load_pairs(p: *const f32) -> ([f32; 8], [f32; 8]) {
         // SAFETY: the caller guarantees sixteen readable floats.
         let all = unsafe { p.cast::<[[f32; 2]; 8]>().read_unaligned() };
@@ -174,7 +180,7 @@ pub use arm::Neon;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! lane {
     ($(#[$doc:meta])* $name:ident, $n:literal, $v:ty, $set:ident, $load:ident, $store:ident, $fma:expr, $max:ident,
-     $add:ident, $sub:ident, $load_pairs:ident, $store_pairs:ident) => {
+     $add:ident, $sub:ident, $settle:ident, $load_pairs:ident, $store_pairs:ident) => {
         $(#[$doc])*
         #[derive(Clone, Copy)]
         pub struct $name;
@@ -219,6 +225,11 @@ macro_rules! lane {
                 unsafe { $sub(a, b) }
             }
             #[inline(always)]
+            unsafe fn settle(v: $v) -> $v {
+                // SAFETY: see the impl.
+                unsafe { $settle(v) }
+            }
+            #[inline(always)]
             unsafe fn load_pairs(p: *const f32) -> ($v, $v) {
                 // SAFETY: see the impl.
                 unsafe { $load_pairs(p) }
@@ -240,8 +251,15 @@ mod arm {
     lane!(
         /// 128-bit vectors.
         Neon, 4, float32x4_t, vdupq_n_f32, vld1q_f32, vst1q_f32, |a, b, c| vfmaq_f32(c, a, b), vmaxq_f32,
-        vaddq_f32, vsubq_f32, load_pairs, store_pairs
+        vaddq_f32, vsubq_f32, settle, load_pairs, store_pairs
     );
+
+    #[inline(always)]
+    unsafe fn settle(mut v: float32x4_t) -> float32x4_t {
+        // SAFETY: no instruction.
+        unsafe { std::arch::asm!("/* {v:v} */", v = inout(vreg) v, options(nomem, nostack, preserves_flags)) };
+        v
+    }
 
     #[inline(always)]
     unsafe fn load_pairs(p: *const f32) -> (float32x4_t, float32x4_t) {
@@ -265,13 +283,29 @@ mod x86 {
     lane!(
         /// 256-bit vectors.
         Avx2, 8, __m256, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_max_ps,
-        _mm256_add_ps, _mm256_sub_ps, load_pairs_256, store_pairs_256
+        _mm256_add_ps, _mm256_sub_ps, settle_256, load_pairs_256, store_pairs_256
     );
     lane!(
         /// 512-bit vectors.
         Avx512, 16, __m512, _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_max_ps,
-        _mm512_add_ps, _mm512_sub_ps, load_pairs_512, store_pairs_512
+        _mm512_add_ps, _mm512_sub_ps, settle_512, load_pairs_512, store_pairs_512
     );
+
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    fn settle_256(mut v: __m256) -> __m256 {
+        // SAFETY: no instruction.
+        unsafe { std::arch::asm!("/* {v} */", v = inout(ymm_reg) v, options(nomem, nostack, preserves_flags)) };
+        v
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx512f")]
+    fn settle_512(mut v: __m512) -> __m512 {
+        // SAFETY: no instruction.
+        unsafe { std::arch::asm!("/* {v} */", v = inout(zmm_reg) v, options(nomem, nostack, preserves_flags)) };
+        v
+    }
 
     #[inline]
     #[target_feature(enable = "avx2")]

@@ -34,27 +34,36 @@ pub struct Tile<'a> {
     pub ahead: Ahead,
 }
 
-/// Rows to prefetch, each as wide as a tile: one row per eight terms of a sum, which matches the speed of memory.
+/// Pieces of memory to prefetch, each as wide as a tile: one piece per eight terms of a sum, which matches the speed of memory.
 #[derive(Clone, Copy)]
 pub struct Ahead {
     pub from: *const f32,
-    /// Floats between rows.
-    pub step: usize,
+    /// Pieces up to the end of the row of the first.
+    pub left: usize,
+    /// Pieces of a row, side by side.
+    pub pieces: usize,
+    /// Floats from the last piece of a row to the first of the next.
+    pub turn: usize,
 }
 
 impl Ahead {
     /// No prefetch: names only memory that is already in cache.
     pub fn none(cached: *const f32) -> Ahead {
-        Ahead { from: cached, step: 0 }
+        Ahead::rows(cached, 0)
     }
 
-    /// Rows that a tile prefetches if its sums have `terms` terms.
-    pub fn rows(terms: usize) -> usize {
+    /// One piece per row, `step` floats apart.
+    pub fn rows(from: *const f32, step: usize) -> Ahead {
+        Ahead { from, left: 1, pieces: 1, turn: step }
+    }
+
+    /// Pieces that a tile prefetches if its sums have `terms` terms.
+    pub fn pieces(terms: usize) -> usize {
         terms.div_ceil(TERMS_PER_FETCH)
     }
 }
 
-/// Terms of a sum per prefetched row.
+/// Terms of a sum per prefetched piece.
 const TERMS_PER_FETCH: usize = 8;
 
 /// A run of pixels that is contiguous in the input, in a tile and in the output.
@@ -164,6 +173,20 @@ impl Kernel {
     }
 }
 
+/// Repeats a statement for `i` from 0 to below `n`, at most 8, with `i` a constant: sums in an array that only constants index stay in
+/// registers, whereas an array in a loop may be written to the stack at every term.
+macro_rules! unrolled {
+    ($i:ident < $n:expr, $body:expr) => {
+        unrolled!($i < $n, $body, [0 1 2 3 4 5 6 7])
+    };
+    ($i:ident < $n:expr, $body:expr, [$($value:literal)*]) => {{
+        $(if $value < $n {
+            let $i: usize = $value;
+            $body
+        })*
+    }};
+}
+
 #[inline(always)]
 unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(t: &Tile) {
     // SAFETY: `Kernel::run` states what must exist.
@@ -176,55 +199,58 @@ unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(t: &Tile) {
                     simd::fetch_now(t.c.add(r * t.c_row), NR * t.c_vector);
                 }
             }
-            Start::Bias(bias) => {
-                for (r, row) in acc.iter_mut().enumerate() {
-                    *row = [L::splat(*bias.add(r)); NR];
-                }
-            }
+            Start::Bias(bias) => unrolled!(r < MR, *acc.get_unchecked_mut(r) = [L::splat(*bias.add(r)); NR]),
         }
-        let mut ahead = t.ahead.from;
+        let (mut ahead, mut left, factors) = (t.ahead.from, t.ahead.left, (t.a, t.row, t.b));
         for block in t.offsets.chunks(TERMS_PER_FETCH) {
             simd::fetch_later(ahead, NR * L::N);
-            ahead = ahead.wrapping_add(t.ahead.step);
+            left -= 1;
+            let step = if left == 0 { t.ahead.turn } else { NR * L::N };
+            left = if left == 0 { t.ahead.pieces } else { left };
+            ahead = ahead.wrapping_add(step);
             // Unrolled, because scalar instructions compete for ports with the multiply-adds.
             let mut fours = block.chunks_exact(4);
             for four in &mut fours {
-                add::<L, MR, NR>(t, four[0], &mut acc);
-                add::<L, MR, NR>(t, four[1], &mut acc);
-                add::<L, MR, NR>(t, four[2], &mut acc);
-                add::<L, MR, NR>(t, four[3], &mut acc);
+                add::<L, MR, NR>(factors, four[0], &mut acc);
+                add::<L, MR, NR>(factors, four[1], &mut acc);
+                add::<L, MR, NR>(factors, four[2], &mut acc);
+                add::<L, MR, NR>(factors, four[3], &mut acc);
             }
             for &one in fours.remainder() {
-                add::<L, MR, NR>(t, one, &mut acc);
+                add::<L, MR, NR>(factors, one, &mut acc);
             }
         }
-        let one = L::splat(1.0);
-        for (r, sums) in acc.iter().enumerate() {
-            for (q, v) in sums.iter().enumerate() {
-                let c = t.c.add(r * t.c_row + q * t.c_vector);
-                let v = if matches!(t.start, Start::Accumulate) { L::fma(*v, one, L::load(c)) } else { *v };
-                L::store(c, v);
-            }
-        }
+        let (one, accumulate) = (L::splat(1.0), matches!(t.start, Start::Accumulate));
+        unrolled!(
+            r < MR,
+            unrolled!(q < NR, {
+                let (c, v) = (t.c.add(r * t.c_row + q * t.c_vector), *acc.get_unchecked(r).get_unchecked(q));
+                L::store(c, if accumulate { L::fma(v, one, L::load(c)) } else { v });
+            })
+        );
     }
 }
 
 /// Adds one term of the sum.
 #[inline(always)]
-unsafe fn add<L: Lane, const MR: usize, const NR: usize>(t: &Tile, (a, b): (u32, u32), acc: &mut [[L::V; NR]; MR]) {
+unsafe fn add<L: Lane, const MR: usize, const NR: usize>(
+    (a, row, b): (*const f32, usize, *const f32),
+    at: (u32, u32),
+    acc: &mut [[L::V; NR]; MR],
+) {
     // SAFETY: `Kernel::run` states what must exist.
     unsafe {
-        let (ap, bp) = (t.a.add(a as usize), t.b.add(b as usize));
+        let (ap, bp) = (a.add(at.0 as usize), b.add(at.1 as usize));
         let mut bv = [L::splat(0.0); NR];
-        for (q, v) in bv.iter_mut().enumerate() {
-            *v = L::load(bp.add(q * L::N));
-        }
-        for (r, sums) in acc.iter_mut().enumerate() {
-            let av = L::splat(*ap.add(r * t.row));
-            for q in 0..NR {
-                sums[q] = L::fma(av, bv[q], sums[q]);
-            }
-        }
+        unrolled!(q < NR, *bv.get_unchecked_mut(q) = L::load(bp.add(q * L::N)));
+        unrolled!(r < MR, {
+            let av = L::splat(*ap.add(r * row));
+            unrolled!(q < NR, {
+                let sum = acc.get_unchecked_mut(r).get_unchecked_mut(q);
+                // The factors of several terms at once would not fit into registers beside the sums.
+                *sum = L::settle(L::fma(av, *bv.get_unchecked(q), *sum));
+            })
+        });
     }
 }
 

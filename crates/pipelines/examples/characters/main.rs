@@ -10,7 +10,7 @@ use diorama_nets::layers::Init;
 use diorama_nets::modules::{ResNet, ResNetSettings};
 use diorama_nets::train::augment::{Augmentation, Draws};
 use diorama_nets::train::{self, Ema, Gradients, Group, Loader, LoaderSettings, Optimizer, Rule, SampleKey, Schedule};
-use diorama_nets::{Device, Mode, ops, read_values};
+use diorama_nets::{Device, Mode, OpError, on_pool, ops, read_values};
 use fonts::{Family, SIDE, in_color};
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
@@ -70,14 +70,17 @@ fn run() -> Result<ExitCode> {
     let schedule = Schedule::cosine(steps / 20, steps);
     while optimizer.steps() < steps {
         let (images, classes): (Vec<Image>, Vec<i64>) = loader.next_batch()?.into_iter().unzip();
-        let logits = net.classify(train::stack(&images, &Device::flex())?, Mode::Train)?;
-        let loss = ops::cross_entropy(logits, &classes, 0.1)?;
-        let value = read_values(loss.clone())[0];
-        let mut gradients = Gradients::take(&net, loss.backward());
-        gradients.clip_norm(2.0);
-        let scale = schedule.scale(optimizer.steps());
-        optimizer.step(&net, gradients, scale);
-        average.update(&net);
+        let value = on_pool(|| -> std::result::Result<f32, OpError> {
+            let logits = net.classify(train::stack(&images, &Device::flex())?, Mode::Train)?;
+            let loss = ops::cross_entropy(logits, &classes, 0.1)?;
+            let value = read_values(loss.clone())[0];
+            let mut gradients = Gradients::take(&net, loss.backward());
+            gradients.clip_norm(2.0);
+            let scale = schedule.scale(optimizer.steps());
+            optimizer.step(&net, gradients, scale);
+            average.update(&net);
+            Ok(value)
+        })?;
 
         let (step, stopped) = (optimizer.steps(), STOP.load(Relaxed));
         if step == 1 {

@@ -5,8 +5,8 @@ use crate::gemm::{Gemm, Init, Precision, View, has_bf16};
 use crate::ops::conv2d::bands::{Scratch, aligned, with_scratch};
 use crate::ops::conv2d::weights::interleave;
 use crate::simd;
-use crate::tile::{Ahead, Kernel, Shared, Start, Tile, kernel};
-use crate::vector::vectorized;
+use crate::tile::{Ahead, Kernel, MOST_VECTORS, Shared, Start, Tile, kernel};
+use crate::vector::{by_lanes, vectorized};
 use rayon::prelude::*;
 use std::cell::Cell;
 use std::ops::Range;
@@ -15,6 +15,10 @@ use std::ops::Range;
 const ROWS: usize = 384;
 /// Fewest rows of a task, because they share the cost of copying a panel.
 const FEWEST_ROWS: usize = 96;
+/// Fewest rows over which B is read from the caches; with fewer, the speed of memory matters.
+const MANY_ROWS: usize = 128;
+/// Panels of B that are then copied side by side, because memory is faster at reading longer rows.
+const PANELS: usize = 2;
 /// Terms of a sum per pass in bf16.
 const ROUNDED_TERMS: usize = 256;
 /// Most groups that a long sum over few outputs is split into, and fewest terms per group.
@@ -175,9 +179,11 @@ impl<'a> Job<'a> {
         let (s, width, height) = (&self.s, self.kernel.width(), self.kernel.rows);
         let a = &self.a[part.batch * s.m * s.k..][..s.m * s.k];
         let b = &self.b[part.batch * s.k * s.n..][..s.k * s.n];
-        let most = self.kernel.terms().min(part.terms.len());
+        let few = s.m < MANY_ROWS;
+        let most = (self.kernel.terms() / if few { PANELS } else { 1 }).min(part.terms.len());
         let Scratch { planes, panel, sums, offsets, .. } = scratch;
-        let panel = aligned(panel, (most + 1) * width);
+        let across = width * if few && !s.b_transposed { PANELS } else { 1 };
+        let panels = aligned(panel, most * across + width);
         let edge = aligned(sums, height * width);
         let rows = aligned(planes, if s.a_transposed { part.rows.len().next_multiple_of(height) * most } else { 0 });
         let (row, term) = if s.a_transposed { (1, height as u32) } else { (s.k, 1) };
@@ -190,40 +196,41 @@ impl<'a> Job<'a> {
             }
             let add = p > part.terms.start || part.accumulate;
             let finish = self.finish.filter(|_| terms.end == part.terms.end);
-            for j in part.columns.clone().step_by(width) {
-                let count = width.min(part.columns.end - j);
-                self.pack(b, terms.clone(), j..j + count, panel);
-                let next = self.after(part, &terms, j);
-                for (tile, i) in part.rows.clone().step_by(height).enumerate() {
-                    let first = tile * Ahead::rows(terms.len()) * s.n;
-                    let ahead = next.filter(|b| first < b.len()).map(|b| Ahead { from: b[first..].as_ptr(), step: s.n });
-                    let a = if s.a_transposed { &rows[(i - part.rows.start) * terms.len()..] } else { &a[i * s.k + terms.start..] };
-                    let tall = height.min(part.rows.end - i);
-                    let to = (part.batch * s.m + i) * s.n + j;
-                    let tile = Tile {
-                        a: a.as_ptr(),
-                        row,
-                        b: panel.as_ptr(),
-                        offsets: &offsets[..terms.len()],
-                        c: edge.as_mut_ptr(),
-                        c_row: width,
-                        c_vector: self.kernel.lanes,
-                        start: Start::Zero,
-                        ahead: ahead.unwrap_or(Ahead::none(panel.as_ptr())),
-                    };
-                    let vectors = count.div_ceil(self.kernel.lanes);
-                    // SAFETY: the blocks of A and the panel hold all terms; C's columns are this task's own.
-                    unsafe {
-                        if count.is_multiple_of(self.kernel.lanes) {
-                            let start = if add { Start::Accumulate } else { Start::Zero };
-                            self.kernel.run(tall, vectors, &Tile { c: part.c.at(to), c_row: s.n, start, ..tile });
-                        } else {
-                            self.kernel.run(tall, vectors, &tile);
-                            store(&edge[..tall * width], width, count, part.c.at(to), s.n, add);
-                        }
-                        if let Some(finish) = finish {
-                            for r in 0..tall {
-                                finish(i + r, j, std::slice::from_raw_parts_mut(part.c.at(to + r * s.n), count));
+            for first in part.columns.clone().step_by(across) {
+                let columns = first..(first + across).min(part.columns.end);
+                self.pack(b, terms.clone(), columns.clone(), panels);
+                let mut ahead = self.after(part, &terms, &columns);
+                for (j, panel) in columns.clone().step_by(width).zip(panels.chunks(terms.len() * width)) {
+                    let count = width.min(columns.end - j);
+                    for i in part.rows.clone().step_by(height) {
+                        let tall = height.min(part.rows.end - i);
+                        let a = if s.a_transposed { &rows[(i - part.rows.start) * terms.len()..] } else { &a[i * s.k + terms.start..] };
+                        let to = (part.batch * s.m + i) * s.n + j;
+                        let tile = Tile {
+                            a: a.as_ptr(),
+                            row,
+                            b: panel.as_ptr(),
+                            offsets: &offsets[..terms.len()],
+                            c: edge.as_mut_ptr(),
+                            c_row: width,
+                            c_vector: self.kernel.lanes,
+                            start: Start::Zero,
+                            ahead: ahead.take(panel.as_ptr()),
+                        };
+                        let vectors = count.div_ceil(self.kernel.lanes);
+                        // SAFETY: the blocks of A and the panel hold all terms; C's columns are this task's own.
+                        unsafe {
+                            if count.is_multiple_of(self.kernel.lanes) {
+                                let start = if add { Start::Accumulate } else { Start::Zero };
+                                self.kernel.run(tall, vectors, &Tile { c: part.c.at(to), c_row: s.n, start, ..tile });
+                            } else {
+                                self.kernel.run(tall, vectors, &tile);
+                                store(&edge[..tall * width], width, count, part.c.at(to), s.n, add);
+                            }
+                            if let Some(finish) = finish {
+                                for r in 0..tall {
+                                    finish(i + r, j, std::slice::from_raw_parts_mut(part.c.at(to + r * s.n), count));
+                                }
                             }
                         }
                     }
@@ -232,13 +239,24 @@ impl<'a> Job<'a> {
         }
     }
 
-    /// Part of B that the panel after the one of column `j` is copied from, for prefetching; none if B is transposed or no panel follows.
-    fn after(&self, part: &Part, terms: &Range<usize>, j: usize) -> Option<&[f32]> {
+    /// Part of B that will be copied after some columns and terms, for prefetching.
+    fn after(&self, part: &Part, terms: &Range<usize>, columns: &Range<usize>) -> Coming {
         let (s, width) = (&self.s, self.kernel.width());
-        let (term, column) = if j + width < part.columns.end { (terms.start, j + width) } else { (terms.end, part.columns.start) };
+        let more = columns.end < part.columns.end;
+        let (term, column) = if more { (terms.start, columns.end) } else { (terms.end, part.columns.start) };
         let end = (term + terms.len()).min(part.terms.end);
-        let first = part.batch * s.k;
-        (!s.b_transposed && term < end).then(|| &self.b[(first + term) * s.n + column..(first + end) * s.n])
+        let across = columns.len().min(part.columns.end - column);
+        let pieces = across.div_ceil(width);
+        Coming {
+            from: self.b[part.batch * s.k * s.n..].as_ptr().wrapping_add(term * s.n + column),
+            left: if s.b_transposed { 0 } else { end.saturating_sub(term) * pieces },
+            pieces,
+            piece: 0,
+            width,
+            stride: s.n,
+            rows: Ahead::pieces(terms.len()) / pieces.max(1),
+            rest: Ahead::pieces(terms.len()) % pieces.max(1),
+        }
     }
 
     /// As [`Self::compute`], with factors rounded to bf16.
@@ -292,33 +310,80 @@ impl<'a> Job<'a> {
         }
     }
 
-    /// Copies some columns and terms of B into a panel, `[terms, width]`.
+    /// Copies some columns and terms of B into panels of `[terms, width]`.
     fn pack(&self, b: &[f32], terms: Range<usize>, columns: Range<usize>, panel: &mut [f32]) {
         let (s, width) = (&self.s, self.kernel.width());
         if s.b_transposed {
             let from = &b[columns.start * s.k + terms.start..];
             return interleave(from, s.k, columns.len(), width, &mut panel[..terms.len() * width]);
         }
-        copy_columns(&b[terms.start * s.n + columns.start..], s.n, columns.len(), width, &mut panel[..terms.len() * width]);
+        let (from, pieces) =
+            (&b[terms.start * s.n + columns.start..], if width == MOST_VECTORS * self.kernel.lanes { columns.len() / width } else { 0 });
+        // SAFETY: B has the rows and columns, and the panels their room.
+        unsafe { copy_panels(from.as_ptr(), s.n, pieces, terms.len(), panel.as_mut_ptr()) };
+        for j in (pieces * width..columns.len()).step_by(width) {
+            let count = width.min(columns.len() - j);
+            for (p, to) in panel[j * terms.len()..].chunks_exact_mut(width).take(terms.len()).enumerate() {
+                to[..count].copy_from_slice(&from[p * s.n + j..][..count]);
+            }
+        }
     }
 }
 
 /// Prefetch distance of a copy, in rows.
 const AHEAD: usize = 12;
 
-vectorized! {
-    /// `out[p, ..count] = from[p · stride ..]` for rows of `width`.
-    fn copy_columns<const F>(from: &[f32], stride: usize, count: usize, width: usize, out: &mut [f32]) {
-        for (p, to) in out.chunks_exact_mut(width).enumerate() {
-            simd::fetch_now(from.as_ptr().wrapping_add((p + AHEAD) * stride), count);
-            let from = &from[p * stride..p * stride + count];
-            if count == 48 && width == 48 {
-                // A constant size compiles to a few vector moves.
-                to[..48].copy_from_slice(&from[..48]);
-            } else {
-                to[..count].copy_from_slice(from);
+by_lanes! {
+    /// Copies `pieces` full panels of `[terms, 3 vectors]` from rows that are `stride` floats apart.
+    unsafe fn copy_panels<L>(from: *const f32, stride: usize, pieces: usize, terms: usize, out: *mut f32) {
+        let width = MOST_VECTORS * L::N;
+        for p in 0..terms {
+            let from = from.add(p * stride);
+            simd::fetch_now(from.wrapping_add(AHEAD * stride), pieces * width);
+            for j in 0..pieces {
+                let (from, to) = (from.add(j * width), out.add((j * terms + p) * width));
+                for q in 0..MOST_VECTORS {
+                    L::store(to.add(q * L::N), L::load(from.add(q * L::N)));
+                }
             }
         }
+    }
+}
+
+/// What is left of a part of B to prefetch, in pieces of a tile's width.
+struct Coming {
+    from: *const f32,
+    /// Pieces of a row, and where in it the next one lies.
+    pieces: usize,
+    piece: usize,
+    width: usize,
+    /// Floats between rows.
+    stride: usize,
+    /// Rows and pieces that a tile takes.
+    rows: usize,
+    rest: usize,
+    /// Pieces that are left.
+    left: usize,
+}
+
+impl Coming {
+    /// What the next tile prefetches.
+    fn take(&mut self, none: *const f32) -> Ahead {
+        if self.left == 0 {
+            return Ahead::none(none);
+        }
+        let ahead = Ahead {
+            from: self.from.wrapping_add(self.piece * self.width),
+            left: self.pieces - self.piece,
+            pieces: self.pieces,
+            turn: self.stride - (self.pieces - 1) * self.width,
+        };
+        self.left = self.left.saturating_sub(self.rows * self.pieces + self.rest);
+        self.piece += self.rest;
+        let more = self.piece >= self.pieces;
+        self.piece -= if more { self.pieces } else { 0 };
+        self.from = self.from.wrapping_add((self.rows + more as usize) * self.stride);
+        ahead
     }
 }
 

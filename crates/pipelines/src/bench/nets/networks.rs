@@ -7,7 +7,7 @@ use diorama_nets::layers::{Init, Linear};
 use diorama_nets::modules::{Fpn, ResNet, ResNetSettings, UNet, UNetSettings, Vgg, VggSettings, Vit, VitSettings};
 use diorama_nets::ops::{self, Activation, Error};
 use diorama_nets::train::{Gradients, Optimizer, Rule};
-use diorama_nets::{Device, Mode, Module, OpError, Tensor, TensorData, Visitor};
+use diorama_nets::{Device, Mode, Module, OpError, Tensor, TensorData, Visitor, on_pool};
 
 type Result<T> = std::result::Result<T, OpError>;
 
@@ -32,7 +32,7 @@ trait Case: Module {
 
 impl Network {
     pub fn measure(&self, wanted: &Wanted, threads: usize) -> Result<NetworkFigures> {
-        ops::with_precision(wanted.precision, || self.measure_as_set(wanted, threads))
+        on_pool(|| ops::with_precision(wanted.precision, || self.measure_as_set(wanted, threads)))
     }
 
     fn measure_as_set(&self, wanted: &Wanted, threads: usize) -> Result<NetworkFigures> {

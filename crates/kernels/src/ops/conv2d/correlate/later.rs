@@ -25,7 +25,7 @@ impl Later {
         if self.planes == 0 {
             return None;
         }
-        let ahead = Ahead { from: self.from.wrapping_add(self.at), step: self.per_tile.div_ceil(rows.max(1)) };
+        let ahead = Ahead::rows(self.from.wrapping_add(self.at), self.per_tile.div_ceil(rows.max(1)));
         self.at += self.per_tile;
         while self.at >= self.len && self.planes > 0 {
             self.at -= self.len;
@@ -39,7 +39,7 @@ impl Later {
     pub fn fetch(&mut self, tiles: usize) {
         for _ in 0..tiles {
             if let Some(part) = self.next(1) {
-                simd::fetch_later(part.from, part.step);
+                simd::fetch_later(part.from, part.turn);
             }
         }
     }

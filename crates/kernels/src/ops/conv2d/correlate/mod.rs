@@ -308,13 +308,13 @@ impl Job<'_> {
 
     /// Prefetch of the pixels after a tile's, if the input is read in place: the share of the tile's `i`th block of output channels.
     fn pixels_ahead(&self, s: &Step, channels: usize, i: usize) -> Option<Ahead> {
-        let (last, first) = (s.segments.last()?, i * Ahead::rows(channels));
+        let (last, first) = (s.segments.last()?, i * Ahead::pieces(channels));
         if !self.in_place || first >= channels {
             return None;
         }
         let size = self.c.input[0] * self.c.input[1];
         let channel = s.part.group * self.c.channels + s.channels.start + first;
-        Some(Ahead { from: self.x.as_ptr().wrapping_add(channel * size + last.from + last.len), step: size })
+        Some(Ahead::rows(self.x.as_ptr().wrapping_add(channel * size + last.from + last.len), size))
     }
 
     fn clip<'a>(&self, phase: &'a Phase, part: &Part) -> Cells<'a> {
@@ -402,7 +402,7 @@ impl Job<'_> {
         for (i, feature) in s.part.features.clone().enumerate().step_by(self.kernel.rows) {
             let rows = self.kernel.rows.min(s.part.features.end - feature);
             let ahead = match later {
-                Some(later) => later.next(Ahead::rows(count)),
+                Some(later) => later.next(Ahead::pieces(count)),
                 None => self.pixels_ahead(s, count, i / self.kernel.rows),
             };
             let ahead = ahead.unwrap_or(Ahead::none(b));
