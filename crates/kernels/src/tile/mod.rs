@@ -32,6 +32,9 @@ pub struct Tile<'a> {
     pub start: Start,
     /// Memory to prefetch meanwhile.
     pub ahead: Ahead,
+    /// If set, rows come in pairs whose floats are written in turns: those of vector `q` of rows `2 r` and `2 r + 1` to
+    /// `c[r · c_row + pairs[q]..]`. Such sums do not start from those in `c`.
+    pub pairs: Option<&'a [usize; MOST_VECTORS]>,
 }
 
 /// Pieces of memory to prefetch, each as wide as a tile: one piece per eight terms of a sum, which matches the speed of memory.
@@ -219,6 +222,16 @@ unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(t: &Tile) {
             for &one in fours.remainder() {
                 add::<L, MR, NR>(factors, one, &mut acc);
             }
+        }
+        if let Some(pairs) = t.pairs {
+            unrolled!(
+                r < MR / 2,
+                unrolled!(q < NR, {
+                    let [even, odd] = [2 * r, 2 * r + 1].map(|r| *acc.get_unchecked(r).get_unchecked(q));
+                    L::store_pairs(t.c.add(r * t.c_row + pairs.get_unchecked(q)), even, odd);
+                })
+            );
+            return;
         }
         let (one, accumulate) = (L::splat(1.0), matches!(t.start, Start::Accumulate));
         unrolled!(
@@ -418,6 +431,7 @@ mod tests {
                 c_vector: lanes,
                 start,
                 ahead: Ahead::none(b.as_ptr()),
+                pairs: None,
             };
             // SAFETY: all operands have the tile's size.
             unsafe { kernel.run(rows, vectors, &t) };

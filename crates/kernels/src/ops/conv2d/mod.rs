@@ -4,6 +4,7 @@ pub(crate) mod bands;
 pub(crate) mod correlate;
 pub mod cpu;
 mod depthwise;
+mod paired;
 pub(crate) mod planes;
 pub mod reference;
 pub(crate) mod shapes;

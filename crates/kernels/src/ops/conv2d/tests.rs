@@ -33,6 +33,8 @@ fn cases() -> Vec<(Conv2d, Images)> {
         (Conv2d { stride: [3, 2], padding: [2, 0], ..conv(5, 4, [2, 5]) }, images(2, 14, 15)),
         (Conv2d { stride: [1, 4], padding: [1, 3], ..conv(2, 3, [4, 4]) }, images(1, 6, 21)),
         (Conv2d { dilation: [2, 3], padding: [2, 3], ..conv(6, 8, [3, 3]) }, images(2, 12, 25)),
+        (Conv2d { stride: [2, 2], ..conv(6, 9, [2, 2]) }, images(2, 8, 64)),
+        (Conv2d { groups: 2, stride: [2, 2], ..conv(8, 10, [2, 2]) }, images(1, 4, 34)),
         (Conv2d { dilation: [2, 2], stride: [2, 2], padding: [1, 4], ..conv(6, 5, [3, 4]) }, images(2, 12, 13)),
         (Conv2d { padding: [4, 5], ..conv(2, 3, [2, 2]) }, images(1, 2, 3)),
         (Conv2d { groups: 3, ..same(conv(12, 9, [3, 3])) }, images(2, 11, 19)),

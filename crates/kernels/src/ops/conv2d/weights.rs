@@ -167,6 +167,7 @@ impl Task<'_> {
                             c_vector: self.kernel.lanes,
                             start: Start::Accumulate,
                             ahead: Ahead::none(planes.as_ptr()),
+                            pairs: None,
                         };
                         // SAFETY: `height` rows of d exist from there, `list_pixels` lists only pixels of d and of the copy, sums have all rows.
                         unsafe { self.kernel.run(height, each.min(l.vectors - v), &tile) };

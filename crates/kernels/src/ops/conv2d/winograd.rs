@@ -214,6 +214,7 @@ impl Job<'_> {
                         c_vector: lanes,
                         start,
                         ahead: Ahead::none(inputs.as_ptr()),
+                        pairs: None,
                     };
                     // SAFETY: weights of that many output channels exist from there, inputs of all channels, and their products.
                     unsafe { self.kernel.run(self.kernel.rows.min(features - f), vectors, &tile) };

@@ -34,6 +34,12 @@ fn cases() -> Vec<(ConvTranspose2d, Images)> {
         (ConvTranspose2d { output_padding: [0, 1], ..layer(6, 9, [2, 1], [1, 2]) }, images(2, 5, 7)),
         (ConvTranspose2d { padding: [0, 1], ..layer(6, 9, [2, 4], [1, 2]) }, images(2, 5, 30)),
         (ConvTranspose2d { padding: [0, 2], ..layer(2, 4, [1, 1], [1, 4]) }, images(1, 300, 2)),
+        (layer(20, 5, [2, 2], [2, 2]), images(2, 3, 16)),
+        (ConvTranspose2d { groups: 2, ..layer(12, 6, [2, 2], [2, 2]) }, images(2, 9, 32)),
+        (layer(7, 9, [3, 2], [3, 2]), images(1, 5, 48)),
+        (layer(6, 9, [1, 2], [1, 2]), images(2, 5, 24)),
+        (layer(6, 9, [2, 2], [3, 2]), images(2, 3, 16)),
+        (layer(200, 4, [2, 2], [2, 2]), images(1, 2, 16)),
         (ConvTranspose2d { groups: 5, padding: [1; 2], ..layer(5, 5, [4, 4], [2, 2]) }, images(2, 7, 33)),
     ]
 }

@@ -216,6 +216,7 @@ impl<'a> Job<'a> {
                             c_vector: self.kernel.lanes,
                             start: Start::Zero,
                             ahead: ahead.take(panel.as_ptr()),
+                            pairs: None,
                         };
                         let vectors = count.div_ceil(self.kernel.lanes);
                         // SAFETY: the blocks of A and the panel hold all terms; C's columns are this task's own.

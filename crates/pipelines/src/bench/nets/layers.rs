@@ -5,6 +5,7 @@ use diorama_geom::rng::Rng;
 use diorama_kernels::ops::conv_transpose2d::{self, ConvTranspose2d};
 use diorama_kernels::ops::conv2d::{self, Conv2d, Gradients, Images};
 use diorama_kernels::ops::linear::{self, Activation, BiasKind, Linear};
+use diorama_nets::on_pool;
 use std::convert::Infallible;
 
 #[derive(Clone, Copy)]
@@ -87,11 +88,11 @@ impl Layer {
     }
 
     pub fn measure(&self, wanted: &Wanted, threads: usize) -> LayerFigures {
-        let (flops, [forward, train]) = match self.kind {
+        let (flops, [forward, train]) = on_pool(|| match self.kind {
             Kind::Conv => self.conv(wanted),
             Kind::Transpose => self.transpose(wanted),
             Kind::Linear => self.linear(wanted),
-        };
+        });
         let rate = |flops: f64, seconds: f64| flops / seconds / threads as f64 / 1e9;
         LayerFigures {
             name: self.name,

@@ -5,10 +5,10 @@ mod later;
 mod outputs;
 
 use super::bands::{Bands, Scratch, aligned, with_scratch};
-use super::depthwise;
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Phase, Tensors, offset};
 use super::winograd;
+use super::{depthwise, paired};
 use crate::gemm::{Gemm, Init, Precision, Rounded, View, has_bf16};
 use crate::ops::activation::Activation;
 use crate::simd;
@@ -87,6 +87,7 @@ impl Correlation {
             return depthwise::run(self, t);
         }
         let Err(t) = winograd::run(self, t) else { return };
+        let Err(t) = paired::run(self, t) else { return };
         self.with_factors(t.weights, |weights| self.run_tiles(weights, t));
     }
 
@@ -165,15 +166,14 @@ impl Correlation {
         self.precision == Precision::Bf16 && has_bf16()
     }
 
-    /// Whether every output pixel has one tap, at the same input pixel.
+    /// Whether every phase has one tap, at its own cell of the input.
     fn is_pointwise(&self) -> bool {
-        let [p] = &self.phases[..] else { return false };
-        let [tap] = &p.taps[..] else { return false };
-        tap.at == [0; 2] && self.step == [1; 2] && self.spread == [1; 2] && self.input == self.output && p.size == self.output
+        let one = |p: &Phase| matches!(&p.taps[..], [tap] if tap.at == [0; 2]) && p.size == self.input;
+        self.step == [1; 2] && self.phases.iter().all(one)
     }
 
     /// Whether phases have equal sizes and each pair holds the even and the odd pixels of the same rows.
-    fn alternates(&self) -> bool {
+    pub(super) fn alternates(&self) -> bool {
         let alternate = |p: &[Phase]| matches!(p, [a, b] if a.start[0] == b.start[0] && [a.start[1], b.start[1]] == [0, 1]);
         let size = self.phases.first().map(|p| p.size);
         self.spread[1] == 2
@@ -432,6 +432,7 @@ impl Job<'_> {
                 c_vector: lanes,
                 start,
                 ahead,
+                pairs: None,
             };
             // SAFETY: weights of `rows` features exist from there; planes and panel hold all offsets; sums have rows · width floats, and
             // the rows of the output have the segment's whole vectors.
