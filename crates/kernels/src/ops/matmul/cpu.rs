@@ -318,8 +318,8 @@ impl<'a> Job<'a> {
             let from = &b[columns.start * s.k + terms.start..];
             return interleave(from, s.k, columns.len(), width, &mut panel[..terms.len() * width]);
         }
-        let (from, pieces) =
-            (&b[terms.start * s.n + columns.start..], if width == MOST_VECTORS * self.kernel.lanes { columns.len() / width } else { 0 });
+        let from = &b[terms.start * s.n + columns.start..];
+        let pieces = if self.kernel.vectors == MOST_VECTORS { columns.len() / width } else { 0 };
         // SAFETY: B has the rows and columns, and the panels their room.
         unsafe { copy_panels(from.as_ptr(), s.n, pieces, terms.len(), panel.as_mut_ptr()) };
         for j in (pieces * width..columns.len()).step_by(width) {
@@ -368,10 +368,10 @@ struct Coming {
 }
 
 impl Coming {
-    /// What the next tile prefetches.
-    fn take(&mut self, none: *const f32) -> Ahead {
+    /// What the next tile prefetches: its share, or what is in cache anyway if none is left.
+    fn take(&mut self, cached: *const f32) -> Ahead {
         if self.left == 0 {
-            return Ahead::none(none);
+            return Ahead::none(cached);
         }
         let ahead = Ahead {
             from: self.from.wrapping_add(self.piece * self.width),
