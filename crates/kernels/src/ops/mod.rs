@@ -31,6 +31,7 @@ pub mod pool;
 pub mod prune;
 pub mod ray_aabb;
 pub mod ray_generation;
+pub mod ray_triangles;
 pub mod resample;
 pub mod sample_pdf;
 pub mod scan;

@@ -70,18 +70,16 @@ fn run() -> Result<ExitCode> {
     let schedule = Schedule::cosine(steps / 20, steps);
     while optimizer.steps() < steps {
         let (images, classes): (Vec<Image>, Vec<i64>) = loader.next_batch()?.into_iter().unzip();
-        let value = on_pool(|| -> std::result::Result<f32, OpError> {
+        let value = on_pool(|| {
             let logits = net.classify(train::stack(&images, &Device::flex())?, Mode::Train)?;
             let loss = ops::cross_entropy(logits, &classes, 0.1)?;
             let value = read_values(loss.clone())[0];
             let mut gradients = Gradients::take(&net, loss.backward());
             gradients.clip_norm(2.0);
-            let scale = schedule.scale(optimizer.steps());
-            optimizer.step(&net, gradients, scale);
+            optimizer.step(&net, gradients, schedule.scale(optimizer.steps()));
             average.update(&net);
-            Ok(value)
+            Ok::<f32, OpError>(value)
         })?;
-
         let (step, stopped) = (optimizer.steps(), STOP.load(Relaxed));
         if step == 1 {
             save_sheet(&out.join("samples.png"), &images)?;

@@ -1,0 +1,150 @@
+use super::*;
+use crate::simd::{Level, with_level};
+use diorama_testkit::random;
+
+/// Triangles of edges of about `size`, in the cube `[−1, 1]³`.
+fn soup(n: usize, size: f32, seed: u64) -> (Vec<[f32; 3]>, Vec<[u32; 3]>) {
+    let (centers, edges) = (random(3 * n, seed), random(9 * n, seed + 1));
+    let vertices = (0..3 * n).map(|i| std::array::from_fn(|k| centers[i / 3 * 3 + k] + size * edges[3 * i + k])).collect();
+    (vertices, (0..n as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect())
+}
+
+fn rays(n: usize, seed: u64) -> Vec<Ray> {
+    let (from, to) = (random(3 * n, seed), random(3 * n, seed + 1));
+    (0..n)
+        .map(|i| {
+            let origin = std::array::from_fn(|k| 2.0 * from[3 * i + k]);
+            let mut direction: [f32; 3] = std::array::from_fn(|k| to[3 * i + k] - origin[k]);
+            // Some are parallel to one axis plane or two.
+            (0..i % 8 % 3).for_each(|k| direction[(i + k) % 3] = 0.0);
+            Ray { origin, direction, range: [0.0, f32::INFINITY] }
+        })
+        .collect()
+}
+
+fn nearest(bvh: &Bvh, rays: &[Ray]) -> Vec<Hit> {
+    let mut hits = vec![Hit::NONE; rays.len()];
+    cpu::nearest(bvh, rays, &mut hits);
+    hits
+}
+
+/// A sphere of `4 n²` vertices around the origin, closed.
+fn sphere(n: usize) -> (Vec<[f32; 3]>, Vec<[u32; 3]>) {
+    let (rows, columns) = (n, 2 * n);
+    let mut vertices = vec![[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]];
+    for r in 1..rows {
+        for c in 0..columns {
+            let (polar, azimuth) = (std::f64::consts::PI * r as f64 / rows as f64, std::f64::consts::TAU * c as f64 / columns as f64);
+            vertices.push([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()].map(|v| v as f32));
+        }
+    }
+    let at = |r: usize, c: usize| match r {
+        0 => 0,
+        r if r == rows => 1,
+        r => (2 + (r - 1) * columns + c % columns) as u32,
+    };
+    let mut triangles = Vec::new();
+    for r in 0..rows {
+        for c in 0..columns {
+            let [a, b, d, e] = [at(r, c), at(r + 1, c), at(r + 1, c + 1), at(r, c + 1)];
+            triangles.extend([[a, b, d], [a, d, e]].into_iter().filter(|t| t[0] != t[1] && t[1] != t[2] && t[2] != t[0]));
+        }
+    }
+    (vertices, triangles)
+}
+
+#[test]
+fn nearest_hits_match_the_reference_on_every_level() {
+    for (n, size) in [(0, 0.1), (1, 1.0), (9, 0.5), (700, 0.3), (3000, 0.1)] {
+        let (vertices, triangles) = soup(n, size, 3);
+        let (bvh, rays) = (Bvh::build(&vertices, &triangles), rays(1500, 9));
+        let want: Vec<_> = rays.iter().map(|r| reference::nearest(&vertices, &triangles, r)).collect();
+        for level in Level::available() {
+            let hits = with_level(level, || nearest(&bvh, &rays));
+            let mut others = 0;
+            for (hit, want) in hits.iter().zip(&want) {
+                match want {
+                    Some((t, triangle, [u, v])) if *triangle == hit.triangle => {
+                        assert!((t - hit.t as f64).abs() < 1e-4 * t.max(1.0), "{hit:?} {want:?}");
+                        assert!((u - hit.weights[0] as f64).abs() < 1e-2 && (v - hit.weights[1] as f64).abs() < 1e-2, "{hit:?} {want:?}");
+                    }
+                    None if !hit.is_some() => {}
+                    _ => others += 1,
+                }
+            }
+            assert!(others <= rays.len() / 1000, "{others} of {} rays differ among {n} triangles", rays.len());
+        }
+        assert!(n < 700 || want.iter().filter(|w| w.is_some()).count() > 100, "the rays must meet triangles");
+    }
+}
+
+#[test]
+fn no_ray_passes_between_the_triangles_of_a_closed_surface() {
+    let (vertices, triangles) = sphere(24);
+    let bvh = Bvh::build(&vertices, &triangles);
+    let mut through = Vec::new();
+    // Rays from inside through corners and through points of edges.
+    for t in &triangles {
+        let [a, b, _] = t.map(|v| vertices[v as usize]);
+        for s in [0.0, 0.25, 0.5, 0.7] {
+            let direction = std::array::from_fn(|k| (1.0 - s) * a[k] + s * b[k] - [0.1, -0.2, 0.05][k]);
+            through.push(Ray { origin: [0.1, -0.2, 0.05], direction, range: [0.0, f32::INFINITY] });
+        }
+    }
+    for level in Level::available() {
+        let hits = with_level(level, || nearest(&bvh, &through));
+        let missed = hits.iter().filter(|h| !h.is_some()).count();
+        assert_eq!(missed, 0, "of {} rays, {level:?}", hits.len());
+    }
+}
+
+#[test]
+fn any_hit_exists_exactly_where_the_nearest_does_within_the_range() {
+    let (vertices, triangles) = soup(2000, 0.05, 21);
+    let bvh = Bvh::build(&vertices, &triangles);
+    let mut rays = rays(2000, 33);
+    let full = nearest(&bvh, &rays);
+    for (ray, hit) in rays.iter_mut().zip(&full).filter(|(_, h)| h.is_some()) {
+        // Half of the ranges end before the hit, or begin after it.
+        ray.range = if hit.triangle % 4 == 0 { [0.0, 0.999 * hit.t] } else { [0.0, 1.001 * hit.t] };
+    }
+    let mut hits = vec![Hit::NONE; rays.len()];
+    cpu::any(&bvh, &rays, &mut hits);
+    let near = nearest(&bvh, &rays);
+    for (i, (any, full)) in hits.iter().zip(&full).enumerate() {
+        assert_eq!(any.is_some(), full.is_some() && full.triangle % 4 != 0, "ray {i}");
+        assert_eq!(any.is_some(), near[i].is_some(), "ray {i}");
+        assert!(!any.is_some() || any.t > rays[i].range[0] && any.t < rays[i].range[1]);
+    }
+    for (ray, hit) in rays.iter_mut().zip(&full).filter(|(_, h)| h.is_some()) {
+        ray.range = [hit.t, f32::INFINITY];
+    }
+    assert!(nearest(&bvh, &rays).iter().zip(&full).all(|(next, h)| !h.is_some() || next.t > h.t), "ranges are open");
+}
+
+#[test]
+fn odd_meshes_build() {
+    let one = [[0.0f32, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]];
+    let down = Ray { origin: [0.2, 0.2, 1.0], direction: [0.0, 0.0, -2.0], range: [0.0, 9.0] };
+    // Many copies of one triangle cannot be told apart; the first is hit.
+    let copies = Bvh::build(&one, &vec![[0, 1, 2]; 5000]);
+    let hit = nearest(&copies, &[down])[0];
+    assert_eq!((hit.triangle, hit.t), (0, 0.5));
+    // Triangles without area, and with corners that are no numbers, are never hit.
+    let mut vertices = one.to_vec();
+    vertices.push([f32::NAN, 0.0, 0.0]);
+    let flat = Bvh::build(&vertices, &[[0, 1, 1], [0, 0, 0], [0, 1, 3], [0, 1, 2]]);
+    assert_eq!(nearest(&flat, &[down])[0].triangle, 3);
+    assert!(!nearest(&Bvh::build(&[], &[]), &[down])[0].is_some());
+}
+
+#[test]
+fn the_tree_and_its_hits_do_not_depend_on_threads() {
+    let (vertices, triangles) = soup(40_000, 0.02, 5);
+    let rays = rays(3000, 6);
+    let with = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| nearest(&Bvh::build(&vertices, &triangles), &rays))
+    };
+    assert_eq!(with(1), with(3));
+}
