@@ -7,6 +7,8 @@ use std::collections::{BTreeMap, BTreeSet};
 const APPLICATIONS: [&str; 5] = ["object", "text", "world", "head", "relight"];
 /// The module that all applications share; it depends on none of them.
 const SHARED: &str = "run";
+/// The folders of `pipelines` beside these.
+const OTHERS: [&str; 1] = ["bench"];
 
 /// Dependencies that close a circle today: (crate, from module, to module). One that no longer exists must be removed.
 const CIRCLES: [(&str, &str, &str); 0] = [];
@@ -59,6 +61,11 @@ pub fn check(krate: &str, sources: &[Source], breaches: &mut Vec<String>) {
 }
 
 fn applications(sources: &[Source], breaches: &mut Vec<String>) {
+    let known = |m: &&String| APPLICATIONS.contains(&m.as_str()) || *m == SHARED || OTHERS.contains(&m.as_str());
+    let folders: BTreeSet<&String> = sources.iter().filter(|s| s.module.len() > 1).map(|s| &s.module[0]).collect();
+    for folder in folders.iter().filter(|m| !known(m)) {
+        breaches.push(format!("pipelines: {folder} is not in the list of applications in tidy/arrows.rs"));
+    }
     for s in sources {
         let Some(from) = s.module.first().filter(|m| APPLICATIONS.contains(&m.as_str()) || *m == SHARED) else { continue };
         for (line, to) in s.names.iter().filter_map(|(line, p)| Some((line, p.first()?))) {
@@ -172,6 +179,8 @@ mod tests {
         assert_eq!(breaches("pipelines", &upward), ["crates/pipelines/src/run/folder.rs:1: run may not import object"]);
         let good = [("object/mod.rs", "use crate::run::folder;\n"), ("run/folder.rs", ""), ("bench.rs", "use crate::object;\n")];
         assert_eq!(breaches("pipelines", &good), Vec::<String>::new());
+        let unlisted = [("fog/mod.rs", ""), ("fog/recipe.rs", "use crate::object;\n"), ("object/mod.rs", ""), ("bench/nets.rs", "")];
+        assert_eq!(breaches("pipelines", &unlisted), ["pipelines: fog is not in the list of applications in tidy/arrows.rs"]);
     }
 
     #[test]

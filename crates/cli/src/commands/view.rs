@@ -78,23 +78,19 @@ impl Verb for View {
             println!("{}", server.address());
         }
         eprintln!("open this address in a browser; press Ctrl-C to end");
-        let Source::Run(run) = source else {
-            server.run(&INTERRUPT);
-            return Ok(Outcome::Done);
-        };
         // If a device given by name fails, the viewer ends.
         std::thread::scope(|s| {
             s.spawn(|| {
                 while !INTERRUPT.load(Ordering::Relaxed) {
                     std::thread::sleep(Duration::from_millis(100));
-                    if run.check_device().is_err() {
+                    if source.check_device().is_err() {
                         INTERRUPT.store(true, Ordering::Relaxed);
                     }
                 }
             });
             server.run(&INTERRUPT);
         });
-        run.check_device().map(|()| Outcome::Done)
+        source.check_device().map(|()| Outcome::Done)
     }
 }
 
@@ -108,6 +104,14 @@ impl Source {
         match self {
             Source::Run(r) => r.clone(),
             Source::Points(p) => p.clone(),
+        }
+    }
+
+    /// The failure of a device that was given by name.
+    fn check_device(&self) -> Result<()> {
+        match self {
+            Source::Run(r) => r.check_device(),
+            Source::Points(_) => Ok(()),
         }
     }
 }

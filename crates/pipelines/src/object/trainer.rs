@@ -263,8 +263,13 @@ impl Trainee for Trainer<'_> {
     }
 
     fn save(&mut self, step: u64, seconds: f64) -> Result<bool> {
-        self.settle()?;
-        self.download()?;
+        match self.settle().and_then(|()| self.download()) {
+            Ok(()) => {}
+            Err(e) => {
+                self.setback = Some(self.survive(e)?);
+                return Ok(false);
+            }
+        }
         if self.model.is_broken() {
             return Ok(false);
         }

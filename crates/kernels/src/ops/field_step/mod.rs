@@ -159,7 +159,7 @@ pub trait RayLoss: Sync {
 /// The composited outputs of a batch of rays.
 #[derive(Clone, Copy, Debug)]
 pub struct RayOutputs<'a> {
-    /// `[R, C]`
+    /// `[R, C]`, background included.
     pub values: &'a [f32],
     /// `[R]`
     pub opacity: &'a [f32],
