@@ -150,7 +150,9 @@ mod tests {
 
     fn breaches(krate: &str, files: &[(&str, &str)]) -> Vec<String> {
         let mut b = Vec::new();
-        applications(&sources(krate, files), &mut b);
+        if krate == "pipelines" {
+            applications(&sources(krate, files), &mut b);
+        }
         circles(krate, &sources(krate, files), &[], &mut b);
         b
     }
