@@ -3,7 +3,7 @@
 
 use super::activate;
 use super::bands::{Scratch, aligned, with_scratch};
-use super::shapes::{Correlation, Phase, Tensors, offset};
+use super::shapes::{Correlation, Tensors, offset};
 use crate::ops::activation::Activation;
 use crate::simd;
 use crate::tile::{Ahead, Kernel, MOST_VECTORS, Pack, Segment, Shared, Start, Tile, kernel};
@@ -26,6 +26,8 @@ struct Job<'a> {
     c: &'a Correlation,
     kernel: &'static Kernel,
     x: &'a [f32],
+    /// Offsets of the input's channels, to copy panels.
+    planes: Vec<(u32, u32)>,
     weights: &'a [f32],
     /// Each value twice; empty for none.
     bias: &'a [f32],
@@ -36,10 +38,8 @@ struct Job<'a> {
 impl Correlation {
     /// Whether phases [alternate](Self::alternates) in whole vectors, and each has one tap at its own pixel of the input.
     fn is_paired(&self, kernel: &Kernel) -> bool {
-        let one = |p: &Phase| matches!(&p.taps[..], [tap] if tap.at == [0; 2]) && p.size == self.input;
-        let whole = self.input[1].is_multiple_of(kernel.lanes) && kernel.rows.is_multiple_of(2);
-        let doubled = self.step == [1; 2] && self.output[1] == 2 * self.input[1];
-        whole && doubled && (1..=kernel.terms()).contains(&self.channels) && self.alternates() && self.phases.iter().all(one)
+        let whole = self.input[1].is_multiple_of(kernel.lanes) && kernel.rows.is_multiple_of(2) && self.output[1] == 2 * self.input[1];
+        whole && (1..=kernel.terms()).contains(&self.channels) && self.alternates() && self.is_pointwise()
     }
 }
 
@@ -56,8 +56,9 @@ pub fn run<'a>(c: &Correlation, t: Tensors<'a>) -> Result<(), Tensors<'a>> {
     c.copy_weights(t.weights, &mut copy);
     copy.extend(t.bias.iter().flat_map(|b| [*b; 2]));
     let (weights, bias) = copy.split_at(weights);
-    let job = Job { c, kernel, x: t.x, weights, bias, activation: t.activation, out: Shared(t.out.as_mut_ptr()) };
     let cells = c.input[0] * c.input[1];
+    let planes = (0..c.channels).map(|p| (0, offset(p * cells))).collect();
+    let job = Job { c, kernel, x: t.x, planes, weights, bias, activation: t.activation, out: Shared(t.out.as_mut_ptr()) };
     let share = (c.batch * c.groups * cells).div_ceil(8 * rayon::current_num_threads());
     let band = share.max(FEWEST).min(cells).next_multiple_of(kernel.width());
     let bands = cells.div_ceil(band);
@@ -93,7 +94,6 @@ impl Job<'_> {
         let panel = aligned(panel, (channels + 1) * width);
         offsets.clear();
         offsets.extend((0..channels).map(|p| (offset(p), offset(p * width))));
-        let pack: Vec<(u32, u32)> = (0..channels).map(|p| (0, offset(p * cells))).collect();
         for first in band.clone().step_by(width) {
             let len = width.min(band.end - first);
             let segments = [Segment { from: first, at: 0, len, to: 0 }];
@@ -101,7 +101,7 @@ impl Job<'_> {
             unsafe {
                 self.kernel.pack(&Pack {
                     from: x.as_ptr(),
-                    offsets: &pack,
+                    offsets: &self.planes,
                     segments: &segments,
                     panel: panel.as_mut_ptr(),
                     width,

@@ -5,8 +5,8 @@ use crate::tile::Shared;
 use rayon::prelude::*;
 use std::cell::Cell;
 
-/// Weights of an input channel that are copied together: a cache line, where they are side by side.
-const LINE: usize = 16;
+/// Output channels per task of a copy.
+const BLOCK: usize = 16;
 
 thread_local! {
     static COPY: Cell<Vec<f32>> = const { Cell::new(Vec::new()) };
@@ -45,18 +45,19 @@ impl Correlation {
         let mut copy = COPY.take();
         copy.resize(self.groups * group, 0.0);
         let out = Shared(copy.as_mut_ptr());
-        let taps = self.order();
-        let block = (LINE / taps.len().max(1)).max(1);
-        let blocks = self.features.div_ceil(block);
+        let blocks = self.features.div_ceil(BLOCK);
         (0..self.groups * blocks).into_par_iter().for_each(|i| {
-            let (g, first) = (i / blocks, i % blocks * block);
+            let (g, first) = (i / blocks, i % blocks * BLOCK);
             for channel in 0..self.channels {
-                for f in first..(first + block).min(self.features) {
+                for f in first..(first + BLOCK).min(self.features) {
                     let from = &weights[g * self.weight_group + f * self.weight_feature + channel * self.weight_channel..];
-                    let to = g * group + f * feature;
-                    for t in &taps {
-                        // SAFETY: every output channel has its own part of the copy.
-                        unsafe { *out.at(to + t.to + channel * t.channel) = from[t.from] };
+                    let mut at = g * group + f * feature;
+                    for phase in &self.phases {
+                        for (t, tap) in phase.taps.iter().enumerate() {
+                            // SAFETY: every output channel has its own part of the copy.
+                            unsafe { *out.at(at + channel * phase.taps.len() + t) = from[tap.weight] };
+                        }
+                        at += self.channels * phase.taps.len();
                     }
                 }
             }
@@ -65,24 +66,4 @@ impl Correlation {
         COPY.set(copy);
         result
     }
-
-    /// The taps of all phases, in the order of the copy.
-    fn order(&self) -> Vec<Place> {
-        let mut first = 0;
-        let mut places = Vec::new();
-        for phase in &self.phases {
-            let channel = phase.taps.len();
-            places.extend(phase.taps.iter().enumerate().map(|(t, tap)| Place { from: tap.weight, to: first + t, channel }));
-            first += self.channels * channel;
-        }
-        places
-    }
-}
-
-/// Where a tap's weights go: from the weights of an input and an output channel to the copy's part of the output channel.
-struct Place {
-    from: usize,
-    to: usize,
-    /// Floats between input channels in the copy.
-    channel: usize,
 }

@@ -35,6 +35,7 @@ impl Later {
         }
         Some(ahead)
     }
+
     /// Prefetches the parts of several tiles at once.
     pub fn fetch(&mut self, tiles: usize) {
         for _ in 0..tiles {

@@ -167,7 +167,7 @@ impl Correlation {
     }
 
     /// Whether every phase has one tap, at its own cell of the input.
-    fn is_pointwise(&self) -> bool {
+    pub(super) fn is_pointwise(&self) -> bool {
         let one = |p: &Phase| matches!(&p.taps[..], [tap] if tap.at == [0; 2]) && p.size == self.input;
         self.step == [1; 2] && self.phases.iter().all(one)
     }
