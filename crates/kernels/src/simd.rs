@@ -109,8 +109,14 @@ pub unsafe trait Lane: Copy {
     unsafe fn sub(a: Self::V, b: Self::V) -> Self::V;
     /// `v`, computed by now: keeps the compiler from mixing what comes before with what comes after.
     unsafe fn settle(v: Self::V) -> Self::V;
+    /// The even and the odd ones of the floats of `a`, then `b`.
+    unsafe fn pairs(a: Self::V, b: Self::V) -> (Self::V, Self::V);
     /// The even and the odd ones of `2 N` floats.
-    unsafe fn load_pairs(p: *const f32) -> (Self::V, Self::V);
+    #[inline(always)]
+    unsafe fn load_pairs(p: *const f32) -> (Self::V, Self::V) {
+        // SAFETY: the caller guarantees that many readable floats.
+        unsafe { Self::pairs(Self::load(p), Self::load(p.add(Self::N))) }
+    }
     /// `2 N` floats, of `even` and `odd` in turns.
     unsafe fn store_pairs(p: *mut f32, even: Self::V, odd: Self::V);
 }
@@ -158,10 +164,9 @@ unsafe impl Lane for Plain {
         v
     }
     #[inline(always)]
-    unsafe fn load_pairs(p: *const f32) -> ([f32; 8], [f32; 8]) {
-        // SAFETY: the caller guarantees sixteen readable floats.
-        let all = unsafe { p.cast::<[[f32; 2]; 8]>().read_unaligned() };
-        (all.map(|v| v[0]), all.map(|v| v[1]))
+    unsafe fn pairs(a: [f32; 8], b: [f32; 8]) -> ([f32; 8], [f32; 8]) {
+        let at = |i: usize| if i < 8 { a[i] } else { b[i - 8] };
+        (std::array::from_fn(|i| at(2 * i)), std::array::from_fn(|i| at(2 * i + 1)))
     }
     #[inline(always)]
     unsafe fn store_pairs(p: *mut f32, even: [f32; 8], odd: [f32; 8]) {
@@ -180,7 +185,7 @@ pub use arm::Neon;
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 macro_rules! lane {
     ($(#[$doc:meta])* $name:ident, $n:literal, $v:ty, $set:ident, $load:ident, $store:ident, $fma:expr, $max:ident,
-     $add:ident, $sub:ident, $settle:ident, $load_pairs:ident, $store_pairs:ident) => {
+     $add:ident, $sub:ident, $settle:ident, $pairs:ident, $store_pairs:ident) => {
         $(#[$doc])*
         #[derive(Clone, Copy)]
         pub struct $name;
@@ -230,9 +235,9 @@ macro_rules! lane {
                 unsafe { $settle(v) }
             }
             #[inline(always)]
-            unsafe fn load_pairs(p: *const f32) -> ($v, $v) {
+            unsafe fn pairs(a: $v, b: $v) -> ($v, $v) {
                 // SAFETY: see the impl.
-                unsafe { $load_pairs(p) }
+                unsafe { $pairs(a, b) }
             }
             #[inline(always)]
             unsafe fn store_pairs(p: *mut f32, even: $v, odd: $v) {
@@ -251,7 +256,7 @@ mod arm {
     lane!(
         /// 128-bit vectors.
         Neon, 4, float32x4_t, vdupq_n_f32, vld1q_f32, vst1q_f32, |a, b, c| vfmaq_f32(c, a, b), vmaxq_f32,
-        vaddq_f32, vsubq_f32, settle, load_pairs, store_pairs
+        vaddq_f32, vsubq_f32, settle, pairs, store_pairs
     );
 
     #[inline(always)]
@@ -262,10 +267,9 @@ mod arm {
     }
 
     #[inline(always)]
-    unsafe fn load_pairs(p: *const f32) -> (float32x4_t, float32x4_t) {
+    unsafe fn pairs(a: float32x4_t, b: float32x4_t) -> (float32x4_t, float32x4_t) {
         // SAFETY: as `Lane` states.
-        let v = unsafe { vld2q_f32(p) };
-        (v.0, v.1)
+        unsafe { (vuzp1q_f32(a, b), vuzp2q_f32(a, b)) }
     }
 
     #[inline(always)]
@@ -283,12 +287,12 @@ mod x86 {
     lane!(
         /// 256-bit vectors.
         Avx2, 8, __m256, _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_max_ps,
-        _mm256_add_ps, _mm256_sub_ps, settle_256, load_pairs_256, store_pairs_256
+        _mm256_add_ps, _mm256_sub_ps, settle_256, pairs_256, store_pairs_256
     );
     lane!(
         /// 512-bit vectors.
         Avx512, 16, __m512, _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_max_ps,
-        _mm512_add_ps, _mm512_sub_ps, settle_512, load_pairs_512, store_pairs_512
+        _mm512_add_ps, _mm512_sub_ps, settle_512, pairs_512, store_pairs_512
     );
 
     #[inline]
@@ -309,9 +313,7 @@ mod x86 {
 
     #[inline]
     #[target_feature(enable = "avx2")]
-    unsafe fn load_pairs_256(p: *const f32) -> (__m256, __m256) {
-        // SAFETY: as `Lane` states.
-        let (a, b) = unsafe { (_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8))) };
+    fn pairs_256(a: __m256, b: __m256) -> (__m256, __m256) {
         // The halves of both come in turns, and are put in order.
         let order = |v| _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(v)));
         (order(_mm256_shuffle_ps::<0b10_00_10_00>(a, b)), order(_mm256_shuffle_ps::<0b11_01_11_01>(a, b)))
@@ -330,9 +332,7 @@ mod x86 {
 
     #[inline]
     #[target_feature(enable = "avx512f")]
-    unsafe fn load_pairs_512(p: *const f32) -> (__m512, __m512) {
-        // SAFETY: as `Lane` states.
-        let (a, b) = unsafe { (_mm512_loadu_ps(p), _mm512_loadu_ps(p.add(16))) };
+    fn pairs_512(a: __m512, b: __m512) -> (__m512, __m512) {
         let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
         let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
         (_mm512_permutex2var_ps(a, even, b), _mm512_permutex2var_ps(a, odd, b))

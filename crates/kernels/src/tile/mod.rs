@@ -43,8 +43,10 @@ pub struct Ahead {
     pub from: *const f32,
     /// Pieces up to the end of the row of the first.
     pub left: usize,
-    /// Pieces of a row, side by side.
+    /// Pieces of a row.
     pub pieces: usize,
+    /// Floats from one piece of a row to the next.
+    pub step: usize,
     /// Floats from the last piece of a row to the first of the next.
     pub turn: usize,
 }
@@ -57,7 +59,7 @@ impl Ahead {
 
     /// One piece per row, `step` floats apart.
     pub fn rows(from: *const f32, step: usize) -> Ahead {
-        Ahead { from, left: 1, pieces: 1, turn: step }
+        Ahead { from, left: 1, pieces: 1, step, turn: step }
     }
 
     /// Pieces that a tile prefetches if its sums have `terms` terms.
@@ -208,7 +210,7 @@ unsafe fn tile<L: Lane, const MR: usize, const NR: usize>(t: &Tile) {
         for block in t.offsets.chunks(TERMS_PER_FETCH) {
             simd::fetch_later(ahead, NR * L::N);
             left -= 1;
-            let step = if left == 0 { t.ahead.turn } else { NR * L::N };
+            let step = if left == 0 { t.ahead.turn } else { t.ahead.step };
             left = if left == 0 { t.ahead.pieces } else { left };
             ahead = ahead.wrapping_add(step);
             // Unrolled, because scalar instructions compete for ports with the multiply-adds.

@@ -4,8 +4,9 @@ pub(crate) mod bands;
 pub(crate) mod correlate;
 pub mod cpu;
 mod depthwise;
+pub(crate) mod later;
 mod paired;
-pub(crate) mod planes;
+mod planes;
 pub mod reference;
 pub(crate) mod shapes;
 #[cfg(test)]

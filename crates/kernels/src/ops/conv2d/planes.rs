@@ -1,5 +1,6 @@
 //! Padded copies of input channels, split by stride, in which every tap of a kernel has a fixed offset.
 
+use super::shapes::offset;
 use crate::simd::Lane;
 use crate::vector::by_lanes;
 use std::ops::Range;
@@ -105,6 +106,29 @@ impl Planes {
         plane * self.plane + shift[0] * self.pitch + shift[1]
     }
 
+    /// Lists the rows (offset in a channel, offset in its copy) that a grid beginning at `first_row` reads, and returns their length. All
+    /// other floats of a copy are zero. Neighboring columns of the input are neighbors in the copy.
+    pub fn list_rows(&self, first_row: usize, out: &mut Vec<(u32, u32)>) -> usize {
+        assert_eq!(self.step[1], 1, "rows are copied as they are");
+        let [height, width] = self.input;
+        let (begin, skipped) = ((-self.low[1]).max(0) as usize, self.low[1].max(0) as usize);
+        let len = width.saturating_sub(skipped).min(self.pitch.saturating_sub(begin));
+        out.clear();
+        let rows = self.plane / self.pitch.max(1);
+        for d in 0..rows * self.step[0] {
+            let y = self.low[0] + (first_row * self.step[0] + d) as isize;
+            let plane = self.residues.iter().position(|r| r[0] == d % self.step[0]);
+            if let (0.., Some(plane)) = (y, plane)
+                && len > 0
+                && (y as usize) < height
+            {
+                let to = plane * self.plane + d / self.step[0] * self.pitch + begin;
+                out.push((offset(y as usize * width + skipped), offset(to)));
+            }
+        }
+        len
+    }
+
     /// Copies `channels` of some images into `out`, with the rows that a grid beginning at `first_row` reads.
     pub fn fill(&self, source: Source, channels: Range<usize>, images: Range<usize>, first_row: usize, out: &mut [f32]) {
         let pixels = self.input[0] * self.input[1];
@@ -152,6 +176,31 @@ by_lanes! {
                 1 => row.copy_from_slice(&from[..row.len()]),
                 2 => every_second::<L>(from[..2 * row.len() - 1].as_ptr(), row.as_mut_ptr(), row.len()),
                 step => row.iter_mut().enumerate().for_each(|(i, o)| *o = from[i * step]),
+            }
+        }
+    }
+}
+
+by_lanes! {
+    /// Copies rows of `len` floats, each from the first to the second of its offsets.
+    ///
+    /// # Safety
+    /// All rows exist on both sides.
+    pub unsafe fn copy_rows<L>(from: *const f32, rows: &[(u32, u32)], len: usize, to: *mut f32) {
+        for &(source, target) in rows {
+            let (from, to) = (from.add(source as usize), to.add(target as usize));
+            let mut i = 0;
+            while i + L::N <= len {
+                L::store(to.add(i), L::load(from.add(i)));
+                i += L::N;
+            }
+            if i < len && len >= L::N {
+                L::store(to.add(len - L::N), L::load(from.add(len - L::N)));
+                continue;
+            }
+            while i < len {
+                *to.add(i) = *from.add(i);
+                i += 1;
             }
         }
     }

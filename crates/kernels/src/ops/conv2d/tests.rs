@@ -24,6 +24,10 @@ fn cases() -> Vec<(Conv2d, Images)> {
         (same(conv(24, 17, [3, 3])), images(5, 5, 6)),
         (conv(16, 24, [3, 3]), images(2, 21, 34)),
         (Conv2d { padding: [2, 0], ..conv(65, 20, [3, 3]) }, images(1, 16, 49)),
+        (same(conv(24, 20, [3, 3])), images(1, 37, 64)),
+        (Conv2d { stride: [2, 2], ..same(conv(70, 43, [3, 3])) }, images(1, 61, 128)),
+        (Conv2d { stride: [2, 2], padding: [0, 2], ..conv(33, 32, [3, 3]) }, images(1, 75, 90)),
+        (Conv2d { groups: 2, stride: [2, 2], ..same(conv(64, 64, [3, 3])) }, images(2, 64, 64)),
         (Conv2d { groups: 2, ..same(conv(48, 34, [3, 3])) }, images(2, 24, 27)),
         (same(conv(4, 6, [5, 3])), images(1, 13, 9)),
         (same(conv(3, 10, [7, 7])), images(1, 20, 23)),
@@ -177,20 +181,25 @@ fn a_kernel_must_fit() {
 
 #[test]
 fn square_kernels_on_many_channels_take_fewer_products() {
-    let images = Images { batch: 2, height: 20, width: 31 };
-    let fewer = |c: Conv2d| {
-        let [x, w, bias, d] = tensors(&c, &images);
+    let images = |height, width| Images { batch: 1, height, width };
+    let (tiny, small, large) = (images(6, 6), images(20, 31), images(97, 128));
+    let fewer = |c: Conv2d, images: &Images| {
+        let [x, w, bias, d] = tensors(&c, images);
         let mut out = vec![0.0; d.len()];
         let t = shapes::Tensors { x: &x, weights: &w, bias: &bias, activation: c.activation, out: &mut out, before: None };
-        winograd::run(&c.correlation(&images), t).is_ok()
+        winograd::run(&c.correlation(images), t).is_ok()
     };
     for level in Level::available() {
         with_level(level, || {
             let c = Conv2d { padding: [1; 2], ..Conv2d::new(64, 64, 3) };
-            assert!(fewer(c), "{level:?}");
-            assert!(fewer(Conv2d { groups: 2, ..c }), "{level:?} in groups");
-            assert!(!fewer(Conv2d { stride: [2; 2], ..c }) && !fewer(Conv2d { dilation: [2; 2], ..c }));
-            assert!(!fewer(Conv2d { channels_in: 3, ..c }) && !fewer(Conv2d { kernel: [3, 1], ..c }));
+            let strided = Conv2d { stride: [2; 2], ..c };
+            assert!(fewer(c, &small) && fewer(strided, &large), "{level:?}");
+            assert!(fewer(Conv2d { groups: 2, ..c }, &small) && fewer(Conv2d { groups: 2, ..strided }, &large), "{level:?} in groups");
+            assert!(!fewer(strided, &tiny) && !fewer(Conv2d { stride: [2, 1], ..c }, &large));
+            assert!(!fewer(Conv2d { dilation: [2; 2], ..c }, &small) && !fewer(Conv2d { kernel: [3, 1], ..c }, &small));
+            assert!(!fewer(Conv2d { channels_in: 3, ..c }, &small));
+            let of_stride = |step| cases().iter().filter(|(c, images)| c.stride == [step; 2] && fewer(*c, images)).count();
+            assert!(of_stride(1) >= 3 && of_stride(2) >= 3, "{level:?}: cases with few products");
         });
     }
 }

@@ -377,6 +377,7 @@ impl Coming {
             from: self.from.wrapping_add(self.piece * self.width),
             left: self.pieces - self.piece,
             pieces: self.pieces,
+            step: self.width,
             turn: self.stride - (self.pieces - 1) * self.width,
         };
         self.left = self.left.saturating_sub(self.rows * self.pieces + self.rest);

@@ -1,10 +1,10 @@
 //! Computes correlations (forward passes and input gradients) as sums over channels and taps, vectorized along output pixels.
 
 mod factors;
-mod later;
 mod outputs;
 
 use super::bands::{Bands, Scratch, aligned, with_scratch};
+use super::later::{Later, Run};
 use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Phase, Tensors, offset};
 use super::winograd;
@@ -14,7 +14,6 @@ use crate::ops::activation::Activation;
 use crate::simd;
 use crate::tile::{Ahead, Kernel, Pack, Segment, Shared, Start, Tile, kernel};
 use factors::Factors;
-use later::Later;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -245,8 +244,7 @@ impl Job<'_> {
                 self.planes.fill(source, channels.clone(), part.images.clone(), part.rows.start, planes);
             }
             let ahead = if pass + 1 < passes { Some((part, pass + 1)) } else { next.map(|n| (n, 0)) };
-            let blocks = part.features.len().div_ceil(self.kernel.rows);
-            let mut later = ahead.filter(|_| !self.in_place).map(|next| self.input_of(next, tiles * blocks));
+            let mut later = ahead.filter(|_| !self.in_place).map(|next| Later::new(self.input_of(next), self.pieces(part, channels.len())));
             let mut tile = 0;
             for ((phases, terms), repeats) in
                 c.phases.chunks(self.joined).zip(self.terms.chunks(self.joined)).zip(self.repeats.chunks(self.joined))
@@ -286,20 +284,23 @@ impl Job<'_> {
         }
     }
 
-    /// Input that a pass copies, to be prefetched by `tiles` tiles.
-    fn input_of(&self, (part, pass): (&Part, usize), tiles: usize) -> Later {
+    /// Pieces of memory that all tiles of a pass over that many channels prefetch.
+    fn pieces(&self, part: &Part, channels: usize) -> usize {
+        let blocks = part.features.len().div_ceil(self.kernel.rows);
+        let tiles = |p| self.cells(&self.clip(p, part)).div_ceil(self.kernel.width());
+        self.c.phases.iter().map(|p| tiles(p) * blocks * Ahead::pieces(channels * p.taps.len())).sum()
+    }
+
+    /// Input that a pass copies.
+    fn input_of(&self, (part, pass): (&Part, usize)) -> Run {
         let c = self.c;
         let channels = pass * self.block..((pass + 1) * self.block).min(c.channels);
-        let read = self.planes.rows_of(part.rows.clone());
-        let (size, len) = (c.input[0] * c.input[1], read.len() * c.input[1]);
+        let (read, size) = (self.planes.rows_of(part.rows.clone()), c.input[0] * c.input[1]);
         let first = part.images.start * c.groups * c.channels + part.group * c.channels + channels.start;
-        let planes = if len > 0 { part.images.len() * channels.len() } else { 0 };
-        Later {
+        Run {
             from: self.x.as_ptr().wrapping_add(first * size + read.start * c.input[1]),
-            at: 0,
-            len,
-            per_tile: (planes * len).div_ceil(tiles.max(1)),
-            planes,
+            len: read.len() * c.input[1],
+            images: part.images.len(),
             channels: channels.len(),
             to_channel: size,
             to_image: (c.groups * c.channels - channels.len() + 1) * size,
@@ -394,7 +395,7 @@ impl Job<'_> {
         };
         if self.c.is_rounded() {
             if let Some(later) = later {
-                later.fetch(s.part.features.len().div_ceil(self.kernel.rows));
+                later.fetch(s.part.features.len().div_ceil(self.kernel.rows) * Ahead::pieces(count));
             }
             return self.rounded_tile(s, &panel[..count * width], last.at + last.len, sums, rounded);
         }
