@@ -42,24 +42,27 @@ by_lanes! {
     /// # Safety
     /// As for [`Form::transform`].
     pub unsafe fn transform<L>(rows: &[*const f32; MOST_ROWS], to: &Strides, out: *mut f32) {
-        for (from, tile) in to.vectors(L::N) {
-            let mut d = [[L::splat(0.0); 5]; 5];
-            for y in 0..5 {
-                let row = rows[y].add(from);
-                let (left, right) = (L::load_pairs(row), L::load_pairs(row.add(2 * L::N)));
-                let ((x0, x2), (x1, x3)) = (L::pairs(left.0, right.0), L::pairs(left.1, right.1));
-                let (left, right) = (L::load_pairs(row.add(4)).0, L::load_pairs(row.add(4 + 2 * L::N)).0);
-                let (x4, _) = L::pairs(left, right);
-                d[y] = [L::sub(x0, x2), x1, x2, x3, L::sub(x4, x2)];
-            }
-            for x in 0..5 {
-                (d[0][x], d[4][x]) = (L::sub(d[0][x], d[2][x]), L::sub(d[4][x], d[2][x]));
-            }
-            let mut out = out.add(to.at(tile));
-            for row in d {
-                for v in row {
-                    L::store(out, v);
-                    out = out.add(to.point);
+        for row in 0..to.rows() {
+            for column in (0..to.row).step_by(L::N) {
+                let (from, tile) = (row * to.from_row + column * to.pixels, row * to.row + column);
+                let mut d = [[L::splat(0.0); 5]; 5];
+                for y in 0..5 {
+                    let row = rows[y].add(from);
+                    let (left, right) = (L::load_pairs(row), L::load_pairs(row.add(2 * L::N)));
+                    let ((x0, x2), (x1, x3)) = (L::pairs(left.0, right.0), L::pairs(left.1, right.1));
+                    let (left, right) = (L::load_pairs(row.add(4)).0, L::load_pairs(row.add(4 + 2 * L::N)).0);
+                    let (x4, _) = L::pairs(left, right);
+                    d[y] = [L::sub(x0, x2), x1, x2, x3, L::sub(x4, x2)];
+                }
+                for x in 0..5 {
+                    (d[0][x], d[4][x]) = (L::sub(d[0][x], d[2][x]), L::sub(d[4][x], d[2][x]));
+                }
+                let mut out = out.add(to.at(tile));
+                for row in d {
+                    for v in row {
+                        L::store(out, v);
+                        out = out.add(to.point);
+                    }
                 }
             }
         }

@@ -17,6 +17,8 @@ use rayon::prelude::*;
 use std::cell::Cell;
 use std::ops::Range;
 
+/// Floats of a cache line.
+const LINE: usize = 16;
 /// Transformed weights of a kernel.
 const WEIGHTS: usize = 16;
 /// Output channels whose weights alternate, so that a tile reads its weights in the order of memory.
@@ -110,7 +112,7 @@ pub fn run<'a>(c: &Correlation, t: Tensors<'a>) -> Result<(), Tensors<'a>> {
     let mut planes = Planes::default();
     let taps_of_tile = (0..form.reach as isize).flat_map(|y| (0..=2 * form.step as isize).map(move |x| [low[0] + y, low[1] + x]));
     planes.update(c.input, [2 * form.step, 1], taps_of_tile);
-    planes.fit(1, grid.rows, 2 * form.step * grid.columns);
+    planes.fit(1, grid.rows, grid.floats_per_row() - 2 * form.step);
     let mut weights = TRANSFORMED.take();
     let pitch = Pitch::of(c);
     weights.resize(c.groups * WEIGHTS * pitch.weight, 0.0);
@@ -124,6 +126,7 @@ pub fn run<'a>(c: &Correlation, t: Tensors<'a>) -> Result<(), Tensors<'a>> {
         terms: (form.terms)(),
         kernel,
         grid,
+        lead: low[1].rem_euclid(LINE as isize) as usize,
         rows: std::array::from_fn(|y| planes.offset([low[0] + y.min(form.reach - 1) as isize, low[1]])),
         planes,
         x: t.x,
@@ -224,7 +227,14 @@ impl Grid {
         let tiles = self.tiles(rows);
         // Rows that padding separates are read as one.
         let row = if self.pitch > self.columns { tiles } else { self.columns };
-        Strides { block: kernel.width(), to_block: count * point, point, tiles, row, pixels: 2 * self.form.step }
+        let (pixels, from_row) = (2 * self.form.step, self.floats_per_row());
+        Strides { block: kernel.width(), to_block: count * point, point, tiles, row, pixels, from_row }
+    }
+
+    /// Floats of the copied input from one row of tiles to the next: whole cache lines, unless rows are read as one.
+    fn floats_per_row(&self) -> usize {
+        let floats = 2 * self.form.step * (self.columns + 1);
+        if self.pitch > self.columns { floats } else { floats.next_multiple_of(LINE) }
     }
 }
 
@@ -244,6 +254,8 @@ struct Job<'a> {
     kernel: &'static Kernel,
     grid: Grid,
     planes: Planes,
+    /// Floats before the copy.
+    lead: usize,
     /// Offsets of a tile's rows in the copy.
     rows: [usize; MOST_ROWS],
     x: &'a [f32],
@@ -262,8 +274,8 @@ impl Job<'_> {
         let tiles = self.grid.tiles(part.rows.len());
         let (blocks, features) = (tiles.div_ceil(width), part.features.len());
         let Scratch { planes, panel, sums, offsets, .. } = scratch;
-        // Whole vectors of tiles are read, even beyond the last tile.
-        let copy = aligned(planes, self.planes.channel + (2 * form.step + 1) * lanes);
+        // Whole vectors of tiles are read, even beyond the last tile. The first pixel of a row begins a cache line.
+        let copy = &mut aligned(planes, self.planes.channel + (2 * form.step + 1) * lanes + LINE)[self.lead..];
         let inputs = aligned(panel, form.inputs * form.channels.min(c.channels) * blocks * width);
         let products = aligned(sums, form.products * features * blocks * width + 4 * tiles.next_multiple_of(lanes));
         let (products, pixels) = products.split_at_mut(form.products * features * blocks * width);
@@ -449,8 +461,9 @@ struct Strides {
     tiles: usize,
     /// Tiles per row of the copied input.
     row: usize,
-    /// Floats of the copied input from one tile to the next; rows of tiles are one such distance apart.
+    /// Floats of the copied input from one tile to the next, and from one row of tiles to the next.
     pixels: usize,
+    from_row: usize,
 }
 
 impl Strides {
@@ -460,12 +473,7 @@ impl Strides {
         tile / self.block * self.to_block + tile % self.block
     }
 
-    /// Offset in the copied input, and first tile, of each vector of `lanes` tiles.
-    #[inline(always)]
-    fn vectors(&self, lanes: usize) -> impl Iterator<Item = (usize, usize)> {
-        (0..self.tiles)
-            .step_by(self.row)
-            .enumerate()
-            .flat_map(move |(y, first)| (0..self.row).step_by(lanes).map(move |x| (self.pixels * (first + y + x), first + x)))
+    fn rows(&self) -> usize {
+        self.tiles / self.row
     }
 }

@@ -31,24 +31,27 @@ by_lanes! {
     /// # Safety
     /// As for [`Form::transform`].
     pub unsafe fn transform<L>(rows: &[*const f32; MOST_ROWS], to: &Strides, out: *mut f32) {
-        for (from, tile) in to.vectors(L::N) {
-            let mut b = [[L::splat(0.0); 4]; 4];
-            for half in 0..2 {
-                let d = |row: usize| L::load_pairs(rows[row].add(from + 2 * half));
-                let (d0, d1, d2, d3) = (d(0), d(1), d(2), d(3));
-                for (x, [d0, d1, d2, d3]) in [[d0.0, d1.0, d2.0, d3.0], [d0.1, d1.1, d2.1, d3.1]].into_iter().enumerate() {
-                    let x = 2 * half + x;
-                    b[0][x] = L::sub(d0, d2);
-                    b[1][x] = L::add(d1, d2);
-                    b[2][x] = L::sub(d2, d1);
-                    b[3][x] = L::sub(d1, d3);
+        for row in 0..to.rows() {
+            for column in (0..to.row).step_by(L::N) {
+                let (from, tile) = (row * to.from_row + column * to.pixels, row * to.row + column);
+                let mut b = [[L::splat(0.0); 4]; 4];
+                for half in 0..2 {
+                    let d = |row: usize| L::load_pairs(rows[row].add(from + 2 * half));
+                    let (d0, d1, d2, d3) = (d(0), d(1), d(2), d(3));
+                    for (x, [d0, d1, d2, d3]) in [[d0.0, d1.0, d2.0, d3.0], [d0.1, d1.1, d2.1, d3.1]].into_iter().enumerate() {
+                        let x = 2 * half + x;
+                        b[0][x] = L::sub(d0, d2);
+                        b[1][x] = L::add(d1, d2);
+                        b[2][x] = L::sub(d2, d1);
+                        b[3][x] = L::sub(d1, d3);
+                    }
                 }
-            }
-            let mut out = out.add(to.at(tile));
-            for [a, b, c, d] in b {
-                for v in [L::sub(a, c), L::add(b, c), L::sub(c, b), L::sub(b, d)] {
-                    L::store(out, v);
-                    out = out.add(to.point);
+                let mut out = out.add(to.at(tile));
+                for [a, b, c, d] in b {
+                    for v in [L::sub(a, c), L::add(b, c), L::sub(c, b), L::sub(b, d)] {
+                        L::store(out, v);
+                        out = out.add(to.point);
+                    }
                 }
             }
         }
