@@ -27,6 +27,14 @@ impl Bands {
         Bands { batch, height: rows, images: 1, rows: rows.div_ceil(parts) }
     }
 
+    /// The same bands, or up to twice as many that take fewer tiles of `width` cells, where rows are `pitch` cells apart.
+    pub fn fitted(self, columns: usize, pitch: usize, width: usize) -> Self {
+        let tiles = |rows: usize| if rows > 0 { ((rows - 1) * pitch + columns).div_ceil(width) } else { 0 };
+        let cost = |rows: usize| self.height / rows * tiles(rows) + tiles(self.height % rows);
+        let rows = (self.rows.div_ceil(2)..=self.rows).rev().min_by_key(|&rows| cost(rows));
+        Bands { rows: rows.filter(|_| self.images == 1).unwrap_or(self.rows), ..self }
+    }
+
     /// Number of bands.
     pub fn len(&self) -> usize {
         self.batch.div_ceil(self.images) * self.height.div_ceil(self.rows)

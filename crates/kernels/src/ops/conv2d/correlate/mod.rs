@@ -121,7 +121,8 @@ impl Correlation {
         let (features, pixels) = self.divide(rows, columns, kernel);
         // The passes fix the order of sums, so they must not depend on the thread count: direct reads handle one image at a time.
         let pixels = if direct { pixels.min(2 * rows * columns - 1) } else { pixels };
-        let bands = Bands::plan(self.batch, rows, columns, pixels);
+        let pitch = if direct { planes.pitch_of(columns) } else { columns };
+        let bands = Bands::plan(self.batch, rows, columns, pixels).fitted(columns, pitch, kernel.width());
         planes.fit(bands.images, bands.rows, columns);
         let taps = self.phases.iter().map(|p| p.taps.len()).max().unwrap_or(0).max(1);
         let block = if in_place {
@@ -198,7 +199,16 @@ impl Correlation {
             features = self.features.div_ceil(parts).next_multiple_of(kernel.rows);
         }
         let tasks = self.groups * self.features.div_ceil(features.max(1));
-        let share = all.div_ceil((if heavy { 3 } else { 8 } * threads).div_ceil(tasks.max(1)));
+        let share = all.div_ceil(
+            (if heavy {
+                3
+            } else if self.is_pointwise() {
+                12
+            } else {
+                8
+            } * threads)
+                .div_ceil(tasks.max(1)),
+        );
         (features, budget(features).min(share.max(FEWEST)).max(1))
     }
 
