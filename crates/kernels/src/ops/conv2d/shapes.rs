@@ -1,6 +1,6 @@
 //! Descriptions of correlations and weight gradients, shared by all algorithms that compute them.
 
-use crate::gemm::Precision;
+use crate::gemm::{Precision, has_bf16};
 use crate::ops::activation::Activation;
 
 /// A weight, and the input pixel that it multiplies relative to a grid cell.
@@ -42,6 +42,34 @@ pub struct Correlation {
     pub weight_feature: usize,
     pub weight_channel: usize,
     pub precision: Precision,
+}
+
+impl Correlation {
+    /// Whether factors are rounded to bf16.
+    pub(super) fn is_rounded(&self) -> bool {
+        self.precision == Precision::Bf16 && has_bf16()
+    }
+
+    /// Whether every phase has one tap, at its own cell of the input.
+    pub(super) fn is_pointwise(&self) -> bool {
+        let one = |p: &Phase| matches!(&p.taps[..], [tap] if tap.at == [0; 2]) && p.size == self.input;
+        self.step == [1; 2] && self.phases.iter().all(one)
+    }
+
+    /// Whether phases have equal sizes and each pair holds the even and the odd pixels of the same rows.
+    pub(super) fn alternates(&self) -> bool {
+        let alternate = |p: &[Phase]| matches!(p, [a, b] if a.start[0] == b.start[0] && [a.start[1], b.start[1]] == [0, 1]);
+        let size = self.phases.first().map(|p| p.size);
+        self.spread[1] == 2
+            && !self.is_rounded()
+            && self.phases.iter().all(|p| Some(p.size) == size)
+            && self.phases.chunks(2).all(alternate)
+    }
+
+    /// Whether two phases read the same inputs.
+    pub(super) fn reads_the_same(&self, a: usize, b: usize) -> bool {
+        self.phases[a].taps.iter().map(|t| t.at).eq(self.phases[b].taps.iter().map(|t| t.at))
+    }
 }
 
 /// Tensors of a [`Correlation`].

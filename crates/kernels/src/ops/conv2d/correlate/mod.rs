@@ -9,7 +9,7 @@ use super::planes::{Planes, Source};
 use super::shapes::{Correlation, Phase, Tensors, offset};
 use super::winograd;
 use super::{depthwise, paired};
-use crate::gemm::{Gemm, Init, Precision, Rounded, View, has_bf16};
+use crate::gemm::{Gemm, Init, Rounded, View};
 use crate::ops::activation::Activation;
 use crate::simd;
 use crate::tile::{Ahead, Kernel, Pack, Segment, Shared, Start, Tile, kernel};
@@ -159,31 +159,6 @@ impl Correlation {
             out: Shared(t.out.as_mut_ptr()),
             before: t.before.map(|b| Shared(b.as_mut_ptr())),
         }
-    }
-
-    /// Whether factors are rounded to bf16.
-    pub(super) fn is_rounded(&self) -> bool {
-        self.precision == Precision::Bf16 && has_bf16()
-    }
-
-    /// Whether every phase has one tap, at its own cell of the input.
-    pub(super) fn is_pointwise(&self) -> bool {
-        let one = |p: &Phase| matches!(&p.taps[..], [tap] if tap.at == [0; 2]) && p.size == self.input;
-        self.step == [1; 2] && self.phases.iter().all(one)
-    }
-
-    /// Whether phases have equal sizes and each pair holds the even and the odd pixels of the same rows.
-    pub(super) fn alternates(&self) -> bool {
-        let alternate = |p: &[Phase]| matches!(p, [a, b] if a.start[0] == b.start[0] && [a.start[1], b.start[1]] == [0, 1]);
-        let size = self.phases.first().map(|p| p.size);
-        self.spread[1] == 2
-            && !self.is_rounded()
-            && self.phases.iter().all(|p| Some(p.size) == size)
-            && self.phases.chunks(2).all(alternate)
-    }
-
-    fn reads_the_same(&self, a: usize, b: usize) -> bool {
-        self.phases[a].taps.iter().map(|t| t.at).eq(self.phases[b].taps.iter().map(|t| t.at))
     }
 
     /// Output channels and pixels per task; splits channels only if there are more weights per input channel than pixels.
