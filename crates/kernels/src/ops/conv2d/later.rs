@@ -34,7 +34,7 @@ impl Later {
     /// Rows that `pieces` request.
     pub fn new(run: Run, pieces: usize) -> Later {
         let planes = if run.len > 0 { run.images * run.channels } else { 0 };
-        // Less than a cache line per piece would request lines twice.
+        // At least a cache line; pieces, which are as wide as a tile, may overlap.
         let step = (planes * run.len).div_ceil(pieces.max(1)).max(16);
         Later { from: run.from, at: 0, run, planes, step }
     }

@@ -4,7 +4,7 @@ pub(crate) mod bands;
 pub(crate) mod correlate;
 pub mod cpu;
 mod depthwise;
-pub(crate) mod later;
+mod later;
 mod paired;
 mod planes;
 pub mod reference;

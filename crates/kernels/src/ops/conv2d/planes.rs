@@ -17,6 +17,8 @@ pub struct Planes {
     reach: [usize; 2],
     residues: Vec<[usize; 2]>,
     rows_per_channel: usize,
+    /// Input rows from the first tap of a cell to its last.
+    span: usize,
     rows: usize,
     pub pitch: usize,
     plane: usize,
@@ -40,6 +42,7 @@ impl Planes {
         (self.input, self.step) = (input, step);
         let first = taps.clone().next().unwrap_or([0; 2]);
         self.low = taps.clone().fold(first, |a, t| [a[0].min(t[0]), a[1].min(t[1])]);
+        self.span = taps.clone().map(|t| (t[0] - self.low[0]) as usize + 1).max().unwrap_or(0);
         self.reach = [0; 2];
         self.residues.clear();
         let mut rows = Vec::new();
@@ -89,7 +92,7 @@ impl Planes {
     /// Input rows that a grid's rows read.
     pub fn rows_of(&self, grid: Range<usize>) -> Range<usize> {
         let first = self.low[0] + (grid.start * self.step[0]) as isize;
-        let end = self.low[0] + ((grid.end + self.reach[0]) * self.step[0]) as isize;
+        let end = self.low[0] + ((grid.end.max(1) - 1) * self.step[0] + self.span) as isize;
         let clip = |row: isize| row.clamp(0, self.input[0] as isize) as usize;
         clip(first)..clip(end).max(clip(first))
     }
@@ -106,17 +109,16 @@ impl Planes {
         plane * self.plane + shift[0] * self.pitch + shift[1]
     }
 
-    /// Lists the rows (offset in a channel, offset in its copy) that a grid beginning at `first_row` reads, and returns their length. All
-    /// other floats of a copy are zero. Neighboring columns of the input are neighbors in the copy.
-    pub fn list_rows(&self, first_row: usize, out: &mut Vec<(u32, u32)>) -> usize {
+    /// Lists the rows (offset in a channel, offset in its copy) that rows of the grid read, and returns their length; the caller zeroes
+    /// all other floats. Neighboring columns of the input are neighbors in the copy.
+    pub fn list_rows(&self, grid: Range<usize>, out: &mut Vec<(u32, u32)>) -> usize {
         assert_eq!(self.step[1], 1, "rows are copied as they are");
         let [height, width] = self.input;
         let (begin, skipped) = ((-self.low[1]).max(0) as usize, self.low[1].max(0) as usize);
         let len = width.saturating_sub(skipped).min(self.pitch.saturating_sub(begin));
         out.clear();
-        let rows = self.plane / self.pitch.max(1);
-        for d in 0..rows * self.step[0] {
-            let y = self.low[0] + (first_row * self.step[0] + d) as isize;
+        for d in 0..(grid.len().max(1) - 1) * self.step[0] + self.span {
+            let y = self.low[0] + (grid.start * self.step[0] + d) as isize;
             let plane = self.residues.iter().position(|r| r[0] == d % self.step[0]);
             if let (0.., Some(plane)) = (y, plane)
                 && len > 0

@@ -156,8 +156,11 @@ fn results_do_not_depend_on_the_number_of_threads() {
     let images = Images { batch: 3, height: 21, width: 50 };
     assert!(c.weight_sums(&images).shares() > 1, "pixels of the weights' gradient are summed in parts");
     // With few threads, several of these small images would share a band.
-    let many = (Conv2d { stride: [2; 2], padding: [1; 2], ..Conv2d::new(20, 20, 3) }, Images { batch: 16, height: 32, width: 32 });
-    for (c, images) in [(c, images), many] {
+    let many = (Conv2d { stride: [2; 2], padding: [1; 2], ..Conv2d::new(20, 7, 3) }, Images { batch: 16, height: 32, width: 32 });
+    // With many threads, its output channels are divided.
+    let one = (Conv2d { stride: [2; 2], padding: [1; 2], ..Conv2d::new(64, 64, 3) }, Images { batch: 1, height: 64, width: 64 });
+    assert!(takes_fewer_products(one.0, &one.1) && !takes_fewer_products(many.0, &many.1));
+    for (c, images) in [(c, images), many, one] {
         let [x, w, b, d] = tensors(&c, &images);
         let run = |threads: usize| {
             rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(|| {
@@ -179,16 +182,19 @@ fn a_kernel_must_fit() {
     Conv2d::new(1, 1, 3).output(&Images { batch: 1, height: 2, width: 9 });
 }
 
+/// Whether the forward pass takes Winograd's way.
+fn takes_fewer_products(c: Conv2d, images: &Images) -> bool {
+    let [x, w, bias, d] = tensors(&c, images);
+    let mut out = vec![0.0; d.len()];
+    let t = shapes::Tensors { x: &x, weights: &w, bias: &bias, activation: c.activation, out: &mut out, before: None };
+    winograd::run(&c.correlation(images), t).is_ok()
+}
+
 #[test]
 fn square_kernels_on_many_channels_take_fewer_products() {
     let images = |height, width| Images { batch: 1, height, width };
     let (tiny, small, large) = (images(6, 6), images(20, 31), images(97, 128));
-    let fewer = |c: Conv2d, images: &Images| {
-        let [x, w, bias, d] = tensors(&c, images);
-        let mut out = vec![0.0; d.len()];
-        let t = shapes::Tensors { x: &x, weights: &w, bias: &bias, activation: c.activation, out: &mut out, before: None };
-        winograd::run(&c.correlation(images), t).is_ok()
-    };
+    let fewer = takes_fewer_products;
     for level in Level::available() {
         with_level(level, || {
             let c = Conv2d { padding: [1; 2], ..Conv2d::new(64, 64, 3) };

@@ -174,16 +174,13 @@ impl Correlation {
             features = self.features.div_ceil(parts).next_multiple_of(kernel.rows);
         }
         let tasks = self.groups * self.features.div_ceil(features.max(1));
-        let share = all.div_ceil(
-            (if heavy {
-                3
-            } else if self.is_pointwise() {
-                12
-            } else {
-                8
-            } * threads)
-                .div_ceil(tasks.max(1)),
-        );
+        let per_thread = match (heavy, self.is_pointwise()) {
+            (true, _) => 3,
+            // Tasks of a pointwise convolution cost little more if they are small.
+            (_, true) => 12,
+            _ => 8,
+        };
+        let share = all.div_ceil((per_thread * threads).div_ceil(tasks.max(1)));
         (features, budget(features).min(share.max(FEWEST)).max(1))
     }
 

@@ -6,7 +6,7 @@
 //!
 //! `y₀ = [g₀ (x₀ − x₂) + g₁ x₁] + (g₀ + g₂) x₂` and `y₁ = (g₀ + g₂) x₂ + [g₁ x₃ + g₂ (x₄ − x₂)]`.
 
-use super::{Costs, Form, LANES, MOST_ROWS, Strides, WEIGHTS};
+use super::{Costs, Form, LANES, REACH, Strides, WEIGHTS};
 use crate::vector::{by_lanes, vectorized};
 
 /// The equation above in both axes.
@@ -16,7 +16,7 @@ pub const FORM: Form = Form {
     inputs: 25,
     channels: 32,
     tiles: 102,
-    products: 9,
+    sums: 9,
     terms,
     transform,
     kernels,
@@ -24,16 +24,16 @@ pub const FORM: Form = Form {
     costs: Costs { input: 214.0, output: 20.0, band: 9.0, weight: 28.0, direct: 5.2, copy: 32.0 },
 };
 
-/// Per product along one axis, its terms (weight, input), of the weights `[g₀, g₁, g₀ + g₂, g₂]` and the inputs
+/// Per sum along one axis, its products (weight, input), of the weights `[g₀, g₁, g₀ + g₂, g₂]` and the inputs
 /// `[x₀ − x₂, x₁, x₂, x₃, x₄ − x₂]`.
-const LINE: [&[(usize, usize)]; 3] = [&[(0, 0), (1, 1)], &[(2, 2)], &[(1, 3), (3, 4)]];
+const AXIS: [&[(usize, usize)]; 3] = [&[(0, 0), (1, 1)], &[(2, 2)], &[(1, 3), (3, 4)]];
 
 fn terms() -> Vec<Vec<(usize, usize)>> {
     let of = |row: (usize, usize), column: (usize, usize)| (4 * row.0 + column.0, 5 * row.1 + column.1);
-    let product = |rows: &[(usize, usize)], columns: &[(usize, usize)]| {
+    let sum = |rows: &[(usize, usize)], columns: &[(usize, usize)]| {
         rows.iter().flat_map(|&row| columns.iter().map(move |&column| of(row, column))).collect()
     };
-    LINE.iter().flat_map(|rows| LINE.iter().map(move |columns| product(rows, columns))).collect()
+    AXIS.iter().flat_map(|rows| AXIS.iter().map(move |columns| sum(rows, columns))).collect()
 }
 
 by_lanes! {
@@ -41,7 +41,7 @@ by_lanes! {
     ///
     /// # Safety
     /// As for [`Form::transform`].
-    pub unsafe fn transform<L>(rows: &[*const f32; MOST_ROWS], to: &Strides, out: *mut f32) {
+    pub unsafe fn transform<L>(rows: &[*const f32; REACH], to: &Strides, out: *mut f32) {
         for row in 0..to.rows() {
             for column in (0..to.row).step_by(L::N) {
                 let (from, tile) = (row * to.from_row + column * to.pixels, row * to.row + column);
@@ -70,7 +70,7 @@ by_lanes! {
 }
 
 by_lanes! {
-    /// Sums of neighboring products in both axes, `+ bias`.
+    /// Neighboring sums added in both axes, `+ bias`.
     ///
     /// # Safety
     /// As for [`Form::collect`].

@@ -21,6 +21,8 @@ use std::ops::Range;
 const LINE: usize = 16;
 /// Transformed weights of a kernel.
 const WEIGHTS: usize = 16;
+/// Most rows of the input that a tile reads.
+const REACH: usize = 5;
 /// Output channels whose weights alternate, so that a tile reads its weights in the order of memory.
 const ROWS: usize = 8;
 /// Kernels transformed together: those of two input channels and as many output channels as alternate.
@@ -40,27 +42,27 @@ struct Form {
     step: usize,
     /// Rows of the input that a tile reads.
     reach: usize,
-    /// Transformed inputs of a tile.
+    /// Transformed inputs of a tile, as many as products.
     inputs: usize,
     /// Input channels per pass.
     channels: usize,
     /// Most tiles of a band, unless a single row has more.
     tiles: usize,
-    /// Products of a tile.
-    products: usize,
-    /// Terms (weight, input) of each product.
+    /// Sums of products of a tile.
+    sums: usize,
+    /// Products (weight, input) of each sum.
     terms: fn() -> Vec<Vec<(usize, usize)>>,
     /// Transforms the inputs of one channel from its rows.
     ///
     /// # Safety
     /// The rows extend by `2 · step` vectors and floats from the last tile; the output holds whole vectors of all tiles.
-    transform: unsafe fn(&[*const f32; MOST_ROWS], &Strides, *mut f32),
+    transform: unsafe fn(&[*const f32; REACH], &Strides, *mut f32),
     /// Transforms the nine weights of each lane.
     kernels: fn(&[[f32; LANES]; 9]) -> [[f32; LANES]; WEIGHTS],
-    /// Adds products and a bias up to two rows of outputs.
+    /// Adds sums and a bias up to two rows of outputs.
     ///
     /// # Safety
-    /// The products are whole vectors of all tiles, and both rows hold two vectors for each of them.
+    /// The sums are whole vectors of all tiles, and both rows hold two vectors for each of them.
     collect: unsafe fn(*const f32, &Strides, f32, [*mut f32; 2]),
     costs: Costs,
 }
@@ -178,7 +180,7 @@ impl Grid {
         let pitch = if columns.is_multiple_of(kernel.lanes) { columns } else { columns + 1 };
         let of = |rows| Grid { form, height, columns, pitch, rows };
         let most = (form.tiles / pitch).clamp(1, height);
-        // Each band reads all weights again.
+        // Transforms of a vector take about as long as three products; each band reads all weights again.
         let cost = |rows: usize| (form.inputs + 3) * of(rows).vectors_of_image(kernel) + WEIGHTS * height.div_ceil(rows);
         of((1..=most).min_by_key(|&rows| cost(rows)).unwrap_or(1))
     }
@@ -211,7 +213,7 @@ impl Grid {
 
     /// Output channels whose products of a band stay in cache.
     fn most_features(&self, c: &Correlation) -> usize {
-        (PRODUCTS / (self.form.products * self.tiles(self.rows))).clamp(1, c.features)
+        (PRODUCTS / (self.form.sums * self.tiles(self.rows))).clamp(1, c.features)
     }
 
     /// Output channels per task.
@@ -222,7 +224,7 @@ impl Grid {
         c.features.div_ceil(parts).next_multiple_of(8)
     }
 
-    /// Layout of what `count` transformed inputs or products of each tile are `point` floats apart.
+    /// Layout of `count` transformed inputs or sums per tile, `point` floats apart.
     fn strides(&self, rows: usize, count: usize, point: usize, kernel: &Kernel) -> Strides {
         let tiles = self.tiles(rows);
         // Rows that padding separates are read as one.
@@ -257,7 +259,7 @@ struct Job<'a> {
     /// Floats before the copy.
     lead: usize,
     /// Offsets of a tile's rows in the copy.
-    rows: [usize; MOST_ROWS],
+    rows: [usize; REACH],
     x: &'a [f32],
     /// Transformed weights, laid out by `pitch`.
     weights: &'a [f32],
@@ -274,11 +276,11 @@ impl Job<'_> {
         let tiles = self.grid.tiles(part.rows.len());
         let (blocks, features) = (tiles.div_ceil(width), part.features.len());
         let Scratch { planes, panel, sums, offsets, .. } = scratch;
-        // Whole vectors of tiles are read, even beyond the last tile. The first pixel of a row begins a cache line.
+        // Whole vectors of tiles are read, even beyond the last tile. Where rows are whole cache lines, their first pixels begin one.
         let copy = &mut aligned(planes, self.planes.channel + (2 * form.step + 1) * lanes + LINE)[self.lead..];
         let inputs = aligned(panel, form.inputs * form.channels.min(c.channels) * blocks * width);
-        let products = aligned(sums, form.products * features * blocks * width + 4 * tiles.next_multiple_of(lanes));
-        let (products, pixels) = products.split_at_mut(form.products * features * blocks * width);
+        let products = aligned(sums, form.sums * features * blocks * width + 4 * tiles.next_multiple_of(lanes));
+        let (products, pixels) = products.split_at_mut(form.sums * features * blocks * width);
         for first in (0..c.channels).step_by(form.channels) {
             let channels = first..(first + form.channels).min(c.channels);
             self.transform_inputs(part, channels.clone(), offsets, copy, inputs);
@@ -290,9 +292,9 @@ impl Job<'_> {
             for block in 0..blocks {
                 let vectors = (tiles - block * width).min(width).div_ceil(lanes);
                 let inputs = &inputs[block * form.inputs * channels.len() * width..];
-                let products = &mut products[block * form.products * features * width..];
+                let products = &mut products[block * form.sums * features * width..];
                 let mut listed = 0;
-                for (product, terms) in self.terms.iter().enumerate() {
+                for (sum, terms) in self.terms.iter().enumerate() {
                     let terms = listed..listed + terms.len() * channels.len();
                     listed = terms.end;
                     for f in (0..features).step_by(self.kernel.rows) {
@@ -305,7 +307,7 @@ impl Job<'_> {
                             row: 1,
                             b: inputs.as_ptr(),
                             offsets: &offsets[terms.clone()],
-                            c: products[(product * features + f) * width..].as_mut_ptr(),
+                            c: products[(sum * features + f) * width..].as_mut_ptr(),
                             c_row: width,
                             c_vector: lanes,
                             start: if first == 0 { Start::Zero } else { Start::Accumulate },
@@ -323,7 +325,7 @@ impl Job<'_> {
         }
     }
 
-    /// Offsets of the terms of all products, each over `channels`.
+    /// Offsets of the products of all sums, each over `channels`.
     fn list_terms(&self, channels: usize, out: &mut Vec<(u32, u32)>) {
         out.clear();
         for &(weight, input) in self.terms.iter().flatten() {
@@ -353,7 +355,7 @@ impl Job<'_> {
     fn transform_inputs(&self, part: &Part, channels: Range<usize>, rows: &mut Vec<(u32, u32)>, copy: &mut [f32], out: &mut [f32]) {
         let (c, count) = (self.c, channels.len());
         let pixels = c.input[0] * c.input[1];
-        let len = self.planes.list_rows(part.rows.start, rows);
+        let len = self.planes.list_rows(part.rows.clone(), rows);
         copy.fill(0.0);
         let to = self.grid.strides(part.rows.len(), self.form.inputs, count * self.kernel.width(), self.kernel);
         for (i, channel) in channels.enumerate() {
@@ -370,7 +372,7 @@ impl Job<'_> {
     fn finish(&self, part: &Part, feature: usize, products: &[f32], features: usize, pixels: &mut [f32]) {
         let (c, width) = (self.c, self.kernel.width());
         let channel = part.group * c.features + feature;
-        let from = self.grid.strides(part.rows.len(), self.form.products, features * width, self.kernel);
+        let from = self.grid.strides(part.rows.len(), self.form.sums, features * width, self.kernel);
         let bias = self.bias.get(channel).copied().unwrap_or(0.0);
         let half = pixels.len() / 2;
         let (top, bottom) = pixels.split_at_mut(half);
@@ -400,9 +402,6 @@ impl Job<'_> {
     }
 }
 
-/// Most rows of the input that a tile reads.
-const MOST_ROWS: usize = 5;
-
 /// Layout of transformed weights `[groups, WEIGHTS, features / ROWS, channels, ROWS]`.
 #[derive(Clone, Copy)]
 struct Pitch {
@@ -415,7 +414,7 @@ struct Pitch {
 impl Pitch {
     fn of(c: &Correlation) -> Pitch {
         let block = c.channels.next_multiple_of(2) * ROWS;
-        Pitch { block, weight: c.features.div_ceil(ROWS) * block + LANES }
+        Pitch { block, weight: (c.features.div_ceil(ROWS) * block / LINE | 1) * LINE }
     }
 }
 

@@ -2,7 +2,7 @@
 //!
 //! A. Lavin, S. Gray, "Fast Algorithms for Convolutional Neural Networks", CVPR 2016, section 4.1.
 
-use super::{Costs, Form, LANES, MOST_ROWS, Strides, WEIGHTS};
+use super::{Costs, Form, LANES, REACH, Strides, WEIGHTS};
 use crate::vector::{by_lanes, vectorized};
 
 /// F(2×2, 3×3) of stride 1.
@@ -12,7 +12,7 @@ pub const FORM: Form = Form {
     inputs: 16,
     channels: 64,
     tiles: 160,
-    products: 16,
+    sums: 16,
     terms,
     transform,
     kernels,
@@ -20,7 +20,7 @@ pub const FORM: Form = Form {
     costs: Costs { input: 72.0, output: 37.0, band: 0.0, weight: 30.0, direct: 3.9, copy: 7.0 },
 };
 
-/// Each product is of one weight and one input.
+/// Each sum is one product.
 fn terms() -> Vec<Vec<(usize, usize)>> {
     (0..16).map(|i| vec![(i, i)]).collect()
 }
@@ -30,7 +30,7 @@ by_lanes! {
     ///
     /// # Safety
     /// As for [`Form::transform`].
-    pub unsafe fn transform<L>(rows: &[*const f32; MOST_ROWS], to: &Strides, out: *mut f32) {
+    pub unsafe fn transform<L>(rows: &[*const f32; REACH], to: &Strides, out: *mut f32) {
         for row in 0..to.rows() {
             for column in (0..to.row).step_by(L::N) {
                 let (from, tile) = (row * to.from_row + column * to.pixels, row * to.row + column);
