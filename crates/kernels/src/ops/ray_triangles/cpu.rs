@@ -1,8 +1,9 @@
 //! Traversal, nearest child first; boxes and triangles are tested eight at a time.
 
+use super::octet::{self, Octet};
 use super::{Bvh, Hit, LEAF, Node, Packet, Ray, WIDTH};
+use crate::simd::{self, Level};
 use crate::tasks::{self, Parts};
-use crate::vector::vectorized;
 
 /// Rays per task.
 const BLOCK: usize = 256;
@@ -51,60 +52,81 @@ impl Prepared {
         }
     }
 
-    /// Distances at which the ray enters the boxes of a node, and whether it meets them.
+    /// Distances at which the ray enters the boxes of a node, and a bit for each that it meets.
     #[inline(always)]
-    fn boxes(&self, node: &Node, range: [f32; 2]) -> ([f32; WIDTH], [bool; WIDTH]) {
-        let (mut near, mut far) = ([range[0]; WIDTH], [range[1]; WIDTH]);
-        for axis in 0..3 {
-            let (enter, leave) = (&node.bounds[axis][self.first[axis]], &node.bounds[axis][1 - self.first[axis]]);
-            for i in 0..WIDTH {
-                let a = (enter[i] - self.origin[axis]) * self.inverse[axis];
-                let b = (leave[i] - self.origin[axis]) * self.inverse[axis] * WIDER;
-                near[i] = if a > near[i] { a } else { near[i] };
-                far[i] = if b < far[i] { b } else { far[i] };
+    unsafe fn boxes<O: Octet>(&self, node: &Node, range: [f32; 2]) -> ([f32; WIDTH], u32) {
+        // SAFETY: the caller guarantees the instruction set.
+        unsafe {
+            let (mut near, mut far) = (O::splat(range[0]), O::splat(range[1]));
+            for axis in 0..3 {
+                let bounds = &node.bounds[axis];
+                let (origin, inverse) = (O::splat(self.origin[axis]), O::splat(self.inverse[axis]));
+                let enter = O::load(&bounds[self.first[axis]]).sub(origin).mul(inverse);
+                let leave = O::load(&bounds[1 - self.first[axis]]).sub(origin).mul(inverse).mul(O::splat(WIDER));
+                (near, far) = (enter.max(near), leave.min(far));
             }
+            let mut distances = [0.0; WIDTH];
+            near.store(&mut distances);
+            (distances, near.at_most(far))
         }
-        (near, std::array::from_fn(|i| near[i] <= far[i]))
     }
 
     /// Nearest hit of a packet within a range.
     #[inline(always)]
-    fn triangles(&self, packet: &Packet, range: [f32; 2], best: &mut Hit) {
-        let [x, y, z] = self.axes;
-        let (mut px, mut py, mut pz) = ([[0.0f32; WIDTH]; 3], [[0.0f32; WIDTH]; 3], [[0.0f32; WIDTH]; 3]);
-        for corner in 0..3 {
-            let p = &packet.corners[corner];
-            for i in 0..WIDTH {
-                let depth = p[z][i] - self.origin[z];
-                px[corner][i] = p[x][i] - self.origin[x] - self.shear[0] * depth;
-                py[corner][i] = p[y][i] - self.origin[y] - self.shear[1] * depth;
-                pz[corner][i] = self.shear[2] * depth;
+    unsafe fn triangles<O: Octet>(&self, packet: &Packet, range: [f32; 2], best: &mut Hit) {
+        // SAFETY: the caller guarantees the instruction set.
+        unsafe {
+            let [x, y, z] = self.axes;
+            let zero = O::splat(0.0);
+            let (mut px, mut py, mut pz) = ([zero; 3], [zero; 3], [zero; 3]);
+            for corner in 0..3 {
+                let p = &packet.corners[corner];
+                let depth = O::load(&p[z]).sub(O::splat(self.origin[z]));
+                px[corner] = O::load(&p[x]).sub(O::splat(self.origin[x])).sub(O::splat(self.shear[0]).mul(depth));
+                py[corner] = O::load(&p[y]).sub(O::splat(self.origin[y])).sub(O::splat(self.shear[1]).mul(depth));
+                pz[corner] = O::splat(self.shear[2]).mul(depth);
             }
-        }
-        // Twice the areas that the ray's point spans with the edges. An edge's area is the negative of its neighbor's, to the last bit.
-        let mut hits = [(f32::INFINITY, 0.0f32, 0.0f32); WIDTH];
-        for i in 0..WIDTH {
-            let a = px[2][i] * py[1][i] - py[2][i] * px[1][i];
-            let b = px[0][i] * py[2][i] - py[0][i] * px[2][i];
-            let c = px[1][i] * py[0][i] - py[1][i] * px[0][i];
-            let sum = a + b + c;
-            let t = (a * pz[0][i] + b * pz[1][i] + c * pz[2][i]) / sum;
-            let same = (a >= 0.0) & (b >= 0.0) & (c >= 0.0) | (a <= 0.0) & (b <= 0.0) & (c <= 0.0);
-            let inside = same & (sum != 0.0) & (t > range[0]) & (t < range[1]);
-            hits[i] = (if inside { t } else { f32::INFINITY }, b / sum, c / sum);
-        }
-        for (i, (t, u, v)) in hits.into_iter().enumerate() {
-            // Of triangles at one distance the first counts, in whatever order packets are met.
-            if t < best.t || t == best.t && t < f32::INFINITY && packet.ids[i] < best.triangle {
-                *best = Hit { t, triangle: packet.ids[i], weights: [u, v] };
+            // Twice the areas that the ray's point spans with the edges. An edge's area is the negative of its neighbor's, to the last bit.
+            let a = px[2].mul(py[1]).sub(py[2].mul(px[1]));
+            let b = px[0].mul(py[2]).sub(py[0].mul(px[2]));
+            let c = px[1].mul(py[0]).sub(py[1].mul(px[0]));
+            let front = zero.at_most(a) & zero.at_most(b) & zero.at_most(c);
+            let back = a.at_most(zero) & b.at_most(zero) & c.at_most(zero);
+            let sum = a.add(b).add(c);
+            let area = sum.below(zero) | zero.below(sum);
+            if (front | back) & area == 0 {
+                return;
+            }
+            let t = a.mul(pz[0]).add(b.mul(pz[1])).add(c.mul(pz[2])).div(sum);
+            let inside = (front | back) & area & O::splat(range[0]).below(t) & t.below(O::splat(range[1])) & t.at_most(O::splat(best.t));
+            let (mut distances, mut u, mut v) = ([0.0; WIDTH], [0.0; WIDTH], [0.0; WIDTH]);
+            t.store(&mut distances);
+            b.div(sum).store(&mut u);
+            c.div(sum).store(&mut v);
+            for i in each(inside) {
+                // Of triangles at one distance the first counts, in whatever order packets are met.
+                let (t, triangle) = (distances[i], packet.ids[i]);
+                if t < best.t || t == best.t && triangle < best.triangle {
+                    *best = Hit { t, triangle, weights: [u[i], v[i]] };
+                }
             }
         }
     }
 }
 
+/// Positions of the bits that are set.
+#[inline(always)]
+fn each(mut bits: u32) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let i = bits.trailing_zeros() as usize;
+        bits &= bits.wrapping_sub(1);
+        (i < WIDTH).then_some(i)
+    })
+}
+
 impl Bvh {
     #[inline(always)]
-    fn trace(&self, ray: &Ray, any: bool, stack: &mut Vec<Entry>) -> Hit {
+    unsafe fn trace<O: Octet>(&self, ray: &Ray, any: bool, stack: &mut Vec<Entry>) -> Hit {
         let (prepared, mut best) = (Prepared::new(ray), Hit::NONE);
         stack.clear();
         if !self.nodes.is_empty() {
@@ -115,37 +137,44 @@ impl Bvh {
                 continue;
             }
             if content & LEAF != 0 {
-                prepared.triangles(&self.packets[(content & !LEAF) as usize], ray.range, &mut best);
+                // SAFETY: as the caller guarantees.
+                unsafe { prepared.triangles::<O>(&self.packets[(content & !LEAF) as usize], ray.range, &mut best) };
                 if any && best.is_some() {
                     return best;
                 }
                 continue;
             }
             let node = &self.nodes[content as usize];
-            let (near, met) = prepared.boxes(node, [ray.range[0], ray.range[1].min(best.t)]);
+            // SAFETY: as the caller guarantees.
+            let (near, met) = unsafe { prepared.boxes::<O>(node, [ray.range[0], ray.range[1].min(best.t)]) };
             let first = stack.len();
-            for i in 0..WIDTH {
-                if met[i] {
-                    // Sorted, the farthest at the bottom.
-                    let mut at = stack.len();
-                    stack.push((node.content[i], near[i]));
-                    while at > first && stack[at - 1].1 < near[i] {
-                        stack.swap(at - 1, at);
-                        at -= 1;
-                    }
+            for i in each(met) {
+                // Sorted, the farthest at the bottom.
+                let mut at = stack.len();
+                stack.push((node.content[i], near[i]));
+                while at > first && stack[at - 1].1 < near[i] {
+                    stack.swap(at - 1, at);
+                    at -= 1;
                 }
             }
         }
         best
     }
-}
 
-vectorized! {
-    fn trace_block<const F>(bvh: &Bvh, rays: &[Ray], any: bool, hits: &mut [Hit]) {
+    #[inline(always)]
+    unsafe fn trace_block<O: Octet>(&self, rays: &[Ray], any: bool, hits: &mut [Hit]) {
         let mut stack = Vec::with_capacity(128);
         for (ray, hit) in rays.iter().zip(hits) {
-            *hit = bvh.trace(ray, any, &mut stack);
+            // SAFETY: as the caller guarantees.
+            *hit = unsafe { self.trace::<O>(ray, any, &mut stack) };
         }
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    unsafe fn trace_block_avx2(&self, rays: &[Ray], any: bool, hits: &mut [Hit]) {
+        // SAFETY: compiled for the set.
+        unsafe { self.trace_block::<octet::Avx2>(rays, any, hits) }
     }
 }
 
@@ -165,6 +194,12 @@ fn run(bvh: &Bvh, rays: &[Ray], any: bool, hits: &mut [Hit]) {
     tasks::run(rays.len().div_ceil(BLOCK), 64 * rays.len(), |i| {
         // SAFETY: each task has a chunk of its own.
         let hits = unsafe { parts.chunk(i, BLOCK) };
-        trace_block(bvh, &rays[i * BLOCK..i * BLOCK + hits.len()], any, hits);
+        let rays = &rays[i * BLOCK..i * BLOCK + hits.len()];
+        // SAFETY: `level()` only names sets that this CPU has.
+        match simd::level() {
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 | Level::Avx2 => unsafe { bvh.trace_block_avx2(rays, any, hits) },
+            _ => unsafe { bvh.trace_block::<octet::Plain>(rays, any, hits) },
+        }
     });
 }

@@ -4,6 +4,7 @@
 
 mod build;
 pub mod cpu;
+mod octet;
 pub mod reference;
 #[cfg(test)]
 mod tests;
