@@ -129,6 +129,24 @@ impl Environment {
         (edge(row) - edge(row + 1)) * 2.0 * PI / self.image.width as f64
     }
 
+    /// Adds a disc of even radiance that gives a surface facing it `irradiance`; `diameter` in radians. Each pixel gets its share.
+    pub fn add_disc(&mut self, center: DVec3, diameter: f64, irradiance: [f64; 3]) {
+        const POINTS: usize = 1024;
+        let (side, up) = center.any_orthonormal_pair();
+        let (w, h) = (self.image.width, self.image.height);
+        for i in 0..POINTS {
+            // Vogel's spiral, even in area.
+            let (t, azimuth) = ((i as f64 + 0.5) / POINTS as f64, i as f64 * PI * (3.0 - 5f64.sqrt()));
+            let sine = (0.5 * diameter).sin() * t.sqrt();
+            let direction = center * (1.0 - sine * sine).sqrt() + sine * (side * azimuth.cos() + up * azimuth.sin());
+            let uv = self.uv(direction);
+            let (x, y) = (((uv.x * w as f64) as usize).min(w - 1), ((uv.y * h as f64) as usize).min(h - 1));
+            let share = 1.0 / (POINTS as f64 * self.solid_angle(y) * self.strength);
+            let pixel = &mut self.image.data[3 * (y * w + x)..][..3];
+            (0..3).for_each(|k| pixel[k] += (irradiance[k] * share) as f32);
+        }
+    }
+
     /// Calls `visit` with direction, solid angle and linear radiance of each pixel.
     pub fn for_each_pixel(&self, mut visit: impl FnMut(DVec3, f64, [f64; 3])) {
         let (w, h) = (self.image.width, self.image.height);
