@@ -24,6 +24,7 @@ pub mod matmul;
 pub mod mean_error;
 pub mod norm;
 pub mod occupancy_update;
+pub mod path_trace;
 pub mod photometric_loss;
 pub mod pixel_draw;
 pub mod pixel_gather;
