@@ -414,7 +414,7 @@ struct Pitch {
 impl Pitch {
     fn of(c: &Correlation) -> Pitch {
         let block = c.channels.next_multiple_of(2) * ROWS;
-        Pitch { block, weight: (c.features.div_ceil(ROWS) * block / LINE | 1) * LINE }
+        Pitch { block, weight: ((c.features.div_ceil(ROWS) * block / LINE) | 1) * LINE }
     }
 }
 
