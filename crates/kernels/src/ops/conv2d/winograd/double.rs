@@ -77,14 +77,7 @@ by_lanes! {
     pub unsafe fn collect<L>(products: *const f32, from: &Strides, bias: f32, rows: [*mut f32; 2]) {
         let bias = L::splat(bias);
         for tile in (0..from.tiles).step_by(L::N) {
-            let mut at = products.add(from.at(tile));
-            let mut m = [[bias; 3]; 3];
-            for row in &mut m {
-                for v in row {
-                    *v = L::load(at);
-                    at = at.add(from.point);
-                }
-            }
+            let m = from.load::<L, 3>(products, tile);
             let mut sums = [[bias; 2]; 3];
             for y in 0..3 {
                 sums[y] = [L::add(m[y][0], m[y][1]), L::add(m[y][1], m[y][2])];

@@ -11,7 +11,7 @@ use super::later::{Later, Run};
 use super::planes::{Planes, copy_rows};
 use super::shapes::{Correlation, Tensors, offset};
 use crate::ops::activation::Activation;
-use crate::simd;
+use crate::simd::{self, Lane};
 use crate::tile::{Ahead, Kernel, Shared, Start, Tile, kernel};
 use rayon::prelude::*;
 use std::cell::Cell;
@@ -281,6 +281,8 @@ impl Job<'_> {
         let inputs = aligned(panel, form.inputs * form.channels.min(c.channels) * blocks * width);
         let products = aligned(sums, form.sums * features * blocks * width + 4 * tiles.next_multiple_of(lanes));
         let (products, pixels) = products.split_at_mut(form.sums * features * blocks * width);
+        // Every channel is copied to the same rows.
+        copy.fill(0.0);
         for first in (0..c.channels).step_by(form.channels) {
             let channels = first..(first + form.channels).min(c.channels);
             self.transform_inputs(part, channels.clone(), offsets, copy, inputs);
@@ -356,7 +358,6 @@ impl Job<'_> {
         let (c, count) = (self.c, channels.len());
         let pixels = c.input[0] * c.input[1];
         let len = self.planes.list_rows(part.rows.clone(), rows);
-        copy.fill(0.0);
         let to = self.grid.strides(part.rows.len(), self.form.inputs, count * self.kernel.width(), self.kernel);
         for (i, channel) in channels.enumerate() {
             let from = &self.x[((part.image * c.groups + part.group) * c.channels + channel) * pixels..][..pixels];
@@ -448,7 +449,7 @@ fn transform_weights(c: &Correlation, form: &Form, taps: &[usize; 9], weights: &
     });
 }
 
-/// Layout of the transformed inputs, or the products, of a channel's tiles: the `p`th of a tile is at
+/// Layout of the transformed inputs, or the sums, of a channel's tiles: the `p`th of a tile is at
 /// `⌊tile / block⌋ · to_block + p · point + tile mod block`.
 struct Strides {
     /// Tiles of a block.
@@ -474,5 +475,25 @@ impl Strides {
 
     fn rows(&self) -> usize {
         self.tiles / self.row
+    }
+
+    /// All `N · N` elements of a vector of tiles.
+    ///
+    /// # Safety
+    /// Whole vectors of all tiles exist from `first`.
+    #[inline(always)]
+    unsafe fn load<L: Lane, const N: usize>(&self, first: *const f32, tile: usize) -> [[L::V; N]; N] {
+        // SAFETY: guaranteed by the caller.
+        unsafe {
+            let mut at = first.add(self.at(tile));
+            let mut elements = [[L::splat(0.0); N]; N];
+            for row in &mut elements {
+                for v in row {
+                    *v = L::load(at);
+                    at = at.add(self.point);
+                }
+            }
+            elements
+        }
     }
 }

@@ -66,15 +66,7 @@ by_lanes! {
     pub unsafe fn collect<L>(products: *const f32, from: &Strides, bias: f32, rows: [*mut f32; 2]) {
         let bias = L::splat(bias);
         for tile in (0..from.tiles).step_by(L::N) {
-            let mut at = products.add(from.at(tile));
-            let mut m = [[bias; 4]; 4];
-            for row in &mut m {
-                for v in row {
-                    *v = L::load(at);
-                    at = at.add(from.point);
-                }
-            }
-            let [a, b, c, d] = m;
+            let [a, b, c, d] = from.load::<L, 4>(products, tile);
             let mut sums = [[bias; 4]; 2];
             for x in 0..4 {
                 sums[0][x] = L::add(L::add(a[x], b[x]), c[x]);
