@@ -21,8 +21,6 @@ const DUST_ALBEDO: f64 = 0.9;
 const FORWARD: f64 = 0.8;
 /// Molecules of ozone per cubic metre where they are densest: 300 Dobson units in a tent of 15 km half width.
 const OZONE: f64 = 300.0 * 2.687e20 / 15_000.0;
-/// Angular diameter of the sun in radians.
-const DISC: f64 = 0.545 * PI / 180.0;
 /// Wavelengths in nanometres: `FIRST + STEP · i`.
 const FIRST: f64 = 385.0;
 const STEP: f64 = 15.0;
@@ -119,6 +117,9 @@ fn rgb(spectrum: &Spectrum) -> [f64; 3] {
 type Depth = [f64; 3];
 
 impl Sky {
+    /// Angular diameter of the sun in radians.
+    pub const SUN_DIAMETER: f64 = 0.545 * PI / 180.0;
+
     /// A clear day at sea level with the sun at an elevation and an azimuth in radians.
     pub fn clear(elevation: f64, azimuth: f64) -> Sky {
         Sky { elevation, azimuth, altitude: 0.0, air: 1.0, dust: 1.0, ozone: 1.0 }
@@ -150,7 +151,7 @@ impl Sky {
     pub fn environment(&self, height: usize) -> Environment {
         let mut map = Environment::from_fn(height, |d| if d.z >= 0.0 { self.radiance(d) } else { [0.0; 3] });
         if self.elevation > 0.0 {
-            map.add_disc(self.sun(), DISC, self.sun_irradiance());
+            map.add_disc(self.sun(), Sky::SUN_DIAMETER, self.sun_irradiance());
         }
         map
     }

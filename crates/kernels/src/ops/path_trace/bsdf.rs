@@ -5,6 +5,7 @@
 //! gets the share that the first one transmits. Directions are in the frame of the shading normal, which is +z, and point away
 //! from the surface.
 
+use super::vector::{dot, luminance, unit};
 use std::sync::OnceLock;
 
 /// Reflectance of dielectrics at normal incidence (index of refraction 1.5).
@@ -46,19 +47,6 @@ pub struct Drawn {
     pub weight: [f32; 3],
     /// Density per steradian.
     pub density: f32,
-}
-
-fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-fn unit(v: [f32; 3]) -> [f32; 3] {
-    let scale = 1.0 / dot(v, v).sqrt();
-    v.map(|x| x * scale)
-}
-
-fn luminance(c: [f32; 3]) -> f32 {
-    0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2]
 }
 
 /// `(1 − cos)⁵`

@@ -4,6 +4,7 @@ use super::octet::{self, Octet};
 use super::{Bvh, Hit, LEAF, Node, Packet, Ray, WIDTH};
 use crate::simd::{self, Level};
 use crate::tasks::{self, Parts};
+use std::cell::RefCell;
 
 /// Rays per task.
 const BLOCK: usize = 256;
@@ -14,6 +15,10 @@ const TINY: f32 = 1e-30;
 
 /// A node or packet to visit, and the distance of its box.
 type Entry = (u32, f32);
+
+thread_local! {
+    static STACK: RefCell<Vec<Entry>> = RefCell::new(Vec::with_capacity(128));
+}
 
 /// What the tests of a ray share.
 struct Prepared {
@@ -168,6 +173,25 @@ impl Bvh {
             // SAFETY: as the caller guarantees.
             *hit = unsafe { self.trace::<O>(ray, any, &mut stack) };
         }
+    }
+
+    /// The nearest hit of one ray, or with `any` some hit; [`Hit::NONE`] if nothing is in its way.
+    pub fn trace_one(&self, ray: &Ray, any: bool) -> Hit {
+        STACK.with_borrow_mut(|stack| {
+            // SAFETY: `level()` only names sets that this CPU has.
+            match simd::level() {
+                #[cfg(target_arch = "x86_64")]
+                Level::Avx512 | Level::Avx2 => unsafe { self.trace_one_avx2(ray, any, stack) },
+                _ => unsafe { self.trace::<octet::Plain>(ray, any, stack) },
+            }
+        })
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    unsafe fn trace_one_avx2(&self, ray: &Ray, any: bool, stack: &mut Vec<Entry>) -> Hit {
+        // SAFETY: compiled for the set.
+        unsafe { self.trace::<octet::Avx2>(ray, any, stack) }
     }
 
     #[cfg(target_arch = "x86_64")]

@@ -1,0 +1,365 @@
+//! Triangles of a scene and where rays meet them: parts that stand once share one hierarchy, parts that stand several times have one each
+//! with a transform per copy.
+
+use super::vector::{V3, cross, mix, sub, transform_direction, transform_normal, transform_point, unit};
+use crate::ops::ray_triangles::{Bvh, Hit, Ray};
+use diorama_geom::glam::DAffine3;
+use diorama_geom::model::{Model, Opacity};
+
+/// Affine transform, rows `[axis][x, y, z, 1]`.
+type Affine = [[f32; 4]; 3];
+
+const IDENTITY: Affine = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+
+/// Triangles with one hierarchy.
+#[derive(Clone, Debug)]
+struct Mesh {
+    bvh: Bvh,
+    positions: Vec<V3>,
+    normals: Vec<V3>,
+    /// Along u, with the sign of the direction against v; zero where there are none.
+    tangents: Vec<[f32; 4]>,
+    uvs: Vec<[f32; 2]>,
+    /// Linear factors of the base color.
+    colors: Vec<V3>,
+    triangles: Vec<[u32; 3]>,
+    /// Index of the material of each triangle.
+    materials: Vec<u32>,
+    /// Index of the instance that each triangle belongs to, for meshes that stand once.
+    instances: Vec<u32>,
+}
+
+/// A mesh where it stands.
+#[derive(Clone, Debug)]
+struct Placed {
+    mesh: usize,
+    /// Index of the instance, for meshes that stand several times.
+    instance: u32,
+    is_moved: bool,
+    world_from_mesh: Affine,
+    mesh_from_world: Affine,
+    low: V3,
+    high: V3,
+}
+
+/// A node of the tree of placed meshes: `low`, `high`, and either two children or one mesh.
+#[derive(Clone, Debug)]
+struct Node {
+    low: V3,
+    high: V3,
+    /// Index of the first of two adjacent children, or the placed mesh with [`LEAF`] set.
+    content: u32,
+}
+
+const LEAF: u32 = 1 << 31;
+
+/// All triangles of a scene.
+#[derive(Clone, Debug)]
+pub struct Geometry {
+    meshes: Vec<Mesh>,
+    /// Those that light cannot pass, and those that it can pass in places.
+    solid: Tree,
+    porous: Tree,
+    pub triangles: usize,
+}
+
+/// Placed meshes and the tree over them.
+#[derive(Clone, Debug, Default)]
+struct Tree {
+    placed: Vec<Placed>,
+    nodes: Vec<Node>,
+}
+
+/// A place on a surface.
+#[derive(Clone, Copy, Debug)]
+pub struct Found {
+    pub hit: Hit,
+    is_porous: bool,
+    placed: u32,
+}
+
+/// Properties of a surface at a point, interpolated; directions are in the world and of length 1.
+#[derive(Clone, Copy, Debug)]
+pub struct Point {
+    pub position: V3,
+    /// Of the triangle.
+    pub flat_normal: V3,
+    pub normal: V3,
+    /// As [`diorama_geom::Mesh::tangents`]; zero without texture coordinates.
+    pub tangent: [f32; 4],
+    pub uv: [f32; 2],
+    pub color: V3,
+    pub material: u32,
+    pub instance: u32,
+}
+
+impl Geometry {
+    /// # Panics
+    /// When a part, material or vertex that is referred to does not exist.
+    pub fn new(model: &Model) -> Geometry {
+        let mut uses = vec![0usize; model.parts.len()];
+        model.instances.iter().for_each(|i| uses[i.part] += 1);
+        let is_porous = |part: usize| {
+            let m = &model.materials[model.parts[part].material];
+            m.opacity != Opacity::Opaque || m.transmission > 0.0
+        };
+        let mut geometry = Geometry { meshes: Vec::new(), solid: Tree::default(), porous: Tree::default(), triangles: model.face_count() };
+        for porous in [false, true] {
+            let mut once = Mesh::empty();
+            let mut placed = Vec::new();
+            let mut of_part = vec![None; model.parts.len()];
+            for (i, instance) in model.instances.iter().enumerate() {
+                let part = instance.part;
+                if is_porous(part) != porous || model.parts[part].mesh.faces.is_empty() {
+                    continue;
+                }
+                let world_from_mesh = rows(&instance.world_from_part);
+                if uses[part] == 1 {
+                    once.append(model, part, i as u32, &instance.world_from_part);
+                    continue;
+                }
+                let mesh = *of_part[part].get_or_insert_with(|| {
+                    let mut mesh = Mesh::empty();
+                    mesh.append(model, part, 0, &DAffine3::IDENTITY);
+                    geometry.meshes.push(mesh.finished());
+                    geometry.meshes.len() - 1
+                });
+                let (low, high) = bounds(geometry.meshes[mesh].positions.iter().map(|p| transform_point(&world_from_mesh, *p)));
+                let mesh_from_world = rows(&instance.world_from_part.inverse());
+                placed.push(Placed { mesh, instance: i as u32, is_moved: true, world_from_mesh, mesh_from_world, low, high });
+            }
+            if !once.triangles.is_empty() {
+                let (low, high) = bounds(once.positions.iter().copied());
+                geometry.meshes.push(once.finished());
+                let mesh = geometry.meshes.len() - 1;
+                placed.push(Placed { mesh, instance: 0, is_moved: false, world_from_mesh: IDENTITY, mesh_from_world: IDENTITY, low, high });
+            }
+            *(if porous { &mut geometry.porous } else { &mut geometry.solid }) = Tree::new(placed);
+        }
+        geometry
+    }
+
+    /// The nearest surface, if any.
+    pub fn nearest(&self, ray: &Ray) -> Option<Found> {
+        let solid = self.solid.nearest(&self.meshes, ray, false);
+        let mut range = ray.range;
+        if let Some(found) = &solid {
+            range[1] = found.hit.t;
+        }
+        self.nearest_porous(&Ray { range, ..*ray }).or(solid)
+    }
+
+    /// The nearest surface among those that light may pass.
+    pub fn nearest_porous(&self, ray: &Ray) -> Option<Found> {
+        if self.porous.nodes.is_empty() {
+            None
+        } else {
+            self.porous.nearest(&self.meshes, ray, false).map(|f| Found { is_porous: true, ..f })
+        }
+    }
+
+    /// Whether something that light cannot pass is in the way.
+    pub fn is_blocked(&self, ray: &Ray) -> bool {
+        self.solid.nearest(&self.meshes, ray, true).is_some()
+    }
+
+    /// Properties of a surface that was found.
+    pub fn point(&self, found: &Found) -> Point {
+        let tree = if found.is_porous { &self.porous } else { &self.solid };
+        let placed = &tree.placed[found.placed as usize];
+        let mesh = &self.meshes[placed.mesh];
+        let (i, w) = (found.hit.triangle as usize, found.hit.weights);
+        let corners = mesh.triangles[i].map(|v| v as usize);
+        let p = corners.map(|v| mesh.positions[v]);
+        let uvs = corners.map(|v| mesh.uvs[v]);
+        let flat = cross(sub(p[1], p[0]), sub(p[2], p[0]));
+        let mut tangent: [f32; 4] = mix(corners.map(|v| mesh.tangents[v]), w);
+        if tangent[3] == 0.0 {
+            tangent = tangent_of(p, uvs);
+        }
+        let mut point = Point {
+            position: mix(p, w),
+            flat_normal: unit(flat),
+            normal: mix(corners.map(|v| mesh.normals[v]), w),
+            tangent,
+            uv: mix(uvs, w),
+            color: mix(corners.map(|v| mesh.colors[v]), w),
+            material: mesh.materials[i],
+            instance: if placed.is_moved { placed.instance } else { mesh.instances[i] },
+        };
+        if placed.is_moved {
+            let t = [tangent[0], tangent[1], tangent[2]];
+            let [x, y, z] = transform_direction(&placed.world_from_mesh, t);
+            point.position = transform_point(&placed.world_from_mesh, point.position);
+            point.flat_normal = unit(transform_normal(&placed.mesh_from_world, flat));
+            point.normal = transform_normal(&placed.mesh_from_world, point.normal);
+            point.tangent = [x, y, z, tangent[3]];
+        }
+        point.normal = unit(point.normal);
+        point
+    }
+}
+
+/// Direction of u across a triangle, and the sign of the direction against v; zero where texture coordinates do not span it.
+fn tangent_of(p: [V3; 3], uv: [[f32; 2]; 3]) -> [f32; 4] {
+    let (e, f) = (sub(p[1], p[0]), sub(p[2], p[0]));
+    let (a, b) = ([uv[1][0] - uv[0][0], uv[1][1] - uv[0][1]], [uv[2][0] - uv[0][0], uv[2][1] - uv[0][1]]);
+    let det = a[0] * b[1] - b[0] * a[1];
+    if det == 0.0 {
+        return [0.0; 4];
+    }
+    let t = unit(std::array::from_fn(|k| (e[k] * b[1] - f[k] * a[1]) / det));
+    // Normal × tangent points along +v where u, v turn clockwise, seen from outside: v grows downwards.
+    [t[0], t[1], t[2], if det < 0.0 { 1.0 } else { -1.0 }]
+}
+
+fn rows(m: &DAffine3) -> Affine {
+    let (x, y, z, t) = (m.matrix3.x_axis, m.matrix3.y_axis, m.matrix3.z_axis, m.translation);
+    std::array::from_fn(|i| [x[i] as f32, y[i] as f32, z[i] as f32, t[i] as f32])
+}
+
+fn bounds(points: impl Iterator<Item = V3>) -> (V3, V3) {
+    points.fold(([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]), |(low, high), p| union((low, high), (p, p)))
+}
+
+fn union(a: (V3, V3), b: (V3, V3)) -> (V3, V3) {
+    (std::array::from_fn(|k| a.0[k].min(b.0[k])), std::array::from_fn(|k| a.1[k].max(b.1[k])))
+}
+
+impl Mesh {
+    fn empty() -> Mesh {
+        Mesh {
+            bvh: Bvh::build(&[], &[]),
+            positions: Vec::new(),
+            normals: Vec::new(),
+            tangents: Vec::new(),
+            uvs: Vec::new(),
+            colors: Vec::new(),
+            triangles: Vec::new(),
+            materials: Vec::new(),
+            instances: Vec::new(),
+        }
+    }
+
+    fn append(&mut self, model: &Model, part: usize, instance: u32, world_from_part: &DAffine3) {
+        let (part, first) = (&model.parts[part], self.positions.len() as u32);
+        let (mesh, n) = (&part.mesh, part.mesh.positions.len());
+        assert!(part.material < model.materials.len(), "part {} has a material that does not exist", part.name);
+        let (there, back) = (rows(world_from_part), rows(&world_from_part.inverse()));
+        let mut normals = mesh.normals.clone();
+        if normals.len() != n {
+            let mut shaded = diorama_geom::Mesh { positions: mesh.positions.clone(), faces: mesh.faces.clone(), ..Default::default() };
+            shaded.compute_normals();
+            normals = shaded.normals;
+        }
+        self.positions.extend(mesh.positions.iter().map(|p| transform_point(&there, *p)));
+        self.normals.extend(normals.iter().map(|v| transform_normal(&back, *v)));
+        self.tangents.extend((0..n).map(|i| match mesh.tangents.get(i) {
+            Some(t) => {
+                let [x, y, z] = transform_direction(&there, [t[0], t[1], t[2]]);
+                [x, y, z, t[3]]
+            }
+            None => [0.0; 4],
+        }));
+        self.uvs.extend((0..n).map(|i| mesh.uvs.get(i).copied().unwrap_or([0.0; 2])));
+        let linear = |c: &V3| c.map(diorama_geom::color::linear_from_srgb);
+        self.colors.extend((0..n).map(|i| mesh.colors_srgb.get(i).map_or([1.0; 3], linear)));
+        // A reflection turns triangles inside out.
+        let is_mirrored = world_from_part.matrix3.determinant() < 0.0;
+        let turned = |f: &[u32; 3]| if is_mirrored { [f[0], f[2], f[1]] } else { *f }.map(|v| first + v);
+        self.triangles.extend(mesh.faces.iter().map(turned));
+        self.materials.resize(self.triangles.len(), part.material as u32);
+        self.instances.resize(self.triangles.len(), instance);
+    }
+
+    fn finished(mut self) -> Mesh {
+        self.bvh = Bvh::build(&self.positions, &self.triangles);
+        self
+    }
+}
+
+impl Tree {
+    fn new(mut placed: Vec<Placed>) -> Tree {
+        let mut nodes = Vec::new();
+        if !placed.is_empty() {
+            let mut order: Vec<u32> = (0..placed.len() as u32).collect();
+            nodes.push(Node { low: [0.0; 3], high: [0.0; 3], content: 0 });
+            split(&placed, &mut order, 0, &mut nodes);
+        }
+        placed.shrink_to_fit();
+        Tree { placed, nodes }
+    }
+
+    fn nearest(&self, meshes: &[Mesh], ray: &Ray, any: bool) -> Option<Found> {
+        if let [only] = &self.placed[..]
+            && !only.is_moved
+        {
+            let hit = meshes[only.mesh].bvh.trace_one(ray, any);
+            return hit.is_some().then_some(Found { hit, is_porous: false, placed: 0 });
+        }
+        let inverse = ray.direction.map(|d| 1.0 / if d.abs() < 1e-30 { 1e-30f32.copysign(d) } else { d });
+        let mut best: Option<Found> = None;
+        let mut range = ray.range;
+        let mut stack = [0u32; 64];
+        let mut size = if self.nodes.is_empty() { 0 } else { 1 };
+        while size > 0 {
+            size -= 1;
+            let node = &self.nodes[stack[size] as usize];
+            let (mut near, mut far) = (range[0], range[1]);
+            for k in 0..3 {
+                let (a, b) = ((node.low[k] - ray.origin[k]) * inverse[k], (node.high[k] - ray.origin[k]) * inverse[k]);
+                near = near.max(a.min(b));
+                far = far.min(a.max(b) * 1.000_000_4);
+            }
+            if near > far {
+                continue;
+            }
+            if node.content & LEAF == 0 {
+                stack[size] = node.content;
+                stack[size + 1] = node.content + 1;
+                size += 2;
+                continue;
+            }
+            let index = node.content & !LEAF;
+            let placed = &self.placed[index as usize];
+            let mut local = Ray { range, ..*ray };
+            if placed.is_moved {
+                local.origin = transform_point(&placed.mesh_from_world, ray.origin);
+                local.direction = transform_direction(&placed.mesh_from_world, ray.direction);
+            }
+            let hit = meshes[placed.mesh].bvh.trace_one(&local, any);
+            if hit.is_some() {
+                best = Some(Found { hit, is_porous: false, placed: index });
+                range[1] = hit.t;
+                if any {
+                    break;
+                }
+            }
+        }
+        best
+    }
+}
+
+/// Fills in node `at` and what is below it, halved by the centers of the boxes.
+fn split(placed: &[Placed], order: &mut [u32], at: usize, nodes: &mut Vec<Node>) {
+    let of = |i: u32| (placed[i as usize].low, placed[i as usize].high);
+    let (low, high) = order.iter().map(|i| of(*i)).reduce(union).expect("at least one");
+    (nodes[at].low, nodes[at].high) = (low, high);
+    if let [only] = order {
+        nodes[at].content = *only | LEAF;
+        return;
+    }
+    let center = |i: u32, k: usize| of(i).0[k] + of(i).1[k];
+    let spread = |k: usize| {
+        let (a, b) = order.iter().fold((f32::MAX, f32::MIN), |(a, b), i| (a.min(center(*i, k)), b.max(center(*i, k))));
+        b - a
+    };
+    let axis = (0..3).max_by(|a, b| spread(*a).total_cmp(&spread(*b))).expect("three axes");
+    order.sort_by(|a, b| center(*a, axis).total_cmp(&center(*b, axis)).then(a.cmp(b)));
+    let first = nodes.len();
+    nodes[at].content = first as u32;
+    nodes.extend([(); 2].map(|_| Node { low: [0.0; 3], high: [0.0; 3], content: 0 }));
+    let (left, right) = order.split_at_mut(order.len() / 2);
+    split(placed, left, first, nodes);
+    split(placed, right, first + 1, nodes);
+}
