@@ -6,6 +6,7 @@ pub mod attention;
 pub mod composite;
 pub mod conv2d;
 pub mod conv_transpose2d;
+pub mod denoise;
 pub mod depth_loss;
 pub mod distortion;
 pub mod dropout;

@@ -79,6 +79,21 @@ pub fn first_hits(scene: &Scene, view: &View, porous: bool) -> Vec<Option<FirstH
     hits
 }
 
+/// The first surface along a ray from a point, whose direction has length 1; panes count, and holes.
+pub fn first_hit(scene: &Scene, origin: DVec3, direction: DVec3) -> Option<FirstHit> {
+    let ray = Ray { origin: narrow(origin), direction: narrow(direction), range: [0.0, f32::INFINITY] };
+    scene.geometry.nearest(&ray).map(|found| {
+        let point = scene.geometry.point(&found);
+        FirstHit { instance: point.instance, position: DVec3::from(point.position.map(f64::from)), depth: found.hit.t as f64 }
+    })
+}
+
+/// Whether something is between two points; panes count, and holes.
+pub fn is_between(scene: &Scene, from: DVec3, to: DVec3) -> bool {
+    let ray = Ray { origin: narrow(from), direction: narrow(to - from), range: [0.0, 1.0] };
+    scene.geometry.is_blocked(&ray) || scene.geometry.nearest_porous(&ray).is_some()
+}
+
 fn narrow(v: DVec3) -> V3 {
     [v.x as f32, v.y as f32, v.z as f32]
 }
@@ -233,6 +248,7 @@ impl Tracer<'_> {
     fn path(&self, mut ray: Ray, sampler: &mut Sampler) -> Pixel {
         let mut out = Pixel::default();
         let (mut throughput, mut density) = ([1.0; 3], f32::INFINITY);
+        let mut is_backdrop = false;
         for bounce in 0..=self.settings.bounces {
             let Meeting { passed, found } = self.meet(ray, sampler);
             throughput = times(throughput, passed);
@@ -248,6 +264,7 @@ impl Tracer<'_> {
                 out.opacity = 1.0;
                 out.depth = met.t;
                 out.albedo = met.surface.material.base_color;
+                is_backdrop = self.scene.is_backdrop[met.point.instance as usize];
             }
             let Some(vertex) = Vertex::new(&met, ray.direction) else { break };
             if bounce == 0 {
@@ -275,6 +292,10 @@ impl Tracer<'_> {
                 throughput = scale(throughput, 1.0 / survival);
             }
             ray = Ray { origin: vertex.position, direction, range: [0.0, f32::INFINITY] };
+        }
+        out.square = luminance(out.color) * luminance(out.color);
+        if is_backdrop {
+            out.backdrop = [out.color[0], out.color[1], out.color[2], 1.0];
         }
         out
     }

@@ -28,18 +28,30 @@ pub struct Scene {
     geometry: Geometry,
     surfaces: Surfaces,
     light: DistantLight,
+    /// Whether an instance is a part of a photograph's scene: [`Pixel::backdrop`].
+    is_backdrop: Vec<bool>,
 }
 
 impl Scene {
     /// # Panics
     /// When the model refers to parts, materials, textures or vertices that do not exist.
     pub fn new(model: &Model, light: &Daylight) -> Scene {
-        Scene { geometry: Geometry::new(model), surfaces: Surfaces::new(model), light: DistantLight::new(light) }
+        Scene {
+            geometry: Geometry::new(model),
+            surfaces: Surfaces::new(model),
+            light: DistantLight::new(light),
+            is_backdrop: vec![false; model.instances.len()],
+        }
     }
 
     /// Replaces the light.
     pub fn set_light(&mut self, light: &Daylight) {
         self.light = DistantLight::new(light);
+    }
+
+    /// Makes the first `instances` of the model the backdrop, whose light is also kept apart.
+    pub fn set_backdrop(&mut self, instances: usize) {
+        self.is_backdrop.iter_mut().enumerate().for_each(|(i, b)| *b = i < instances);
     }
 
     /// Triangles of all instances.
@@ -121,20 +133,25 @@ pub struct Pixel {
     pub unshadowed: f32,
     /// Share of the sun's disc that is visible from the surface.
     pub sun: f32,
+    /// The part of the color that comes from samples whose first surface is of the backdrop, and the share of these samples.
+    pub backdrop: [f32; 4],
+    /// Square of the samples' luminance, for their variance.
+    pub square: f32,
 }
 
 impl Pixel {
-    const LEN: usize = 14;
+    /// Numbers of a pixel.
+    pub const LEN: usize = 19;
 
     fn values(&self) -> [f32; Pixel::LEN] {
-        let [a, b, c] = [self.color, self.albedo, self.normal];
-        let d = [self.depth, self.opacity, self.direct, self.unshadowed, self.sun];
-        std::array::from_fn(|i| match i {
-            0..3 => a[i],
-            3..6 => b[i - 3],
-            6..9 => c[i - 6],
-            _ => d[i - 9],
-        })
+        let mut v = [0.0; Pixel::LEN];
+        v[..3].copy_from_slice(&self.color);
+        v[3..6].copy_from_slice(&self.albedo);
+        v[6..9].copy_from_slice(&self.normal);
+        v[9..14].copy_from_slice(&[self.depth, self.opacity, self.direct, self.unshadowed, self.sun]);
+        v[14..18].copy_from_slice(&self.backdrop);
+        v[18] = self.square;
+        v
     }
 
     fn of(v: [f32; Pixel::LEN]) -> Pixel {
@@ -147,6 +164,8 @@ impl Pixel {
             direct: v[11],
             unshadowed: v[12],
             sun: v[13],
+            backdrop: [v[14], v[15], v[16], v[17]],
+            square: v[18],
         }
     }
 }
@@ -175,7 +194,7 @@ impl Film {
         Image { width: self.width, height: self.height, channels: C, data }
     }
 
-    /// All means `[H, W, 14]`, for storage.
+    /// All means `[H, W, 19]`, for storage.
     pub fn to_image(&self) -> Image {
         self.image(Pixel::values)
     }
@@ -183,7 +202,7 @@ impl Film {
     /// The film of stored means.
     ///
     /// # Panics
-    /// When the image is not `[H, W, 14]`.
+    /// When the image is not `[H, W, 19]`.
     pub fn of_image(image: &Image, samples: u32) -> Film {
         assert_eq!(image.channels, Pixel::LEN, "a film has {} channels", Pixel::LEN);
         let pixels = image.data.chunks_exact(Pixel::LEN).map(|v| Pixel::of(std::array::from_fn(|i| v[i]))).collect();
