@@ -40,6 +40,8 @@ pub struct Material {
     pub base_color_texture: Option<usize>,
     pub roughness: f32,
     pub metallic: f32,
+    /// Factor of the reflection at the surface of what is not metal; 0 makes it perfectly diffuse.
+    pub specular: f32,
     /// Index of a texture whose green is roughness and whose blue is metalness; its red, if `is_occluding`, is ambient occlusion.
     pub metallic_roughness_texture: Option<usize>,
     pub is_occluding: bool,
@@ -67,6 +69,7 @@ impl Default for Material {
             base_color_texture: None,
             roughness: 1.0,
             metallic: 0.0,
+            specular: 1.0,
             metallic_roughness_texture: None,
             is_occluding: false,
             normal_texture: None,

@@ -55,6 +55,7 @@ pub mod application;
 pub mod bench;
 pub mod error;
 pub mod object;
+pub mod relight;
 pub mod run;
 
 pub use application::Application;

@@ -15,6 +15,7 @@ mod mask_flags;
 mod prepare;
 mod process;
 mod quickstart;
+mod relight;
 mod render;
 mod train;
 mod view;
@@ -72,6 +73,8 @@ pub enum Command {
     Completions(manual::Completions),
     Man(manual::Man),
     #[command(subcommand)]
+    Relight(relight::Relight),
+    #[command(subcommand)]
     Bench(bench::Bench),
 }
 
@@ -91,6 +94,7 @@ impl Command {
             Command::Doctor(v) => v,
             Command::Completions(v) => v,
             Command::Man(v) => v,
+            Command::Relight(noun) => noun.verb(),
             Command::Bench(noun) => noun.verb(),
         }
     }

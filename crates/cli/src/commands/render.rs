@@ -157,7 +157,7 @@ impl Render {
     }
 }
 
-fn parse_size(text: &str) -> Result<(u32, u32)> {
+pub fn parse_size(text: &str) -> Result<(u32, u32)> {
     let bad = || PipelineError::Usage(format!("--size {text}: expected WIDTHxHEIGHT, each 16 to 8192"));
     let (w, h) = text.split_once('x').ok_or_else(bad)?;
     let side = |s: &str| s.parse::<u32>().ok().filter(|v| (16..=8192).contains(v)).ok_or_else(bad);

@@ -192,8 +192,13 @@ fn keys(value: &toml::Value, prefix: &str) -> Vec<String> {
 }
 
 fn unknown_key(key: &str, known: &[String]) -> String {
-    let nearest = known.iter().min_by_key(|k| distance(key, k).min(k.rsplit('.').next().map_or(99, |last| distance(key, last))));
-    format!("unknown configuration key {key}; did you mean {}?", nearest.map_or("", |k| k))
+    format!("unknown configuration key {key}; did you mean {}?", nearest(key, known))
+}
+
+/// The known key that is most like another one, by its whole path or its last part; empty if none is known.
+pub fn nearest<'a>(key: &str, known: &'a [String]) -> &'a str {
+    let by = |k: &&String| distance(key, k).min(k.rsplit('.').next().map_or(99, |last| distance(key, last)));
+    known.iter().min_by_key(by).map_or("", |k| k)
 }
 
 /// Levenshtein distance.

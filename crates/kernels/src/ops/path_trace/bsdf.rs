@@ -24,6 +24,8 @@ pub struct Material {
     pub base_color: [f32; 3],
     pub roughness: f32,
     pub metallic: f32,
+    /// Factor of the reflection at the surface of what is not metal.
+    pub specular: f32,
 }
 
 /// What scatters light at a point that is seen from one direction.
@@ -67,10 +69,11 @@ impl Bsdf {
         // Of white microfacets the share `scale` is left; the rest meets others, and is colored once more.
         let gain = |f0: f32| 1.0 + f0 * (1.0 / scale - 1.0);
         let mix = |dielectric: f32, metal: f32| dielectric + (metal - dielectric) * metallic;
-        let straight = base.map(|c| mix(DIELECTRIC * gain(DIELECTRIC), c * gain(c)));
-        let grazing = base.map(|c| mix((1.0 - DIELECTRIC) * gain(DIELECTRIC), (1.0 - c) * gain(c)));
+        let coat = m.specular.clamp(0.0, 1.0) * gain(DIELECTRIC);
+        let straight = base.map(|c| mix(DIELECTRIC * coat, c * gain(c)));
+        let grazing = base.map(|c| mix((1.0 - DIELECTRIC) * coat, (1.0 - c) * gain(c)));
         let reflected = std::array::from_fn(|i| straight[i] * scale + grazing[i] * offset);
-        let surface = (DIELECTRIC * scale + (1.0 - DIELECTRIC) * offset) * gain(DIELECTRIC);
+        let surface = (DIELECTRIC * scale + (1.0 - DIELECTRIC) * offset) * coat;
         let diffuse = base.map(|c| c * (1.0 - metallic) * (1.0 - surface).max(0.0));
         let (glossy, matte) = (luminance(reflected), luminance(diffuse));
         let glossy = if glossy + matte > 0.0 { glossy / (glossy + matte) } else { 1.0 };
@@ -94,15 +97,16 @@ impl Bsdf {
         (value, density)
     }
 
-    /// Draws a direction from three numbers in `[0, 1)`; none if it is below the surface.
-    pub fn draw(&self, random: [f32; 3]) -> Option<Drawn> {
-        let incoming = if random[0] < self.glossy {
-            let half = self.draw_normal([random[1], random[2]]);
+    /// Draws a direction from two numbers in `[0, 1)`; none if it is below the surface.
+    pub fn draw(&self, [choice, random]: [f32; 2]) -> Option<Drawn> {
+        let incoming = if choice < self.glossy {
+            let half = self.draw_normal([choice / self.glossy, random]);
             let twice = 2.0 * dot(self.outgoing, half);
             unit(std::array::from_fn(|k| twice * half[k] - self.outgoing[k]))
         } else {
-            let (radius, angle) = (random[1].sqrt(), std::f32::consts::TAU * random[2]);
-            [radius * angle.cos(), radius * angle.sin(), (1.0 - random[1]).max(0.0).sqrt()]
+            let squared = (choice - self.glossy) / (1.0 - self.glossy);
+            let (radius, (y, x)) = (squared.sqrt(), (std::f32::consts::TAU * random).sin_cos());
+            [radius * x, radius * y, (1.0 - squared).max(0.0).sqrt()]
         };
         let (value, density) = self.evaluate(incoming);
         (density > 0.0).then(|| Drawn { incoming, weight: value.map(|v| v / density), density })
@@ -196,9 +200,9 @@ fn shares() -> &'static Shares {
 mod tests {
     use super::*;
 
-    /// Points of `[0, 1)³` that fill it evenly (the additive recurrence of Roberts 2018).
-    fn points(n: usize) -> impl Iterator<Item = [f32; 3]> {
-        (0..n).map(|i| [0.819_172_51, 0.671_043_61, 0.549_700_48].map(|a: f64| (0.5 + a * i as f64).fract() as f32))
+    /// Points of `[0, 1)²` that fill it evenly (the additive recurrence of Roberts 2018).
+    fn points(n: usize) -> impl Iterator<Item = [f32; 2]> {
+        (0..n).map(|i| [0.754_877_666_246_692_7, 0.569_840_290_998_053_2].map(|a: f64| (0.5 + a * i as f64).fract() as f32))
     }
 
     fn outgoing(cosine: f32) -> [f32; 3] {
@@ -207,7 +211,7 @@ mod tests {
     }
 
     fn material(base: f32, roughness: f32, metallic: f32) -> Material {
-        Material { base_color: [base, 0.5 * base, 0.2 * base], roughness, metallic }
+        Material { base_color: [base, 0.5 * base, 0.2 * base], roughness, metallic, specular: 1.0 }
     }
 
     #[test]
@@ -215,7 +219,7 @@ mod tests {
         for metallic in [0.0, 0.4, 1.0] {
             for roughness in [0.05, 0.2, 0.5, 0.8, 1.0] {
                 for cosine in [0.1, 0.3, 0.7, 1.0] {
-                    let white = Material { base_color: [1.0; 3], roughness, metallic };
+                    let white = Material { base_color: [1.0; 3], roughness, metallic, specular: 1.0 };
                     let bsdf = Bsdf::new(&white, outgoing(cosine)).unwrap();
                     let n = 1 << 14;
                     let sum: f64 = points(n).filter_map(|p| bsdf.draw(p)).map(|d| d.weight[0] as f64).sum();
@@ -286,6 +290,15 @@ mod tests {
                 let got = points(n).filter_map(|p| bsdf.draw(p)).map(|d| d.weight[channel] as f64).sum::<f64>() / n as f64;
                 assert!((want - got).abs() < 4e-3, "{roughness} {metallic}: {want} {got}");
             }
+        }
+    }
+
+    #[test]
+    fn without_reflection_a_surface_is_lambertian() {
+        let bsdf = Bsdf::new(&Material { specular: 0.0, ..material(0.8, 0.3, 0.0) }, outgoing(0.3)).unwrap();
+        for v in [outgoing(0.9), outgoing(0.2)] {
+            let (value, density) = bsdf.evaluate(v);
+            assert!((value[0] - 0.8 * v[2] / std::f32::consts::PI).abs() < 1e-6 && (density - v[2] / std::f32::consts::PI).abs() < 1e-6);
         }
     }
 

@@ -276,8 +276,7 @@ impl Tracer<'_> {
             if self.settings.strategy != Strategy::Surface {
                 out.color = along(out.color, 1.0, times(throughput, self.direct(&vertex, sampler)));
             }
-            let (lobe, at) = (sampler.one(), sampler.pair());
-            let Some(drawn) = vertex.bsdf.draw([lobe, at[0], at[1]]) else { break };
+            let Some(drawn) = vertex.bsdf.draw(sampler.pair()) else { break };
             let direction = vertex.world(drawn.incoming);
             if dot(direction, vertex.flat) <= 0.0 {
                 break;

@@ -13,14 +13,14 @@ const LEAST: f32 = 0.1;
 pub struct DistantLight {
     width: usize,
     height: usize,
-    /// Linear radiance `[H, W]`, scaled by the strength.
-    radiance: Vec<V3>,
+    /// Linear radiance, scaled by the strength, and density per steradian of drawing from the map, `[H, W]`.
+    texels: Vec<[f32; 4]>,
     /// Angle by which sources are turned, in turns.
     turn: f32,
     rows: Steps,
     columns: Vec<Steps>,
-    /// Density per steradian of the pixels, `[H, W]`.
-    density: Vec<f32>,
+    /// Cosine of the polar angle at the upper edge of each row, and at the lower one of the last, `[H + 1]`.
+    edges: Vec<f32>,
     sun: Option<Disc>,
     /// Probability of drawing from the sun.
     sun_share: f32,
@@ -126,9 +126,6 @@ impl DistantLight {
             row_weights = (0..height).map(|y| environment.solid_angle(y)).collect();
         }
         let rows = Steps::new(&row_weights);
-        let density = (0..width * height)
-            .map(|i| rows.share(i / width) * columns[i / width].share(i % width) / environment.solid_angle(i / width) as f32)
-            .collect();
         let sun = light.sun.map(|s| {
             let solid_angle = s.solid_angle();
             Disc {
@@ -144,8 +141,16 @@ impl DistantLight {
             let share = from_sun / (from_sun + from_map as f32);
             if from_map > 0.0 { share.clamp(LEAST, 1.0 - LEAST) } else { 1.0 }
         });
+        let texels = (0..width * height)
+            .map(|i| {
+                let share = rows.share(i / width) * columns[i / width].share(i % width);
+                let [r, g, b] = radiance[i];
+                [r, g, b, share * (1.0 - sun_share) / environment.solid_angle(i / width) as f32]
+            })
+            .collect();
+        let edges = (0..=height).map(|y| (std::f64::consts::PI * y as f64 / height as f64).cos() as f32).collect();
         let turn = (environment.turn / std::f64::consts::TAU) as f32;
-        DistantLight { width, height, radiance, turn, rows, columns, density, sun, sun_share }
+        DistantLight { width, height, texels, turn, rows, columns, edges, sun, sun_share }
     }
 
     /// Draws a direction from the sun's disc.
@@ -163,23 +168,26 @@ impl DistantLight {
         let [mut a, b] = random;
         let is_sun = a < self.sun_share;
         a = if is_sun { a / self.sun_share } else { (a - self.sun_share) / (1.0 - self.sun_share) };
-        let direction = match self.draw_sun([a, b]) {
-            Some(direction) if is_sun => direction,
+        match self.draw_sun([a, b]) {
+            Some(direction) if is_sun => {
+                let (radiance, density) = self.evaluate(direction);
+                Drawn { direction, radiance, density }
+            }
             _ => self.draw_map([a, b]),
-        };
-        let (radiance, density) = self.evaluate(direction);
-        Drawn { direction, radiance, density }
+        }
     }
 
-    fn draw_map(&self, random: [f32; 2]) -> V3 {
+    fn draw_map(&self, random: [f32; 2]) -> Drawn {
         let (y, fy) = self.rows.find(random[0]);
         let (x, fx) = self.columns[y].find(random[1]);
         // Even in solid angle, not in the polar angle.
-        let edge = |row: usize| (PI * row as f32 / self.height as f32).cos();
-        let z = edge(y) + fy * (edge(y + 1) - edge(y));
+        let z = self.edges[y] + fy * (self.edges[y + 1] - self.edges[y]);
         let sine = (1.0 - z * z).max(0.0).sqrt();
-        let azimuth = TAU * ((x as f32 + fx) / self.width as f32 - 0.5 - self.turn);
-        [sine * azimuth.sin(), sine * azimuth.cos(), z]
+        let (column, row) = (x as f32 + fx, z.clamp(-1.0, 1.0).acos() / PI * self.height as f32);
+        let (right, ahead) = (TAU * (column / self.width as f32 - 0.5 - self.turn)).sin_cos();
+        let direction = [sine * right, sine * ahead, z];
+        let (radiance, density) = self.with_sun(direction, self.bilinear(column, row, (x, y)));
+        Drawn { direction, radiance, density }
     }
 
     /// Linear radiance from a direction of length 1, and the density per steradian with which it is drawn.
@@ -188,23 +196,38 @@ impl DistantLight {
         let v = direction[2].clamp(-1.0, 1.0).acos() / PI;
         let (x, y) = ((u - u.floor()) * self.width as f32, v * self.height as f32);
         let (column, row) = ((x as usize).min(self.width - 1), (y as usize).min(self.height - 1));
-        let mut density = self.density[row * self.width + column] * (1.0 - self.sun_share);
-        let mut radiance = self.bilinear(x - 0.5, y - 0.5);
-        if let Some(sun) = self.sun.filter(|s| s.contains(direction)) {
-            density += sun.density * self.sun_share;
-            radiance = along(radiance, 1.0, sun.radiance);
-        }
-        (radiance, density)
+        self.with_sun(direction, self.bilinear(x, y, (column, row)))
     }
 
-    fn bilinear(&self, x: f32, y: f32) -> V3 {
+    /// Adds the sun's radiance and density where a direction points into it.
+    fn with_sun(&self, direction: V3, (radiance, density): (V3, f32)) -> (V3, f32) {
+        match &self.sun {
+            Some(sun) if sun.contains(direction) => (along(radiance, 1.0, sun.radiance), density + sun.density * self.sun_share),
+            _ => (radiance, density),
+        }
+    }
+
+    /// Radiance at pixel coordinates, and the density of the pixel that they lie in.
+    fn bilinear(&self, x: f32, y: f32, (column, row): (usize, usize)) -> (V3, f32) {
+        let (x, y) = (x - 0.5, y - 0.5);
         let (left, top) = (x.floor(), y.floor());
         let (fx, fy) = (x - left, y - top);
-        let columns = [left as isize, left as isize + 1].map(|c| c.rem_euclid(self.width as isize) as usize);
-        let rows = [top as isize, top as isize + 1].map(|r| r.clamp(0, self.height as isize - 1) as usize * self.width);
-        let p = |r: usize, c: usize| self.radiance[rows[r] + columns[c]];
+        let (left, top) = (left as isize, top as isize);
+        let wrapped = |c: isize| {
+            if c < 0 {
+                self.width - 1
+            } else if c as usize >= self.width {
+                0
+            } else {
+                c as usize
+            }
+        };
+        let columns = [wrapped(left), wrapped(left + 1)];
+        let rows = [top, top + 1].map(|r| r.clamp(0, self.height as isize - 1) as usize * self.width);
+        let p = |r: usize, c: usize| &self.texels[rows[r] + columns[c]];
         let [a, b, c, d] = [p(0, 0), p(0, 1), p(1, 0), p(1, 1)];
-        std::array::from_fn(|k| (1.0 - fy) * (a[k] * (1.0 - fx) + b[k] * fx) + fy * (c[k] * (1.0 - fx) + d[k] * fx))
+        let radiance = std::array::from_fn(|k| (1.0 - fy) * (a[k] * (1.0 - fx) + b[k] * fx) + fy * (c[k] * (1.0 - fx) + d[k] * fx));
+        (radiance, self.texels[row * self.width + column][3])
     }
 }
 
@@ -241,7 +264,7 @@ mod tests {
             // The mean of 1 / density over the draws is the solid angle that they cover.
             let covered: f64 = random(n).map(|r| 1.0 / light.draw(r).density as f64).sum::<f64>() / n as f64;
             let lit: f64 = (0..light.height * light.width)
-                .filter(|i| light.density[*i] > 0.0)
+                .filter(|i| light.texels[*i][3] > 0.0)
                 .map(|i| daylight.environment.solid_angle(i / light.width))
                 .sum();
             assert!((covered / lit - 1.0).abs() < 0.02, "{covered} {lit}");

@@ -46,8 +46,12 @@ impl World {
             world.normals.extend(part.mesh.normals.iter().map(|n| normal_matrix * wide(n)));
             world.triangles.extend(part.mesh.faces.iter().map(|f| f.map(|v| v + first)));
             let m = &model.materials[part.material];
-            let material =
-                Material { base_color: [m.base_color[0], m.base_color[1], m.base_color[2]], roughness: m.roughness, metallic: m.metallic };
+            let material = Material {
+                base_color: [m.base_color[0], m.base_color[1], m.base_color[2]],
+                roughness: m.roughness,
+                metallic: m.metallic,
+                specular: m.specular,
+            };
             world.materials.resize(world.triangles.len(), material);
         }
         world

@@ -56,9 +56,10 @@ impl Sampler {
         [scrambled(first, 0x68bc_21eb), scrambled(second, 0x02e5_be93)]
     }
 
-    /// The next number in `[0, 1)`.
+    /// The next number in `[0, 1)`, without regard to the other samples: for decisions between two ways.
     pub fn one(&mut self) -> f32 {
-        self.pair()[0]
+        self.dimension = self.dimension.wrapping_add(1);
+        unit(hash(self.seed ^ self.index.wrapping_mul(0x85eb_ca6b) ^ self.dimension.wrapping_mul(0x9e37_79b9)))
     }
 }
 
@@ -92,7 +93,7 @@ mod tests {
             (0..dimension).for_each(|_| {
                 s.pair();
             });
-            s.one() as f64 - 0.5
+            s.pair()[0] as f64 - 0.5
         };
         let n = 4096;
         let correlation = |a: &dyn Fn(u32) -> f64, b: &dyn Fn(u32) -> f64| 12.0 * (0..n).map(|i| a(i) * b(i)).sum::<f64>() / n as f64;

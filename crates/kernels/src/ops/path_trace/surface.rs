@@ -67,7 +67,12 @@ impl Surfaces {
             emission = times(emission, [r, g, b]);
         }
         Surface {
-            material: bsdf::Material { base_color: times([base[0], base[1], base[2]], point.color), roughness, metallic },
+            material: bsdf::Material {
+                base_color: times([base[0], base[1], base[2]], point.color),
+                roughness,
+                metallic,
+                specular: m.specular,
+            },
             normal: self.normal(m, point),
             emission,
             opacity: match m.opacity {
