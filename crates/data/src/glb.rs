@@ -2,48 +2,12 @@
 //! as (x, z, −y). COLOR_0 is linear, as the standard requires.
 
 use crate::error::{DataError, Result};
+use crate::gltf::binary::{ARRAY, CLAMP, Chunk, ELEMENTS, FLOAT, LINEAR, LINEAR_MIPMAP, UINT, USHORT, join, y_up};
 use crate::{atomic, photo};
 use diorama_geom::Mesh;
 use diorama_geom::color::linear_from_srgb;
 use serde_json::{Value, json};
 use std::path::Path;
-
-fn y_up(p: [f32; 3]) -> [f32; 3] {
-    [p[0], p[2], -p[1]]
-}
-
-/// Buffer view targets: vertex attributes, and indices.
-const ARRAY: u32 = 34962;
-const ELEMENTS: u32 = 34963;
-
-/// The binary chunk under construction, with its buffer views and accessors.
-#[derive(Default)]
-struct Chunk {
-    bytes: Vec<u8>,
-    views: Vec<Value>,
-    accessors: Vec<Value>,
-}
-
-impl Chunk {
-    /// Appends bytes and a buffer view for them; returns the index of the view.
-    fn view(&mut self, data: Vec<u8>, target: Option<u32>) -> usize {
-        let mut view = json!({ "buffer": 0, "byteOffset": self.bytes.len(), "byteLength": data.len() });
-        if let Some(target) = target {
-            view["target"] = target.into();
-        }
-        self.views.push(view);
-        self.bytes.extend(data);
-        self.bytes.resize(self.bytes.len().next_multiple_of(4), 0);
-        self.views.len() - 1
-    }
-
-    /// Appends data and an accessor for them; returns the index of the accessor.
-    fn add(&mut self, data: Vec<u8>, target: u32, mut accessor: Value) -> Value {
-        accessor["bufferView"] = self.view(data, Some(target)).into();
-        self.accessors.push(accessor);
-        (self.accessors.len() - 1).into()
-    }
-}
 
 /// Encodes a mesh as GLB.
 ///
@@ -59,14 +23,14 @@ pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
     let mut chunk = Chunk::default();
     let mut attributes = attributes(mesh, texture.is_some(), &mut chunk);
     let indices = mesh.faces.iter().flatten().flat_map(|i| i.to_le_bytes()).collect();
-    let indices = chunk.add(indices, ELEMENTS, json!({ "componentType": 5125, "count": mesh.faces.len() * 3, "type": "SCALAR" }));
+    let indices = chunk.add(indices, ELEMENTS, json!({ "componentType": UINT, "count": mesh.faces.len() * 3, "type": "SCALAR" }));
     if normal_map.is_some() {
         let turned = mesh.tangents.iter().flat_map(|t| {
             let [x, y, z] = y_up([t[0], t[1], t[2]]);
             [x, y, z, t[3]]
         });
         let data = turned.flat_map(f32::to_le_bytes).collect();
-        attributes["TANGENT"] = chunk.add(data, ARRAY, json!({ "componentType": 5126, "count": n, "type": "VEC4" }));
+        attributes["TANGENT"] = chunk.add(data, ARRAY, json!({ "componentType": FLOAT, "count": n, "type": "VEC4" }));
     }
     let mut images = Vec::new();
     for image in [texture, normal_map].into_iter().flatten() {
@@ -86,7 +50,7 @@ pub fn encode(mesh: &Mesh, path: &Path) -> Result<Vec<u8>> {
     });
     if texture.is_some() {
         // Linear filters with mipmaps. Repeating coordinates would blend in the opposite edge.
-        root["samplers"] = json!([{ "magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071 }]);
+        root["samplers"] = json!([{ "magFilter": LINEAR, "minFilter": LINEAR_MIPMAP, "wrapS": CLAMP, "wrapT": CLAMP }]);
         root["textures"] = (0..images.len()).map(|i| json!({ "sampler": 0, "source": i })).collect();
         root["images"] = images.into();
     }
@@ -105,19 +69,19 @@ fn attributes(mesh: &Mesh, is_textured: bool, chunk: &mut Chunk) -> Value {
         (std::array::from_fn(|k| lo[k].min(p[k])), std::array::from_fn(|k| hi[k].max(p[k])))
     });
     let mut attributes = json!({});
-    let accessor = json!({ "componentType": 5126, "count": n, "type": "VEC3", "min": lo, "max": hi });
+    let accessor = json!({ "componentType": FLOAT, "count": n, "type": "VEC3", "min": lo, "max": hi });
     attributes["POSITION"] = chunk.add(floats(&mut turned.iter().copied()), ARRAY, accessor);
     if mesh.normals.len() == n {
         let data = floats(&mut mesh.normals.iter().map(|v| y_up(*v)));
-        attributes["NORMAL"] = chunk.add(data, ARRAY, json!({ "componentType": 5126, "count": n, "type": "VEC3" }));
+        attributes["NORMAL"] = chunk.add(data, ARRAY, json!({ "componentType": FLOAT, "count": n, "type": "VEC3" }));
     }
     if is_textured {
         let data = mesh.uvs.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
-        attributes["TEXCOORD_0"] = chunk.add(data, ARRAY, json!({ "componentType": 5126, "count": n, "type": "VEC2" }));
+        attributes["TEXCOORD_0"] = chunk.add(data, ARRAY, json!({ "componentType": FLOAT, "count": n, "type": "VEC2" }));
     } else if mesh.colors_srgb.len() == n {
         let word = |v: f32| ((linear_from_srgb(v.clamp(0.0, 1.0)) * 65535.0 + 0.5) as u16).to_le_bytes();
         let data = mesh.colors_srgb.iter().flat_map(|c| [word(c[0]), word(c[1]), word(c[2]), [255, 255]]).flatten().collect();
-        attributes["COLOR_0"] = chunk.add(data, ARRAY, json!({ "componentType": 5123, "count": n, "type": "VEC4", "normalized": true }));
+        attributes["COLOR_0"] = chunk.add(data, ARRAY, json!({ "componentType": USHORT, "count": n, "type": "VEC4", "normalized": true }));
     }
     attributes
 }
@@ -135,23 +99,6 @@ fn material(is_textured: bool, is_lit: bool) -> Value {
         material["normalTexture"] = json!({ "index": 1 });
     }
     material
-}
-
-/// The file: header, JSON chunk and binary chunk.
-fn join(root: &Value, binary: &[u8], path: &Path) -> Result<Vec<u8>> {
-    let mut text = serde_json::to_vec(root).expect("JSON of plain values");
-    text.resize(text.len().next_multiple_of(4), b' ');
-    let total = 12 + 8 + text.len() + 8 + binary.len();
-    let total = u32::try_from(total).map_err(|_| DataError::input(path, "the mesh exceeds 4 GiB, the limit of .glb; lower --faces"))?;
-    let mut out = b"glTF".to_vec();
-    out.extend(2u32.to_le_bytes());
-    out.extend(total.to_le_bytes());
-    for (kind, chunk) in [(b"JSON", &text[..]), (b"BIN\0", binary)] {
-        out.extend((chunk.len() as u32).to_le_bytes());
-        out.extend(kind);
-        out.extend(chunk);
-    }
-    Ok(out)
 }
 
 /// Writes a `.glb` atomically.

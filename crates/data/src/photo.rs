@@ -126,31 +126,40 @@ pub fn is_same_aspect(a: (u32, u32), b: (u32, u32)) -> bool {
 /// Remedy for damaged files.
 const CURE: &str = "copy it again, or leave such photographs out with --skip-broken";
 
-fn undecodable(path: &Path, e: impl std::fmt::Display) -> DataError {
-    DataError::input(path, format!("cannot be decoded as an image: {e}; {CURE}"))
+/// A file that is decoded, and the remedy that messages name.
+#[derive(Clone, Copy)]
+pub(crate) struct Origin<'a> {
+    pub path: &'a Path,
+    pub cure: &'a str,
 }
 
-fn ends_early(path: &Path) -> DataError {
-    DataError::input(path, format!("the image file ends early, as if it was truncated; {CURE}"))
+impl Origin<'_> {
+    fn undecodable(self, e: impl std::fmt::Display) -> DataError {
+        DataError::input(self.path, format!("cannot be decoded as an image: {e}; {}", self.cure))
+    }
+
+    fn ends_early(self) -> DataError {
+        DataError::input(self.path, format!("the image file ends early, as if it was truncated; {}", self.cure))
+    }
 }
 
 /// Describes the error of a decoder.
-fn failed(path: &Path, limits: &PhotoLimits, e: image::ImageError) -> DataError {
+fn failed(origin: Origin, limits: &PhotoLimits, e: image::ImageError) -> DataError {
     let mut cause: Option<&dyn std::error::Error> = Some(&e);
     while let Some(c) = cause {
         if c.downcast_ref::<std::io::Error>().is_some_and(|e| e.kind() == std::io::ErrorKind::UnexpectedEof) {
-            return ends_early(path);
+            return origin.ends_early();
         }
         cause = c.source();
     }
     // Some decoders return the error only as text.
     let text = e.to_string();
     if ["unexpected end of file", "failed to fill whole buffer", "unexpected EOF"].iter().any(|t| text.contains(t)) {
-        return ends_early(path);
+        return origin.ends_early();
     }
     match e {
-        image::ImageError::Limits(_) => too_large(path, limits),
-        e => undecodable(path, e),
+        image::ImageError::Limits(_) => too_large(origin.path, limits),
+        e => origin.undecodable(e),
     }
 }
 
@@ -158,17 +167,17 @@ fn failed(path: &Path, limits: &PhotoLimits, e: image::ImageError) -> DataError 
 trait Source: BufRead + Seek {}
 impl<T: BufRead + Seek> Source for T {}
 
-fn decoder<'a>(path: &Path, limits: &PhotoLimits, file: Box<dyn Source + 'a>) -> Result<impl ImageDecoder + 'a> {
-    let mut reader = ImageReader::new(file).with_guessed_format().map_err(DataError::io(path, "read"))?;
+fn decoder<'a>(origin: Origin, limits: &PhotoLimits, file: Box<dyn Source + 'a>) -> Result<impl ImageDecoder + use<'a>> {
+    let mut reader = ImageReader::new(file).with_guessed_format().map_err(DataError::io(origin.path, "read"))?;
     let mut l = Limits::default();
     l.max_image_width = Some(limits.max_side);
     l.max_image_height = Some(limits.max_side);
     l.max_alloc = Some(limits.max_bytes);
     reader.limits(l);
-    let decoder = reader.into_decoder().map_err(|e| failed(path, limits, e))?;
+    let decoder = reader.into_decoder().map_err(|e| failed(origin, limits, e))?;
     let (w, h) = decoder.dimensions();
     if w > limits.max_side || h > limits.max_side || decoder.total_bytes() > limits.max_bytes {
-        return Err(too_large(path, limits));
+        return Err(too_large(origin.path, limits));
     }
     Ok(decoder)
 }
@@ -196,7 +205,7 @@ pub fn header(path: &Path) -> Result<Header> {
         Some(j) => (j.width, j.height, Orientation::from_exif(j.orientation).unwrap_or(Orientation::NoTransforms), Depth::Eight),
         None => {
             file.rewind().map_err(DataError::io(path, "read"))?;
-            let mut d = decoder(path, &limits, Box::new(file))?;
+            let mut d = decoder(Origin { path, cure: CURE }, &limits, Box::new(file))?;
             let (w, h) = d.dimensions();
             (w, h, d.orientation().unwrap_or(Orientation::NoTransforms), depth_of(d.color_type()))
         }
@@ -205,7 +214,7 @@ pub fn header(path: &Path) -> Result<Header> {
         return Err(too_large(path, &limits));
     }
     if w == 0 || h == 0 {
-        return Err(undecodable(path, format!("it has {w}×{h} pixels")));
+        return Err(Origin { path, cure: CURE }.undecodable(format!("it has {w}×{h} pixels")));
     }
     let size = if turns_sides(orientation) { (h, w) } else { (w, h) };
     Ok(Header { size, is_turned: orientation != Orientation::NoTransforms, depth })
@@ -241,18 +250,9 @@ pub(crate) fn as_stored(bytes: &[u8]) -> image::ImageResult<DynamicImage> {
 /// # Errors
 /// If the file is not an image, ends early, or contains a value that is not a number.
 pub fn load_full(path: &Path) -> Result<Photo> {
-    let limits = PhotoLimits::default();
     let bytes = std::fs::read(path).map_err(DataError::io(path, "read"))?;
-    if bytes.is_empty() {
-        return Err(DataError::input(path, format!("the image file is empty (0 bytes); {CURE}")));
-    }
-    // The decoder fills missing JPEG data with gray.
-    let bytes = if bytes.starts_with(&[0xff, 0xd8]) { jpeg::whole(&bytes).ok_or_else(|| ends_early(path))? } else { (&bytes[..]).into() };
     let is_exr = bytes.starts_with(&[0x76, 0x2f, 0x31, 0x01]);
-    let mut decoder = decoder(path, &limits, Box::new(Cursor::new(&*bytes)))?;
-    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    let mut im = DynamicImage::from_decoder(decoder).map_err(|e| failed(path, &limits, e))?;
-    im.apply_orientation(orientation);
+    let im = decode(Origin { path, cure: CURE }, &bytes)?;
     let (width, height) = (im.width() as usize, im.height() as usize);
     let channels = if im.color().has_alpha() { 4 } else { 3 };
     let floats = |im: DynamicImage| {
@@ -278,6 +278,21 @@ pub fn load_full(path: &Path) -> Result<Photo> {
 
 /// The largest value of 16-bit floats.
 const LARGEST: f32 = 65504.0;
+
+/// Decodes the bytes of a picture, turned as its metadata ask, with its own channels and numbers.
+pub(crate) fn decode(origin: Origin, bytes: &[u8]) -> Result<DynamicImage> {
+    let limits = PhotoLimits::default();
+    if bytes.is_empty() {
+        return Err(DataError::input(origin.path, format!("the image file is empty (0 bytes); {}", origin.cure)));
+    }
+    // The decoder fills missing JPEG data with gray.
+    let bytes = if bytes.starts_with(&[0xff, 0xd8]) { jpeg::whole(bytes).ok_or_else(|| origin.ends_early())? } else { bytes.into() };
+    let mut decoder = decoder(origin, &limits, Box::new(Cursor::new(&*bytes)))?;
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let mut im = DynamicImage::from_decoder(decoder).map_err(|e| failed(origin, &limits, e))?;
+    im.apply_orientation(orientation);
+    Ok(im)
+}
 
 fn check_range(path: &Path, im: &Image) -> Result<()> {
     let Some(at) = im.data.iter().position(|v| v.is_nan() || v.abs() > LARGEST) else { return Ok(()) };

@@ -22,7 +22,7 @@ pub struct Part {
     pub material: usize,
 }
 
-/// A part that stands somewhere.
+/// A part that stands somewhere. Under a mirroring transform (negative determinant) the outside stays outside: there, faces wind clockwise.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Instance {
     /// Index of the part.
@@ -104,7 +104,7 @@ pub struct Texture {
 }
 
 /// Values of a texture outside of its image.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Wrap {
     #[default]
     Repeat,

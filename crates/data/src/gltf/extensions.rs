@@ -1,0 +1,41 @@
+//! Extensions of glTF that are read, and what to do about others.
+
+use super::document::Document;
+use super::scene::Notes;
+use crate::error::Result;
+
+/// Extensions that are read.
+const READ: [&str; 6] = [
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_transmission",
+    "KHR_materials_unlit",
+    "EXT_texture_webp",
+];
+
+/// Refuses extensions without which the file cannot be understood, and notes others that are not read.
+pub fn check(document: &Document, notes: &mut Notes) -> Result<()> {
+    let root = &document.root;
+    if let Some(name) = root.extensions_required.iter().find(|n| !READ.contains(&n.as_str())) {
+        return Err(document.wrong(format!("it requires the extension {name}, which is not read; {}", cure(name))));
+    }
+    for name in root.extensions_used.iter().filter(|n| !READ.contains(&n.as_str())) {
+        notes.add(format!("the extension {name} is left out"));
+    }
+    if !root.animations.is_empty() {
+        notes.add("animations are left out".into());
+    }
+    Ok(())
+}
+
+fn cure(name: &str) -> &'static str {
+    match name {
+        "KHR_draco_mesh_compression" | "EXT_meshopt_compression" | "KHR_meshopt_compression" => {
+            "decompress it: npx @gltf-transform/cli copy IN.glb OUT.glb, or export it without compression"
+        }
+        "KHR_texture_basisu" => "convert its textures: npx @gltf-transform/cli ktxdecompress IN.glb OUT.glb, or export PNG textures",
+        "KHR_materials_pbrSpecularGlossiness" => "convert it: npx @gltf-transform/cli metalrough IN.glb OUT.glb",
+        _ => "export it without",
+    }
+}

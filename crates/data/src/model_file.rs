@@ -1,0 +1,26 @@
+//! Models in files: glTF and OBJ.
+
+use crate::error::{DataError, Result};
+use crate::{gltf, obj};
+use diorama_geom::model::Model;
+use std::path::Path;
+
+/// A model, and what was left out or assumed when it was read, in plain words.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LoadedModel {
+    pub model: Model,
+    pub notes: Vec<String>,
+}
+
+/// Reads a `.glb`, `.gltf` or `.obj` file.
+///
+/// # Errors
+/// If the file cannot be read or has another extension.
+pub fn read(path: &Path) -> Result<LoadedModel> {
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    match extension.as_str() {
+        "glb" | "gltf" => gltf::read(path),
+        "obj" => obj::read(path, None),
+        _ => Err(DataError::input(path, "a model is read from .glb, .gltf or .obj; export it as one of these")),
+    }
+}
