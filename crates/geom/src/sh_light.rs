@@ -54,6 +54,14 @@ impl ShLight {
         light
     }
 
+    /// Environment map `[height, 2 height, 3]` of the smoothest light that shades as this does; black where that would be negative.
+    pub fn environment(&self, height: usize) -> Environment {
+        Environment::from_fn(height, |d| {
+            let basis = basis(d);
+            std::array::from_fn(|k| (0..9).map(|i| self.0[i][k] * basis[i] * PI / COSINE[BANDS[i]]).sum::<f64>().max(0.0))
+        })
+    }
+
     /// Adds a distant sun in a direction of length 1 that gives a surface facing it the irradiance `E`, linear RGB.
     ///
     /// A white surface then reflects `E / π (3/32 + c/2 + 15 c² / 32)` for the cosine `c` of its angle to the sun, in place of `E / π max(c, 0)`.
@@ -118,6 +126,17 @@ impl ShLight {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn light_s_environment_shades_as_the_light() {
+        let mut light = ShLight::uniform([0.5, 0.6, 0.7]);
+        light.0[2] = [0.1, 0.0, -0.1];
+        light.0[4] = [0.05; 3];
+        let back = ShLight::of(&light.environment(256));
+        for (a, b) in light.0.iter().flatten().zip(back.0.iter().flatten()) {
+            assert!((a - b).abs() < 2e-3, "{a} {b}");
+        }
+    }
     use crate::rng::Rng;
     use glam::DQuat;
 

@@ -5,7 +5,7 @@ use super::picture::{self, Job};
 use super::scene_file::{Backplate, Denoise, Focus, SceneFile, Snap, object_of};
 use crate::error::{PipelineError, Result};
 use crate::run::{RunDescription, kept_capture};
-use diorama_data::{DataError, gltf, photo};
+use diorama_data::{DataError, model_file, photo};
 use diorama_geom::glam::{DAffine3, DMat3, DVec3};
 use diorama_geom::{Camera, Image, Model, Pose};
 use diorama_kernels::ops::denoise;
@@ -54,9 +54,9 @@ pub fn load(file: &SceneFile) -> Result<Composition> {
     let mut notes = Vec::new();
     let mut read = |path: &Path, field: &str| -> Result<Model> {
         require_file(path, field)?;
-        let (model, more) = gltf::read(path)?;
-        notes.extend(more);
-        Ok(model)
+        let read = model_file::read(path)?;
+        notes.extend(read.notes);
+        Ok(read.model)
     };
     let mut model = file.scene.as_ref().map(|s| read(&s.mesh, "scene.mesh")).transpose()?.unwrap_or_default();
     let place = model.instances.len();
@@ -108,13 +108,7 @@ pub fn load(file: &SceneFile) -> Result<Composition> {
 ///
 /// # Errors
 /// When an unfinished picture cannot be written.
-pub fn render(
-    c: &mut Composition,
-    file: &SceneFile,
-    kept: &Path,
-    stop: &AtomicBool,
-    progress: &mut dyn FnMut(f64),
-) -> Result<Composed> {
+pub fn render(c: &mut Composition, file: &SceneFile, kept: &Path, stop: &AtomicBool, progress: &mut dyn FnMut(f64)) -> Result<Composed> {
     let samples = file.render.spp;
     let passes = if c.photograph.is_some() { 2.0 } else { 1.0 };
     let job = |scene, part: &str| Job {

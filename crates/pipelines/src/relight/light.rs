@@ -53,9 +53,9 @@ impl LightOptions {
         let light = match &self.source {
             Source::File(path) if is_text(path) => Daylight::of(sh_text::read(path)?.environment(ROWS)),
             Source::File(path) => {
-                let (environment, note) = environment::read(path)?;
-                notes.extend(note);
-                Daylight::of(environment)
+                let read = environment::read(path)?;
+                notes.extend(read.notes);
+                Daylight::of(read.environment)
             }
             Source::Sky { elevation, rotation } => {
                 if !(-18.0..=90.0).contains(elevation) {

@@ -4,9 +4,9 @@ use super::light::{LightOptions, require_file};
 use super::picture::{self, Job};
 use crate::error::{PipelineError, Result};
 use diorama_data::film::Film as Video;
-use diorama_data::{DataError, gltf, photo};
+use diorama_data::{DataError, model_file, photo};
 use diorama_geom::glam::DVec3;
-use diorama_geom::{Camera, Model, Pose};
+use diorama_geom::{Camera, Pose};
 use diorama_kernels::ops::denoise;
 use diorama_kernels::ops::path_trace::{Scene, Settings, View};
 use serde::Serialize;
@@ -66,7 +66,7 @@ pub fn render(
     progress: &mut dyn FnMut(f64),
 ) -> Result<Turntable> {
     require_file(model, "model")?;
-    let (geometry, mut notes) = gltf::read(model)?;
+    let model_file::LoadedModel { model: geometry, mut notes } = model_file::read(model)?;
     let (light, more) = options.light.read()?;
     notes.extend(more);
     let Some((low, high)) = geometry.bounds().map(|(l, h)| (DVec3::from(l), DVec3::from(h))) else {
@@ -102,8 +102,7 @@ pub fn render(
         } else {
             let view = View { camera, world_from_camera: Pose::look_at(eye, center, DVec3::Z), lens: None };
             let job = Job { scene: &scene, view, settings, samples: options.samples, kept: None, key: String::new() };
-            let (mut film, interrupted) =
-                picture::render(&job, stop, &mut |s| progress((i as f64 + s) / options.frames as f64))?;
+            let (mut film, interrupted) = picture::render(&job, stop, &mut |s| progress((i as f64 + s) / options.frames as f64))?;
             if interrupted {
                 made.interrupted = true;
                 break;

@@ -12,7 +12,9 @@ use std::time::Instant;
 
 /// Render a model from all sides under one light
 #[derive(Args, Clone, Debug)]
-#[command(after_help = "Examples:\n  diorama relight turntable chair.glb --light dusk.hdr --frames 36 -o turn/\n  diorama relight turntable chair.glb --light sky:8,200 --background -o turn.mp4")]
+#[command(
+    after_help = "Examples:\n  diorama relight turntable chair.glb --light dusk.hdr --frames 36 -o turn/\n  diorama relight turntable chair.glb --light sky:8,200 --background -o turn.mp4"
+)]
 pub struct Turntable {
     /// Model (.glb or .gltf)
     model: PathBuf,
