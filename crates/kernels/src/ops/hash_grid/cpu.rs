@@ -1,12 +1,14 @@
 //! Vectorized over points, parallel over (level, chunk of points) forward and over levels backward,
 //! so that every gradient row has one writer and sums are in a fixed order.
 
+mod gradient;
 mod jacobian;
 
 use super::{HashGrid, Level};
 use crate::simd;
 use rayon::prelude::*;
 
+pub use gradient::{Along, TableGradient, gradient, gradient_backward};
 pub use jacobian::{jacobian, jacobian_backward};
 
 /// Points per task.
@@ -259,15 +261,15 @@ mod x86 {
 
     /// Indices and weights of the eight corners of sixteen points.
     #[repr(C, align(64))]
-    struct Corners {
-        rows: [[u32; 16]; 8],
-        weights: [[f32; 16]; 8],
+    pub(super) struct Corners {
+        pub(super) rows: [[u32; 16]; 8],
+        pub(super) weights: [[f32; 16]; 8],
     }
 
     /// Constants of a level.
     #[derive(Clone, Copy)]
-    struct Hash {
-        n: __m512,
+    pub(super) struct Hash {
+        pub(super) n: __m512,
         last: __m512i,
         v1: __m512i,
         v2: __m512i,
@@ -278,7 +280,7 @@ mod x86 {
     /// The coordinates of the sixteen points `[16, 3]` at `src`.
     #[inline]
     #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
-    unsafe fn by_coordinate(src: *const f32) -> [__m512; 3] {
+    pub(super) unsafe fn by_coordinate(src: *const f32) -> [__m512; 3] {
         let lane3 = _mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 33, 36, 39, 42, 45);
         // SAFETY: the caller vouches for 48 floats.
         unsafe {
@@ -292,7 +294,7 @@ mod x86 {
     impl Hash {
         #[inline]
         #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
-        fn new(level: &Level) -> Self {
+        pub(super) fn new(level: &Level) -> Self {
             let (p1, p2, mask, xor) = if level.dense {
                 let s = level.cells as i32 + 1;
                 (s, s * s, -1i32, false)
@@ -309,10 +311,10 @@ mod x86 {
             }
         }
 
-        /// Corners of sixteen points, given by coordinate.
+        /// Rows of the corners of sixteen points, given by coordinate, and the fractions along the axes.
         #[inline]
         #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
-        fn corners(&self, points: [__m512; 3]) -> [(__m512i, __m512); 8] {
+        pub(super) fn cells(&self, points: [__m512; 3]) -> ([__m512i; 8], [__m512; 3]) {
             let (zero, one, unit) = (_mm512_setzero_ps(), _mm512_set1_ps(1.0), _mm512_set1_epi32(1));
             let axis = |x: __m512| {
                 let x = _mm512_mul_ps(_mm512_min_ps(_mm512_max_ps(x, zero), one), self.n);
@@ -325,18 +327,28 @@ mod x86 {
             let xs = [ix, _mm512_add_epi32(ix, unit)];
             let ys = [y0, _mm512_add_epi32(y0, self.v1)];
             let zs = [z0, _mm512_add_epi32(z0, self.v2)];
-            let wx = [_mm512_sub_ps(one, fx), fx];
-            let wy = [_mm512_sub_ps(one, fy), fy];
-            let wz = [_mm512_sub_ps(one, fz), fz];
-            let mut out = [(unit, zero); 8];
-            for (c, out) in out.iter_mut().enumerate() {
+            let mut rows = [unit; 8];
+            for (c, row) in rows.iter_mut().enumerate() {
                 let (a, b, d) = (c & 1, (c >> 1) & 1, c >> 2);
-                let row = if self.xor {
+                *row = if self.xor {
                     _mm512_and_epi32(_mm512_xor_epi32(_mm512_xor_epi32(xs[a], ys[b]), zs[d]), self.mask)
                 } else {
                     _mm512_add_epi32(_mm512_add_epi32(xs[a], ys[b]), zs[d])
                 };
-                *out = (row, _mm512_mul_ps(wx[a], _mm512_mul_ps(wy[b], wz[d])));
+            }
+            (rows, [fx, fy, fz])
+        }
+
+        /// Corners of sixteen points, given by coordinate.
+        #[inline]
+        #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+        fn corners(&self, points: [__m512; 3]) -> [(__m512i, __m512); 8] {
+            let (rows, f) = self.cells(points);
+            let one = _mm512_set1_ps(1.0);
+            let [wx, wy, wz] = f.map(|f| [_mm512_sub_ps(one, f), f]);
+            let mut out = [(rows[0], one); 8];
+            for (c, out) in out.iter_mut().enumerate() {
+                *out = (rows[c], _mm512_mul_ps(wx[c & 1], _mm512_mul_ps(wy[(c >> 1) & 1], wz[c >> 2])));
             }
             out
         }

@@ -77,3 +77,15 @@ pub fn jacobian_backward(grid: &HashGrid, points: &[f64], d_jacobian: &[f64]) ->
     });
     d_table
 }
+
+/// Backward pass of the points' gradient `Jᵀ g`, given its gradient `d` `[S, 3]`: gradients of `g` (`J d`, `[L, S, F]`) and of the table.
+/// The points get none.
+pub fn gradient_backward(grid: &HashGrid, points: &[f64], table: &[f64], g: &[f64], d: &[f64]) -> (Vec<f64>, Vec<f64>) {
+    let (mut d_g, mut d_table) = (vec![0.0; g.len()], vec![0.0; table.len()]);
+    each(grid, points, |o, i, t, _, dw| {
+        let along: f64 = (0..3).map(|k| dw[k] * d[i * 3 + k]).sum();
+        d_g[o] += along * table[t];
+        d_table[t] += along * g[o];
+    });
+    (d_g, d_table)
+}

@@ -43,6 +43,33 @@ fn jacobian_matches_the_reference_both_ways() {
 }
 
 #[test]
+fn gradient_matches_the_reference_both_ways() {
+    for c in cases::cases() {
+        let (p, t, g, s) = (wide(&c.points), wide(&c.table), wide(&c.d), c.points.len() / 3);
+        let (value, direction) = (random(s, 8), random(s * 3, 9));
+        let mut out = vec![7.0; s * 3];
+        cpu::gradient(&c.grid, &c.points, &c.table, &c.d, &mut out);
+        assert_close("gradient", &out, &reference::backward(&c.grid, &p, &t, &g).0, 1e-4);
+        let (want, mut want_table) = reference::gradient_backward(&c.grid, &p, &t, &g, &wide(&direction));
+        let weighted: Vec<f64> = g.iter().enumerate().map(|(e, g)| g * value[e / c.grid.config.features % s] as f64).collect();
+        want_table.iter_mut().zip(reference::backward(&c.grid, &p, &t, &weighted).1).for_each(|(a, b)| *a += b);
+        let along = cpu::Along { value: &value, direction: &direction };
+        for marks in [c.table.len() / cpu::LINE, 0] {
+            let (mut got, mut grads, mut touched) = (vec![7.0; c.d.len()], vec![0.0; c.table.len()], vec![0u8; marks]);
+            let d_table = cpu::TableGradient { grads: &mut grads, touched: &mut touched };
+            cpu::gradient_backward(&c.grid, &c.points, &c.table, &c.d, along, &mut got, Some(d_table));
+            assert_close("derivatives", &got, &want, 1e-4);
+            assert_close("table", &grads, &want_table, 1e-4);
+            let lines = grads.chunks(cpu::LINE).zip(&touched);
+            assert!(lines.into_iter().all(|(line, t)| *t == 1 || line.iter().all(|g| *g == 0.0)), "a line without a mark");
+        }
+        let mut alone = vec![7.0; c.d.len()];
+        cpu::gradient_backward(&c.grid, &c.points, &c.table, &c.d, along, &mut alone, None);
+        assert_close("derivatives alone", &alone, &want, 1e-4);
+    }
+}
+
+#[test]
 fn reference_gradients_match_central_differences() {
     let grid = HashGrid::new(HashGridConfig { levels: 2, features: 2, log2_size: 6, base: 2, finest: 7 });
     let p = vec![0.31, 0.62, 0.77, 0.12, 0.55, 0.41];
@@ -54,4 +81,9 @@ fn reference_gradients_match_central_differences() {
     let dj = wide(&random(6 * grid.output_dims(), 4));
     let g = reference::jacobian_backward(&grid, &p, &dj);
     assert_gradient("jacobian", &g, &t, 1e-6, |x| reference::jacobian(&grid, &p, x).iter().zip(&dj).map(|(a, b)| a * b).sum());
+    let (g, d) = (wide(&random(2 * grid.output_dims(), 5)), wide(&random(6, 6)));
+    let (d_g, d_table) = reference::gradient_backward(&grid, &p, &t, &g, &d);
+    let loss = |t: &[f64], g: &[f64]| reference::backward(&grid, &p, t, g).0.iter().zip(&d).map(|(a, b)| a * b).sum::<f64>();
+    assert_gradient("gradient to g", &d_g, &g, 1e-6, |x| loss(&t, x));
+    assert_gradient("gradient to table", &d_table, &t, 1e-6, |x| loss(x, &g));
 }
