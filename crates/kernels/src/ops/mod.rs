@@ -7,6 +7,7 @@ pub mod composite;
 pub mod conv2d;
 pub mod conv_transpose2d;
 pub mod denoise;
+pub mod density_gradient;
 pub mod depth_loss;
 pub mod distortion;
 pub mod dropout;

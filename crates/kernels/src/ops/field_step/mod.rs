@@ -109,6 +109,14 @@ impl BlockEncoding {
         }
     }
 
+    /// Derivatives `[N, output_dims]` along `v` `[N, 3]`, overwritten.
+    pub fn tangent(&self, points: &[f32], v: &[f32], out: &mut [f32]) {
+        match self {
+            BlockEncoding::Frequency(f) => frequency::cpu::tangent(f, points, v, out),
+            BlockEncoding::TriangleWave { bands } => triangle_wave::cpu::tangent(3, *bands, points, v, out),
+        }
+    }
+
     /// Gradient of the points, overwritten.
     pub fn backward(&self, points: &[f32], d: &[f32], d_points: &mut [f32]) {
         match self {

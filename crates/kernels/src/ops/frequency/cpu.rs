@@ -47,3 +47,20 @@ pub fn backward(f: &Frequency, x: &[f32], d_out: &[f32], dx: &mut [f32]) {
         }
     }
 }
+
+/// Derivatives of the encoding along `v` `[N, dims]`, `[N, output_dims]`, overwritten.
+pub fn tangent(f: &Frequency, x: &[f32], v: &[f32], out: &mut [f32]) {
+    let (dims, width) = (f.dims, f.output_dims());
+    let base = if f.include_input { dims } else { 0 };
+    let unit = if f.pi { std::f64::consts::PI } else { 1.0 };
+    for ((row, v), o) in x.chunks_exact(dims).zip(v.chunks_exact(dims)).zip(out.chunks_exact_mut(width)) {
+        o[..base].copy_from_slice(&v[..base]);
+        for (i, &x) in row.iter().enumerate() {
+            bands(f, x, |k, s, c| {
+                let scale = f.band_weight(k) * unit * (1u64 << k) as f64 * v[i] as f64;
+                o[base + 2 * k * dims + i] = (scale * c) as f32;
+                o[base + (2 * k + 1) * dims + i] = (-scale * s) as f32;
+            });
+        }
+    }
+}

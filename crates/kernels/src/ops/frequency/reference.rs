@@ -39,3 +39,19 @@ pub fn backward(f: &Frequency, x: &[f64], d_out: &[f64]) -> Vec<f64> {
     }
     dx
 }
+
+/// Derivatives of the encoding along `v` `[N, dims]`.
+pub fn tangent(f: &Frequency, x: &[f64], v: &[f64]) -> Vec<f64> {
+    let mut out = Vec::new();
+    for (row, v) in x.chunks_exact(f.dims).zip(v.chunks_exact(f.dims)) {
+        if f.include_input {
+            out.extend_from_slice(v);
+        }
+        for k in 0..f.bands {
+            let (s, w) = (angle_scale(f, k), f.band_weight(k));
+            out.extend(row.iter().zip(v).map(|(x, v)| w * s * (s * x).cos() * v));
+            out.extend(row.iter().zip(v).map(|(x, v)| -w * s * (s * x).sin() * v));
+        }
+    }
+    out
+}

@@ -89,6 +89,29 @@ vectorized! {
     }
 }
 
+/// Second derivative of a monotonic activation from its output.
+///
+/// # Panics
+/// When the activation is not monotonic.
+#[inline(always)]
+pub fn second_slope_from_output(a: Activation, y: f32) -> f32 {
+    let s = slope_from_output(a, y);
+    match a {
+        Activation::None | Activation::Relu | Activation::LeakyRelu => 0.0,
+        Activation::Sigmoid => s * (1.0 - 2.0 * y),
+        Activation::Softplus => s * (1.0 - s),
+        Activation::TruncatedExp => {
+            if s < y {
+                0.0
+            } else {
+                s
+            }
+        }
+        Activation::Tanh => -2.0 * y * s,
+        Activation::Silu => panic!("the slope of SiLU is no function of its output"),
+    }
+}
+
 thread_local! {
     /// The gradient before the activation, of all rows or of a block.
     static SLOPES: Cell<Vec<f32>> = const { Cell::new(Vec::new()) };

@@ -42,6 +42,25 @@ pub fn slope(a: Activation, x: f64) -> f64 {
     }
 }
 
+/// Second derivative of an activation.
+pub fn second_slope(a: Activation, x: f64) -> f64 {
+    let s = activate(Activation::Sigmoid, x);
+    match a {
+        Activation::None | Activation::Relu | Activation::LeakyRelu => 0.0,
+        Activation::Sigmoid => s * (1.0 - s) * (1.0 - 2.0 * s),
+        Activation::Softplus => s * (1.0 - s),
+        Activation::TruncatedExp => {
+            if x < 15.0 {
+                x.exp()
+            } else {
+                0.0
+            }
+        }
+        Activation::Tanh => -2.0 * x.tanh() * slope(a, x),
+        Activation::Silu => s * (1.0 - s) * (2.0 + x * (1.0 - 2.0 * s)),
+    }
+}
+
 fn pre(m: usize, &Dense { k, n, bias, .. }: &Dense, x: &[f64], w: &[f64], b: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; m * n];
     for i in 0..m {

@@ -32,3 +32,14 @@ pub fn backward(dims: usize, bands: usize, x: &[f32], d: &[f32], g: &mut [f32]) 
             .sum::<f64>() as f32;
     }
 }
+
+/// Derivatives of the encoding along `v` `[N, dims]`, `[N, dims · bands]`, overwritten.
+pub fn tangent(dims: usize, bands: usize, x: &[f32], v: &[f32], out: &mut [f32]) {
+    assert_eq!(out.len(), x.len() * bands, "triangle wave of {dims} dims: shapes");
+    for ((x, v), o) in x.iter().zip(v).zip(out.chunks_exact_mut(bands.max(1))) {
+        for (k, o) in o.iter_mut().enumerate() {
+            let (p, scale) = phase(*x, k);
+            *o = (scale * if p >= 1.0 { 2.0 } else { -2.0 }) as f32 * v;
+        }
+    }
+}

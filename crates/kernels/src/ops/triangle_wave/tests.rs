@@ -10,6 +10,9 @@ fn matches_the_reference_both_ways() {
         let mut g = vec![9.0; x.len()];
         cpu::backward(dims, bands, &x, &d, &mut g);
         assert_close("backward", &g, &reference::backward(bands, &wide(&x), &wide(&d)), 1e-4);
+        let (v, mut along) = (random(x.len(), 8), vec![9.0; d.len()]);
+        cpu::tangent(dims, bands, &x, &v, &mut along);
+        assert_close("tangent", &along, &reference::tangent(bands, &wide(&x), &wide(&v)), 1e-4);
     }
 }
 
@@ -18,6 +21,9 @@ fn reference_gradient_matches_central_differences() {
     let (x, d) = (vec![0.13, -0.37, 0.81], wide(&random(12, 2)));
     let g = reference::backward(4, &x, &d);
     assert_gradient("x", &g, &x, 1e-6, |x| reference::forward(4, x).iter().zip(&d).map(|(a, b)| a * b).sum());
+    let v = [0.4, -1.2, 0.7];
+    let along: f64 = reference::tangent(4, &x, &v).iter().zip(&d).map(|(t, d)| t * d).sum();
+    assert!((along - g.iter().zip(&v).map(|(g, v)| g * v).sum::<f64>()).abs() < 1e-9, "tangent: {along}");
 }
 
 #[test]
