@@ -24,7 +24,7 @@ use super::frequency::{self, Frequency};
 use super::fused_mlp::{Head, Mlp};
 use super::triangle_wave;
 
-pub use step::{StepBuffers, StepInput, StepOutput, run};
+pub use step::{Extras, StepBuffers, StepInput, StepOutput, run};
 
 /// A network that maps an encoded position and per-ray codes to a density and to what is composited with it.
 ///

@@ -21,6 +21,8 @@ pub struct Step {
     /// Per network input, `[S, K]`.
     pub d_inputs: Vec<Vec<f64>>,
     pub d_background: Vec<f64>,
+    /// `[S, K]`
+    pub d_extras: Vec<f64>,
 }
 
 fn head(net: &FieldNet, h: Head, channels: usize, values: &[Vec<f64>], s: usize, f: impl Fn(f64) -> f64) -> Vec<f64> {
@@ -28,12 +30,26 @@ fn head(net: &FieldNet, h: Head, channels: usize, values: &[Vec<f64>], s: usize,
     (0..s * channels).map(|e| f(values[h.layer][e / channels * width + h.channel + e % channels] + h.shift as f64)).collect()
 }
 
-/// Forward, then backward for the loss `Σ d · out` over outputs, depth, opacity and weights.
+/// [`step_with_extras`] without any.
 pub fn step(net: &FieldNet, params: &[f64], p: &Packed, inputs: &[&[f64]], background: &[f64], d: &Composited<f64>) -> Step {
+    step_with_extras(net, params, p, inputs, &[], background, d)
+}
+
+/// Forward, then backward for the loss `Σ d · out` over outputs, extras `[S, K]`, depth, opacity and weights.
+pub fn step_with_extras(
+    net: &FieldNet,
+    params: &[f64],
+    p: &Packed,
+    inputs: &[&[f64]],
+    extras: &[f64],
+    background: &[f64],
+    d: &Composited<f64>,
+) -> Step {
     let s = p.samples();
+    let k = if s > 0 { extras.len() / s } else { (background.len() / p.rays().max(1)).saturating_sub(net.channels()) };
     let values = mlp::forward(&net.mlp, params, inputs, s);
     let sigma = head(net, net.density, 1, &values, s, |x| activate(net.density.activation, x));
-    let c = net.channels();
+    let c = net.channels() + k;
     let (mut outputs, mut first) = (vec![0.0; s * c], 0);
     for o in &net.outputs {
         let own = head(net, o.head, o.channels, &values, s, |x| activate(o.head.activation, x));
@@ -41,6 +57,9 @@ pub fn step(net: &FieldNet, params: &[f64], p: &Packed, inputs: &[&[f64]], backg
             outputs[e / o.channels * c + first + e % o.channels] = v;
         }
         first += o.channels;
+    }
+    for (e, v) in extras.iter().enumerate() {
+        outputs[e / k * c + first + e % k] = *v;
     }
     let out = composite::reference::forward(p, &sigma, &outputs, c, background);
     let (ds, dc, d_background) = composite::reference::backward(p, &sigma, &outputs, c, background, d);
@@ -56,5 +75,6 @@ pub fn step(net: &FieldNet, params: &[f64], p: &Packed, inputs: &[&[f64]], backg
         first += if i == 0 { 0 } else { channels };
     }
     let (d_params, d_inputs) = mlp::backward(&net.mlp, params, inputs, s, &seeds);
-    Step { out, sigma, d_params, d_inputs, d_background }
+    let d_extras = (0..s * k).map(|e| dc[e / k * c + c - k + e % k]).collect();
+    Step { out, sigma, d_params, d_inputs, d_background, d_extras }
 }

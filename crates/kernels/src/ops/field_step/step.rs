@@ -22,17 +22,28 @@ pub struct StepInput<'a> {
     /// `[params_len]`
     pub params: &'a [f32],
     pub samples: Packed<'a>,
-    /// Background of every output, `[R, C]`.
+    /// Composited behind the network's outputs.
+    pub extras: Extras<'a>,
+    /// Background of every output and extra, `[R, C + K]`.
     pub background: &'a [f32],
     /// Distance `D` within which gradients of samples are scaled by `(t / D)²`, so that space close to a
     /// camera, which few rays share, learns no faster than the rest (Philip and Deschaintre 2023); 0: none.
     pub near_scaling: f32,
 }
 
+/// Values of samples that the caller gives.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Extras<'a> {
+    /// `[S, K]`
+    pub values: &'a [f32],
+    /// `K`; 0: none.
+    pub width: usize,
+}
+
 /// Results of a step per ray and per sample.
 #[derive(Clone, Debug, Default)]
 pub struct StepOutput {
-    /// `[R, C]`, background included.
+    /// `[R, C + K]`, background included.
     pub values: Vec<f32>,
     /// `[R]`
     pub opacity: Vec<f32>,
@@ -40,8 +51,10 @@ pub struct StepOutput {
     pub depth: Vec<f32>,
     /// `[S]`
     pub weights: Vec<f32>,
-    /// `[R, C]`, zero without a loss.
+    /// `[R, C + K]`, zero without a loss.
     pub d_background: Vec<f32>,
+    /// Gradients of the extras, `[S, K]`; without a loss they are not written.
+    pub d_extras: Vec<f32>,
     pub loss: f64,
 }
 
@@ -58,7 +71,7 @@ struct Group {
     inputs: Vec<Vec<f32>>,
     d_inputs: Vec<Vec<f32>>,
     sigma: Vec<f32>,
-    /// Outputs side by side, `[n, C]`.
+    /// Outputs and extras side by side, `[n, C + K]`.
     values: Vec<f32>,
     d_sigma: Vec<f32>,
     d_values: Vec<f32>,
@@ -70,10 +83,10 @@ struct Group {
 }
 
 impl StepOutput {
-    /// Room for `r` rays of `c` channels and `s` samples.
-    fn resize(&mut self, r: usize, s: usize, c: usize) {
-        let StepOutput { values, opacity, depth, weights, d_background, .. } = self;
-        for (v, n) in [(values, r * c), (opacity, r), (depth, r), (weights, s), (d_background, r * c)] {
+    /// Room for `r` rays of `c` channels, extras included, and `s` samples of `k` extras.
+    fn resize(&mut self, r: usize, s: usize, c: usize, k: usize) {
+        let StepOutput { values, opacity, depth, weights, d_background, d_extras, .. } = self;
+        for (v, n) in [(values, r * c), (opacity, r), (depth, r), (weights, s), (d_background, r * c), (d_extras, s * k)] {
             v.resize(n, 0.0);
         }
     }
@@ -90,6 +103,14 @@ struct Shared<'a> {
     depth: Disjoint<'a>,
     weights: Disjoint<'a>,
     d_background: Disjoint<'a>,
+    d_extras: Disjoint<'a>,
+}
+
+impl StepInput<'_> {
+    /// Channels that are composited.
+    fn channels(&self) -> usize {
+        self.net.channels() + self.extras.width
+    }
 }
 
 /// Evaluates and composites all samples; with a loss, also runs the backward pass and adds to `d_params`.
@@ -105,12 +126,13 @@ pub fn run(
     out: &mut StepOutput,
     d_params: &mut [f32],
 ) {
-    let (r, s, c) = (input.samples.rays(), input.samples.samples(), input.net.channels());
+    let (r, s, c, k) = (input.samples.rays(), input.samples.samples(), input.channels(), input.extras.width);
     let mlp = &input.net.mlp;
     assert!(input.background.len() == r * c && input.params.len() == mlp.params_len(), "field: shapes");
     assert_eq!(codes.len() + 1, mlp.input_widths.len(), "field: codes");
+    assert_eq!(input.extras.values.len(), s * k, "field: extras");
     assert!(c > 0 && input.net.heads().all(|(h, _)| h.activation.is_monotonic()), "field: heads");
-    out.resize(r, s, c);
+    out.resize(r, s, c, k);
     let shared = Shared {
         features: None,
         encoded: None,
@@ -126,6 +148,7 @@ pub fn run(
         depth: Disjoint::new(&mut out.depth),
         weights: Disjoint::new(&mut out.weights),
         d_background: Disjoint::new(&mut out.d_background),
+        d_extras: Disjoint::new(&mut out.d_extras),
     };
     let shared = match positions {
         Positions::Features { data, levels, width, wanted } => {
@@ -199,7 +222,7 @@ fn run_block(
     let p = &input.samples;
     let net = input.net;
     let (s0, s1) = (p.offsets[rays.start] as usize, p.offsets[rays.end] as usize);
-    let (n, c) = (s1 - s0, net.channels());
+    let (n, c) = (s1 - s0, input.channels());
     gather_inputs(input, shared, rays.clone(), s0, n, group);
     let inputs: Vec<&[f32]> = group.inputs.iter().map(|v| &v[..]).collect();
     forward_block(&net.mlp, input.params, &inputs, n, &mut group.acts);
@@ -211,6 +234,7 @@ fn run_block(
         read_head(net, o.head, n, &group.acts, (&mut group.values, c, first, o.channels));
         first += o.channels;
     }
+    input.extras.copy(s0, c, &mut group.values);
     group.d_sigma.resize(n, 0.0);
     group.d_values.resize(n * c, 0.0);
     // With the number of channels known, the loops over them are unrolled.
@@ -220,6 +244,22 @@ fn run_block(
     }
     if loss.is_some() {
         backward(input, shared, prepared, rays, s0, n, group);
+        let k = input.extras.width;
+        // SAFETY: this block's samples.
+        let d_extras = unsafe { shared.d_extras.part(s0 * k..s1 * k) };
+        for (d, row) in d_extras.chunks_exact_mut(k.max(1)).zip(group.d_values.chunks_exact(c)) {
+            d.copy_from_slice(&row[c - k..]);
+        }
+    }
+}
+
+impl Extras<'_> {
+    /// Copies those of the samples from `s0` on to the last columns of rows `[n, c]`.
+    fn copy(&self, s0: usize, c: usize, rows: &mut [f32]) {
+        let k = self.width;
+        for (row, v) in rows.chunks_exact_mut(c).zip(self.values[s0 * k..].chunks_exact(k.max(1))) {
+            row[c - k..].copy_from_slice(v);
+        }
     }
 }
 
@@ -359,7 +399,7 @@ fn write_head(net: &FieldNet, head: Head, acts: &mut Activations, out: &[f32], (
 fn backward(input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::ops::Range<usize>, s0: usize, n: usize, group: &mut Group) {
     let net = input.net;
     let widths = &net.mlp.input_widths;
-    let c = net.channels();
+    let c = input.channels();
     for (head, _) in net.heads() {
         let len = n * net.mlp.layers[head.layer].width;
         group.acts.seed(head.layer)[..len].fill(0.0);

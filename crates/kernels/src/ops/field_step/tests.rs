@@ -56,7 +56,8 @@ fn fused_equals_composed_with_features_codes_and_all_gradients() {
         let loss = Linear { color, depth, opacity, weights };
         let (mut d_first, mut d_second) = (vec![9.0; c.codes[0].len()], vec![9.0; c.codes[1].len()]);
         let (mut out, mut d_params) = (StepOutput::default(), vec![0.0; c.params.len()]);
-        let input = StepInput { net, params: &c.params, samples: p, background: &c.background, near_scaling: 0.0 };
+        let input =
+            StepInput { net, params: &c.params, samples: p, extras: Extras::default(), background: &c.background, near_scaling: 0.0 };
         let [first, second] = cases::CODES;
         let mut codes = [
             RayCode { values: &c.codes[0], width: first, gradient: Some(&mut d_first) },
@@ -94,7 +95,7 @@ fn fused_equals_composed_with_encoded_positions() {
     let bg = random(210, 9);
     let loss = Linear::new(70, 3, n);
     let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
-    let input = StepInput { net: &net, params: &params, samples: p, background: &bg, near_scaling: 0.0 };
+    let input = StepInput { net: &net, params: &params, samples: p, extras: Extras::default(), background: &bg, near_scaling: 0.0 };
     let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: Some(&mut d_points) };
     run(&input, positions, &mut [], Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
     let rows = frequency::reference::forward(&encoding, &wide(&points));
@@ -118,7 +119,14 @@ fn the_result_does_not_depend_on_the_thread_count() {
             let loss = Linear::new(200, 3, n);
             let mut d_params = vec![0.0; params.len()];
             let mut out = StepOutput::default();
-            let input = StepInput { net: &net, params: &params, samples: s.packed(), background: &bg, near_scaling: 0.0 };
+            let input = StepInput {
+                net: &net,
+                params: &params,
+                samples: s.packed(),
+                extras: Extras::default(),
+                background: &bg,
+                near_scaling: 0.0,
+            };
             let mut codes = [RayCode { values: &sh, width: 16, gradient: None }, RayCode { values: &emb, width: 5, gradient: None }];
             let positions = Positions::Features { data: &mut features, levels: 4, width: 2, wanted: true };
             run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
@@ -141,7 +149,7 @@ fn near_samples_learn_with_the_square_of_their_distance() {
     let (points, bg, params) = (random(n * 3, 5), random(60, 9), net.mlp.init(&Rng::new(1, 1)));
     let gradient = |near_scaling: f32| {
         let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
-        let input = StepInput { net: &net, params: &params, samples: s.packed(), background: &bg, near_scaling };
+        let input = StepInput { net: &net, params: &params, samples: s.packed(), extras: Extras::default(), background: &bg, near_scaling };
         let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: Some(&mut d_points) };
         run(&input, positions, &mut [], Some(&Linear::new(20, 3, n)), &mut StepBuffers::default(), &mut out, &mut d_params);
         d_points
@@ -243,7 +251,7 @@ fn run_many(loss: &dyn RayLoss, net: &FieldNet, rays: usize) -> (StepOutput, Vec
     let points = random(s.t.len() * 3, 5);
     let (params, code, bg) = (net.mlp.init(&Rng::new(1, 1)), random(rays * 36, 7), random(rays * 43, 9));
     let (mut out, mut d_params, mut d_code) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; code.len()]);
-    let input = StepInput { net, params: &params, samples: s.packed(), background: &bg, near_scaling: 0.0 };
+    let input = StepInput { net, params: &params, samples: s.packed(), extras: Extras::default(), background: &bg, near_scaling: 0.0 };
     let mut codes = [RayCode { values: &code, width: 36, gradient: Some(&mut d_code) }];
     let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: None };
     run(&input, positions, &mut codes, Some(loss), &mut StepBuffers::default(), &mut out, &mut d_params);
@@ -268,6 +276,38 @@ fn any_number_of_outputs_is_composited_and_differentiated() {
         assert_close("d background", &out.d_background, &want.d_background, 1e-4);
         assert_close("d params", &d_params, &want.d_params, 1e-4);
         assert_close("d code", &d_code, &fold(&p, &want.d_inputs[1], 36), 1e-4);
+    }
+}
+
+#[test]
+fn extras_are_composited_behind_the_outputs_and_differentiated() {
+    let encoding = Frequency { dims: 3, bands: 2, include_input: true, pi: true, window: None };
+    let net = many_outputs(encoding.output_dims());
+    for (rays, k) in [(1, 3), (80, 3), (80, 1)] {
+        let s = scene(rays, 3);
+        let (p, n, c) = (s.packed(), s.t.len(), 43 + k);
+        let (points, extras, bg, code) = (random(n * 3, 5), random(n * k, 8), random(rays * c, 9), random(rays * 36, 7));
+        let (loss, params) = (Linear::new(rays, c, n), net.mlp.init(&Rng::new(1, 1)));
+        let (mut out, mut d_params, mut d_code) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; code.len()]);
+        let extra = Extras { values: &extras, width: k };
+        let input = StepInput { net: &net, params: &params, samples: p, extras: extra, background: &bg, near_scaling: 0.0 };
+        let mut codes = [RayCode { values: &code, width: 36, gradient: Some(&mut d_code) }];
+        let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: None };
+        run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
+        let rows = frequency::reference::forward(&encoding, &wide(&points));
+        let inputs = [rows, expand(&p, &code, 36)];
+        let views: Vec<&[f64]> = inputs.iter().map(|v| &v[..]).collect();
+        let want = reference::step_with_extras(&net, &wide(&params), &p, &views, &wide(&extras), &wide(&bg), &loss.wide());
+        assert_close("values", &out.values, &want.out.color, 1e-4);
+        assert_close("d background", &out.d_background, &want.d_background, 1e-4);
+        assert_close("d extras", &out.d_extras, &want.d_extras, 1e-4);
+        assert_close("d params", &d_params, &want.d_params, 1e-4);
+        assert_close("d code", &d_code, &fold(&p, &want.d_inputs[1], 36), 1e-4);
+        // The weights' gradients hold the extras' part: without the loss on them, parameters learn something else.
+        let mut blind = loss.wide();
+        (0..rays * k).for_each(|e| blind.color[e / k * c + 43 + e % k] = 0.0);
+        let other = reference::step_with_extras(&net, &wide(&params), &p, &views, &wide(&extras), &wide(&bg), &blind);
+        assert!(other.d_params.iter().zip(&want.d_params).any(|(a, b)| (a - b).abs() > 1e-3));
     }
 }
 
@@ -303,7 +343,7 @@ fn triangle_waves_are_encoded_in_the_step() {
     let (points, params, bg) = (random(n * 3, 5), net.mlp.init(&Rng::new(1, 1)), random(150, 9));
     let loss = Linear::new(50, 3, n);
     let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
-    let input = StepInput { net: &net, params: &params, samples: p, background: &bg, near_scaling: 0.0 };
+    let input = StepInput { net: &net, params: &params, samples: p, extras: Extras::default(), background: &bg, near_scaling: 0.0 };
     let positions = Positions::Encoded { encoding: BlockEncoding::TriangleWave { bands }, points: &points, d_points: Some(&mut d_points) };
     run(&input, positions, &mut [], Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
     let rows = wave::forward(bands, &wide(&points));
