@@ -73,7 +73,16 @@ fn main() {
     let encode = time(|| hash::forward(&grid, &points, &table, &mut features));
     let d = random(SAMPLES * 32, 4);
     let scatter = time(|| hash::backward(&grid, &points, &d, &mut grads, Some(&mut touched)));
+    let (mut along, mut d_points) = (vec![0.0; SAMPLES * 32], vec![0.0; SAMPLES * 3]);
+    let gradient = time(|| hash::gradient(&grid, &points, &table, &d, &mut d_points));
+    let (value, direction) = (random(SAMPLES, 10), random(SAMPLES * 3, 11));
+    let derivatives = time(|| hash::derivatives(&grid, &points, &table, &direction, &mut along));
+    let back = time(|| {
+        let to = TableGradient { grads: &mut grads, touched: &mut touched };
+        hash::gradient_backward(&grid, &points, &d, hash::Along { value: &value, direction: &direction }, to);
+    });
     println!("hash grid: encode {encode:.1} ms, scatter {scatter:.1} ms");
+    println!("hash grid: gradient {gradient:.1} ms, derivatives {derivatives:.1} ms, scatter with slopes {back:.1} ms");
     let offsets: Vec<u32> = (0..=RAYS).map(|r| (r * PER_RAY) as u32).collect();
     let (t, dt, background) = (random(SAMPLES, 5), vec![0.02; SAMPLES], vec![0.0; RAYS * 6]);
     let (codes, extras) = (random(RAYS * 16, 6), random(SAMPLES * 3, 7));

@@ -7,7 +7,7 @@ use crate::gemm::{self, Gemm, Init, View, gemm};
 use crate::ops::fused_mlp::{Layer, Source};
 use crate::ops::hash_grid::cpu as hash;
 use crate::ops::linear::Activation;
-use crate::ops::linear::cpu::{activate, scale_by_slope, second_slope_from_output, slope_from_output};
+use crate::ops::linear::cpu::{activate, second_slope_from_output, slope_from_output};
 use crate::sums;
 use crate::tasks::Parts;
 use crate::vector::{fma, vectorized};
@@ -21,6 +21,8 @@ const BLOCK: usize = 252;
 /// Most groups with gradients of their own, and samples that make another group worth its memory traffic.
 const GROUPS: usize = 16;
 const GROUP_SAMPLES: usize = 2048;
+/// Samples per task of elementwise work.
+const TASK: usize = 8192;
 
 /// Destinations of a backward pass, added to.
 pub struct DensitySinks<'a> {
@@ -86,6 +88,21 @@ vectorized! {
     }
 }
 
+/// Scales by the slopes of a piecewise linear activation with outputs `y`.
+fn scale(a: Activation, y: &[f32], d: &mut [f32]) {
+    match a {
+        Activation::None => {}
+        a => scale_signed(y, slope_from_output(a, -1.0), d),
+    }
+}
+
+vectorized! {
+    /// Scales by `leak` where `y` is not positive.
+    fn scale_signed<const F>(y: &[f32], leak: f32, d: &mut [f32]) {
+        d.iter_mut().zip(y).for_each(|(d, y)| *d = if *y > 0.0 { *d } else { leak * *d });
+    }
+}
+
 vectorized! {
     /// Rows `u w`, added to `out` where it `accumulates`.
     fn outer<const F>(u: &[f32], w: &[f32], accumulates: bool, out: &mut [f32]) {
@@ -148,21 +165,26 @@ pub fn forward(net: &DensityNet, params: &[f32], points: &DensityPoints, wants_g
         pass.reverse(prepared, block.len(), g, true);
         if is_hash {
             // SAFETY: as above.
-            return pass.by_level(&block, |level, range| unsafe { write_level(&g.d_features, net.input, level, d_features.range(range)) });
+            return pass.by_level(&block, |first, width, range| unsafe {
+                copy_columns(width, (&g.d_features, net.input, first), (d_features.range(range), width, 0));
+            });
         }
         // SAFETY: as above.
         let own = unsafe { d_points.range(block.start * 3..block.end * 3) };
         pass.encoding_backward(&block, &g.d_features, own);
     });
-    buf.gradient.clear();
-    if !wants_gradient {
-        return;
-    }
-    if let DensityPoints::Hash { grid, table, points, .. } = points {
+    buf.gradient.resize(buf.d_points.len(), 0.0);
+    if let (DensityPoints::Hash { grid, table, points, .. }, true) = (points, wants_gradient) {
         hash::gradient(grid, points, table, &buf.d_features, &mut buf.d_points);
     }
     let a = net.head.activation;
-    buf.gradient.extend(buf.d_points.iter().enumerate().map(|(e, d)| d * slope_from_output(a, buf.sigma[e / 3])));
+    let parts = buf.gradient.par_chunks_mut(TASK * 3).zip(buf.d_points.par_chunks(TASK * 3)).zip(buf.sigma.par_chunks(TASK));
+    parts.for_each(|((out, d), sigma)| {
+        for ((o, d), sigma) in out.chunks_exact_mut(3).zip(d.chunks_exact(3)).zip(sigma) {
+            let slope = slope_from_output(a, *sigma);
+            (0..3).for_each(|k| o[k] = slope * d[k]);
+        }
+    });
 }
 
 /// Adds the gradients of parameters, given those of what [`forward`] gave for the same points and parameters.
@@ -183,8 +205,11 @@ pub fn backward(net: &DensityNet, params: &[f32], points: &DensityPoints, d: Den
         let width = grid.config.features;
         if follows {
             buf.derivatives.resize(n * net.input, 0.0);
-            let along = hash::Along { value: &buf.d_raw, direction: &buf.directions };
-            hash::gradient_backward(grid, points, table, &buf.d_features, along, &mut buf.derivatives, to.table);
+            hash::derivatives(grid, points, table, &buf.directions, &mut buf.derivatives);
+            if let Some(to) = to.table {
+                let along = hash::Along { value: &buf.d_raw, direction: &buf.directions };
+                hash::gradient_backward(grid, points, &buf.d_features, along, to);
+            }
         } else if let Some(to) = to.table {
             let d_raw = &buf.d_raw;
             buf.d_features.par_chunks_mut(n * width).for_each(|level| combine(level, width, d_raw, &[]));
@@ -220,19 +245,26 @@ pub fn backward(net: &DensityNet, params: &[f32], points: &DensityPoints, d: Den
 
 /// The gradient of the density before its activation, and the directions along which features change.
 fn seeds(net: &DensityNet, d: DensityGradients, buf: &mut DensityBuffers) {
-    let a = net.head.activation;
+    let (a, n) = (net.head.activation, buf.sigma.len());
     buf.d_raw.clear();
-    buf.d_raw.resize(buf.sigma.len(), 0.0);
-    buf.directions.clear();
-    for (i, (out, sigma)) in buf.d_raw.iter_mut().zip(&buf.sigma).enumerate() {
-        let slope = slope_from_output(a, *sigma);
-        *out = d.sigma.get(i).map_or(0.0, |d| d * slope);
-        if let Some(d) = d.gradient.get(i * 3..i * 3 + 3) {
-            let by: f32 = d.iter().zip(&buf.d_points[i * 3..]).map(|(d, n)| d * n).sum();
-            *out += second_slope_from_output(a, *sigma) * by;
-            buf.directions.extend(d.iter().map(|d| d * slope));
+    buf.d_raw.resize(n, 0.0);
+    buf.directions.resize(d.gradient.len(), 0.0);
+    buf.d_raw.par_chunks_mut(TASK).zip(buf.sigma.par_chunks(TASK)).enumerate().for_each(|(c, (out, sigma))| {
+        let d = d.sigma.get(c * TASK..).unwrap_or_default();
+        for ((o, sigma), d) in out.iter_mut().zip(sigma).zip(d) {
+            *o = d * slope_from_output(a, *sigma);
         }
-    }
+    });
+    let parts = buf.d_raw.par_chunks_mut(TASK).zip(buf.sigma.par_chunks(TASK));
+    let of_points = buf.directions.par_chunks_mut(TASK * 3).zip(d.gradient.par_chunks(TASK * 3)).zip(buf.d_points.par_chunks(TASK * 3));
+    parts.zip(of_points).for_each(|((out, sigma), ((directions, d), n))| {
+        let vectors = directions.chunks_exact_mut(3).zip(d.chunks_exact(3)).zip(n.chunks_exact(3));
+        for ((o, sigma), ((v, d), n)) in out.iter_mut().zip(sigma).zip(vectors) {
+            let slope = slope_from_output(a, *sigma);
+            *o += second_slope_from_output(a, *sigma) * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2]);
+            (0..3).for_each(|k| v[k] = slope * d[k]);
+        }
+    });
 }
 
 /// Samples of a group, a multiple of a block.
@@ -255,11 +287,21 @@ fn each_block(n: usize, groups: &mut Vec<Group>, f: impl Fn(Range<usize>, &mut G
     count
 }
 
-/// Copies one level's columns of rows `[n, K]`.
-fn write_level(rows: &[f32], k: usize, level: usize, out: &mut [f32]) {
-    let width = out.len() / (rows.len() / k).max(1);
-    for (o, row) in out.chunks_exact_mut(width).zip(rows.chunks_exact(k)) {
-        o.copy_from_slice(&row[level * width..(level + 1) * width]);
+/// Copies columns of rows from one array to another: `width` columns, in rows so long and from column so and so on.
+fn copy_columns(width: usize, from: (&[f32], usize, usize), to: (&mut [f32], usize, usize)) {
+    match width {
+        1 => copy_few::<1>(from, to),
+        2 => copy_few::<2>(from, to),
+        4 => copy_few::<4>(from, to),
+        _ => copy_few::<8>(from, to),
+    }
+}
+
+/// [`copy_columns`] of a width that is known, which are moves in place of calls.
+fn copy_few<const F: usize>((from, from_row, a): (&[f32], usize, usize), (to, to_row, b): (&mut [f32], usize, usize)) {
+    for (t, f) in to.chunks_exact_mut(to_row).zip(from.chunks_exact(from_row)) {
+        let few: [f32; F] = f[a..a + F].try_into().expect("columns");
+        t[b..b + F].copy_from_slice(&few);
     }
 }
 
@@ -319,23 +361,16 @@ impl<'a> Pass<'a> {
         Pass { net, params, points }
     }
 
-    /// Calls `f(level, range)` for the block's part of each level of numbers `[L, N, F]`.
-    fn by_level(&self, block: &Range<usize>, f: impl Fn(usize, Range<usize>)) {
+    /// Calls `f(first column, columns, range)` for the block's part of each level of numbers `[L, N, F]`.
+    fn by_level(&self, block: &Range<usize>, mut f: impl FnMut(usize, usize, Range<usize>)) {
         let DensityPoints::Hash { grid, .. } = self.points else { return };
         let (n, width) = (self.points.len(), grid.config.features);
-        (0..grid.levels.len()).for_each(|l| f(l, (l * n + block.start) * width..(l * n + block.end) * width));
+        (0..grid.levels.len()).for_each(|l| f(l * width, width, (l * n + block.start) * width..(l * n + block.end) * width));
     }
 
     /// Rows `[n, K]` of numbers `[L, N, F]`.
     fn rows(&self, block: &Range<usize>, levels: &[f32], out: &mut [f32]) {
-        let DensityPoints::Hash { grid, .. } = self.points else { return };
-        let (n, width, k) = (self.points.len(), grid.config.features, self.net.input);
-        for l in 0..grid.levels.len() {
-            let level = &levels[(l * n + block.start) * width..(l * n + block.end) * width];
-            for (row, v) in out.chunks_exact_mut(k).zip(level.chunks_exact(width)) {
-                row[l * width..(l + 1) * width].copy_from_slice(v);
-            }
-        }
+        self.by_level(block, |first, width, range| copy_columns(width, (&levels[range], width, 0), (out, self.net.input, first)));
     }
 
     /// Encoded positions.
@@ -422,7 +457,7 @@ impl<'a> Pass<'a> {
         for (j, layer) in net.layers[..last].iter().enumerate().rev() {
             let (before, rest) = g.u.split_at_mut(j);
             let u = &mut rest[0];
-            scale_by_slope(layer.activation, &[], &g.values[j], u);
+            scale(layer.activation, &g.values[j], u);
             for (s, k, first) in net.inputs(j) {
                 if matches!(s, Source::Input(_)) && !wanted {
                     continue;
@@ -447,7 +482,7 @@ impl<'a> Pass<'a> {
                 outer(d_raw, self.bias(j), false, out);
             }
             self.product(j, n, &g.features, before, (if layer.bias { Init::Accumulate } else { Init::Zero }, false), out);
-            scale_by_slope(layer.activation, &[], &g.values[j], out);
+            scale(layer.activation, &g.values[j], out);
             if layer.frozen {
                 continue;
             }

@@ -8,7 +8,7 @@ use super::{HashGrid, Level};
 use crate::simd;
 use rayon::prelude::*;
 
-pub use gradient::{Along, TableGradient, gradient, gradient_backward};
+pub use gradient::{Along, TableGradient, derivatives, gradient, gradient_backward};
 pub use jacobian::{jacobian, jacobian_backward};
 
 /// Points per task.

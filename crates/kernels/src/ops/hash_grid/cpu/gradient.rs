@@ -2,13 +2,15 @@
 //! `J` is linear in the table, so that the backward pass is a scatter with derivatives of the corners' weights.
 
 use super::super::{HashGrid, Level};
-use super::{LINE, cell, trilinear_slopes};
+use super::{LINE, cell, trilinear_slopes, weights};
 #[cfg(target_arch = "x86_64")]
 use crate::simd;
 use rayon::prelude::*;
 
-/// Points per task, a multiple of sixteen.
-const CHUNK: usize = 4096;
+/// Points per task of derivatives, and bounds of those of gradients, multiples of sixteen: a task runs through all levels, whose parts of
+/// the table should stay in cache for many points.
+const CHUNK: usize = 8192;
+const LONG: (usize, usize) = (2048, 32768);
 
 /// Directions of a backward pass.
 #[derive(Clone, Copy)]
@@ -37,12 +39,13 @@ pub struct TableGradient<'a> {
 pub fn gradient(grid: &HashGrid, points: &[f32], table: &[f32], g: &[f32], out: &mut [f32]) {
     let (s, width) = (points.len() / 3, grid.config.features);
     assert!(table.len() == grid.params_len() && g.len() == s * grid.output_dims() && out.len() == s * 3, "hash grid: gradient");
-    out.par_chunks_mut(CHUNK * 3).zip(points.par_chunks(CHUNK * 3)).enumerate().for_each(|(chunk, (out, points))| {
+    let size = s.div_ceil(rayon::current_num_threads()).clamp(LONG.0, LONG.1).next_multiple_of(16);
+    out.par_chunks_mut(size * 3).zip(points.par_chunks(size * 3)).enumerate().for_each(|(chunk, (out, points))| {
         out.fill(0.0);
         let n = points.len() / 3;
         for (l, level) in grid.levels.iter().enumerate() {
             let rows = &table[level.offset * width..(level.offset + level.rows) * width];
-            let g = &g[(l * s + chunk * CHUNK) * width..][..n * width];
+            let g = &g[(l * s + chunk * size) * width..][..n * width];
             match width {
                 1 => gradient_level::<1>(level, points, rows, g, out),
                 2 => gradient_level2(level, points, rows, g, out),
@@ -77,51 +80,95 @@ fn gradient_level2(level: &Level, points: &[f32], rows: &[f32], g: &[f32], out: 
     gradient_level::<2>(level, points, rows, g, out);
 }
 
-/// Features' derivatives `J d` along `d = along.direction`, overwritten, and the gradient of `Σ g · (value · features + J d)` with
-/// respect to the table, where one is wanted. With `g` the gradient of a function of the features, this is the backward pass of
-/// [`gradient`] and of the features together.
+/// Derivatives `J d` of the features along directions `d`, overwritten.
 ///
 /// # Shapes
-/// points `[S, 3]`, table `[rows, F]`, g and derivatives `[L, S, F]`.
+/// points and directions `[S, 3]`, table `[rows, F]`, out `[L, S, F]`.
 ///
 /// # Panics
 /// When a slice does not fit.
-pub fn gradient_backward(
-    grid: &HashGrid,
-    points: &[f32],
-    table: &[f32],
-    g: &[f32],
-    along: Along,
-    derivatives: &mut [f32],
-    d_table: Option<TableGradient>,
-) {
+pub fn derivatives(grid: &HashGrid, points: &[f32], table: &[f32], directions: &[f32], out: &mut [f32]) {
     let (s, width) = (points.len() / 3, grid.config.features);
-    assert!(table.len() == grid.params_len() && [g.len(), derivatives.len()] == [s * grid.output_dims(); 2], "hash grid: gradient");
-    assert!(along.value.len() == s && along.direction.len() == s * 3, "hash grid: direction");
+    assert!(table.len() == grid.params_len() && out.len() == s * grid.output_dims(), "hash grid: derivatives");
+    assert_eq!(directions.len(), s * 3, "hash grid: directions");
+    out.par_chunks_mut((s * width).max(1)).zip(&grid.levels).for_each(|(out, level)| {
+        let rows = &table[level.offset * width..(level.offset + level.rows) * width];
+        let parts = out.par_chunks_mut(CHUNK * width).zip(points.par_chunks(CHUNK * 3)).zip(directions.par_chunks(CHUNK * 3));
+        parts.for_each(|((out, points), directions)| match width {
+            1 => derivatives_level::<1>(level, points, rows, directions, out),
+            2 => derivatives_level2(level, points, rows, directions, out),
+            4 => derivatives_level::<4>(level, points, rows, directions, out),
+            _ => derivatives_level::<8>(level, points, rows, directions, out),
+        });
+    });
+}
+
+/// The rows of a point's cell with the weights' derivatives along `d`, and the weights.
+#[inline(always)]
+fn slopes_along(level: &Level, p: &[f32], d: &[f32]) -> ([usize; 8], [f32; 8], [f32; 8]) {
+    let (idx, f, clamped) = cell(level, p);
+    let step: [f32; 3] = std::array::from_fn(|k| if clamped[k] { 0.0 } else { d[k] * level.cells as f32 });
+    let along = |c: usize| {
+        let w = |k: usize| if (c >> k) & 1 == 1 { f[k] } else { 1.0 - f[k] };
+        let s = |k: usize| if (c >> k) & 1 == 1 { step[k] } else { -step[k] };
+        s(0) * w(1) * w(2) + w(0) * s(1) * w(2) + w(0) * w(1) * s(2)
+    };
+    (idx, std::array::from_fn(along), weights(f))
+}
+
+fn derivatives_level<const F: usize>(level: &Level, points: &[f32], rows: &[f32], directions: &[f32], out: &mut [f32]) {
+    for ((p, d), o) in points.chunks_exact(3).zip(directions.chunks_exact(3)).zip(out.chunks_exact_mut(F)) {
+        let (idx, along, _) = slopes_along(level, p, d);
+        let mut sums = [0.0f32; F];
+        for (row, along) in idx.iter().zip(along) {
+            (0..F).for_each(|k| sums[k] += along * rows[row * F + k]);
+        }
+        o.copy_from_slice(&sums);
+    }
+}
+
+fn derivatives_level2(level: &Level, points: &[f32], rows: &[f32], directions: &[f32], out: &mut [f32]) {
+    #[cfg(target_arch = "x86_64")]
+    if simd::level() == simd::Level::Avx512 {
+        let whole = points.len() / 3 / 16 * 16;
+        assert!(rows.len() >= level.rows * 2 && directions.len() >= whole * 3 && out.len() >= whole * 2, "hash grid: level");
+        // SAFETY: the CPU has AVX-512; `whole` points are a multiple of 16 inside all slices; every row index is below `level.rows` by
+        // construction.
+        unsafe { x86::derivatives16(level, &points[..whole * 3], rows, directions, out) };
+        return derivatives_level::<2>(level, &points[whole * 3..], rows, &directions[whole * 3..], &mut out[whole * 2..]);
+    }
+    derivatives_level::<2>(level, points, rows, directions, out);
+}
+
+/// Adds the gradient of `Σ g · (value · features + J d)` with respect to the table, `d = along.direction`. With `g` the gradient of a
+/// function of the features, this is the table's part of the backward pass of [`gradient`] and of the features together.
+///
+/// # Shapes
+/// points `[S, 3]`, g `[L, S, F]`.
+///
+/// # Panics
+/// When a slice does not fit.
+pub fn gradient_backward(grid: &HashGrid, points: &[f32], g: &[f32], along: Along, to: TableGradient) {
+    let (s, width) = (points.len() / 3, grid.config.features);
+    assert!(g.len() == s * grid.output_dims() && along.value.len() == s && along.direction.len() == s * 3, "hash grid: gradient");
+    let marked = [0, grid.params_len() / LINE].contains(&to.touched.len());
+    assert!(to.grads.len() == grid.params_len() && marked, "hash grid: table gradient");
     if s == 0 {
         return;
     }
-    let (mut rest, mut marks) = match d_table {
-        None => (&mut [][..], &mut [][..]),
-        Some(d) => {
-            assert!(d.grads.len() == table.len() && [0, table.len() / LINE].contains(&d.touched.len()), "hash grid: table gradient");
-            (d.grads, d.touched)
-        }
-    };
+    let (mut rest, mut marks) = (to.grads, to.touched);
     let mut tasks = Vec::with_capacity(grid.levels.len());
-    for ((l, level), derivatives) in grid.levels.iter().enumerate().zip(derivatives.chunks_exact_mut(s * width)) {
-        let (own, tail) = rest.split_at_mut((level.rows * width).min(rest.len()));
+    for (level, g) in grid.levels.iter().zip(g.chunks_exact(s * width)) {
+        let (own, tail) = rest.split_at_mut(level.rows * width);
         let (own_marks, other_marks) = marks.split_at_mut((level.rows * width / LINE).min(marks.len()));
         (rest, marks) = (tail, other_marks);
-        let rows = &table[level.offset * width..(level.offset + level.rows) * width];
-        let at = LevelTask { level, points, rows, g: &g[l * s * width..(l + 1) * s * width], along };
-        tasks.push((at, derivatives, own, own_marks));
+        tasks.push((LevelTask { level, points, g, along }, own, own_marks));
     }
-    tasks.into_par_iter().with_max_len(1).for_each(|(task, derivatives, own, marks)| match width {
-        1 => task.run::<1>(derivatives, own, marks),
-        2 => task.run2(derivatives, own, marks),
-        4 => task.run::<4>(derivatives, own, marks),
-        _ => task.run::<8>(derivatives, own, marks),
+    tasks.into_par_iter().with_max_len(1).for_each(|(task, own, marks)| match width {
+        1 => task.run::<1>(own, marks),
+        2 => task.run2(own, marks),
+        4 => task.run::<4>(own, marks),
+        _ => task.run::<8>(own, marks),
     });
 }
 
@@ -130,56 +177,38 @@ pub fn gradient_backward(
 struct LevelTask<'a> {
     level: &'a Level,
     points: &'a [f32],
-    rows: &'a [f32],
     g: &'a [f32],
     along: Along<'a>,
 }
 
 impl LevelTask<'_> {
-    /// `d_rows` is empty where no gradient of the table is wanted, `marks` where no marks are.
-    fn run<const F: usize>(&self, derivatives: &mut [f32], d_rows: &mut [f32], marks: &mut [u8]) {
-        let &LevelTask { level, points, rows, g, along } = self;
-        let per_point = points.chunks_exact(3).zip(along.direction.chunks_exact(3)).zip(along.value).zip(g.chunks_exact(F));
-        for ((((p, d), value), g), out) in per_point.zip(derivatives.chunks_exact_mut(F)) {
-            let (idx, f, clamped) = cell(level, p);
-            let step: [f32; 3] = std::array::from_fn(|k| if clamped[k] { 0.0 } else { d[k] * level.cells as f32 });
-            let mut sums = [0.0f32; F];
-            for c in 0..8usize {
-                let w = |k: usize| if (c >> k) & 1 == 1 { f[k] } else { 1.0 - f[k] };
-                let s = |k: usize| if (c >> k) & 1 == 1 { step[k] } else { -step[k] };
-                let derivative = s(0) * w(1) * w(2) + w(0) * s(1) * w(2) + w(0) * w(1) * s(2);
-                let row = idx[c] * F;
-                for k in 0..F {
-                    sums[k] += derivative * rows[row + k];
-                }
-                if !d_rows.is_empty() {
-                    let share = derivative + value * w(0) * w(1) * w(2);
-                    for k in 0..F {
-                        d_rows[row + k] += share * g[k];
-                    }
-                    if !marks.is_empty() {
-                        marks[row / LINE] = 1;
-                    }
+    /// `marks` is empty where none are wanted.
+    fn run<const F: usize>(&self, d_rows: &mut [f32], marks: &mut [u8]) {
+        let per_point = self.points.chunks_exact(3).zip(self.along.direction.chunks_exact(3)).zip(self.along.value);
+        for (((p, d), value), g) in per_point.zip(self.g.chunks_exact(F)) {
+            let (idx, along, weights) = slopes_along(self.level, p, d);
+            for c in 0..8 {
+                let (row, share) = (idx[c] * F, along[c] + value * weights[c]);
+                (0..F).for_each(|k| d_rows[row + k] += share * g[k]);
+                if let Some(mark) = marks.get_mut(row / LINE) {
+                    *mark = 1;
                 }
             }
-            out.copy_from_slice(&sums);
         }
     }
 
-    fn run2(&self, derivatives: &mut [f32], d_rows: &mut [f32], marks: &mut [u8]) {
+    fn run2(&self, d_rows: &mut [f32], marks: &mut [u8]) {
         #[cfg(target_arch = "x86_64")]
         if simd::level() == simd::Level::Avx512 && !marks.is_empty() {
-            let whole = self.points.len() / 3 / 16 * 16;
+            let (first, rest) = self.split(self.points.len() / 3 / 16 * 16);
             let n = self.level.rows * 2;
-            assert!(self.rows.len() >= n && d_rows.len() >= n && marks.len() * LINE >= n, "hash grid: level");
-            let (first, rest) = self.split(whole);
-            let (out, left) = derivatives.split_at_mut(whole * 2);
-            // SAFETY: the CPU has AVX-512; `whole` points are a multiple of 16 inside all slices, which `split` cut; every row index is
-            // below `level.rows`, which rows, gradient and marks cover.
-            unsafe { x86::backward16(&first, out, d_rows, marks) };
-            return rest.run::<2>(left, d_rows, marks);
+            assert!(d_rows.len() >= n && marks.len() * LINE >= n, "hash grid: level");
+            // SAFETY: the CPU has AVX-512; the points are a multiple of 16 inside all slices, which `split` cut; every row index is
+            // below `level.rows`, which gradient and marks cover.
+            unsafe { x86::backward16(&first, d_rows, marks) };
+            return rest.run::<2>(d_rows, marks);
         }
-        self.run::<2>(derivatives, d_rows, marks);
+        self.run::<2>(d_rows, marks);
     }
 
     /// The first `n` points of rows of two features, and the others.
@@ -279,12 +308,59 @@ mod x86 {
         }
     }
 
+    /// The weights' derivatives along `d` of the corners of sixteen points, given by coordinate, and the weights.
+    #[inline]
+    #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+    fn slopes_along(n: __m512, at: [__m512; 3], d: [__m512; 3], f: [__m512; 3]) -> [(__m512, __m512); 8] {
+        let (zero, one) = (_mm512_setzero_ps(), _mm512_set1_ps(1.0));
+        let [wx, wy, wz] = f.map(|f| [_mm512_sub_ps(one, f), f]);
+        let mut s = [[zero; 2]; 3];
+        for k in 0..3 {
+            let step = _mm512_mul_ps(d[k], scale(n, at[k]));
+            s[k] = [_mm512_sub_ps(zero, step), step];
+        }
+        let mut out = [(zero, zero); 8];
+        for (c, out) in out.iter_mut().enumerate() {
+            let (i, j, k) = (c & 1, (c >> 1) & 1, c >> 2);
+            let yz = _mm512_mul_ps(wy[j], wz[k]);
+            let across = _mm512_fmadd_ps(s[1][j], wz[k], _mm512_mul_ps(wy[j], s[2][k]));
+            *out = (_mm512_fmadd_ps(s[0][i], yz, _mm512_mul_ps(wx[i], across)), _mm512_mul_ps(wx[i], yz));
+        }
+        out
+    }
+
+    /// Derivatives of the features of sixteen points at a time, two features per row.
+    ///
+    /// # Safety
+    /// As for [`gradient16`]; `directions` and `out` cover the points.
+    #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
+    pub unsafe fn derivatives16(level: &Level, points: &[f32], rows: &[f32], directions: &[f32], out: &mut [f32]) {
+        let hash = Hash::new(level);
+        let (base, low, high) = (rows.as_ptr().cast::<i64>(), lanes(&LOW), lanes(&HIGH));
+        for group in 0..points.len() / 48 {
+            let (mut lo, mut hi) = (_mm512_setzero_ps(), _mm512_setzero_ps());
+            // SAFETY: all loads and stores lie inside the slices, see the caller.
+            unsafe {
+                let at = by_coordinate(points.as_ptr().add(group * 48));
+                let d = by_coordinate(directions.as_ptr().add(group * 48));
+                let (rows, f) = hash.cells(at);
+                for (row, (along, _)) in rows.into_iter().zip(slopes_along(hash.n, at, d, f)) {
+                    let (first, second) = gather(row, base);
+                    lo = _mm512_fmadd_ps(_mm512_permutexvar_ps(low, along), first, lo);
+                    hi = _mm512_fmadd_ps(_mm512_permutexvar_ps(high, along), second, hi);
+                }
+                _mm512_storeu_ps(out.as_mut_ptr().add(group * 32), lo);
+                _mm512_storeu_ps(out.as_mut_ptr().add(group * 32 + 16), hi);
+            }
+        }
+    }
+
     /// [`LevelTask::run`] for sixteen points at a time, two features per row; the rows of the next sixteen are prefetched.
     ///
     /// # Safety
-    /// As for [`gradient16`]; `derivatives` covers the points, `d_rows` and `marks` all rows of the level.
+    /// AVX-512F and DQ; a multiple of 16 points; `d_rows` and `marks` cover all rows of the level.
     #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
-    pub unsafe fn backward16(task: &LevelTask, derivatives: &mut [f32], d_rows: &mut [f32], marks: &mut [u8]) {
+    pub unsafe fn backward16(task: &LevelTask, d_rows: &mut [f32], marks: &mut [u8]) {
         let hash = Hash::new(task.level);
         let groups = task.points.len() / 48;
         let empty = || Corners { rows: [[0; 16]; 8], weights: [[0.0; 16]; 8] };
@@ -294,11 +370,17 @@ mod x86 {
             // SAFETY: all loads and stores lie inside the slices, see the caller.
             unsafe {
                 if group < groups {
-                    let (lo, hi) = shares(task, &hash, group, &mut buffers[group % 2]);
-                    _mm512_storeu_ps(derivatives.as_mut_ptr().add(group * 32), lo);
-                    _mm512_storeu_ps(derivatives.as_mut_ptr().add(group * 32 + 16), hi);
-                    for row in buffers[group % 2].rows.iter().flatten() {
-                        _mm_prefetch::<_MM_HINT_ET0>(base.add(*row as usize * 2).cast());
+                    let at = by_coordinate(task.points.as_ptr().add(group * 48));
+                    let d = by_coordinate(task.along.direction.as_ptr().add(group * 48));
+                    let value = _mm512_loadu_ps(task.along.value.as_ptr().add(group * 16));
+                    let (rows, f) = hash.cells(at);
+                    let next = &mut buffers[group % 2];
+                    for (c, (row, (along, weight))) in rows.into_iter().zip(slopes_along(hash.n, at, d, f)).enumerate() {
+                        _mm512_store_si512(next.rows[c].as_mut_ptr().cast(), row);
+                        _mm512_store_ps(next.weights[c].as_mut_ptr(), _mm512_fmadd_ps(value, weight, along));
+                        for row in &next.rows[c] {
+                            _mm_prefetch::<_MM_HINT_ET0>(base.add(*row as usize * 2).cast());
+                        }
                     }
                 }
                 if group == 0 {
@@ -318,43 +400,5 @@ mod x86 {
                 }
             }
         }
-    }
-
-    /// Corners of the sixteen points of a group with their shares of the gradient, and the features' derivatives.
-    ///
-    /// # Safety
-    /// As for [`backward16`], with `group` within the points.
-    #[inline]
-    #[target_feature(enable = "avx512f,avx512dq,avx2,fma")]
-    unsafe fn shares(task: &LevelTask, hash: &Hash, group: usize, corners: &mut Corners) -> (__m512, __m512) {
-        let (low, high, zero, one) = (lanes(&LOW), lanes(&HIGH), _mm512_setzero_ps(), _mm512_set1_ps(1.0));
-        let (mut lo, mut hi) = (zero, zero);
-        // SAFETY: all loads and stores lie inside the slices, see the caller.
-        unsafe {
-            let at = by_coordinate(task.points.as_ptr().add(group * 48));
-            let d = by_coordinate(task.along.direction.as_ptr().add(group * 48));
-            let value = _mm512_loadu_ps(task.along.value.as_ptr().add(group * 16));
-            let (rows, f) = hash.cells(at);
-            let [wx, wy, wz] = f.map(|f| [_mm512_sub_ps(one, f), f]);
-            let mut s = [[zero; 2]; 3];
-            for k in 0..3 {
-                let step = _mm512_mul_ps(d[k], scale(hash.n, at[k]));
-                s[k] = [_mm512_sub_ps(zero, step), step];
-            }
-            let base = task.rows.as_ptr().cast::<i64>();
-            for c in 0..8 {
-                let (i, j, k) = (c & 1, (c >> 1) & 1, c >> 2);
-                let yz = _mm512_mul_ps(wy[j], wz[k]);
-                let across = _mm512_fmadd_ps(s[1][j], wz[k], _mm512_mul_ps(wy[j], s[2][k]));
-                let derivative = _mm512_fmadd_ps(s[0][i], yz, _mm512_mul_ps(wx[i], across));
-                let share = _mm512_fmadd_ps(_mm512_mul_ps(value, wx[i]), yz, derivative);
-                _mm512_store_si512(corners.rows[c].as_mut_ptr().cast(), rows[c]);
-                _mm512_store_ps(corners.weights[c].as_mut_ptr(), share);
-                let (first, second) = gather(rows[c], base);
-                lo = _mm512_fmadd_ps(_mm512_permutexvar_ps(low, derivative), first, lo);
-                hi = _mm512_fmadd_ps(_mm512_permutexvar_ps(high, derivative), second, hi);
-            }
-        }
-        (lo, hi)
     }
 }
