@@ -19,6 +19,14 @@ impl Space {
         }
     }
 
+    /// Derivative of [`Space::normalize`] at `centered` along `v`.
+    pub fn normalize_tangent(self, centered: [f32; 3], v: [f32; 3]) -> [f32; 3] {
+        match self {
+            Space::Cube(edge) => v.map(|v| v / edge),
+            Space::Contracted(edge) => contract_tangent(centered.map(|v| 2.0 / edge * v), v).map(|t| 0.5 / edge * t),
+        }
+    }
+
     /// Gradient of [`Space::normalize`] with respect to its input at `centered`, given the gradient of its output.
     pub fn normalize_backward(self, centered: [f32; 3], d: [f32; 3]) -> [f32; 3] {
         match self {
@@ -49,16 +57,23 @@ pub fn uncontract(y: [f32; 3]) -> [f32; 3] {
     [y[0] * s, y[1] * s, y[2] * s]
 }
 
-/// Gradient of [`contract`] with respect to its input at `x`, given the gradient of its output.
-pub fn contract_backward(x: [f32; 3], d: [f32; 3]) -> [f32; 3] {
+/// Axis of the largest coordinate, and `s` and `ds/dm` of `y = s(m) x` with `s = 2/m − 1/m²`; none where `m ≤ 1` and `y = x`.
+fn stretch(x: [f32; 3]) -> Option<(usize, f32, f32)> {
     let big = (0..3).max_by(|&a, &b| x[a].abs().total_cmp(&x[b].abs())).unwrap_or(0);
     let m = x[big].abs();
-    if m <= 1.0 {
-        return d;
-    }
-    // y = s(m) x with s = 2/m − 1/m², so ds/dm = −2/m² + 2/m³.
-    let s = (2.0 - 1.0 / m) / m;
-    let slope = -2.0 / (m * m) + 2.0 / (m * m * m);
+    (m > 1.0).then(|| (big, (2.0 - 1.0 / m) / m, -2.0 / (m * m) + 2.0 / (m * m * m)))
+}
+
+/// Derivative of [`contract`] at `x` along `v`.
+pub fn contract_tangent(x: [f32; 3], v: [f32; 3]) -> [f32; 3] {
+    let Some((big, s, slope)) = stretch(x) else { return v };
+    let by = x[big].signum() * slope * v[big];
+    std::array::from_fn(|k| s * v[k] + by * x[k])
+}
+
+/// Gradient of [`contract`] with respect to its input at `x`, given the gradient of its output.
+pub fn contract_backward(x: [f32; 3], d: [f32; 3]) -> [f32; 3] {
+    let Some((big, s, slope)) = stretch(x) else { return d };
     let mut g = d.map(|d| d * s);
     g[big] += x[big].signum() * slope * (d[0] * x[0] + d[1] * x[1] + d[2] * x[2]);
     g
@@ -83,6 +98,9 @@ mod tests {
                 let numeric = (at(1e-2) - at(-1e-2)) / 2e-2;
                 assert!((g[k] as f64 - numeric).abs() < 2e-3, "{x:?} {k}: {} {numeric}", g[k]);
             }
+            let v = [0.9, 0.2, -0.4];
+            let dot = |a: [f32; 3], b: [f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+            assert!((dot(contract_tangent(x, v), d) - dot(g, v)).abs() < 1e-5, "{x:?}: tangent and gradient disagree");
         }
     }
 

@@ -66,7 +66,8 @@ fn field() -> Field {
     let (adam, rng) = (Adam { rate: 1e-2, ..Adam::default() }, Rng::new(1, 2));
     let table = (0..grid.params_len() as u64).map(|i| 1e-4 * (2.0 * rng.uniform(i) - 1.0)).collect();
     let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(1, 1)), adam);
-    Field { encoder: Encoder::Hash { grid, table: ParamGroup::sparse("table", table, adam) }, codes, net, space: Space::Cube(1.0), weights }
+    let encoder = Encoder::Hash { grid, table: ParamGroup::sparse("table", table, adam) };
+    Field { encoder, codes, net, space: Space::Cube(1.0), weights, normals: None }
 }
 
 /// Squared difference to colors.

@@ -64,7 +64,7 @@ fn field() -> Field {
     let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(7, 2)), Adam { rate: 1e-2, ..Adam::default() });
     let codes = RayCodes::new(DirectionCode::SphericalHarmonics(2), None);
     let encoder = Encoder::VoxelCorners { grid, table: ParamGroup::sparse("table", table, adam) };
-    let mut field = Field { encoder, codes, net, space: Space::Cube(1.0), weights };
+    let mut field = Field { encoder, codes, net, space: Space::Cube(1.0), weights, normals: None };
     // The color network stays as it is: colors are learned as features alone.
     field.freeze_layers(|l| l == 2 || l == 3);
     field

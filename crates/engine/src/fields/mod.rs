@@ -1,12 +1,14 @@
 //! Radiance fields: an encoding of position, codes of rays, and a network.
 
 mod encoder;
+mod normals;
 mod presets;
 mod ray_codes;
 mod visible;
 
 pub use diorama_kernels::ops::prune::Pruning;
 pub use encoder::{Encoded, Encoder, VoxelGrid};
+pub use normals::{DensitySlope, NORMAL, Normals, NormalsError};
 pub use presets::{baseline, mlp, nerf, ngp};
 pub use ray_codes::{Appearance, DirectionCode, RayCodes};
 pub use visible::{VisibleBuffers, VisibleSamples};
@@ -17,7 +19,7 @@ use diorama_geom::contraction::Space;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::field_step::{
-    self, BatchLoss, FieldNet, InjectedGradients, RayCode, RayGradients, RayLoss, RayOutputs, StepBuffers, StepInput, StepOutput,
+    self, BatchLoss, Extras, FieldNet, InjectedGradients, RayCode, RayGradients, RayLoss, RayOutputs, StepBuffers, StepInput, StepOutput,
 };
 use diorama_kernels::ops::fused_mlp::cpu::Activations;
 use rayon::prelude::*;
@@ -30,6 +32,8 @@ pub struct Field {
     pub net: FieldNet,
     pub space: Space,
     pub weights: ParamGroup,
+    /// Normals that are composited behind the network's outputs; see [`Field::set_normals`].
+    pub normals: Option<Normals>,
 }
 
 /// Anything with a density at every point, for occupancy grids and meshing.
@@ -75,6 +79,7 @@ pub struct FieldBuffers {
     pub d_given: Vec<Vec<f32>>,
     d_points: Vec<f32>,
     injected: RayGradients,
+    normals: normals::NormalBuffers,
     pub visible: VisibleBuffers,
     step: StepBuffers,
     pub out: StepOutput,
@@ -139,18 +144,27 @@ impl Field {
         self.encoder.forward(&out.unit, &mut out.features);
     }
 
-    /// Composites a batch of encoded samples into `buf.out`.
+    /// Composites a batch of encoded samples into `buf.out`: the network's outputs and, where the field has them, normals.
     pub fn render(&self, batch: &Batch, encoded: &mut Encoded, buf: &mut FieldBuffers) {
+        self.render_outputs(batch, encoded, buf);
+        if let Some(how) = &self.normals {
+            self.add_normals(how, batch, encoded, buf);
+        }
+    }
+
+    /// [`Field::render`] without normals.
+    pub(crate) fn render_outputs(&self, batch: &Batch, encoded: &mut Encoded, buf: &mut FieldBuffers) {
         let (mut direction, mut appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
         self.codes.encode(batch.dirs, batch.images, &mut direction, &mut appearance);
         let mut codes = self.ray_codes(batch, &direction, &appearance);
         let positions = self.encoder.positions(encoded, None, false);
-        field_step::run(&self.step_input(batch), positions, &mut codes, None, &mut buf.step, &mut buf.out, &mut []);
+        let input = self.step_input(batch, Extras::default(), batch.background);
+        field_step::run(&input, positions, &mut codes, None, &mut buf.step, &mut buf.out, &mut []);
         drop(codes);
         (buf.direction, buf.appearance) = (direction, appearance);
     }
 
-    /// Outputs `[N, C]` of the field at model points `[N, 3]`, viewed along unit directions `[N, 3]`, with the mean appearance code.
+    /// Outputs `[N, C]` of the field, normals included, at model points `[N, 3]`, viewed along unit directions `[N, 3]`, with the mean appearance code.
     pub fn outputs_at<'a>(&self, model: &[f32], dirs: &[f32], buf: &'a mut FieldBuffers) -> &'a [f32] {
         // One sample per ray, so long that it is opaque.
         let n = model.len() / 3;
@@ -164,12 +178,13 @@ impl Field {
         &buf.out.values
     }
 
-    fn step_input<'a>(&'a self, batch: &Batch<'a>) -> StepInput<'a> {
+    fn step_input<'a>(&'a self, batch: &Batch<'a>, extras: Extras<'a>, background: &'a [f32]) -> StepInput<'a> {
         StepInput {
             net: &self.net,
             params: &self.weights.values,
             samples: batch.samples,
-            background: batch.background,
+            extras,
+            background,
             near_scaling: batch.near_scaling,
         }
     }
@@ -185,11 +200,13 @@ impl Field {
     /// [`Field::render`] with a loss: adds gradients to the groups and, where asked, gives those of the positions.
     pub fn train(&mut self, batch: &Batch, encoded: &mut Encoded, loss: Loss, buf: &mut FieldBuffers, d_positions: Option<&mut Vec<f32>>) {
         let mut injected = std::mem::take(&mut buf.injected);
+        if self.normals.is_some() || matches!(loss, Loss::Batch(_)) {
+            self.render(batch, encoded, buf);
+        }
         let value = match loss {
             Loss::Rays(_) => None,
             Loss::Batch(loss) => {
-                self.render(batch, encoded, buf);
-                injected.clear(batch.samples.rays(), self.net.channels());
+                injected.clear(batch.samples.rays(), self.channels());
                 let out = RayOutputs { values: &buf.out.values, opacity: &buf.out.opacity, depth: &buf.out.depth };
                 Some(loss.batch(&out, &mut injected))
             }
@@ -229,12 +246,20 @@ impl Field {
         let in_step = d_positions.is_some() && self.encoder.levels().is_none();
         buf.d_points.resize(if in_step { batch.positions.len() } else { 0 }, 0.0);
         let positions = self.encoder.positions(encoded, in_step.then_some(&mut buf.d_points[..]), wants_features);
-        field_step::run(&self.step_input(batch), positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut grads);
+        let (extras, background) = match self.normals {
+            None => (Extras::default(), batch.background),
+            Some(_) => (buf.normals.extras(), buf.normals.background()),
+        };
+        let input = self.step_input(batch, extras, background);
+        field_step::run(&input, positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut grads);
         drop(codes);
         self.weights.grads = grads;
         buf.stages.done("network");
         self.encoder.backward(encoded);
         buf.stages.done("scatter");
+        if let Some(how) = self.normals {
+            self.normals_backward(&how, buf);
+        }
         if let Some(d) = d_positions {
             d.resize(batch.positions.len(), 0.0);
             match in_step {
@@ -260,6 +285,7 @@ impl Field {
             net: self.net.clone(),
             space: self.space,
             weights: self.weights.values_only(),
+            normals: self.normals,
         }
     }
 
@@ -287,5 +313,7 @@ impl DensityQuery for Field {
     }
 }
 
+#[cfg(test)]
+mod normals_tests;
 #[cfg(test)]
 mod tests;

@@ -65,6 +65,7 @@ pub fn ngp(grid: HashGridConfig, space: Space, rate: f32, images: usize, dims: u
         codes: RayCodes::new(DirectionCode::SphericalHarmonics(4), appearance),
         net,
         space,
+        normals: None,
     }
 }
 
@@ -127,5 +128,6 @@ fn frequency_field(net: FieldNet, encoding: Frequency, codes: RayCodes, space: S
         codes,
         net,
         space,
+        normals: None,
     }
 }

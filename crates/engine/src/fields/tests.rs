@@ -30,7 +30,7 @@ fn field(encoder: Encoder, codes: RayCodes) -> Field {
         mlp,
     };
     let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(1, 1)), Adam::default());
-    Field { encoder, codes, net, space: Space::Cube(1.0), weights }
+    Field { encoder, codes, net, space: Space::Cube(1.0), weights, normals: None }
 }
 
 fn voxels() -> Encoder {

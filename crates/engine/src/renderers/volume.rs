@@ -1,6 +1,7 @@
 //! Volume rendering of views: `Σ_i T_i α_i c_i` along each ray (Mildenhall et al. 2020, equation 3).
 
 pub use super::accelerator::Accelerator;
+pub use super::layers::Layers;
 pub use super::quality::Quality;
 pub use super::traced::Traced;
 pub use super::view::View;
@@ -75,11 +76,7 @@ const COARSEST: usize = 4;
 
 impl<'a> Tracer<'a> {
     /// Full quality before black, without bounds besides the outer `cube` (lowest corner and edge, model space).
-    ///
-    /// # Panics
-    /// When the field has other than three channels.
     pub fn new(field: &'a Field, placement: Placement, cube: (f32, f32)) -> Tracer<'a> {
-        assert_eq!(field.net.channels(), 3, "a tracer draws three channels");
         Tracer {
             field,
             coarse: None,
@@ -101,6 +98,9 @@ impl<'a> Tracer<'a> {
 
 impl Tracer<'_> {
     /// Renders the view of a camera that stands in model space; `progress` receives the number of rows done since the last call.
+    ///
+    /// # Panics
+    /// When the field's network has other than three channels.
     pub fn view(&self, camera: &PosedCamera, progress: &mut dyn FnMut(usize)) -> View {
         let (w, h) = (camera.camera.width as usize, camera.camera.height as usize);
         let mut out = View::empty(w, h);
@@ -163,19 +163,12 @@ impl Tracer<'_> {
     }
 
     /// Traces the rays of a batch, whose origins, directions and extents are set; colors stay as the field has them.
+    ///
+    /// # Panics
+    /// When the field's network has other than three channels.
     pub fn trace(&self, batch: &mut RayBatch, buf: &mut FieldBuffers) -> Traced {
-        if let Some((min, max)) = self.clip {
-            diorama_kernels::ops::ray_aabb::cpu::intersect(&batch.origins, &batch.dirs, min, max, self.near, &mut batch.near_far);
-        }
-        if let Some(crop) = &self.crop {
-            cut_to(crop, batch);
-        }
-        let restored = |mut out: Traced, light: &[f32], pruning: Pruning| {
-            if pruning.min_alpha > 0.0 || pruning.min_weight > 0.0 {
-                out.restore_opacity(light, pruning.stop);
-            }
-            out
-        };
+        assert_eq!(self.field.net.channels(), 3, "a tracer draws three channels; Tracer::layers renders any");
+        self.cut(batch);
         match self.accelerator.map(|a| a.trace(batch, &self.placement, self.appearance)) {
             Some(Ok((out, light))) => {
                 let out = match (self.placement, light) {
@@ -190,6 +183,24 @@ impl Tracer<'_> {
         if let Some(out) = self.trace_blocks(batch) {
             return self.before_backdrop(batch, out);
         }
+        let mut samples = self.place(batch, buf);
+        self.composite(self.field, batch, &mut samples, buf);
+        let out = self.restored(take_traced(buf), batch, buf);
+        self.before_backdrop(batch, out)
+    }
+
+    /// Shortens rays to what is shown.
+    pub(super) fn cut(&self, batch: &mut RayBatch) {
+        if let Some((min, max)) = self.clip {
+            diorama_kernels::ops::ray_aabb::cpu::intersect(&batch.origins, &batch.dirs, min, max, self.near, &mut batch.near_far);
+        }
+        if let Some(crop) = &self.crop {
+            cut_to(crop, batch);
+        }
+    }
+
+    /// Samples of the main field, encoded.
+    pub(super) fn place(&self, batch: &RayBatch, buf: &mut FieldBuffers) -> VisibleSamples {
         let mut samples = PlacedSamples::default();
         let on = PlaceOn { field: self.field, occupancy: self.occupancy.map(Occupancy::bits), batch, first: 0 };
         self.placement.place(&on, &mut samples, buf, &mut |samples, buf| {
@@ -197,13 +208,15 @@ impl Tracer<'_> {
             placement::encode(coarse, batch, samples);
             self.composite(coarse, batch, samples, buf);
         });
-        self.composite(self.field, batch, &mut samples.main, buf);
-        let out = take_traced(buf);
-        let out = match self.placement {
+        samples.main
+    }
+
+    /// Rays of samples that [`Tracer::place`] placed, with the opacity of those that it dropped.
+    pub(super) fn restored(&self, out: Traced, batch: &RayBatch, buf: &FieldBuffers) -> Traced {
+        match self.placement {
             Placement::Occupancy { pruning, .. } => restored(out, &buf.visible.light(batch.len()), pruning),
             _ => out,
-        };
-        self.before_backdrop(batch, out)
+        }
     }
 
     /// Traces block by block; none where samples are not placed by a grid, or the field cannot be evaluated this way.
@@ -241,12 +254,19 @@ impl Tracer<'_> {
         let samples = Packed { offsets: &on.samples.offsets, t: &on.samples.t, dt: &on.samples.dt };
         let (dirs, images, background) = (&batch.dirs[..], images.as_deref(), &background[..]);
         let b = Batch { samples, positions: &on.positions, dirs, images, given: &[], background, near_scaling: 0.0 };
-        field.render(&b, &mut on.encoded, buf);
+        field.render_outputs(&b, &mut on.encoded, buf);
     }
 }
 
+fn restored(mut out: Traced, light: &[f32], pruning: Pruning) -> Traced {
+    if pruning.min_alpha > 0.0 || pruning.min_weight > 0.0 {
+        out.restore_opacity(light, pruning.stop);
+    }
+    out
+}
+
 /// Moves a field's rendered rays out of its buffers.
-fn take_traced(buf: &mut FieldBuffers) -> Traced {
+pub(super) fn take_traced(buf: &mut FieldBuffers) -> Traced {
     let o = &mut buf.out;
     Traced { rgb: std::mem::take(&mut o.values), opacity: std::mem::take(&mut o.opacity), depth: std::mem::take(&mut o.depth) }
 }

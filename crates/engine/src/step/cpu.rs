@@ -249,7 +249,7 @@ impl Drawn<'_> {
         match s.loss {
             Loss::Batch(loss) => field.train(&b, &mut on.encoded, fields::Loss::Batch(loss), buffers, d_positions),
             Loss::Photometric(terms) => {
-                assert_eq!(field.net.channels(), 3, "a photometric loss compares colors alone");
+                assert_eq!(field.channels(), 3, "a photometric loss compares colors alone");
                 let loss = Photometric::new(terms, measure(field), batch.targets(background), samples);
                 field.train(&b, &mut on.encoded, fields::Loss::Rays(&loss), buffers, d_positions);
             }

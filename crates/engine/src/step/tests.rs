@@ -128,7 +128,7 @@ fn voxel_field(features: usize) -> Field {
     };
     let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(1, 1)), Adam { rate: 1e-2, ..Adam::default() });
     let codes = RayCodes { given: vec![5], ..RayCodes::new(DirectionCode::None, None) };
-    Field { encoder: Encoder::VoxelCorners { grid, table }, codes, net, space: Space::Cube(1.0), weights }
+    Field { encoder: Encoder::VoxelCorners { grid, table }, codes, net, space: Space::Cube(1.0), weights, normals: None }
 }
 
 /// Mean squared distance of every channel from one value, which is known only of all rays together: their mean is subtracted.

@@ -10,6 +10,7 @@
 
 pub mod cpu;
 pub mod reference;
+mod rows;
 #[cfg(test)]
 mod tests;
 
