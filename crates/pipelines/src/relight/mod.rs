@@ -1,10 +1,14 @@
 //! Light that can be changed: models with materials composed into scenes and rendered under other skies.
 //!
 //! [`scene_file`] describes a composition, [`compose`] renders it, [`turntable`] renders a model from all sides. [`light`] reads environment
-//! maps, skies and spherical harmonics, [`picture`] refines a picture in passes that can be interrupted.
+//! maps, skies and spherical harmonics, [`picture`] refines a picture in passes that can be interrupted. [`outdoor`] is the scene model,
+//! [`synth`] generates a benchmark for it, [`truth`] its exact layers.
 
 pub mod compose;
 pub mod light;
+pub mod outdoor;
 pub mod picture;
 pub mod scene_file;
+pub mod synth;
+pub mod truth;
 pub mod turntable;

@@ -1,0 +1,296 @@
+//! The scene model: a field of density, albedo and shadow, and light and sky per session.
+
+use super::config::Config;
+use super::shading::{LIGHT, SKY};
+use crate::error::{PipelineError, Result};
+use crate::run::param_state::{self, entry};
+use diorama_data::checkpoint::{Checkpoint, Entry};
+use diorama_engine::fields::{DirectionCode, Encoder, Field, Normals, Pruning, RayCodes};
+use diorama_engine::params::{ParamGroup, ParamSet, Schedule};
+use diorama_engine::renderers::volume::{Backdrop, Quality, Tracer};
+use diorama_engine::samplers::occupancy::Occupancy;
+use diorama_engine::samplers::placement::Placement;
+use diorama_engine::step::Scene;
+use diorama_engine::train::Origin;
+use diorama_geom::capture::Split;
+use diorama_geom::contraction::Space;
+use diorama_geom::rng::Rng;
+use diorama_geom::sh_light::ShLight;
+use diorama_geom::{Capture, Similarity};
+use diorama_kernels::ops::adam::Adam;
+use diorama_kernels::ops::field_step::{FieldNet, Output};
+use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
+use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
+use diorama_kernels::ops::linear::Activation;
+use diorama_kernels::ops::ray_generation::PosedCamera;
+use std::collections::HashMap;
+use std::path::Path;
+
+/// Streams of initial values.
+const WEIGHTS: u64 = 1;
+const TABLE: u64 = 2;
+/// Output layers are padded to a whole vector.
+const PADDED: usize = 16;
+/// Shift of the shadow before its sigmoid: at first, little is in shadow.
+const LIT: f32 = 2.0;
+/// Where rays end in space without a bound, in inner cubes.
+const FAR: f32 = 1024.0;
+
+/// Field, lights and capture of one run.
+pub struct SceneModel {
+    pub config: Config,
+    pub capture: Capture,
+    pub model_from_world: Similarity,
+    pub field: Field,
+    pub occupancy: Occupancy,
+    /// `[lights, 9, 3]`
+    pub lights: ParamGroup,
+    /// `[lights, 16, 3]`
+    pub skies: ParamGroup,
+    /// Logarithms of gains, `[train, 3]`; empty without gains.
+    pub gains: ParamGroup,
+    /// Training frames, as indices into the capture, and the light of each.
+    pub train: Vec<usize>,
+    pub light_of: Vec<u32>,
+    /// Session of each light, where photographs of a session share it.
+    pub sessions: Vec<u32>,
+    pub origin: Origin,
+    pub rays: u64,
+    /// Running median of the errors, in sRGB.
+    pub median: f32,
+    pub rate_scale: f32,
+}
+
+impl SceneModel {
+    /// An untrained model.
+    ///
+    /// # Errors
+    /// When the configuration is wrong, or there are no training photographs.
+    pub fn new(config: Config, capture: Capture) -> Result<SceneModel> {
+        use crate::run::config::Configuration;
+        config.check()?;
+        let train = capture.indices(Split::Train);
+        if train.is_empty() {
+            return Err(PipelineError::Usage(format!("{}: no photographs to train on", config.data.path.display())));
+        }
+        let (light_of, sessions) = lights_of(&config, &capture, &train);
+        let space = match config.field.space == "unbounded" {
+            true => Space::Contracted(2.0),
+            false => Space::Cube(capture.scene.aabb_scale.max(1) as f32),
+        };
+        let (edge, unbounded) = match space {
+            Space::Contracted(_) => (1, true),
+            Space::Cube(e) => (e as u32, false),
+        };
+        let cascades = if unbounded { 8 } else { edge.ilog2() as usize + 1 };
+        let schedule = Schedule { warmup: 0.01, final_scale: config.optim.final_scale, decay_from: 0.3 };
+        let adam = |rate: f32| Adam { rate, ..Adam::default() };
+        let group = |name, values, rate| ParamGroup { schedule, ..ParamGroup::dense(name, values, adam(rate)) };
+        let n = sessions.len().max(light_of.iter().map(|l| *l as usize + 1).max().unwrap_or(0));
+        let rate = config.optim.light_rate;
+        let gains = if config.light.gain { vec![0.0; 3 * train.len()] } else { Vec::new() };
+        let mut field = field(&config, space, edge)?;
+        field.weights.schedule = schedule;
+        field.encoder.table_mut().into_iter().for_each(|t| t.schedule = schedule);
+        let mut model = SceneModel {
+            model_from_world: capture.scene.model_from_world(),
+            field,
+            occupancy: Occupancy::new(config.sampling.occupancy_resolution, cascades, unbounded),
+            lights: group("lights", first_lights(n), rate),
+            skies: group("skies", first_skies(n), rate),
+            gains: group("gains", gains, rate),
+            train,
+            light_of,
+            sessions,
+            origin: Origin::default(),
+            rays: 0,
+            median: 0.1,
+            rate_scale: 1.0,
+            config,
+            capture,
+        };
+        let cameras = model.cameras();
+        model.occupancy.keep_visible(&cameras, 2);
+        Ok(model)
+    }
+
+    /// A frame's camera at the run's resolution, in model space.
+    pub fn posed(&self, frame: usize) -> PosedCamera {
+        let f = &self.capture.frames[frame];
+        PosedCamera { camera: f.camera.downscaled(self.config.data.downscale), pose: self.model_from_world.pose(&f.world_from_camera) }
+    }
+
+    /// The training cameras.
+    pub fn cameras(&self) -> Vec<PosedCamera> {
+        self.train.iter().map(|i| self.posed(*i)).collect()
+    }
+
+    /// Lowest corner and edge of the outer cube in model space.
+    pub fn cube(&self) -> (f32, f32) {
+        match self.field.space {
+            Space::Contracted(_) => (0.5 - FAR, 2.0 * FAR),
+            Space::Cube(edge) => (0.5 - 0.5 * edge, edge),
+        }
+    }
+
+    /// Cameras and extent of the rays of training.
+    pub fn scene(&self) -> Scene {
+        Scene { cameras: self.cameras(), near: self.config.sampling.near, cube: self.cube() }
+    }
+
+    /// Limits below which samples are dropped in training.
+    pub fn pruning(&self) -> Pruning {
+        Pruning { stop: 1e-4, min_alpha: 3e-3, thin: 0.7 * self.field.net.density.shift.exp(), min_weight: 0.0 }
+    }
+
+    /// A renderer of layers.
+    pub fn tracer(&self, quality: Quality) -> Tracer<'_> {
+        Tracer {
+            field: &self.field,
+            coarse: None,
+            occupancy: Some(&self.occupancy),
+            placement: Placement::occupied(&self.occupancy, self.config.sampling.max_samples, quality.pruning()),
+            backdrop: Backdrop::Color([0.0; 3]),
+            near: self.config.sampling.near,
+            cube: self.cube(),
+            clip: None,
+            crop: None,
+            is_linear: true,
+            shared_weight: 0.0,
+            appearance: None,
+            tolerance: 0.0,
+            accelerator: None,
+        }
+    }
+
+    /// The light of a session or photograph.
+    pub fn light(&self, index: usize) -> ShLight {
+        let values = &self.lights.values[index * LIGHT..][..LIGHT];
+        ShLight(std::array::from_fn(|i| std::array::from_fn(|k| values[3 * i + k] as f64)))
+    }
+
+    /// The sky of a session or photograph, `[16, 3]`.
+    pub fn sky(&self, index: usize) -> &[f32] {
+        &self.skies.values[index * SKY..][..SKY]
+    }
+
+    /// The light of a frame of the capture: its own, or that of its session; none for sessions that were not trained on.
+    pub fn light_of_frame(&self, frame: usize) -> Option<usize> {
+        match self.train.iter().position(|t| *t == frame) {
+            Some(i) => Some(self.light_of[i] as usize),
+            None if self.config.light.of == "image" => None,
+            None => self.sessions.iter().position(|s| Some(*s) == self.capture.frames[frame].session.or(Some(0))),
+        }
+    }
+
+    /// Everything that is trained by gradients.
+    pub fn params(&mut self) -> ParamSet<'_> {
+        let mut params = ParamSet::default();
+        params.add("field", self.field.groups_mut());
+        params.add("", [&mut self.lights, &mut self.skies, &mut self.gains]);
+        params
+    }
+
+    /// Everything that a checkpoint holds.
+    pub fn entries(&mut self) -> (Vec<Entry<'_>>, HashMap<String, String>) {
+        let metadata = HashMap::from([
+            ("method".to_string(), "relight".to_string()),
+            ("step".into(), self.origin.step.to_string()),
+            ("rays".into(), self.rays.to_string()),
+            ("seconds_bits".into(), self.origin.seconds.to_bits().to_string()),
+            ("median_bits".into(), self.median.to_bits().to_string()),
+            ("rate_scale_bits".into(), self.rate_scale.to_bits().to_string()),
+        ]);
+        let mut params = ParamSet::default();
+        params.add("field", self.field.groups_mut());
+        params.add("", [&mut self.lights, &mut self.skies, &mut self.gains]);
+        let mut entries = param_state::entries(params);
+        entries.extend([entry("occupancy", &self.occupancy.grid.density), entry("occupancy.fresh", &self.occupancy.grid.fresh)]);
+        (entries, metadata)
+    }
+
+    /// Takes over a checkpoint of the same shape.
+    ///
+    /// # Errors
+    /// When the checkpoint is of another method or shape.
+    pub fn restore(&mut self, mut c: Checkpoint, file: &Path) -> Result<()> {
+        fn number<T: std::str::FromStr>(c: &Checkpoint, key: &str, file: &Path) -> Result<T> {
+            let value = c.metadata.get(key).and_then(|v| v.parse().ok());
+            value.ok_or_else(|| PipelineError::Usage(format!("{}: metadata {key} is missing or malformed", file.display())))
+        }
+        self.origin = Origin { step: number(&c, "step", file)?, seconds: f64::from_bits(number(&c, "seconds_bits", file)?) };
+        self.rays = number(&c, "rays", file)?;
+        self.median = f32::from_bits(number(&c, "median_bits", file)?);
+        self.rate_scale = f32::from_bits(number(&c, "rate_scale_bits", file)?);
+        param_state::restore(&mut self.params(), &mut c, file)?;
+        param_state::take(&mut self.occupancy.grid.density, "occupancy", &mut c, file)?;
+        param_state::take(&mut self.occupancy.grid.fresh, "occupancy.fresh", &mut c, file)?;
+        self.occupancy.grid.refresh();
+        Ok(())
+    }
+}
+
+/// The light of each training frame, and the sessions in order.
+fn lights_of(config: &Config, capture: &Capture, train: &[usize]) -> (Vec<u32>, Vec<u32>) {
+    if config.light.of == "image" {
+        return ((0..train.len() as u32).collect(), Vec::new());
+    }
+    let session = |i: &usize| capture.frames[*i].session.unwrap_or(0);
+    let mut sessions: Vec<u32> = train.iter().map(session).collect();
+    sessions.sort_unstable();
+    sessions.dedup();
+    (train.iter().map(|i| sessions.binary_search(&session(i)).expect("listed") as u32).collect(), sessions)
+}
+
+/// Even light with a little more from above.
+fn first_lights(n: usize) -> Vec<f32> {
+    let mut light = ShLight::uniform([0.9; 3]);
+    light.0[2] = [0.3; 3];
+    (0..n).flat_map(|_| light.0.into_iter().flatten().map(|v| v as f32)).collect()
+}
+
+/// Even, bright skies.
+fn first_skies(n: usize) -> Vec<f32> {
+    // The first basis function is 0.2821.
+    (0..n).flat_map(|_| (0..SKY).map(|i| if i < 3 { 0.5 / 0.282_094_8 } else { 0.0 })).collect()
+}
+
+/// Hash grid → density and features; features → albedo; features and gray light → shadow.
+fn field(config: &Config, space: Space, edge: u32) -> Result<Field> {
+    use Source::{Input, Layer as L};
+    let f = &config.field;
+    let scale = if matches!(space, Space::Contracted(_)) { 4 } else { edge };
+    let grid = HashGrid::new(HashGridConfig { levels: f.levels, features: 2, log2_size: f.log2_size, base: f.base, finest: f.finest * scale });
+    let layer = |inputs: Vec<Source>, width: usize, activation| Layer::new(inputs, width, activation, true);
+    let layers = vec![
+        layer(vec![Input(0)], f.width, Activation::Relu),
+        layer(vec![L(0)], PADDED, Activation::None),
+        layer(vec![L(1)], f.width, Activation::Relu),
+        layer(vec![L(2)], PADDED, Activation::None),
+        layer(vec![L(1), Input(1)], f.width, Activation::Relu),
+        layer(vec![L(4)], PADDED, Activation::None),
+    ];
+    let head = |layer, activation, shift| Head { layer, channel: 0, activation, shift };
+    let net = FieldNet {
+        density: head(1, Activation::TruncatedExp, 0.0),
+        outputs: vec![
+            Output { head: head(3, Activation::Sigmoid, 0.0), channels: 3 },
+            Output { head: head(5, Activation::Sigmoid, LIT), channels: 1 },
+        ],
+        mlp: Mlp::new(vec![grid.output_dims(), 9], layers),
+    };
+    let rng = Rng::new(config.seed, TABLE);
+    let table = (0..grid.params_len()).map(|i| (rng.uniform(i as u64) * 2.0 - 1.0) * 1e-4).collect();
+    let o = &config.optim;
+    let weights = net.mlp.init(&Rng::new(config.seed, WEIGHTS));
+    let mut field = Field {
+        weights: ParamGroup::dense("weights", weights, Adam { rate: o.net_rate, ..Adam::default() }),
+        encoder: Encoder::Hash { grid, table: ParamGroup::sparse("table", table, Adam { rate: o.grid_rate, ..Adam::default() }) },
+        codes: RayCodes { direction: DirectionCode::None, appearance: None, given: vec![9] },
+        net,
+        space,
+        normals: None,
+    };
+    field.set_normals(Some(Normals::default())).map_err(|e| PipelineError::Usage(e.to_string()))?;
+    Ok(field)
+}

@@ -1,0 +1,118 @@
+//! Training recipe of the scene model, to be read from top to bottom.
+
+use super::config::Config;
+use super::model::SceneModel;
+use super::trainer::Trainer;
+use crate::error::{PipelineError, Result};
+use crate::run::photographs::StoredPhotographs;
+use crate::run::{RunDescription, RunFolder, folder, kept_capture};
+use diorama_data::import::{self, ImportOptions};
+use diorama_data::checkpoint;
+use diorama_data::pixel_store::{PixelStore, StoreOptions};
+use diorama_engine::train::{self, Event, RunError, RunOptions, Summary};
+use diorama_geom::capture::Split;
+use diorama_geom::{Capture, Reduction};
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+/// Result of training.
+pub struct Trained {
+    pub model: SceneModel,
+    pub summary: Summary,
+}
+
+/// Trains into `folder`, from the start or from its checkpoint.
+///
+/// # Errors
+/// When the capture or a checkpoint cannot be read, or training diverges.
+pub fn train(
+    config: &Config,
+    folder: &mut RunFolder,
+    resume: bool,
+    interrupt: &AtomicBool,
+    events: &mut dyn FnMut(&Event),
+) -> Result<Trained> {
+    let capture = if resume { folder.capture()? } else { load_capture(config)? };
+    capture.notes.iter().for_each(|n| events(&Event::Note(n.clone())));
+    single_light(&capture).into_iter().for_each(|n| events(&Event::Note(n)));
+    let photographs = load_pixels(config, &capture)?;
+    let mut model = SceneModel::new(config.clone(), capture)?;
+    if resume {
+        if checkpoint::exists(&folder.checkpoints()) {
+            let (c, note) = checkpoint::load(&folder.checkpoints())?;
+            model.restore(c, &checkpoint::latest(&folder.checkpoints()))?;
+            note.into_iter().for_each(|n| events(&Event::Note(n)));
+        }
+        folder.cut_metrics(model.origin.step)?;
+    } else {
+        folder.write_description(&model.config, &model.capture)?;
+    }
+    let (origin, checkpoints) = (model.origin, folder.checkpoints());
+    let mut trainer = Trainer::new(model, photographs, &checkpoints)?;
+    let r = &config.run;
+    let options = RunOptions {
+        steps: (r.steps > 0).then_some(r.steps),
+        seconds: (r.seconds > 0.0).then_some(r.seconds),
+        log_every: r.log_every,
+        save_every_seconds: r.save_every_seconds,
+        save_every_steps: None,
+        evaluate_every: None,
+    };
+    let mut log_error = None;
+    let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
+        if let Err(e) = folder.log(e) {
+            log_error.get_or_insert(e);
+        }
+        events(e);
+    });
+    if let Some(e) = log_error {
+        return Err(e);
+    }
+    let summary = result.map_err(|e| match e {
+        RunError::Failed(e) => e,
+        RunError::Diverged { first, again } => {
+            PipelineError::Diverged { first, again, kept: format!("{} may hold a checkpoint", checkpoints.display()) }
+        }
+    })?;
+    folder.draw_curves()?;
+    Ok(Trained { model: trainer.model, summary })
+}
+
+/// The capture that a configuration names.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn load_capture(config: &Config) -> Result<Capture> {
+    let options = ImportOptions { split: config.data.split.parse().map_err(PipelineError::Usage)?, ..ImportOptions::default() };
+    Ok(import::import(&config.data.path, &options)?)
+}
+
+/// A warning where all photographs are of one light: then albedo and light cannot be told apart.
+fn single_light(capture: &Capture) -> Option<String> {
+    let mut sessions: Vec<Option<u32>> = capture.frames.iter().map(|f| f.session).collect();
+    sessions.sort_unstable();
+    sessions.dedup();
+    (sessions.len() == 1).then(|| {
+        "all photographs are of one session: albedo and light are ambiguous; photograph at other times of day, or name sessions".into()
+    })
+}
+
+fn load_pixels(config: &Config, capture: &Capture) -> Result<StoredPhotographs> {
+    let frames: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.frames[i]).collect();
+    let reduction = Reduction::Factor(config.data.downscale);
+    let options = StoreOptions { reduction, budget: config.data.memory_budget, masks: capture.masks, white: 0.0 };
+    Ok(StoredPhotographs::new(PixelStore::load(&frames, &options, &|| {})?))
+}
+
+/// A trained model, and notes.
+///
+/// # Errors
+/// When the folder holds no run of this application, or its checkpoint is damaged.
+pub fn load(run: &Path) -> Result<(SceneModel, Vec<String>)> {
+    let config: Config = RunDescription::read(run)?.config()?;
+    let capture = kept_capture::read(run, None, &config.data.path)?;
+    let (checkpoint, file, note) = folder::last_checkpoint(run)?;
+    let mut model = SceneModel::new(config, capture)?;
+    model.restore(checkpoint, &file)?;
+    Ok((model, note.into_iter().collect()))
+}

@@ -1,0 +1,87 @@
+//! Views of the scene model under any light, and its layers.
+
+use super::model::SceneModel;
+use super::shading::{self, CHANNELS};
+use super::trainer::gray;
+use diorama_engine::renderers::layers::Layers;
+use diorama_engine::renderers::volume::Quality;
+use diorama_geom::Image;
+use diorama_geom::glam::DVec3;
+use diorama_geom::sh_light::ShLight;
+use diorama_kernels::ops::ray_generation::{self, PosedCamera};
+
+/// Light in which a view is shown: spherical harmonics, and the sky behind.
+pub struct ViewLight {
+    pub light: ShLight,
+    /// `[16, 3]`
+    pub sky: Vec<f32>,
+}
+
+impl ViewLight {
+    /// A light with an even sky of the radiance that comes from above.
+    pub fn of(light: ShLight) -> ViewLight {
+        let above = light.shade(DVec3::Z);
+        let sky = (0..shading::SKY).map(|i| if i < 3 { above[i].max(0.0) as f32 / 0.282_094_8 } else { 0.0 }).collect();
+        ViewLight { light, sky }
+    }
+
+    fn numbers(&self) -> Vec<f32> {
+        self.light.0.iter().flatten().map(|v| *v as f32).collect()
+    }
+}
+
+/// Layers of a view; images are `[H, W, 3]` or `[H, W, 1]`.
+pub struct SceneView {
+    /// Linear light.
+    pub color: Image,
+    /// Linear, not multiplied by the opacity.
+    pub albedo: Image,
+    /// Of unit length.
+    pub normal: Image,
+    pub shadow: Image,
+    /// Light that a white surface would send, shadow included.
+    pub irradiance: Image,
+    pub depth: Image,
+    pub opacity: Image,
+}
+
+impl SceneModel {
+    /// Renders a camera that stands in model space under a light; `progress` receives rows.
+    pub fn view(&self, camera: &PosedCamera, light: &ViewLight, progress: &mut dyn FnMut(usize)) -> SceneView {
+        let numbers = light.numbers();
+        let code: Vec<f32> = numbers.chunks_exact(3).map(gray).collect();
+        let Layers { values, opacity, depth } = self.tracer(Quality::Full).layers(camera, &[&code], progress);
+        let (w, h) = (values.width, values.height);
+        let pixels: Vec<f32> = (0..w * h).flat_map(|i| [(i % w) as f32 + 0.5, (i / w) as f32 + 0.5]).collect();
+        let (mut origins, mut dirs) = (vec![0.0; 3 * w * h], vec![0.0; 3 * w * h]);
+        ray_generation::cpu::forward(std::slice::from_ref(camera), &vec![0; w * h], &pixels, &mut origins, &mut dirs);
+        let image = |channels| Image::zeros(w, h, channels);
+        let mut out = SceneView {
+            color: image(3),
+            albedo: image(3),
+            normal: image(3),
+            shadow: image(1),
+            irradiance: image(3),
+            depth,
+            opacity,
+        };
+        for (i, v) in values.data.chunks_exact(CHANNELS).enumerate() {
+            let mut v: [f32; CHANNELS] = std::array::from_fn(|k| v[k]);
+            let o = out.opacity.data[i];
+            // The shadow is composited before 1.
+            v[3] += 1.0 - o;
+            let rgb = shading::color(&v, o, &dirs[3 * i..3 * i + 3], &numbers, &light.sky);
+            let length = v[4..].iter().map(|n| n * n).sum::<f32>().sqrt().max(1e-20);
+            let normal: [f32; 3] = std::array::from_fn(|k| v[4 + k] / length);
+            let lit = light.light.shade(DVec3::from(normal.map(f64::from)));
+            for k in 0..3 {
+                out.color.data[3 * i + k] = rgb[k];
+                out.albedo.data[3 * i + k] = if o > 1e-3 { v[k] / o } else { 0.0 };
+                out.normal.data[3 * i + k] = normal[k];
+                out.irradiance.data[3 * i + k] = v[3] * lit[k].max(0.0) as f32;
+            }
+            out.shadow.data[i] = v[3];
+        }
+        out
+    }
+}

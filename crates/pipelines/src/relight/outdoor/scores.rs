@@ -1,0 +1,197 @@
+//! Scores of the scene model against a generated benchmark.
+
+use super::model::SceneModel;
+use super::render::ViewLight;
+use crate::error::{PipelineError, Result};
+use crate::relight::truth::{self, Truth, ViewLayers};
+use diorama_data::photo;
+use diorama_geom::capture::Split;
+use diorama_geom::color::{linear_from_srgb, srgb_from_linear};
+use diorama_geom::glam::DVec3;
+use diorama_geom::sh_light::ShLight;
+use diorama_geom::{Image, ImageU8};
+use serde::Serialize;
+use std::path::Path;
+
+/// Scores over the pixels of held-out views that show opaque surfaces.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct SceneScores {
+    /// Under the light that training never saw, given as spherical harmonics.
+    pub unseen_light_psnr: f64,
+    /// The same by exact albedo, normals and shadow, under the same harmonics.
+    pub oracle_psnr: f64,
+    /// The mean of the pictures in all lights of training in place of the model's.
+    pub mean_light_psnr: f64,
+    /// Views that were held out in the lights of training.
+    pub seen_light_psnr: f64,
+    /// Of linear albedo after one factor per channel.
+    pub albedo_psnr: f64,
+    pub normal_median_deg: f64,
+    /// Correlation of the shadow with the share of direct light that arrives.
+    pub shadow_correlation: f64,
+    pub views: usize,
+}
+
+/// Sum of squares of errors in sRGB.
+#[derive(Default)]
+struct Errors {
+    sum: f64,
+    n: usize,
+}
+
+impl Errors {
+    fn add(&mut self, linear: [f32; 3], srgb: [f32; 3]) {
+        for k in 0..3 {
+            let e = srgb_from_linear(linear[k].clamp(0.0, 1.0)) - srgb[k];
+            self.sum += (e * e) as f64;
+        }
+        self.n += 3;
+    }
+
+    fn psnr(&self) -> f64 {
+        -10.0 * (self.sum / self.n.max(1) as f64).log10()
+    }
+}
+
+/// Judges a model; `look` receives the name of each held-out photograph in the unseen light, the model's picture and the photograph.
+///
+/// # Errors
+/// When the data set has no truth, or files are missing.
+pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &ImageU8, &ImageU8) -> Result<()>) -> Result<SceneScores> {
+    if !Truth::exists(data) {
+        return Err(PipelineError::Usage(format!("{}: has no truth; only generated benchmarks do", data.display())));
+    }
+    let truth = Truth::read(data)?;
+    let gauge = gauge(model, &truth);
+    let (mut unseen, mut oracle, mut mean, mut seen) = <(Errors, Errors, Errors, Errors)>::default();
+    let (mut albedos, mut angles, mut shadows) = (Vec::new(), Vec::new(), Vec::new());
+    let mut views = 0;
+    for frame in model.capture.indices(Split::Test) {
+        let name = &model.capture.frames[frame].name;
+        let Some(of) = truth.views.iter().find(|v| name.ends_with(&v.photograph)) else { continue };
+        let photograph = photo::load(&model.capture.frames[frame].image)?;
+        let layers = truth::read_view(data, &of.view)?;
+        let (light, is_unseen) = (&truth.lights[of.light], of.light == truth.unseen);
+        let view_light = match model.light_of_frame(frame).filter(|_| !is_unseen) {
+            Some(l) => ViewLight { light: model.light(l), sky: model.sky(l).to_vec() },
+            None => ViewLight::of(scaled(&light.light(), gauge)),
+        };
+        let view = model.view(&model.posed(frame), &view_light, &mut |_| {});
+        let shadow = truth::read_shadow(data, &of.photograph)?;
+        let others = if is_unseen { mean_picture(data, &truth, &of.view)? } else { None };
+        let exact = light.light();
+        for i in valid(&layers) {
+            let rgb = |image: &Image| -> [f32; 3] { std::array::from_fn(|k| image.data[3 * i + k]) };
+            let photo: [f32; 3] = std::array::from_fn(|k| photograph.data[photograph.channels * i + k] as f32 / 255.0);
+            let (got, normal) = (rgb(&view.color), rgb(&view.normal));
+            let n = DVec3::from(rgb(&layers.normal).map(f64::from)).normalize_or_zero();
+            (if is_unseen { &mut unseen } else { &mut seen }).add(got, photo);
+            shadows.push((view.shadow.data[i] as f64, shadow.data[3 * i] as f64));
+            if is_unseen {
+                let lit = exact.shade(n);
+                let albedo = rgb(&layers.albedo);
+                oracle.add(std::array::from_fn(|k| albedo[k] * lit[k].max(0.0) as f32 * shadow.data[3 * i]), photo);
+                others.iter().for_each(|o| mean.add(rgb(o), photo));
+                albedos.push((rgb(&view.albedo), albedo));
+                angles.push(n.dot(DVec3::from(normal.map(f64::from))).clamp(-1.0, 1.0).acos().to_degrees());
+            }
+        }
+        if is_unseen {
+            views += 1;
+            look(&of.photograph, &encoded(&view.color), &photograph)?;
+        }
+    }
+    angles.sort_by(f64::total_cmp);
+    Ok(SceneScores {
+        unseen_light_psnr: unseen.psnr(),
+        oracle_psnr: oracle.psnr(),
+        mean_light_psnr: mean.psnr(),
+        seen_light_psnr: seen.psnr(),
+        albedo_psnr: scaled_psnr(&albedos),
+        normal_median_deg: angles.get(angles.len() / 2).copied().unwrap_or(f64::NAN),
+        shadow_correlation: correlation(&shadows),
+        views,
+    })
+}
+
+fn valid(layers: &ViewLayers) -> impl Iterator<Item = usize> + '_ {
+    (0..layers.valid.data.len()).filter(|i| layers.valid.data[*i] > 0.5)
+}
+
+/// sRGB of a linear image.
+pub fn encoded(linear: &Image) -> ImageU8 {
+    let data = linear.data.iter().map(|v| srgb_from_linear(v.clamp(0.0, 1.0))).collect();
+    Image { data, ..linear.clone() }.to_u8()
+}
+
+/// Factor by channel from exact light to the model's: brightness is shared between albedo and light by chance.
+fn gauge(model: &SceneModel, truth: &Truth) -> [f64; 3] {
+    std::array::from_fn(|k| {
+        let (mut both, mut own) = (0.0, 0.0);
+        for (l, session) in model.sessions.iter().enumerate() {
+            let Some(exact) = truth.lights.get(*session as usize) else { continue };
+            let learned = model.light(l);
+            for i in 0..9 {
+                both += learned.0[i][k] * exact.harmonics[i][k];
+                own += exact.harmonics[i][k] * exact.harmonics[i][k];
+            }
+        }
+        if own > 0.0 && both > 0.0 { both / own } else { 1.0 }
+    })
+}
+
+fn scaled(light: &ShLight, by: [f64; 3]) -> ShLight {
+    ShLight(light.0.map(|c| std::array::from_fn(|k| c[k] * by[k])))
+}
+
+/// Mean in linear light of the photographs of a view in the lights of training.
+fn mean_picture(data: &Path, truth: &Truth, view: &str) -> Result<Option<Image>> {
+    let mut sum: Option<Image> = None;
+    let mut n = 0.0;
+    for v in truth.views.iter().filter(|v| v.view == view && v.light != truth.unseen) {
+        let mut photograph = photo::load(&data.join("images").join(format!("{}.png", v.photograph)))?.to_f32();
+        photograph.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
+        match &mut sum {
+            Some(sum) => sum.data.iter_mut().zip(&photograph.data).for_each(|(s, v)| *s += v),
+            None => sum = Some(photograph),
+        }
+        n += 1.0;
+    }
+    sum.iter_mut().for_each(|s| s.data.iter_mut().for_each(|v| *v /= n));
+    Ok(sum)
+}
+
+/// PSNR of linear colors after the best factor per channel.
+fn scaled_psnr(pairs: &[([f32; 3], [f32; 3])]) -> f64 {
+    let mut sum = 0.0;
+    for k in 0..3 {
+        let of = |f: &dyn Fn(f64, f64) -> f64| pairs.iter().map(|(got, want)| f(got[k] as f64, want[k] as f64)).sum::<f64>();
+        let factor = of(&|g, w| g * w) / of(&|g, _| g * g).max(1e-12);
+        sum += of(&|g, w| (factor * g - w) * (factor * g - w));
+    }
+    -10.0 * (sum / (3 * pairs.len()).max(1) as f64).log10()
+}
+
+/// Pearson's correlation.
+fn correlation(pairs: &[(f64, f64)]) -> f64 {
+    let n = pairs.len() as f64;
+    let mean = |f: fn(&(f64, f64)) -> f64| pairs.iter().map(f).sum::<f64>() / n;
+    let (a, b) = (mean(|p| p.0), mean(|p| p.1));
+    let of = |f: &dyn Fn(f64, f64) -> f64| pairs.iter().map(|p| f(p.0 - a, p.1 - b)).sum::<f64>();
+    of(&|x, y| x * y) / (of(&|x, _| x * x) * of(&|_, y| y * y)).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn factors_do_not_count_and_noise_does() {
+        let pairs: Vec<([f32; 3], [f32; 3])> = (0..50).map(|i| ([0.01 * i as f32; 3], [0.02 * i as f32, 0.005 * i as f32, 0.01 * i as f32])).collect();
+        assert!(scaled_psnr(&pairs) > 100.0, "{}", scaled_psnr(&pairs));
+        let off: Vec<_> = pairs.iter().enumerate().map(|(i, (g, w))| (*g, w.map(|v| v + if i % 2 == 0 { 0.1 } else { -0.1 }))).collect();
+        assert!((scaled_psnr(&off) - 20.0).abs() < 0.3, "{}", scaled_psnr(&off));
+        let line: Vec<(f64, f64)> = (0..20).map(|i| (i as f64, 3.0 - 2.0 * i as f64)).collect();
+        assert!((correlation(&line) + 1.0).abs() < 1e-12);
+    }
+}

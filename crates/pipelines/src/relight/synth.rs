@@ -1,0 +1,207 @@
+//! Generated benchmark: a street photographed in several lights by known cameras, with exact albedo, normals, depth, shadow and light.
+//!
+//! The folder is a capture (`transforms_train.json`, `transforms_test.json`, `images/`) with a `truth/` that training never reads.
+
+use super::truth::{self, LightTruth, Truth, ViewTruth};
+use crate::error::{PipelineError, Result};
+use diorama_data::{DataError, atomic, photo};
+use diorama_geom::color::srgb_from_linear;
+use diorama_geom::daylight::Daylight;
+use diorama_geom::environment::Environment;
+use diorama_geom::glam::DVec3;
+use diorama_geom::sky::Sky;
+use diorama_geom::{Camera, Image, Model, Pose};
+use diorama_kernels::ops::path_trace::{Film, Scene, Settings, View, cpu};
+use diorama_scenes::street;
+use serde_json::json;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Rows of the maps of the lights.
+const ROWS: usize = 128;
+/// Radiance that a white surface facing up sends to the cameras, by which photographs are exposed.
+const EXPOSED: f64 = 0.8;
+/// Bounces of light.
+const BOUNCES: u32 = 6;
+/// Every so many views, one is held out.
+const HOLD_OUT: usize = 5;
+
+/// Size of the benchmark.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SynthOptions {
+    pub views: usize,
+    /// Lights of training, 1 to 4; another one is held out.
+    pub lights: usize,
+    pub size: (u32, u32),
+    /// Samples per pixel.
+    pub samples: u32,
+    pub seed: u64,
+}
+
+impl SynthOptions {
+    /// # Errors
+    /// When the name is not that of a size.
+    pub fn named(name: &str) -> Result<SynthOptions> {
+        let of = |views, size, samples| SynthOptions { views, lights: 4, size, samples, seed: 0 };
+        match name {
+            "ci" => Ok(of(10, (64, 48), 64)),
+            "middle" => Ok(of(60, (320, 180), 32)),
+            "gpu" => Ok(of(88, (640, 360), 256)),
+            _ => Err(PipelineError::Usage(format!("size {name:?}: expected ci, middle or gpu"))),
+        }
+    }
+}
+
+/// Name, sun's elevation and azimuth in degrees; none: overcast. The last one is held out.
+const LIGHTS: [(&str, Option<(f64, f64)>); 5] = [
+    ("morning", Some((28.0, 95.0))),
+    ("noon", Some((58.0, 185.0))),
+    ("evening", Some((16.0, 265.0))),
+    ("overcast", None),
+    ("unseen", Some((38.0, 220.0))),
+];
+
+/// The light of a name in [`LIGHTS`], exposed.
+fn light(index: usize) -> Daylight {
+    let light = match LIGHTS[index].1 {
+        Some((elevation, azimuth)) => Daylight::clear(&Sky::clear(elevation.to_radians(), azimuth.to_radians()), ROWS),
+        // CIE overcast sky (Moon and Spencer 1942).
+        None => Daylight::of(Environment::from_fn(ROWS, |d| [0.95, 1.0, 1.05].map(|c| if d.z > 0.0 { c * (1.0 + 2.0 * d.z) / 3.0 } else { 0.0 }))),
+    };
+    let up = irradiance(&light, DVec3::Z);
+    let gray = 0.2126 * up[0] + 0.7152 * up[1] + 0.0722 * up[2];
+    light.turned(0.0, EXPOSED * std::f64::consts::PI / gray)
+}
+
+/// Irradiance of a surface without shadows.
+pub fn irradiance(light: &Daylight, normal: DVec3) -> [f64; 3] {
+    let mut sum = [0.0; 3];
+    light.environment.for_each_pixel(|d, solid_angle, radiance| {
+        let weight = solid_angle * d.dot(normal).max(0.0);
+        (0..3).for_each(|k| sum[k] += weight * radiance[k]);
+    });
+    if let Some(sun) = light.sun {
+        (0..3).for_each(|k| sum[k] += sun.irradiance[k] * sun.direction.dot(normal).max(0.0));
+    }
+    sum
+}
+
+/// What was generated.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct Synthesized {
+    pub photographs: usize,
+    pub held_out: usize,
+    pub triangles: usize,
+    pub interrupted: bool,
+}
+
+/// Generates the benchmark into a folder. `progress` gets the share that is done.
+///
+/// # Errors
+/// When the folder exists and is not replaced by `force`, or a file cannot be written.
+pub fn generate(
+    out: &Path,
+    options: &SynthOptions,
+    force: bool,
+    stop: &AtomicBool,
+    progress: &mut dyn FnMut(f64),
+) -> Result<Synthesized> {
+    if out.join("transforms_train.json").exists() && !force {
+        return Err(PipelineError::Usage(format!("{}: holds a capture; give --force to replace it", out.display())));
+    }
+    if !(1..LIGHTS.len()).contains(&options.lights) || options.views < 2 {
+        return Err(PipelineError::Usage(format!("a benchmark has 1 to {} lights and at least 2 views", LIGHTS.len() - 1)));
+    }
+    for folder in ["images", "truth"] {
+        let folder = out.join(folder);
+        std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
+    }
+    let model = street::model(options.seed);
+    let cameras = street::cameras(options.views, options.size.0, options.size.1, options.seed);
+    let lights: Vec<usize> = (0..options.lights).chain([LIGHTS.len() - 1]).collect();
+    let daylights: Vec<Daylight> = lights.iter().map(|l| light(*l)).collect();
+    let mut scene = Scene::new(&model, &daylights[0]);
+    let mut made = Synthesized { photographs: 0, held_out: 0, triangles: model.face_count(), interrupted: false };
+    let (mut frames, mut views) = ([Vec::new(), Vec::new()], Vec::new());
+    let total = (cameras.len() * lights.len()) as f64;
+    for (v, (camera, pose)) in cameras.iter().enumerate() {
+        let view = View { camera: *camera, world_from_camera: *pose, lens: None };
+        for (l, daylight) in daylights.iter().enumerate() {
+            scene.set_light(daylight);
+            let is_unseen = l + 1 == daylights.len();
+            let is_held_out = v % HOLD_OUT == HOLD_OUT - 1;
+            // Of the light that is held out, only the views that are held out.
+            if is_unseen && !is_held_out {
+                continue;
+            }
+            let mut film = Film::new(camera);
+            let settings =
+                Settings { seed: options.seed + (v * lights.len() + l) as u64, bounces: BOUNCES, light_layers: true, ..Settings::default() };
+            cpu::render(&scene, &view, &settings, options.samples, &mut film);
+            let name = format!("v{v:03}_{}", LIGHTS[lights[l]].0);
+            save_photograph(&out.join("images").join(format!("{name}.png")), &film)?;
+            truth::save_shadow(out, &name, &film)?;
+            if l == 0 {
+                let is_valid = valid_pixels(&scene, &view, &model, &film);
+                truth::save_view(out, &format!("v{v:03}"), &film, &is_valid)?;
+            }
+            frames[is_held_out as usize].push(frame(&name, camera, pose, l));
+            views.push(ViewTruth { photograph: name, view: format!("v{v:03}"), light: l, held_out: is_held_out });
+            *(if is_held_out { &mut made.held_out } else { &mut made.photographs }) += 1;
+            progress((v * lights.len() + l + 1) as f64 / total);
+            if stop.load(Ordering::Relaxed) {
+                made.interrupted = true;
+                return Ok(made);
+            }
+        }
+    }
+    let of_light = |l: usize| LightTruth::of(LIGHTS[lights[l]].0, &daylights[l]);
+    let truth = Truth { lights: (0..lights.len()).map(of_light).collect(), views, unseen: lights.len() - 1 };
+    for (l, daylight) in daylights.iter().enumerate() {
+        truth::save_light(out, &truth.lights[l].name, daylight)?;
+    }
+    truth.save(out)?;
+    let bounds = model.bounds().unwrap_or_default();
+    for (name, frames) in ["transforms_train.json", "transforms_test.json"].into_iter().zip(frames) {
+        atomic::write(&out.join(name), &serde_json::to_vec_pretty(&capture(frames, &cameras, bounds)).expect("plain values"))?;
+    }
+    Ok(made)
+}
+
+/// sRGB of a film.
+fn save_photograph(path: &Path, film: &Film) -> Result<()> {
+    let srgb = film.image(|p| p.color.map(|v| srgb_from_linear(v.clamp(0.0, 1.0))));
+    Ok(photo::save_png(path, &srgb.to_u8())?)
+}
+
+/// Where a pixel shows an opaque surface: neither sky nor glass.
+fn valid_pixels(scene: &Scene, view: &View, model: &Model, film: &Film) -> Image {
+    let first = cpu::first_hits(scene, view, true);
+    let is_glass = |i: u32| model.materials[model.parts[model.instances[i as usize].part].material].transmission > 0.0;
+    let valid = first.iter().zip(&film.pixels).map(|(hit, p)| (p.opacity > 0.99 && hit.is_some_and(|h| !is_glass(h.instance))) as u32 as f32);
+    Image { width: film.width, height: film.height, channels: 1, data: valid.collect() }
+}
+
+/// A frame of `transforms.json`: poses have y up and look along −z there.
+fn frame(name: &str, camera: &Camera, pose: &Pose, session: usize) -> serde_json::Value {
+    let p = pose.flip_y_z();
+    let row = |i: usize| [p.rotation.x_axis[i], p.rotation.y_axis[i], p.rotation.z_axis[i], p.translation[i]];
+    json!({
+        "file_path": format!("images/{name}.png"),
+        "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+        "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height,
+        "session": session,
+    })
+}
+
+/// `transforms.json` whose box holds cameras and scene: the inner cube is the whole of it.
+fn capture(frames: Vec<serde_json::Value>, cameras: &[(Camera, Pose)], (low, high): ([f64; 3], [f64; 3])) -> serde_json::Value {
+    let (mut low, mut high) = (DVec3::from(low), DVec3::from(high));
+    for (_, pose) in cameras {
+        (low, high) = (low.min(pose.translation), high.max(pose.translation));
+    }
+    let (center, half) = (0.5 * (low + high), 0.505 * (high - low).max_element());
+    let scale = 0.5 / half;
+    let offset = DVec3::splat(0.5) - scale * center;
+    json!({ "aabb_scale": 1, "scale": scale, "offset": [offset.x, offset.y, offset.z], "frames": frames })
+}
