@@ -1,5 +1,7 @@
 //! Fuzz targets: every parser of untrusted bytes, as a function that must neither crash nor hang.
 
+mod models;
+
 use diorama_data::{
     archive, camera_path_json, checkpoint, colmap, import, llff, photo, photo_import, sparse_ply, splat_ply, transforms_json, weights,
 };
@@ -39,6 +41,10 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "splat_ply", run: splats, seeds: splat_seeds },
     Parser { name: "sparse_ply", run: sparse_points, seeds: sparse_seeds },
     Parser { name: "weights", run: load_weights, seeds: weights_seeds },
+    Parser { name: "gltf", run: models::gltf, seeds: models::gltf_seeds },
+    Parser { name: "obj", run: models::obj, seeds: models::obj_seeds },
+    Parser { name: "environment", run: models::environment, seeds: models::environment_seeds },
+    Parser { name: "sh_text", run: models::sh_text, seeds: models::sh_seeds },
 ];
 
 /// The parser with a given name.

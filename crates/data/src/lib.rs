@@ -4,6 +4,7 @@
 //!   [`Capture`](diorama_geom::Capture); [`masks`] and [`sparse`] add masks and points.
 //! - [`pixel_store::PixelStore`] decodes the photographs of a capture within a memory budget; [`photo`] reads and writes single images.
 //! - [`glb`], [`mesh_text`] (OBJ, PLY, STL), [`usdz`], [`collada`] and [`point_cloud`] (LAS, E57) write meshes and points.
+//! - [`model_file`] reads models (glTF, OBJ), [`gltf`] also writes them; [`environment`] and [`sh_text`] hold light.
 //! - [`film`] writes MP4 and GIF, [`depth`] sequences of depth maps, [`plot`] charts.
 //! - [`checkpoint`] saves named arrays atomically; [`weights`] reads safetensors and PyTorch's `.pth`.
 //!

@@ -1,8 +1,8 @@
 //! A glTF file with its buffers: `.glb`, or `.gltf` with data beside it or inside of it.
 
 use super::binary::{BIN, JSON, MAGIC};
-use super::data_uri;
 use super::schema::{BufferView, Root};
+use super::{data_uri, extensions};
 use crate::error::{self, DataError, Result};
 use std::borrow::Cow;
 use std::cell::Cell;
@@ -31,6 +31,8 @@ impl<'a> Document<'a> {
             DataError::input(path, format!("not glTF: {e}; {cure}"))
         })?;
         let mut document = Document { path, root, buffers: Vec::new(), numbers: Cell::new(0) };
+        // Before the buffers, which compression may leave out.
+        extensions::check(&document)?;
         document.buffers = (0..document.root.buffers.len()).map(|i| document.load_buffer(i, binary)).collect::<Result<_>>()?;
         Ok(document)
     }

@@ -14,19 +14,23 @@ const READ: [&str; 6] = [
     "EXT_texture_webp",
 ];
 
-/// Refuses extensions without which the file cannot be understood, and notes others that are not read.
-pub fn check(document: &Document, notes: &mut Notes) -> Result<()> {
-    let root = &document.root;
-    if let Some(name) = root.extensions_required.iter().find(|n| !READ.contains(&n.as_str())) {
+/// Refuses a file that cannot be understood without an extension that is not read.
+pub fn check(document: &Document) -> Result<()> {
+    if let Some(name) = document.root.extensions_required.iter().find(|n| !READ.contains(&n.as_str())) {
         return Err(document.wrong(format!("it requires the extension {name}, which is not read; {}", cure(name))));
     }
+    Ok(())
+}
+
+/// Notes other extensions that are not read.
+pub fn note(document: &Document, notes: &mut Notes) {
+    let root = &document.root;
     for name in root.extensions_used.iter().filter(|n| !READ.contains(&n.as_str())) {
         notes.add(format!("the extension {name} is left out"));
     }
     if !root.animations.is_empty() {
         notes.add("animations are left out".into());
     }
-    Ok(())
 }
 
 fn cure(name: &str) -> &'static str {

@@ -249,6 +249,13 @@ fn damaged_files_name_the_place_and_the_cure() {
     for (got, want) in [
         (changed(&|s| s["extensionsRequired"] = json!(["KHR_draco_mesh_compression"])), "gltf-transform/cli copy"),
         (changed(&|s| s["extensionsRequired"] = json!(["KHR_texture_basisu"])), "ktxdecompress"),
+        (
+            changed(&|s| {
+                s["extensionsRequired"] = json!(["EXT_meshopt_compression"]);
+                s["buffers"][0] = json!({ "byteLength": 9 });
+            }),
+            "requires the extension EXT_meshopt_compression",
+        ),
         (changed(&|s| s["extensionsRequired"] = json!(["ACME_hair"])), "ACME_hair"),
         (changed(&|s| s["accessors"][0]["count"] = 7.into()), "mesh \"square\", POSITION: 7 elements do not fit into 72 bytes"),
         (changed(&|s| s["accessors"][1]["count"] = 5.into()), "mesh \"square\" has 6 positions, but 5 of TEXCOORD_0"),

@@ -36,7 +36,7 @@ pub fn read(path: &Path) -> Result<LoadedModel> {
         materials: HashMap::new(),
         parts: HashMap::new(),
     };
-    extensions::check(&document, &mut reader.notes)?;
+    extensions::note(&document, &mut reader.notes);
     reader.place_nodes()?;
     if reader.model.instances.is_empty() {
         return Err(document.wrong("no node of its scene has triangles; export the objects as meshes"));

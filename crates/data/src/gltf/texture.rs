@@ -4,7 +4,8 @@ use super::binary::{CLAMP, MIRROR};
 use super::document::Document;
 use super::scene::Notes;
 use crate::error::{DataError, Result};
-use crate::photo::{self, Origin};
+use crate::model_file::decode_texture;
+use crate::photo::Origin;
 use diorama_geom::ImageU8;
 use diorama_geom::model::{Texture, Wrap};
 use std::borrow::Cow;
@@ -76,12 +77,5 @@ fn decode(document: &Document, index: usize, what: &str) -> Result<ImageU8> {
         DataError::Input { message, .. } if path == document.path => document.wrong(format!("{title}: {message}")),
         e => e,
     };
-    let image = photo::decode(Origin { path: &path, cure: CURE }, &bytes).map_err(named)?;
-    let (width, height) = (image.width() as usize, image.height() as usize);
-    if width == 0 || height == 0 {
-        return Err(document.wrong(format!("{title} has no pixels; {CURE}")));
-    }
-    let channels = if image.color().has_alpha() { 4 } else { 3 };
-    let data = if channels == 4 { image.into_rgba8().into_raw() } else { image.into_rgb8().into_raw() };
-    Ok(ImageU8 { width, height, channels, data })
+    decode_texture(Origin { path: &path, cure: CURE }, &bytes).map_err(named)
 }

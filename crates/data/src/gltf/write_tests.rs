@@ -95,8 +95,7 @@ fn any_model() -> impl Strategy<Value = Model> {
     (textures, 1usize..3, 1usize..4, 1usize..5).prop_flat_map(|(textures, materials, parts, instances)| {
         let part = (any_mesh(), 0..materials, "[a-z]{0,6}").prop_map(|(mesh, material, name)| Part { name, mesh, material });
         let instance = (0..parts, any_place()).prop_map(|(part, world_from_part)| Instance { part, world_from_part });
-        let (materials, n) = (proptest::collection::vec(any_material(textures.len()), materials), textures.len());
-        let _ = n;
+        let materials = proptest::collection::vec(any_material(textures.len()), materials);
         (Just(textures), materials, proptest::collection::vec(part, parts), proptest::collection::vec(instance, instances))
             .prop_map(|(textures, materials, parts, instances)| Model { textures, materials, parts, instances })
     })

@@ -1,8 +1,8 @@
 //! Materials of `.mtl` files: matte colors, textures, normal maps, opacity and emission.
 
 use crate::error::{self, Result};
-use crate::photo::{self, Origin};
-use diorama_geom::ImageU8;
+use crate::model_file::decode_texture;
+use crate::photo::Origin;
 use diorama_geom::model::{Material, Opacity, Texture, Wrap};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -100,11 +100,8 @@ impl Library {
             return Ok(Some(*known));
         }
         let origin = Origin { path: &file, cure: "copy it again" };
-        let image = photo::decode(origin, &error::read(&file, LIMIT)?)?;
-        let (width, height) = (image.width() as usize, image.height() as usize);
-        let channels = if image.color().has_alpha() { 4 } else { 3 };
-        let data = if channels == 4 { image.into_rgba8().into_raw() } else { image.into_rgb8().into_raw() };
-        self.textures.push(Texture { image: ImageU8 { width, height, channels, data }, wrap: [wrap; 2] });
+        let image = decode_texture(origin, &error::read(&file, LIMIT)?)?;
+        self.textures.push(Texture { image, wrap: [wrap; 2] });
         self.files.insert((file, wrap), self.textures.len() - 1);
         Ok(Some(self.textures.len() - 1))
     }

@@ -33,7 +33,7 @@ pub fn read(path: &Path, up: Option<Up>) -> Result<LoadedModel> {
     let text = String::from_utf8_lossy(&bytes);
     let is_marked = text.lines().next().is_some_and(|l| l.starts_with('#') && l.contains("z up"));
     let up = up.unwrap_or(if is_marked { Up::Z } else { Up::Y });
-    let mut reader = Reader { path, up, ..Reader::new(path) };
+    let mut reader = Reader::new(path, up);
     let mut joined = String::new();
     for (number, line) in text.lines().enumerate() {
         if let Some(start) = line.strip_suffix('\\') {
@@ -77,10 +77,10 @@ struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    fn new(path: &'a Path) -> Reader<'a> {
+    fn new(path: &'a Path, up: Up) -> Reader<'a> {
         Reader {
             path,
-            up: Up::Y,
+            up,
             positions: Vec::new(),
             colors: Vec::new(),
             uvs: Vec::new(),
