@@ -103,13 +103,13 @@ fn the_gradient_of_the_density_is_its_slope_in_model_space() {
             assert!((at(i, k, 0.0) - sigma[i]).abs() < 1e-4 * sigma[i].max(1.0));
             let (low, high) = (at(i, k, -step), at(i, k, step));
             // A kink is no place to take a difference.
-            if (high - 2.0 * sigma[i] + low).abs() < 1e-3 * scale * step {
+            if (high - 2.0 * sigma[i] + low).abs() < 2e-2 * scale * step {
                 let numeric = (high - low) / (2.0 * step);
-                assert!((numeric - got[i * 3 + k]).abs() < 4e-3 * scale, "{:?} {i} {k}: {} for {numeric}", f.space, got[i * 3 + k]);
+                assert!((numeric - got[i * 3 + k]).abs() < 2e-2 * scale, "{:?} {i} {k}: {} for {numeric}", f.space, got[i * 3 + k]);
                 checked += 1;
             }
         }
-        assert!(checked > 10, "{:?}: {checked}", f.space);
+        assert!(checked > 27, "{:?}: {checked}", f.space);
     }
 }
 
@@ -130,11 +130,11 @@ fn fields_learn_from_their_normals() {
                         value(&mut f)[i] -= by;
                         loss
                     };
-                    let numeric = ((at(1e-3) - at(-1e-3)) / 2e-3) as f32;
-                    agreeing += ((numeric - grads[i]).abs() < 0.02 * grads[i].abs()) as usize;
+                    let numeric = ((at(3e-4) - at(-3e-4)) / 6e-4) as f32;
+                    agreeing += ((numeric - grads[i]).abs() < 0.01 * grads[i].abs()) as usize;
                 }
                 // A kink between the two spoils a difference.
-                assert!(agreeing >= 9, "{name} of {:?} in {:?}: {agreeing} of 12 agree", slope, rays.positions.len());
+                assert!(agreeing >= 10, "{name}, {slope:?}: {agreeing} of 12 agree");
             };
             check("weights", &weights, &|f| &mut f.weights.values);
             if !table.is_empty() {
@@ -148,7 +148,7 @@ fn fields_learn_from_their_normals() {
 fn normals_are_composited_behind_the_outputs_and_light_samples_have_no_part() {
     for mut f in fields_with_normals(DensitySlope::Exact) {
         let rays = Rays::new(f.space);
-        let mut render = |f: &Field| {
+        let render = |f: &Field| {
             let (mut encoded, mut buf) = (Encoded::default(), FieldBuffers::default());
             f.encode(&rays.positions, &mut encoded);
             f.render(&rays.batch(), &mut encoded, &mut buf);

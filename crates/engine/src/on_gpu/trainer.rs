@@ -256,7 +256,11 @@ pub struct GpuTrainer {
 
 impl GpuTrainer {
     /// Uploads parameters, grid, photographs and cameras.
+    ///
+    /// # Panics
+    /// When a field composites normals.
     pub fn new(gpu: Gpu, scene: Scene, of: &Trainees, photographs: Option<GpuPhotographs>) -> Self {
+        assert!(!of.composites_normals(), "a device composites no normals of a field; train on the CPU");
         let cameras = GpuCameras::upload(&gpu, &scene.cameras);
         let error_map = of.error_map.as_ref().zip(photographs.as_ref()).map(|(m, p)| GpuErrorMap::upload(&gpu, m, p.sizes()));
         let corrections = of.corrections.as_ref().map(|(g, focal)| (GpuGroup::upload(&gpu, g), *focal));

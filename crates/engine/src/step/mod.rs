@@ -165,6 +165,11 @@ impl<'a> Trainees<'a> {
         Trainees { field, coarse: None, learned: None, occupancy: None, corrections: None, error_map: None }
     }
 
+    /// Whether a field composites normals, which the CPU alone does.
+    pub fn composites_normals(&self) -> bool {
+        [Some(&*self.field), self.coarse.as_deref()].into_iter().flatten().any(|f| f.normals.is_some())
+    }
+
     /// The parameters among them, by the names that checkpoints have, then the grid and the map, which learn without gradients.
     pub fn into_params(self) -> (ParamSet<'a>, Option<&'a mut Occupancy>, Option<&'a mut ErrorMap>) {
         let mut params = ParamSet::default();
@@ -213,5 +218,7 @@ pub fn corrected(cameras: &[PosedCamera], corrections: &[f32]) -> Vec<PosedCamer
     cameras.iter().zip(rows).map(|(c, d)| c.corrected(&std::array::from_fn(|k| d[k] as f64))).collect()
 }
 
+#[cfg(test)]
+mod sphere_tests;
 #[cfg(test)]
 mod tests;

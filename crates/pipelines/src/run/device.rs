@@ -350,6 +350,9 @@ mod running {
         }
 
         pub fn begin(&mut self, of: &Trainees, scene: Scene, pictures: Option<Pictures>) -> Result<()> {
+            if of.composites_normals() {
+                return Err(PipelineError::Usage(format!("{} composites no normals of a field; use --device cpu", self.gpu.name)));
+            }
             if let Some(store) = pictures.map(|p| p.photographs.store()) {
                 // Of the smallest budgets even 1 of 64 × 64 pixels may be more.
                 let bytes: u64 = (0..store.len()).map(|i| (store.kept(i) * store.format().bytes()) as u64).sum();
