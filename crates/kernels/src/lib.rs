@@ -30,6 +30,7 @@ pub mod gemm;
 pub mod gpu;
 pub mod math;
 pub mod ops;
+mod partials;
 pub mod probe;
 pub mod simd;
 mod sums;

@@ -2,6 +2,7 @@
 
 pub mod activation;
 pub mod adam;
+
 pub mod attention;
 pub mod composite;
 pub mod conv2d;
@@ -18,6 +19,8 @@ pub mod frequency;
 pub mod fused_mlp;
 pub mod grid_sample;
 pub mod hash_grid;
+
+pub mod interpolate;
 pub mod linear;
 pub mod march;
 pub mod marching_cubes;
@@ -32,6 +35,7 @@ pub mod pixel_draw;
 pub mod pixel_gather;
 pub mod pool;
 pub mod prune;
+pub mod rasterize;
 pub mod ray_aabb;
 pub mod ray_generation;
 pub mod ray_triangles;
@@ -43,6 +47,7 @@ pub mod spherical_harmonics;
 pub mod ssim;
 pub mod strata;
 pub mod sum;
+
 pub mod triangle_wave;
 pub mod trilinear_corner_grid;
 pub mod weight_step;
