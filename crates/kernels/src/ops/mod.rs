@@ -48,6 +48,7 @@ pub mod ssim;
 pub mod strata;
 pub mod sum;
 
+pub mod texture;
 pub mod triangle_wave;
 pub mod trilinear_corner_grid;
 pub mod weight_step;
