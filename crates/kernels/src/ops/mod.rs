@@ -3,6 +3,7 @@
 pub mod activation;
 pub mod adam;
 
+pub mod antialias;
 pub mod attention;
 pub mod composite;
 pub mod conv2d;
