@@ -1,6 +1,6 @@
 //! Blocks of points: texels are found first, a few instructions for many points, and then read.
 
-use super::taps::{BLOCK, Lookup, Points, Taps, find};
+use super::taps::{BLOCK, Lookup, Points, Table, Taps, find};
 use super::{FACES, Filter, Kind, Texture, dot, face_of};
 use crate::tasks::{self, Parts};
 use crate::vector::{fma, vectorized};
@@ -71,14 +71,14 @@ vectorized! {
 
 /// Calls `work(range of points, what they read)` for blocks of points, in parallel.
 fn by_points(t: &Texture, coordinates: &[f32], level: &[f32], work: impl Fn(std::ops::Range<usize>, &Points, &Lookup) + Sync) {
-    let (levels, total) = (t.levels(), coordinates.len() / t.coordinates());
+    let (table, total) = (Table::new(t), coordinates.len() / t.coordinates());
     let per_task = BLOCK * BLOCKS;
     tasks::run(total.div_ceil(per_task), total * t.channels * 8, |task| {
         let (mut points, mut found) = (Points::EMPTY, Lookup::EMPTY);
         for first in (task * per_task..((task + 1) * per_task).min(total)).step_by(BLOCK) {
             let range = first..(first + BLOCK).min(total);
             points.read(t, coordinates, level, total / t.images.max(1), range.clone());
-            find(t, &levels, &points, &mut found);
+            find(t, &table, &points, &mut found);
             work(range, &points, &found);
         }
     });

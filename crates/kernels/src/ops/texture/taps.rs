@@ -1,12 +1,16 @@
 //! The texels that points read, found for a block of points at a time.
 
-use super::{FACES, Filter, Kind, Level, Texture, dot, face_of};
+use super::{FACES, Filter, Kind, Texture, dot, face_of};
 use crate::math::multiversion;
 
 /// Points of a block.
 pub(super) const BLOCK: usize = 256;
 /// No texel is missing.
 const NONE: u8 = 4;
+/// A point at the edge of a cube's face, whose texels are still to be found.
+const AT_EDGE: u8 = 5;
+/// Levels at most, a power of two.
+const LEVELS: usize = 16;
 
 /// Points of a block, by coordinate.
 pub(super) struct Points {
@@ -33,6 +37,8 @@ pub(super) struct Lookup {
     pub share: [f32; BLOCK],
     /// 1 where the level is between two, else 0.
     pub free: [f32; BLOCK],
+    /// The finer one of the levels.
+    first: [u32; BLOCK],
 }
 
 impl Points {
@@ -80,7 +86,7 @@ impl Taps {
 }
 
 impl Lookup {
-    pub const EMPTY: Lookup = Lookup { taps: [Taps::EMPTY, Taps::EMPTY], share: [0.0; BLOCK], free: [0.0; BLOCK] };
+    pub const EMPTY: Lookup = Lookup { taps: [Taps::EMPTY, Taps::EMPTY], share: [0.0; BLOCK], free: [0.0; BLOCK], first: [0; BLOCK] };
 
     /// The levels that are read.
     pub fn taps(&self, t: &Texture) -> &[Taps] {
@@ -132,19 +138,115 @@ fn along(repeat: bool, nearest: bool, n: f32, c: f32) -> (u32, u32, f32, f32) {
     unsafe { (integer(low), integer(high), between, slope) }
 }
 
+/// Sizes of levels and the texels before them, by level.
+pub(super) struct Table {
+    width: [f32; LEVELS],
+    height: [f32; LEVELS],
+    first: [u32; LEVELS],
+    len: usize,
+}
+
+impl Table {
+    pub fn new(t: &Texture) -> Table {
+        let mut table = Table { width: [0.0; LEVELS], height: [0.0; LEVELS], first: [0; LEVELS], len: 0 };
+        for (l, level) in t.levels().iter().enumerate() {
+            (table.height[l], table.width[l]) = (level.size[0] as f32, level.size[1] as f32);
+            (table.first[l], table.len) = (level.first as u32, l + 1);
+        }
+        table
+    }
+}
+
 #[inline(always)]
-fn flat(repeat: bool, nearest: bool, level: &Level, points: &Points, i: usize, taps: &mut Taps) {
-    let [h, w] = level.size;
-    let (x0, x1, x, slope_x) = along(repeat, nearest, w as f32, points.coordinates[0][i]);
-    let (y0, y1, y, slope_y) = along(repeat, nearest, h as f32, points.coordinates[1][i]);
-    let first = level.first as u32 + points.image[i] * (h * w) as u32;
-    let (upper, lower) = (first + y0 * w as u32, first + y1 * w as u32);
-    taps.texel[0][i] = upper + x0;
-    taps.texel[1][i] = upper + x1;
-    taps.texel[2][i] = lower + x0;
-    taps.texel[3][i] = lower + x1;
+fn flat(repeat: bool, nearest: bool, table: &Table, l: usize, points: &Points, i: usize, taps: &mut Taps) {
+    let (w, h) = (table.width[l % LEVELS], table.height[l % LEVELS]);
+    let (x0, x1, x, slope_x) = along(repeat, nearest, w, points.coordinates[0][i]);
+    let (y0, y1, y, slope_y) = along(repeat, nearest, h, points.coordinates[1][i]);
+    // SAFETY: sizes of levels.
+    let (width, height) = unsafe { (integer(w), integer(h)) };
+    let first = table.first[l % LEVELS].wrapping_add(points.image[i].wrapping_mul(width.wrapping_mul(height)));
+    let (upper, lower) = (first.wrapping_add(y0.wrapping_mul(width)), first.wrapping_add(y1.wrapping_mul(width)));
+    taps.texel[0][i] = upper.wrapping_add(x0);
+    taps.texel[1][i] = upper.wrapping_add(x1);
+    taps.texel[2][i] = lower.wrapping_add(x0);
+    taps.texel[3][i] = lower.wrapping_add(x1);
     (taps.between[0][i], taps.between[1][i]) = (x, y);
     (taps.slope[0][i], taps.slope[1][i]) = (slope_x, slope_y);
+}
+
+/// Face of a direction, and its place there in 0..=1 along s and t; the first face's center for a direction without length.
+#[inline(always)]
+fn on_face(d: [f32; 3]) -> (u32, f32, f32) {
+    let size = d.map(f32::abs);
+    let is_x = (size[0] >= size[1]) & (size[0] >= size[2]);
+    let is_y = !is_x & (size[1] >= size[2]);
+    let major = if is_x {
+        d[0]
+    } else if is_y {
+        d[1]
+    } else {
+        d[2]
+    };
+    let sign = if major < 0.0 { -1.0 } else { 1.0 };
+    let s = if is_x {
+        -sign * d[2]
+    } else if is_y {
+        d[0]
+    } else {
+        sign * d[0]
+    };
+    let t = if is_y { sign * d[2] } else { -d[1] };
+    let inverse = if major.abs() > 0.0 { 0.5 / major.abs() } else { 0.0 };
+    let axis = if is_x {
+        0
+    } else if is_y {
+        2
+    } else {
+        4
+    };
+    (axis + (major < 0.0) as u32, within(s * inverse + 0.5, 1.0), within(t * inverse + 0.5, 1.0))
+}
+
+/// Finds the texels of a point within a face; those of a point at its edge are wrong, and marked.
+#[inline(always)]
+fn cube(nearest: bool, table: &Table, l: usize, points: &Points, i: usize, taps: &mut Taps) {
+    let (face, s, t) = on_face([points.coordinates[0][i], points.coordinates[1][i], points.coordinates[2][i]]);
+    let n = table.width[l % LEVELS];
+    let (x, y) = (s * n - 0.5, t * n - 0.5);
+    let half = if nearest { 0.5 } else { 0.0 };
+    let (x0, y0) = ((x + half).floor(), (y + half).floor());
+    let is_within = (x0 >= 0.0) & (y0 >= 0.0) & (x0 + 1.0 < n) & (y0 + 1.0 < n);
+    // SAFETY: within 0..n.
+    let (column, row, width) = unsafe { (integer(within(x0, n - 1.0)), integer(within(y0, n - 1.0)), integer(n)) };
+    let faces = points.image[i].wrapping_mul(6).wrapping_add(face).wrapping_mul(width.wrapping_mul(width));
+    let texel = table.first[l % LEVELS].wrapping_add(faces).wrapping_add(row.wrapping_mul(width)).wrapping_add(column);
+    let (right, below) = if nearest { (0, 0) } else { (1, width) };
+    taps.texel[0][i] = texel;
+    taps.texel[1][i] = texel.wrapping_add(right);
+    taps.texel[2][i] = texel.wrapping_add(below);
+    taps.texel[3][i] = texel.wrapping_add(below).wrapping_add(right);
+    let kept = if nearest { 0.0 } else { 1.0 };
+    (taps.between[0][i], taps.between[1][i]) = ((x - x0) * kept, (y - y0) * kept);
+    (taps.slope[0][i], taps.slope[1][i]) = (n * kept, n * kept);
+    taps.missing[i] = if is_within | nearest { NONE } else { AT_EDGE };
+}
+
+/// Finds the texels of the points that are marked, whose levels `of` tells.
+fn find_edges(table: &Table, points: &Points, taps: &mut Taps, of: impl Fn(usize) -> usize) {
+    for i in (0..points.len).filter(|i| taps.missing[*i] == AT_EDGE).collect::<Vec<_>>() {
+        let (face, s, t) = on_face(std::array::from_fn(|k| points.coordinates[k][i]));
+        let (l, size) = (of(i), table.width[of(i)]);
+        let (n, [x0, y0]) = (size as i32, [s, t].map(|v| (v * size - 0.5).floor() as i32));
+        let first = table.first[l] as usize + (points.image[i] as usize * 6) * (n * n) as usize;
+        taps.missing[i] = NONE;
+        for k in 0..4 {
+            let texel = around(face as usize, x0 + (k & 1), y0 + (k >> 1), n);
+            if texel.is_none() {
+                taps.missing[i] = k as u8;
+            }
+            taps.texel[k as usize][i] = (first + texel.unwrap_or(0)) as u32;
+        }
+    }
 }
 
 /// Texel of a face, or of the face next to it where x or y is just outside; `None` where both are.
@@ -166,84 +268,67 @@ fn around(face: usize, x: i32, y: i32, n: i32) -> Option<usize> {
     Some(((face as i32 * n + y) * n + x) as usize)
 }
 
-fn cube(nearest: bool, level: &Level, points: &Points, i: usize, taps: &mut Taps) {
-    let d = std::array::from_fn(|k| points.coordinates[k][i]);
-    let (face, n) = (face_of(d), level.size[0] as i32);
-    let [major, s, t] = FACES[face];
-    // A direction that is no number, or has no length, reads some texel.
-    let place = |axis| within((dot(d, axis) / dot(d, major) + 1.0) * 0.5, 1.0) * n as f32 - 0.5;
-    let (x, y) = (place(s), place(t));
-    let first = level.first + points.image[i] as usize * 6 * (n * n) as usize;
-    taps.missing[i] = NONE;
-    if nearest {
-        let at = |v: f32| ((v + 0.5) as i32).min(n - 1);
-        let texel = first + ((face as i32 * n + at(y)) * n + at(x)) as usize;
-        (0..4).for_each(|k| taps.texel[k][i] = texel as u32);
-        (0..2).for_each(|k| (taps.between[k][i], taps.slope[k][i]) = (0.0, 0.0));
-        return;
-    }
-    let (x0, y0) = (x.floor(), y.floor());
-    for k in 0..4 {
-        let texel = around(face, x0 as i32 + (k & 1), y0 as i32 + (k >> 1), n);
-        if texel.is_none() {
-            taps.missing[i] = k as u8;
-        }
-        taps.texel[k as usize][i] = (first + texel.unwrap_or(0)) as u32;
-    }
-    (taps.between[0][i], taps.between[1][i]) = (x - x0, y - y0);
-    (0..2).for_each(|k| taps.slope[k][i] = n as f32);
-}
-
 multiversion! {
-    /// Texels of flat textures in one level.
-    fn find_flat(repeat: bool, nearest: bool, level: &Level, points: &Points, taps: &mut Taps) {
+    /// Texels in the finest level; those at edges of a cube's faces are marked.
+    fn find_finest(is_cube: bool, repeat: bool, nearest: bool, table: &Table, points: &Points, taps: &mut Taps) {
+        let n = points.len.min(BLOCK);
         // A loop of its own for every mode.
-        match (repeat, nearest) {
-            (true, true) => (0..points.len.min(BLOCK)).for_each(|i| flat(true, true, level, points, i, taps)),
-            (true, false) => (0..points.len.min(BLOCK)).for_each(|i| flat(true, false, level, points, i, taps)),
-            (false, true) => (0..points.len.min(BLOCK)).for_each(|i| flat(false, true, level, points, i, taps)),
-            (false, false) => (0..points.len.min(BLOCK)).for_each(|i| flat(false, false, level, points, i, taps)),
+        match (is_cube, repeat, nearest) {
+            (true, _, true) => (0..n).for_each(|i| cube(true, table, 0, points, i, taps)),
+            (true, _, false) => (0..n).for_each(|i| cube(false, table, 0, points, i, taps)),
+            (_, true, true) => (0..n).for_each(|i| flat(true, true, table, 0, points, i, taps)),
+            (_, true, false) => (0..n).for_each(|i| flat(true, false, table, 0, points, i, taps)),
+            (_, false, true) => (0..n).for_each(|i| flat(false, true, table, 0, points, i, taps)),
+            (_, false, false) => (0..n).for_each(|i| flat(false, false, table, 0, points, i, taps)),
         }
     }
 }
 
 multiversion! {
-    /// Texels of flat textures in the two levels around that of each point.
-    fn find_levels(repeat: bool, levels: &[Level], points: &Points, found: &mut Lookup) {
-        let most = levels.len() - 1;
+    /// Texels in the two levels around that of each point; those at edges of a cube's faces are marked.
+    fn find_levels(is_cube: bool, repeat: bool, table: &Table, points: &Points, found: &mut Lookup) {
+        let most = (table.len - 1) as u32;
+        let [finer, coarser] = &mut found.taps;
         for i in 0..points.len.min(BLOCK) {
-            let low = found.share[i];
-            // SAFETY: `find` leaves a level's number there.
-            let first = (unsafe { integer(low.floor()) } as usize).min(most);
-            flat(repeat, false, &levels[first], points, i, &mut found.taps[0]);
-            flat(repeat, false, &levels[(first + 1).min(most)], points, i, &mut found.taps[1]);
-            found.share[i] = low - first as f32;
+            let level = points.level[i];
+            let low = within(level, most as f32);
+            found.free[i] = if (level > 0.0) & (level < most as f32) { 1.0 } else { 0.0 };
+            found.share[i] = low - low.floor();
+            // SAFETY: one of the levels.
+            found.first[i] = unsafe { integer(low.floor()) };
+        }
+        let (n, first) = (points.len.min(BLOCK), &found.first);
+        let next = |i: usize| (first[i] + 1).min(most) as usize;
+        match (is_cube, repeat) {
+            (true, _) => {
+                (0..n).for_each(|i| cube(false, table, first[i] as usize, points, i, finer));
+                (0..n).for_each(|i| cube(false, table, next(i), points, i, coarser));
+            }
+            (false, true) => {
+                (0..n).for_each(|i| flat(true, false, table, first[i] as usize, points, i, finer));
+                (0..n).for_each(|i| flat(true, false, table, next(i), points, i, coarser));
+            }
+            (false, false) => {
+                (0..n).for_each(|i| flat(false, false, table, first[i] as usize, points, i, finer));
+                (0..n).for_each(|i| flat(false, false, table, next(i), points, i, coarser));
+            }
         }
     }
 }
 
 /// Finds what points read.
-pub(super) fn find(t: &Texture, levels: &[Level], points: &Points, found: &mut Lookup) {
-    let (nearest, repeat) = (t.filter == Filter::Nearest, t.kind == Kind::Repeat);
+pub(super) fn find(t: &Texture, table: &Table, points: &Points, found: &mut Lookup) {
+    let (is_cube, repeat, nearest) = (t.kind == Kind::Cube, t.kind == Kind::Repeat, t.filter == Filter::Nearest);
     if t.filter == Filter::Trilinear {
-        let most = (levels.len() - 1) as f32;
-        for i in 0..points.len {
-            let level = points.level[i];
-            found.share[i] = within(level, most);
-            found.free[i] = if level > 0.0 && level < most { 1.0 } else { 0.0 };
-        }
+        find_levels(is_cube, repeat, table, points, found);
+    } else {
+        find_finest(is_cube, repeat, nearest, table, points, &mut found.taps[0]);
     }
-    match (t.kind, t.filter) {
-        (Kind::Cube, Filter::Trilinear) => {
-            for i in 0..points.len {
-                let first = found.share[i] as usize;
-                cube(false, &levels[first], points, i, &mut found.taps[0]);
-                cube(false, &levels[(first + 1).min(levels.len() - 1)], points, i, &mut found.taps[1]);
-                found.share[i] -= first as f32;
-            }
+    if is_cube {
+        let Lookup { taps: [finer, coarser], first, .. } = found;
+        find_edges(table, points, finer, |i| first[i] as usize);
+        if t.filter == Filter::Trilinear {
+            find_edges(table, points, coarser, |i| (first[i] as usize + 1).min(table.len - 1));
         }
-        (Kind::Cube, _) => (0..points.len).for_each(|i| cube(nearest, &levels[0], points, i, &mut found.taps[0])),
-        (_, Filter::Trilinear) => find_levels(repeat, levels, points, found),
-        _ => find_flat(repeat, nearest, &levels[0], points, &mut found.taps[0]),
     }
 }
