@@ -32,19 +32,24 @@ pub fn case_table() -> CaseTable {
 }
 
 fn triangles(corners: [usize; 4], inside: usize) -> Vec<[Edge; 3]> {
-    let (within, without): (Vec<usize>, Vec<usize>) = corners.iter().partition(|c| inside >> **c & 1 == 1);
+    let places = corners.map(|c| [0, 1, 2].map(|k| (c >> k & 1) as f32));
     // The corners of a tetrahedron are nested sets of bits.
-    let edge = |a: usize, b: usize| Edge { corner: a.min(b), direction: a ^ b };
+    let edge = |[a, b]: [usize; 2]| Edge { corner: corners[a.min(b)], direction: corners[a] ^ corners[b] };
+    cut(places, corners.map(|c| inside >> c & 1 == 1)).into_iter().map(|t| t.map(edge)).collect()
+}
+
+/// Triangles of the surface in a tetrahedron, counter-clockwise seen from outside; each vertex is named by the corners of its edge.
+pub(crate) fn cut(places: [[f32; 3]; 4], inside: [bool; 4]) -> Vec<[[usize; 2]; 3]> {
+    let (within, without): (Vec<usize>, Vec<usize>) = (0..4).partition(|c| inside[*c]);
     let found = match (&within[..], &without[..]) {
-        (&[a], &[b, c, d]) | (&[b, c, d], &[a]) => vec![[edge(a, b), edge(a, c), edge(a, d)]],
-        (&[a, b], &[c, d]) => vec![[edge(a, c), edge(a, d), edge(b, d)], [edge(a, c), edge(b, d), edge(b, c)]],
+        (&[a], &[b, c, d]) | (&[b, c, d], &[a]) => vec![[[a, b], [a, c], [a, d]]],
+        (&[a, b], &[c, d]) => vec![[[a, c], [a, d], [b, d]], [[a, c], [b, d], [b, c]]],
         _ => Vec::new(),
     };
-    let place = |c: usize| [0, 1, 2].map(|k| (c >> k & 1) as f32);
-    let middle = |c: &[usize]| [0, 1, 2].map(|k| c.iter().map(|c| place(*c)[k]).sum::<f32>() / c.len().max(1) as f32);
+    let middle = |c: &[usize]| [0, 1, 2].map(|k| c.iter().map(|c| places[*c][k]).sum::<f32>() / c.len().max(1) as f32);
     let outward = diorama_geom::mesh::sub(middle(&without), middle(&within));
-    let faces_outward = |t: &[Edge; 3]| {
-        let [p, q, r] = t.map(|e| middle(&[e.corner, e.corner | e.direction]));
+    let faces_outward = |t: &[[usize; 2]; 3]| {
+        let [p, q, r] = t.map(|e| middle(&e));
         let n = diorama_geom::mesh::cross(diorama_geom::mesh::sub(q, p), diorama_geom::mesh::sub(r, p));
         (0..3).map(|k| n[k] * outward[k]).sum::<f32>() > 0.0
     };
