@@ -1,8 +1,9 @@
 //! `poses_bounds.npy` of LLFF (Mildenhall et al. 2019): per image a 3×5 matrix (axes down, right, back; center; height, width, focal
 //! length) and the nearest and farthest depth.
 
-use crate::error::{self, DataError, Result};
+use crate::error::{DataError, Result};
 use crate::imported::{self, Imported};
+use crate::npy;
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::{Camera, Lens, Pose};
@@ -11,7 +12,7 @@ use std::path::{Path, PathBuf};
 /// Reads `poses_bounds.npy` and the photographs in `images` (or reduced in `images_2` and so on), matched in the order of their names.
 pub fn read(root: &Path) -> Result<Imported> {
     let file = root.join("poses_bounds.npy");
-    let (shape, values) = read_npy(&file)?;
+    let (shape, values) = npy::read(&file)?;
     if shape.len() != 2 || shape[1] != 17 {
         return Err(DataError::input(&file, format!("has shape {shape:?}; expected [images, 17]")));
     }
@@ -56,51 +57,6 @@ pub fn read(root: &Path) -> Result<Imported> {
     Ok(out)
 }
 
-/// Shape and values of a little-endian f4 or f8 array in C order. The size is compared with the file before anything is allocated.
-pub fn read_npy(file: &Path) -> Result<(Vec<usize>, Vec<f64>)> {
-    let data = error::read(file, 1 << 30)?;
-    let bad = |what: &str| DataError::input(file, format!("is not a usable .npy file: {what}"));
-    if data.len() < 12 || &data[..6] != b"\x93NUMPY" {
-        return Err(bad("the magic bytes are missing"));
-    }
-    let (length, start): (usize, usize) = if data[6] == 1 {
-        (u16::from_le_bytes([data[8], data[9]]) as usize, 10)
-    } else {
-        (u32::from_le_bytes([data[8], data[9], data[10], data[11]]) as usize, 12)
-    };
-    let header = data.get(start..start.saturating_add(length)).ok_or_else(|| bad("the header ends too early"))?;
-    let header = String::from_utf8_lossy(header);
-    let field = |key: &str| header.split_once(key).map(|h| h.1.trim_start_matches([':', ' ', '\'', '"']));
-    let size = match field("'descr'") {
-        Some(d) if d.starts_with("<f8") => 8,
-        Some(d) if d.starts_with("<f4") => 4,
-        _ => return Err(bad("only little-endian f4 and f8 are read")),
-    };
-    if field("'fortran_order'").is_none_or(|f| !f.starts_with("False")) {
-        return Err(bad("only C order is read"));
-    }
-    let shape = field("'shape'").and_then(|s| s.strip_prefix('(')).and_then(|s| s.split_once(')')).ok_or_else(|| bad("no shape"))?.0;
-    let shape: Vec<usize> = shape
-        .split(',')
-        .map(str::trim)
-        .filter(|s| !s.is_empty())
-        .map(|s| s.parse().map_err(|_| bad("the shape is malformed")))
-        .collect::<Result<_>>()?;
-    let count = shape.iter().try_fold(1usize, |a, b| a.checked_mul(*b));
-    let bytes = count.and_then(|c| c.checked_mul(size));
-    let body = &data[start + length..];
-    if bytes.is_none_or(|b| body.len() < b) {
-        return Err(bad(&format!("shape {shape:?} needs more bytes than the file has")));
-    }
-    let body = &body[..bytes.unwrap_or(0)];
-    let values = if size == 8 {
-        body.chunks_exact(8).map(|b| f64::from_le_bytes(b.try_into().expect("eight bytes"))).collect()
-    } else {
-        body.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("four bytes")) as f64).collect()
-    };
-    Ok((shape, values))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -139,9 +95,9 @@ mod tests {
         let file = dir.path().join("a.npy");
         for shape in ["1000000000000, 17", "99999999999999999999, 2", "3, 17"] {
             std::fs::write(&file, npy(shape, &[1.0; 17])).unwrap();
-            assert!(read_npy(&file).unwrap_err().is_input(), "{shape}");
+            assert!(npy::read(&file).unwrap_err().is_input(), "{shape}");
         }
         std::fs::write(&file, b"\x93NUMPY\x01\0\xff\xff{").unwrap();
-        assert!(read_npy(&file).is_err());
+        assert!(npy::read(&file).is_err());
     }
 }

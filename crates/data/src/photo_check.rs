@@ -2,7 +2,7 @@
 
 use crate::error::{DataError, Result};
 use crate::photo::{self, Depth, Header, Photo};
-use crate::{llff, photo_import, sparse};
+use crate::{npy, photo_import, sparse};
 use diorama_geom::Capture;
 use diorama_geom::capture::{ColorSpace, Frame};
 use rayon::prelude::*;
@@ -182,7 +182,7 @@ fn depth_fits(f: &Frame) -> Result<()> {
     let Some(file) = &f.depth else { return Ok(()) };
     let extension = file.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
     let size = if extension == "npy" {
-        match llff::read_npy(file)?.0[..] {
+        match npy::read(file)?.0[..] {
             [h, w] | [h, w, 1] => (w as u32, h as u32),
             ref shape => return Err(DataError::input(file, format!("has shape {shape:?}; a depth map is [height, width]"))),
         }
