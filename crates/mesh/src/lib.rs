@@ -39,9 +39,13 @@
 pub mod atlas;
 pub mod bake;
 pub mod clean;
+pub mod closest_point;
 pub mod color;
 pub mod extract;
 pub mod normal_map;
 pub mod repair;
 pub mod simplify;
+pub mod surface_limits;
+pub mod tetrahedral_fit;
+pub mod tetrahedral_grid;
 pub mod visibility;
