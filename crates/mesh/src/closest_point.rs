@@ -19,11 +19,16 @@ pub struct Closest {
 }
 
 /// Closest-point queries of a mesh.
-pub struct ClosestPoint {
+pub struct TriangleTree {
     triangles: Vec<[Vec3; 3]>,
     /// Order of the triangles in the tree.
     order: Vec<u32>,
     nodes: Vec<Node>,
+}
+
+/// Signed distances of a closed mesh.
+pub struct SignedDistance {
+    tree: TriangleTree,
     normals: Pseudonormals,
 }
 
@@ -44,18 +49,18 @@ struct Pseudonormals {
     corners: Vec<[Vec3; 3]>,
 }
 
-impl ClosestPoint {
+impl TriangleTree {
     /// Builds the tree.
     ///
     /// # Panics
     /// When the mesh has no faces.
-    pub fn new(mesh: &Mesh) -> ClosestPoint {
+    pub fn new(mesh: &Mesh) -> TriangleTree {
         assert!(!mesh.faces.is_empty(), "closest point: a mesh without faces");
         let triangles: Vec<[Vec3; 3]> = mesh.faces.iter().map(|f| f.map(|i| Vec3::from(mesh.positions[i as usize]))).collect();
         let mut order: Vec<u32> = (0..triangles.len() as u32).collect();
         let mut nodes = Vec::with_capacity(triangles.len());
         build(&triangles, &mut order, 0, &mut nodes);
-        ClosestPoint { normals: pseudonormals(mesh, &triangles), triangles, order, nodes }
+        TriangleTree { triangles, order, nodes }
     }
 
     /// The mesh's point closest to `p`.
@@ -86,9 +91,25 @@ impl ClosestPoint {
         }
         best
     }
+}
+
+impl SignedDistance {
+    /// Builds the tree and the normals.
+    ///
+    /// # Panics
+    /// When the mesh has no faces.
+    pub fn new(mesh: &Mesh) -> SignedDistance {
+        let tree = TriangleTree::new(mesh);
+        SignedDistance { normals: pseudonormals(mesh, &tree.triangles), tree }
+    }
+
+    /// The mesh's point closest to `p`.
+    pub fn nearest(&self, p: [f32; 3]) -> Closest {
+        self.tree.nearest(p)
+    }
 
     /// Distance to the mesh, negative inside.
-    pub fn signed_distance(&self, p: [f32; 3]) -> f32 {
+    pub fn at(&self, p: [f32; 3]) -> f32 {
         let c = self.nearest(p);
         let (face, used) = (c.face as usize, c.weights.map(|w| w > 0.0));
         let normal = match used {
@@ -201,13 +222,13 @@ mod tests {
     fn distances_of_a_box_are_exact() {
         let mesh = slab();
         assert!(mesh.is_watertight() && (mesh.volume() - 0.4).abs() < 1e-6);
-        let (tree, rng) = (ClosestPoint::new(&mesh), Rng::new(1, 1));
+        let (distance, rng) = (SignedDistance::new(&mesh), Rng::new(1, 1));
         for i in 0..2000 {
             let p: [f32; 3] = std::array::from_fn(|k| 4.0 * rng.uniform(i * 3 + k as u64) - 2.0).map(|v: f32| v * 0.7);
             let q: [f32; 3] = std::array::from_fn(|k| p[k].abs() - [1.0, 0.5, 0.1][k]);
             let out = q.map(|v| v.max(0.0));
             let want = (out[0] * out[0] + out[1] * out[1] + out[2] * out[2]).sqrt() + q[0].max(q[1]).max(q[2]).min(0.0);
-            assert!((tree.signed_distance(p) - want).abs() < 1e-5, "{p:?}: {} {want}", tree.signed_distance(p));
+            assert!((distance.at(p) - want).abs() < 1e-5, "{p:?}: {} {want}", distance.at(p));
         }
     }
 
@@ -217,7 +238,7 @@ mod tests {
         let positions: Vec<[f32; 3]> = (0..600).map(|i| std::array::from_fn(|k| rng.uniform(i * 3 + k as u64))).collect();
         let faces: Vec<[u32; 3]> = (0..200).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect();
         let mesh = Mesh { positions, faces, ..Mesh::default() };
-        let tree = ClosestPoint::new(&mesh);
+        let tree = TriangleTree::new(&mesh);
         for i in 0..300u64 {
             let p: [f32; 3] = std::array::from_fn(|k| 2.0 * rng.uniform(9000 + i * 3 + k as u64) - 0.5);
             let got = tree.nearest(p);

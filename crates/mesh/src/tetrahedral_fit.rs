@@ -1,10 +1,11 @@
-//! Fits the surface of a tetrahedral grid to a target: distances and offsets that make the mean squared distance of the surface to the
-//! target least, by Adam.
+//! Fits the surface of a tetrahedral grid to a target: distances and offsets that make the mean squared distance least, from the surface to
+//! the target and from points of the target to the surface, by Adam.
 
-use crate::closest_point::ClosestPoint;
+use crate::closest_point::{SignedDistance, TriangleTree};
 use crate::tetrahedral_grid::TetrahedralGrid;
 use diorama_geom::Mesh;
 use diorama_geom::mesh::{cross, sub};
+use diorama_geom::rng::Rng;
 use diorama_kernels::ops::adam::{self, Adam};
 use diorama_kernels::ops::tetrahedral_surface::{self, Surface};
 use rayon::prelude::*;
@@ -16,15 +17,50 @@ pub trait Target: Sync {
 
     /// Distance to the target, negative inside.
     fn signed_distance(&self, p: [f32; 3]) -> f32;
+
+    /// Points spread evenly over the target, to which the surface comes close; without them only the surface's own points count.
+    fn points(&self) -> &[[f32; 3]] {
+        &[]
+    }
 }
 
-impl Target for ClosestPoint {
+/// A closed mesh as a target.
+pub struct MeshTarget {
+    distance: SignedDistance,
+    points: Vec<[f32; 3]>,
+}
+
+impl MeshTarget {
+    /// With `points` points spread evenly over the area, which the fitted surface comes close to.
+    ///
+    /// # Panics
+    /// When the mesh has no faces.
+    pub fn new(mesh: &Mesh, points: usize) -> MeshTarget {
+        let corners = |f: &[u32; 3]| f.map(|i| mesh.positions[i as usize]);
+        let mut sum = 0.0;
+        let areas: Vec<f64> = mesh.faces.iter().map(|f| double_area(corners(f)) as f64).map(|area| (sum += area, sum).1).collect();
+        let rng = Rng::new(0, 0xf17);
+        let point = |i: usize| {
+            let at = sum * (i as f64 + 0.5) / points as f64;
+            let face = areas.partition_point(|a| *a < at).min(areas.len() - 1);
+            let (u, v) = (rng.uniform(2 * i as u64).sqrt(), rng.uniform(2 * i as u64 + 1));
+            blend(corners(&mesh.faces[face]), [1.0 - u, u * (1.0 - v), u * v])
+        };
+        MeshTarget { distance: SignedDistance::new(mesh), points: (0..points).map(point).collect() }
+    }
+}
+
+impl Target for MeshTarget {
     fn closest(&self, p: [f32; 3]) -> [f32; 3] {
-        self.nearest(p).point
+        self.distance.nearest(p).point
     }
 
     fn signed_distance(&self, p: [f32; 3]) -> f32 {
-        ClosestPoint::signed_distance(self, p)
+        self.distance.at(p)
+    }
+
+    fn points(&self) -> &[[f32; 3]] {
+        &self.points
     }
 }
 
@@ -65,7 +101,10 @@ pub fn fit(grid: &TetrahedralGrid, target: &dyn Target, options: &FitOptions) ->
     for step in 0..options.steps {
         grid.deform(&offsets, &mut positions);
         tetrahedral_surface::cpu::extract(&grid.topology, &distances, &positions, &mut surface);
-        let d_vertices = gradient(&surface.positions, &surface.faces, target, options.subdivision);
+        let mesh = Mesh { positions: std::mem::take(&mut surface.positions), faces: std::mem::take(&mut surface.faces), ..Mesh::default() };
+        let mut d_vertices = gradient_to_target(&mesh, target, options.subdivision);
+        add_gradient_from_points(&mesh, target.points(), &mut d_vertices);
+        (surface.positions, surface.faces) = (mesh.positions, mesh.faces);
         d_s.fill(0.0);
         d_positions.fill([0.0; 3]);
         let gradients = (&mut d_s[..], &mut d_positions[..]);
@@ -111,11 +150,11 @@ fn blend(corners: [[f32; 3]; 3], weights: [f32; 3]) -> [f32; 3] {
     std::array::from_fn(|k| (0..3).map(|i| weights[i] * corners[i][k]).sum())
 }
 
-/// Gradient of the mean squared distance to the target over the area, areas and closest points held.
-fn gradient(positions: &[[f32; 3]], faces: &[[u32; 3]], target: &dyn Target, subdivision: usize) -> Vec<[f32; 3]> {
+/// Gradient of the squared distance to the target over the area, areas and closest points held.
+fn gradient_to_target(mesh: &Mesh, target: &dyn Target, subdivision: usize) -> Vec<[f32; 3]> {
     let samples = centers(subdivision);
     let of = |f: &[u32; 3]| {
-        let corners = f.map(|i| positions[i as usize]);
+        let corners = f.map(|i| mesh.positions[i as usize]);
         let weight = double_area(corners) / samples.len() as f32;
         let mut d = [[0.0f32; 3]; 3];
         for w in &samples {
@@ -125,14 +164,33 @@ fn gradient(positions: &[[f32; 3]], faces: &[[u32; 3]], target: &dyn Target, sub
         }
         d
     };
-    let of_faces: Vec<[[f32; 3]; 3]> = faces.par_iter().with_min_len(64).map(of).collect();
-    let mut out = vec![[0.0; 3]; positions.len()];
-    for (f, d) in faces.iter().zip(&of_faces) {
-        for (i, d) in f.iter().zip(d) {
-            (0..3).for_each(|k| out[*i as usize][k] += d[k]);
-        }
-    }
+    let of_faces: Vec<[[f32; 3]; 3]> = mesh.faces.par_iter().with_min_len(64).map(of).collect();
+    let mut out = vec![[0.0; 3]; mesh.positions.len()];
+    mesh.faces.iter().zip(&of_faces).for_each(|(f, d)| add(f, d, &mut out));
     out
+}
+
+/// Adds the gradient of the squared distance of points to the surface, as much in all as the surface's area weighs.
+fn add_gradient_from_points(mesh: &Mesh, points: &[[f32; 3]], out: &mut [[f32; 3]]) {
+    if points.is_empty() || mesh.faces.is_empty() {
+        return;
+    }
+    let tree = TriangleTree::new(mesh);
+    let area: f64 = mesh.faces.iter().map(|f| double_area(f.map(|i| mesh.positions[i as usize])) as f64).sum();
+    let weight = (area / points.len() as f64) as f32;
+    let of = |p: &[f32; 3]| {
+        let c = tree.nearest(*p);
+        let away = sub(c.point, *p);
+        (c.face, c.weights.map(|w| away.map(|v| weight * w * v)))
+    };
+    let of_points: Vec<(u32, [[f32; 3]; 3])> = points.par_iter().with_min_len(64).map(of).collect();
+    of_points.iter().for_each(|(face, d)| add(&mesh.faces[*face as usize], d, out));
+}
+
+fn add(face: &[u32; 3], d: &[[f32; 3]; 3], out: &mut [[f32; 3]]) {
+    for (i, d) in face.iter().zip(d) {
+        (0..3).for_each(|k| out[*i as usize][k] += d[k]);
+    }
 }
 
 /// Mean distance of the mesh's surface to the target, over its area, from `subdivision²` samples of each triangle; infinite for a mesh
