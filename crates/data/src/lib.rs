@@ -6,7 +6,8 @@
 //! - [`glb`], [`mesh_text`] (OBJ, PLY, STL), [`usdz`], [`collada`] and [`point_cloud`] (LAS, E57) write meshes and points.
 //! - [`model_file`] reads models (glTF, OBJ), [`gltf`] also writes them; [`environment`] and [`sh_text`] hold light.
 //! - [`film`] writes MP4 and GIF, [`depth`] sequences of depth maps, [`plot`] charts.
-//! - [`checkpoint`] saves named arrays atomically; [`weights`] reads safetensors and PyTorch's `.pth`.
+//! - [`checkpoint`] saves named arrays atomically; [`weights`] reads safetensors and PyTorch's `.pth`, [`tetrahedra_npz`]
+//!   tetrahedral grids.
 //!
 //! Every failure is a [`DataError`]: one line that names the file and what to do. Files are written through [`atomic`], so they appear
 //! complete or not at all.

@@ -100,4 +100,25 @@ mod tests {
             assert!(e.is_input() && e.to_string().contains("tets.npz") && e.to_string().contains(what), "{e}");
         }
     }
+
+    #[test]
+    fn no_changed_byte_crashes_the_reader() {
+        let arrays = |v: Vec<u8>, i: Vec<u8>| read_of(&[("vertices", v), ("indices", i)]);
+        let (vertices, cells) = (npy("<f4", "5, 3", floats(&VERTICES)), npy("<i8", "2, 4", ints(&[4, 0, 2, 1, 4, 0, 3, 2])));
+        for at in 0..vertices.len().max(cells.len()) {
+            for value in [0, b'9', 0x80, 0xff] {
+                let changed = |a: &[u8]| {
+                    let mut a = a.to_vec();
+                    a.iter_mut().skip(at).take(1).for_each(|b| *b = value);
+                    a
+                };
+                for read in [arrays(changed(&vertices), cells.clone()), arrays(vertices.clone(), changed(&cells))] {
+                    let usable = |g: Tetrahedra| (0..g.cells.len()).all(|i| g.volume(i) > 0.0);
+                    assert!(read.is_err() || read.is_ok_and(usable), "byte {at} as {value}");
+                }
+            }
+        }
+        let e = arrays(vertices[..vertices.len() - 1].to_vec(), cells).unwrap_err().to_string();
+        assert!(e.contains("needs more bytes"), "{e}");
+    }
 }

@@ -4,6 +4,8 @@
 //! [`clean::remove_floaters`] and [`clean::remove_unseen`], [`simplify::simplify`], [`repair::close`], then either [`color::color_from_field`]
 //! for vertex colors, or [`atlas::unwrap`] with [`bake`] and [`normal_map`] for textures. `diorama-data` writes the result to files.
 //!
+//! Surfaces that are trained lie in a deformable [`tetrahedral_grid`]; [`tetrahedral_fit`] fits one to a mesh.
+//!
 //! ```
 //! use diorama_geom::field_query::FieldQuery;
 //! use diorama_mesh::extract::{self, Grid, Method};
