@@ -156,7 +156,7 @@ fn centers_on_shared_edges_belong_to_one_triangle() {
     let square = |i: u32| {
         let a = i / n * (n + 1) + i % n;
         let b = a + n + 1;
-        if i % 3 == 0 { [[a, a + 1, b], [a + 1, b + 1, b]] } else { [[b + 1, a, a + 1], [a, b + 1, b]] }
+        if i.is_multiple_of(3) { [[a, a + 1, b], [a + 1, b + 1, b]] } else { [[b + 1, a, a + 1], [a, b + 1, b]] }
     };
     let triangles: Vec<[u32; 3]> = (0..n * n).flat_map(square).collect();
     let raster = Rasterize { images: 1, vertices: 81, size: [64, 64] };

@@ -110,7 +110,7 @@ fn each_range(taps: &Taps, shift: u32, i: usize, mut visit: impl FnMut(usize)) {
     }
 }
 
-/// Calls `visit(entry, range)` for what some points read, in the points' order.
+/// Calls `visit(entry, range)` for what some points with a gradient read, in the points' order.
 fn each_entry(s: &Source, shift: u32, points: Range<usize>, mut visit: impl FnMut(usize, usize)) {
     let (mut block, mut found, mut ranges) = (Points::EMPTY, Lookup::EMPTY, [[0; BLOCK]; 2]);
     for first in points.clone().step_by(BLOCK) {
@@ -118,7 +118,12 @@ fn each_entry(s: &Source, shift: u32, points: Range<usize>, mut visit: impl FnMu
         for l in 0..s.depth() {
             find_ranges(&found.taps[l], shift, &mut ranges[l]);
         }
+        let n = s.texture.channels;
         for i in 0..block.len {
+            // Pixels of the background, say.
+            if s.d[(first + i) * n..(first + i + 1) * n].iter().all(|d| *d == 0.0) {
+                continue;
+            }
             for (l, ranges) in ranges.iter().enumerate().take(s.depth()) {
                 let entry = (first + i) * s.depth() + l;
                 match ranges[i] {

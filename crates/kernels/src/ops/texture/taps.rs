@@ -233,7 +233,10 @@ fn cube(nearest: bool, table: &Table, l: usize, points: &Points, i: usize, taps:
 
 /// Finds the texels of the points that are marked, whose levels `of` tells.
 fn find_edges(table: &Table, points: &Points, taps: &mut Taps, of: impl Fn(usize) -> usize) {
-    for i in (0..points.len).filter(|i| taps.missing[*i] == AT_EDGE).collect::<Vec<_>>() {
+    for i in 0..points.len {
+        if taps.missing[i] != AT_EDGE {
+            continue;
+        }
         let (face, s, t) = on_face(std::array::from_fn(|k| points.coordinates[k][i]));
         let (l, size) = (of(i), table.width[of(i)]);
         let (n, [x0, y0]) = (size as i32, [s, t].map(|v| (v * size - 0.5).floor() as i32));
@@ -272,14 +275,38 @@ multiversion! {
     /// Texels in the finest level; those at edges of a cube's faces are marked.
     fn find_finest(is_cube: bool, repeat: bool, nearest: bool, table: &Table, points: &Points, taps: &mut Taps) {
         let n = points.len.min(BLOCK);
-        // A loop of its own for every mode.
+        // A loop of its own for every mode, not a closure's: that would be compiled without the instruction set.
         match (is_cube, repeat, nearest) {
-            (true, _, true) => (0..n).for_each(|i| cube(true, table, 0, points, i, taps)),
-            (true, _, false) => (0..n).for_each(|i| cube(false, table, 0, points, i, taps)),
-            (_, true, true) => (0..n).for_each(|i| flat(true, true, table, 0, points, i, taps)),
-            (_, true, false) => (0..n).for_each(|i| flat(true, false, table, 0, points, i, taps)),
-            (_, false, true) => (0..n).for_each(|i| flat(false, true, table, 0, points, i, taps)),
-            (_, false, false) => (0..n).for_each(|i| flat(false, false, table, 0, points, i, taps)),
+            (true, _, true) => {
+                for i in 0..n {
+                    cube(true, table, 0, points, i, taps);
+                }
+            }
+            (true, _, false) => {
+                for i in 0..n {
+                    cube(false, table, 0, points, i, taps);
+                }
+            }
+            (_, true, true) => {
+                for i in 0..n {
+                    flat(true, true, table, 0, points, i, taps);
+                }
+            }
+            (_, true, false) => {
+                for i in 0..n {
+                    flat(true, false, table, 0, points, i, taps);
+                }
+            }
+            (_, false, true) => {
+                for i in 0..n {
+                    flat(false, true, table, 0, points, i, taps);
+                }
+            }
+            (_, false, false) => {
+                for i in 0..n {
+                    flat(false, false, table, 0, points, i, taps);
+                }
+            }
         }
     }
 }
@@ -301,16 +328,28 @@ multiversion! {
         let next = |i: usize| (first[i] + 1).min(most) as usize;
         match (is_cube, repeat) {
             (true, _) => {
-                (0..n).for_each(|i| cube(false, table, first[i] as usize, points, i, finer));
-                (0..n).for_each(|i| cube(false, table, next(i), points, i, coarser));
+                for i in 0..n {
+                    cube(false, table, first[i] as usize, points, i, finer);
+                }
+                for i in 0..n {
+                    cube(false, table, next(i), points, i, coarser);
+                }
             }
             (false, true) => {
-                (0..n).for_each(|i| flat(true, false, table, first[i] as usize, points, i, finer));
-                (0..n).for_each(|i| flat(true, false, table, next(i), points, i, coarser));
+                for i in 0..n {
+                    flat(true, false, table, first[i] as usize, points, i, finer);
+                }
+                for i in 0..n {
+                    flat(true, false, table, next(i), points, i, coarser);
+                }
             }
             (false, false) => {
-                (0..n).for_each(|i| flat(false, false, table, first[i] as usize, points, i, finer));
-                (0..n).for_each(|i| flat(false, false, table, next(i), points, i, coarser));
+                for i in 0..n {
+                    flat(false, false, table, first[i] as usize, points, i, finer);
+                }
+                for i in 0..n {
+                    flat(false, false, table, next(i), points, i, coarser);
+                }
             }
         }
     }
