@@ -14,3 +14,4 @@
 
 pub mod ray_caster;
 pub mod still_life;
+pub mod street;

@@ -2,7 +2,7 @@
 
 pub mod accelerator;
 mod blocks;
-mod layers;
+pub mod layers;
 pub mod quality;
 pub mod splat;
 pub mod supervised;

@@ -51,8 +51,8 @@ pub mod ssim;
 pub mod strata;
 pub mod sum;
 
-pub mod texture;
 pub mod tetrahedral_surface;
+pub mod texture;
 pub mod triangle_wave;
 pub mod trilinear_corner_grid;
 pub mod weight_step;

@@ -26,6 +26,20 @@ const BOUNCES: u32 = 6;
 /// Every so many views, one is held out.
 const HOLD_OUT: usize = 5;
 
+/// A place and the cameras that photograph it.
+pub struct Place {
+    pub model: Model,
+    pub cameras: Vec<(Camera, Pose)>,
+}
+
+impl Place {
+    /// The procedural street.
+    pub fn street(options: &SynthOptions) -> Place {
+        let [w, h] = [options.size.0, options.size.1];
+        Place { model: street::model(options.seed), cameras: street::cameras(options.views, w, h, options.seed) }
+    }
+}
+
 /// Size of the benchmark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SynthOptions {
@@ -66,7 +80,9 @@ fn light(index: usize) -> Daylight {
     let light = match LIGHTS[index].1 {
         Some((elevation, azimuth)) => Daylight::clear(&Sky::clear(elevation.to_radians(), azimuth.to_radians()), ROWS),
         // CIE overcast sky (Moon and Spencer 1942).
-        None => Daylight::of(Environment::from_fn(ROWS, |d| [0.95, 1.0, 1.05].map(|c| if d.z > 0.0 { c * (1.0 + 2.0 * d.z) / 3.0 } else { 0.0 }))),
+        None => Daylight::of(Environment::from_fn(ROWS, |d| {
+            [0.95, 1.0, 1.05].map(|c| if d.z > 0.0 { c * (1.0 + 2.0 * d.z) / 3.0 } else { 0.0 })
+        })),
     };
     let up = irradiance(&light, DVec3::Z);
     let gray = 0.2126 * up[0] + 0.7152 * up[1] + 0.0722 * up[2];
@@ -101,6 +117,7 @@ pub struct Synthesized {
 /// When the folder exists and is not replaced by `force`, or a file cannot be written.
 pub fn generate(
     out: &Path,
+    place: &Place,
     options: &SynthOptions,
     force: bool,
     stop: &AtomicBool,
@@ -109,18 +126,17 @@ pub fn generate(
     if out.join("transforms_train.json").exists() && !force {
         return Err(PipelineError::Usage(format!("{}: holds a capture; give --force to replace it", out.display())));
     }
-    if !(1..LIGHTS.len()).contains(&options.lights) || options.views < 2 {
-        return Err(PipelineError::Usage(format!("a benchmark has 1 to {} lights and at least 2 views", LIGHTS.len() - 1)));
+    if !(1..LIGHTS.len()).contains(&options.lights) || place.cameras.len() < HOLD_OUT {
+        return Err(PipelineError::Usage(format!("a benchmark has 1 to {} lights and at least {HOLD_OUT} views", LIGHTS.len() - 1)));
     }
     for folder in ["images", "truth"] {
         let folder = out.join(folder);
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
-    let model = street::model(options.seed);
-    let cameras = street::cameras(options.views, options.size.0, options.size.1, options.seed);
+    let (model, cameras) = (&place.model, &place.cameras);
     let lights: Vec<usize> = (0..options.lights).chain([LIGHTS.len() - 1]).collect();
     let daylights: Vec<Daylight> = lights.iter().map(|l| light(*l)).collect();
-    let mut scene = Scene::new(&model, &daylights[0]);
+    let mut scene = Scene::new(model, &daylights[0]);
     let mut made = Synthesized { photographs: 0, held_out: 0, triangles: model.face_count(), interrupted: false };
     let (mut frames, mut views) = ([Vec::new(), Vec::new()], Vec::new());
     let total = (cameras.len() * lights.len()) as f64;
@@ -135,14 +151,18 @@ pub fn generate(
                 continue;
             }
             let mut film = Film::new(camera);
-            let settings =
-                Settings { seed: options.seed + (v * lights.len() + l) as u64, bounces: BOUNCES, light_layers: true, ..Settings::default() };
+            let settings = Settings {
+                seed: options.seed + (v * lights.len() + l) as u64,
+                bounces: BOUNCES,
+                light_layers: true,
+                ..Settings::default()
+            };
             cpu::render(&scene, &view, &settings, options.samples, &mut film);
             let name = format!("v{v:03}_{}", LIGHTS[lights[l]].0);
             save_photograph(&out.join("images").join(format!("{name}.png")), &film)?;
             truth::save_shadow(out, &name, &film)?;
             if l == 0 {
-                let is_valid = valid_pixels(&scene, &view, &model, &film);
+                let is_valid = valid_pixels(&scene, &view, model, &film);
                 truth::save_view(out, &format!("v{v:03}"), &film, &is_valid)?;
             }
             frames[is_held_out as usize].push(frame(&name, camera, pose, l));
@@ -163,7 +183,7 @@ pub fn generate(
     truth.save(out)?;
     let bounds = model.bounds().unwrap_or_default();
     for (name, frames) in ["transforms_train.json", "transforms_test.json"].into_iter().zip(frames) {
-        atomic::write(&out.join(name), &serde_json::to_vec_pretty(&capture(frames, &cameras, bounds)).expect("plain values"))?;
+        atomic::write(&out.join(name), &serde_json::to_vec_pretty(&capture(frames, cameras, bounds)).expect("plain values"))?;
     }
     Ok(made)
 }
@@ -178,7 +198,8 @@ fn save_photograph(path: &Path, film: &Film) -> Result<()> {
 fn valid_pixels(scene: &Scene, view: &View, model: &Model, film: &Film) -> Image {
     let first = cpu::first_hits(scene, view, true);
     let is_glass = |i: u32| model.materials[model.parts[model.instances[i as usize].part].material].transmission > 0.0;
-    let valid = first.iter().zip(&film.pixels).map(|(hit, p)| (p.opacity > 0.99 && hit.is_some_and(|h| !is_glass(h.instance))) as u32 as f32);
+    let valid =
+        first.iter().zip(&film.pixels).map(|(hit, p)| (p.opacity > 0.99 && hit.is_some_and(|h| !is_glass(h.instance))) as u32 as f32);
     Image { width: film.width, height: film.height, channels: 1, data: valid.collect() }
 }
 

@@ -125,7 +125,7 @@ impl Config {
         let pick = |small: usize, large: usize| if ci { small } else { large };
         Config {
             seed: 0,
-            data: DataConfig { path, downscale: 1, split: "auto".into(), memory_budget: 4 << 30 },
+            data: DataConfig { path, downscale: 1, split: "file".into(), memory_budget: 4 << 30 },
             field: FieldConfig {
                 levels: pick(8, 16),
                 log2_size: pick(14, 19) as u32,
@@ -180,7 +180,11 @@ impl Configuration for Config {
         if self.field.width == 0 || !self.field.width.is_multiple_of(16) || self.field.width > 512 {
             return fault("field.width: must be a multiple of 16 up to 512");
         }
-        if self.field.levels == 0 || self.field.base == 0 || self.field.finest < self.field.base || !(4..=24).contains(&self.field.log2_size) {
+        if self.field.levels == 0
+            || self.field.base == 0
+            || self.field.finest < self.field.base
+            || !(4..=24).contains(&self.field.log2_size)
+        {
             return fault("field: levels and base must be at least 1, finest at least base, log2_size from 4 to 24");
         }
         if self.data.downscale == 0 || self.sampling.rays == 0 || self.sampling.max_samples == 0 || self.sampling.occupancy_every == 0 {
@@ -207,7 +211,9 @@ mod tests {
             Config::new(preset, "d".into()).check().unwrap();
         }
         let mut c = Config::template();
-        for (key, value) in [("light.of", "sun"), ("field.width", "20"), ("loss.huber", "0"), ("sampling.rays", "0"), ("field.space", "cube")] {
+        for (key, value) in
+            [("light.of", "sun"), ("field.width", "20"), ("loss.huber", "0"), ("sampling.rays", "0"), ("field.space", "cube")]
+        {
             let e = c.clone().set(key, value).unwrap_err();
             assert!(e.is_input() && e.to_string().contains(key.split('.').next().unwrap()), "{e}");
         }

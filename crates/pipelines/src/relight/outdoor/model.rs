@@ -260,7 +260,8 @@ fn field(config: &Config, space: Space, edge: u32) -> Result<Field> {
     use Source::{Input, Layer as L};
     let f = &config.field;
     let scale = if matches!(space, Space::Contracted(_)) { 4 } else { edge };
-    let grid = HashGrid::new(HashGridConfig { levels: f.levels, features: 2, log2_size: f.log2_size, base: f.base, finest: f.finest * scale });
+    let grid =
+        HashGrid::new(HashGridConfig { levels: f.levels, features: 2, log2_size: f.log2_size, base: f.base, finest: f.finest * scale });
     let layer = |inputs: Vec<Source>, width: usize, activation| Layer::new(inputs, width, activation, true);
     let layers = vec![
         layer(vec![Input(0)], f.width, Activation::Relu),

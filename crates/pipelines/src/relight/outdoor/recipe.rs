@@ -6,8 +6,8 @@ use super::trainer::Trainer;
 use crate::error::{PipelineError, Result};
 use crate::run::photographs::StoredPhotographs;
 use crate::run::{RunDescription, RunFolder, folder, kept_capture};
-use diorama_data::import::{self, ImportOptions};
 use diorama_data::checkpoint;
+use diorama_data::import::{self, ImportOptions};
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_engine::train::{self, Event, RunError, RunOptions, Summary};
 use diorama_geom::capture::Split;
@@ -99,7 +99,7 @@ fn single_light(capture: &Capture) -> Option<String> {
 
 fn load_pixels(config: &Config, capture: &Capture) -> Result<StoredPhotographs> {
     let frames: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.frames[i]).collect();
-    let reduction = Reduction::Factor(config.data.downscale);
+    let reduction = Reduction::Times(config.data.downscale);
     let options = StoreOptions { reduction, budget: config.data.memory_budget, masks: capture.masks, white: 0.0 };
     Ok(StoredPhotographs::new(PixelStore::load(&frames, &options, &|| {})?))
 }

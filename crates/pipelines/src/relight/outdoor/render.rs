@@ -56,15 +56,8 @@ impl SceneModel {
         let (mut origins, mut dirs) = (vec![0.0; 3 * w * h], vec![0.0; 3 * w * h]);
         ray_generation::cpu::forward(std::slice::from_ref(camera), &vec![0; w * h], &pixels, &mut origins, &mut dirs);
         let image = |channels| Image::zeros(w, h, channels);
-        let mut out = SceneView {
-            color: image(3),
-            albedo: image(3),
-            normal: image(3),
-            shadow: image(1),
-            irradiance: image(3),
-            depth,
-            opacity,
-        };
+        let mut out =
+            SceneView { color: image(3), albedo: image(3), normal: image(3), shadow: image(1), irradiance: image(3), depth, opacity };
         for (i, v) in values.data.chunks_exact(CHANNELS).enumerate() {
             let mut v: [f32; CHANNELS] = std::array::from_fn(|k| v[k]);
             let o = out.opacity.data[i];

@@ -187,7 +187,8 @@ mod tests {
 
     #[test]
     fn factors_do_not_count_and_noise_does() {
-        let pairs: Vec<([f32; 3], [f32; 3])> = (0..50).map(|i| ([0.01 * i as f32; 3], [0.02 * i as f32, 0.005 * i as f32, 0.01 * i as f32])).collect();
+        let pairs: Vec<([f32; 3], [f32; 3])> =
+            (0..50).map(|i| ([0.01 * i as f32; 3], [0.02 * i as f32, 0.005 * i as f32, 0.01 * i as f32])).collect();
         assert!(scaled_psnr(&pairs) > 100.0, "{}", scaled_psnr(&pairs));
         let off: Vec<_> = pairs.iter().enumerate().map(|(i, (g, w))| (*g, w.map(|v| v + if i % 2 == 0 { 0.1 } else { -0.1 }))).collect();
         assert!((scaled_psnr(&off) - 20.0).abs() < 0.3, "{}", scaled_psnr(&off));

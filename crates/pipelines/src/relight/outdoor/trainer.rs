@@ -123,8 +123,11 @@ impl Trainee for Trainer<'_> {
         let placement = Placement::Occupancy { march, pruning: self.model.pruning() };
         let (until, block) = OCCUPANCY_WARMUP;
         let block = if step <= until { block } else { 1 };
-        let probes = (step > 0 && step.is_multiple_of(c.sampling.occupancy_every))
-            .then(|| Probes { rng: Rng::new(c.seed, OCCUPANCY), points: c.sampling.occupancy_points, block });
+        let probes = (step > 0 && step.is_multiple_of(c.sampling.occupancy_every)).then(|| Probes {
+            rng: Rng::new(c.seed, OCCUPANCY),
+            points: c.sampling.occupancy_points,
+            block,
+        });
         let described = Step {
             probes,
             progress: progress as f32,

@@ -1,0 +1,64 @@
+//! `diorama relight eval`
+
+use crate::commands::process::{note, use_threads};
+use crate::commands::{Outcome, Verb};
+use clap::Args;
+use diorama_data::{DataError, photo};
+use diorama_pipelines::Result;
+use diorama_pipelines::relight::outdoor::{recipe, scores};
+use std::path::PathBuf;
+
+/// Score a run of the scene model on a generated benchmark
+#[derive(Args, Clone, Debug)]
+pub struct Eval {
+    /// Folder of the run
+    run: PathBuf,
+    /// Folder for pictures of the held-out views, each beside its photograph [default: RUN/eval]
+    #[arg(short, long)]
+    out: Option<PathBuf>,
+    /// Number of CPU threads [default: all]
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Print one JSON object on stdout
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for Eval {
+    fn json(&self) -> bool {
+        self.json
+    }
+
+    fn run(&self) -> Result<Outcome> {
+        use_threads(self.threads)?;
+        let (model, notes) = recipe::load(&self.run)?;
+        notes.iter().for_each(|n| note(n));
+        let out = self.out.clone().unwrap_or_else(|| self.run.join("eval"));
+        std::fs::create_dir_all(&out).map_err(DataError::io(&out, "create"))?;
+        let s = scores::judge(&model, &model.config.data.path, &mut |name, ours, theirs| {
+            Ok(photo::save_png(&out.join(format!("{name}.png")), &beside(ours, theirs))?)
+        })?;
+        if self.json {
+            println!("{}", serde_json::to_string(&s).expect("plain values"));
+        } else {
+            println!(
+                "unseen light     {:.2} dB (exact layers {:.2}, mean light {:.2})",
+                s.unseen_light_psnr, s.oracle_psnr, s.mean_light_psnr
+            );
+            println!("seen lights      {:.2} dB", s.seen_light_psnr);
+            println!("albedo           {:.2} dB", s.albedo_psnr);
+            println!("normals          {:.1}° median", s.normal_median_deg);
+            println!("shadow           {:.2} correlation", s.shadow_correlation);
+            println!("{} views in {}", s.views, out.display());
+        }
+        Ok(Outcome::Done)
+    }
+}
+
+/// Two pictures side by side.
+fn beside(a: &diorama_geom::ImageU8, b: &diorama_geom::ImageU8) -> diorama_geom::ImageU8 {
+    let rows = a.data.chunks_exact(a.width * a.channels).zip(b.data.chunks_exact(b.width * b.channels));
+    let rgb = |row: &[u8], c: usize| row.chunks_exact(c).flat_map(|p| [p[0], p[1], p[2]]).collect::<Vec<u8>>();
+    let data = rows.flat_map(|(p, q)| [rgb(p, a.channels), rgb(q, b.channels)].concat()).collect();
+    diorama_geom::ImageU8 { width: a.width + b.width, height: a.height, channels: 3, data }
+}

@@ -1,0 +1,72 @@
+//! `diorama relight synth`
+
+use crate::commands::process::{INTERRUPT, use_threads, watch_interrupts};
+use crate::commands::{Outcome, Verb};
+use crate::terminal::ShareShown;
+use clap::Args;
+use diorama_pipelines::relight::synth::{self, Place, SynthOptions};
+use diorama_pipelines::{PipelineError, Result};
+use std::path::PathBuf;
+use std::time::Instant;
+
+/// Generate a street photographed in several lights, with exact albedo, normals, depth, shadow and light
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  diorama relight synth --size ci -o data/street")]
+pub struct Synth {
+    /// ci (10 views of 64×48), middle (60 of 320×180) or gpu (88 of 640×360)
+    #[arg(long, default_value = "ci")]
+    size: String,
+    /// Views [default: by size]
+    #[arg(long)]
+    views: Option<usize>,
+    /// Lights of training, 1 to 4; one more is held out
+    #[arg(long, default_value_t = 4)]
+    lights: usize,
+    /// Samples per pixel [default: by size]
+    #[arg(long)]
+    spp: Option<u32>,
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Folder for the capture
+    #[arg(short, long, default_value = "data/street")]
+    out: PathBuf,
+    /// Replace an earlier capture
+    #[arg(long)]
+    force: bool,
+    /// Number of CPU threads [default: all]
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Print one JSON object on stdout
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for Synth {
+    fn json(&self) -> bool {
+        self.json
+    }
+
+    fn run(&self) -> Result<Outcome> {
+        use_threads(self.threads)?;
+        let mut options = SynthOptions::named(&self.size)?;
+        (options.lights, options.seed) = (self.lights, self.seed);
+        self.views.iter().for_each(|v| options.views = *v);
+        self.spp.iter().for_each(|s| options.samples = *s);
+        if options.samples == 0 {
+            return Err(PipelineError::Usage("--spp: must be at least 1".into()));
+        }
+        watch_interrupts();
+        let (start, mut shown) = (Instant::now(), ShareShown::new());
+        let made =
+            synth::generate(&self.out, &Place::street(&options), &options, self.force, &INTERRUPT, &mut |s| shown.show(s, "photographs"))?;
+        shown.finish();
+        if self.json {
+            println!("{}", serde_json::to_string(&made).expect("plain values"));
+        } else {
+            let seconds = start.elapsed().as_secs_f64();
+            println!("{} photographs, {} held out, of {} triangles in {seconds:.1} s", made.photographs, made.held_out, made.triangles);
+            println!("{}", self.out.display());
+        }
+        Ok(if made.interrupted { Outcome::Interrupted } else { Outcome::Done })
+    }
+}

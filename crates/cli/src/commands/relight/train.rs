@@ -1,0 +1,96 @@
+//! `diorama relight train`
+
+use crate::commands::process::{INTERRUPT, use_threads, watch_interrupts};
+use crate::commands::{Outcome, Verb};
+use crate::terminal::Progress;
+use clap::Args;
+use diorama_pipelines::relight::outdoor::config::{Config, Preset};
+use diorama_pipelines::relight::outdoor::recipe;
+use diorama_pipelines::run::{RunFolder, config};
+use diorama_pipelines::{PipelineError, Result};
+use std::path::PathBuf;
+
+/// Train the scene model: photographs of a place in several lights to albedo, normals, shadow and light
+#[derive(Args, Clone, Debug)]
+#[command(
+    after_help = "Examples:\n  diorama relight train data/street --preset ci -o runs/street\n  diorama relight train --resume -o runs/street"
+)]
+pub struct Train {
+    /// Folder of the capture
+    data: Option<PathBuf>,
+    /// ci or fast
+    #[arg(long, default_value = "fast")]
+    preset: String,
+    /// Run folder
+    #[arg(short, long, default_value = "runs/relight")]
+    out: PathBuf,
+    /// Steps of the whole run
+    #[arg(long)]
+    steps: Option<u64>,
+    /// Seconds of the whole run
+    #[arg(long)]
+    seconds: Option<f64>,
+    #[arg(long)]
+    seed: Option<u64>,
+    /// KEY=VALUE of the configuration; may be repeated
+    #[arg(long)]
+    set: Vec<String>,
+    /// Go on from the last checkpoint
+    #[arg(long)]
+    resume: bool,
+    /// Replace an earlier run
+    #[arg(long)]
+    force: bool,
+    /// Number of CPU threads [default: all]
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Print one JSON object on stdout
+    #[arg(long)]
+    json: bool,
+}
+
+impl Verb for Train {
+    fn json(&self) -> bool {
+        self.json
+    }
+
+    fn run(&self) -> Result<Outcome> {
+        use_threads(self.threads)?;
+        let (mut folder, mut config) = match (self.resume, &self.data) {
+            (true, None) => {
+                let (folder, description) = RunFolder::open(&self.out)?;
+                (folder, description.config::<Config>()?)
+            }
+            (true, Some(_)) => return Err(PipelineError::Usage("--resume: the run knows its capture; leave out the folder".into())),
+            (false, None) => return Err(PipelineError::Usage("give the folder of a capture, or --resume".into())),
+            (false, Some(data)) => {
+                let preset = match self.preset.as_str() {
+                    "ci" => Preset::Ci,
+                    "fast" => Preset::Fast,
+                    other => return Err(PipelineError::Usage(format!("--preset {other:?}: expected ci or fast"))),
+                };
+                let config = Config::new(preset, data.clone());
+                recipe::load_capture(&config)?;
+                (RunFolder::create(&self.out, self.force)?, config)
+            }
+        };
+        self.steps.iter().for_each(|s| config.run.steps = *s);
+        self.seconds.iter().for_each(|s| config.run.seconds = *s);
+        self.seed.iter().for_each(|s| config.seed = *s);
+        config::set_all(&mut config, &self.set)?;
+        watch_interrupts();
+        let mut progress = Progress::new();
+        let trained = recipe::train(&config, &mut folder, self.resume, &INTERRUPT, &mut |e| progress.event(e))?;
+        let s = &trained.summary;
+        if self.json {
+            println!(
+                "{}",
+                serde_json::json!({ "run": self.out, "steps": s.step, "seconds": s.seconds, "loss": s.loss, "interrupted": s.interrupted })
+            );
+        } else {
+            println!("{} steps in {:.0} s, loss {:.5}", s.step, s.seconds, s.loss);
+            println!("{}", self.out.display());
+        }
+        Ok(if s.interrupted { Outcome::Interrupted } else { Outcome::Done })
+    }
+}
