@@ -64,6 +64,7 @@ pub mod imported;
 pub mod jpeg;
 pub mod json;
 pub mod llff;
+mod loaded_model;
 pub mod lock;
 pub mod masks;
 pub mod memory;

@@ -18,6 +18,11 @@ pub const USHORT: u32 = 5123;
 pub const UINT: u32 = 5125;
 pub const FLOAT: u32 = 5126;
 
+/// Primitive modes.
+pub const TRIANGLES: u32 = 4;
+pub const TRIANGLE_STRIP: u32 = 5;
+pub const TRIANGLE_FAN: u32 = 6;
+
 /// Filters and wrap modes of samplers.
 pub const LINEAR: u32 = 9729;
 pub const LINEAR_MIPMAP: u32 = 9987;
@@ -62,6 +67,13 @@ impl Chunk {
         let index = self.add(data, ARRAY, accessor);
         self.views.last_mut().expect("the view that was added")["byteStride"] = stride.into();
         index
+    }
+}
+
+/// Names an item, if there is a name.
+pub fn name(item: &mut Value, name: &str) {
+    if !name.is_empty() {
+        item["name"] = name.into();
     }
 }
 

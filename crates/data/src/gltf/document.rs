@@ -32,7 +32,7 @@ impl<'a> Document<'a> {
         })?;
         let mut document = Document { path, root, buffers: Vec::new(), numbers: Cell::new(0) };
         // Before the buffers, which compression may leave out.
-        extensions::check(&document)?;
+        extensions::check(&document.root, path)?;
         document.buffers = (0..document.root.buffers.len()).map(|i| document.load_buffer(i, binary)).collect::<Result<_>>()?;
         Ok(document)
     }

@@ -1,8 +1,9 @@
 //! Extensions of glTF that are read, and what to do about others.
 
-use super::document::Document;
-use super::scene::Notes;
-use crate::error::Result;
+use super::schema::Root;
+use crate::error::{DataError, Result};
+use crate::loaded_model::Notes;
+use std::path::Path;
 
 /// Extensions that are read.
 const READ: [&str; 6] = [
@@ -15,16 +16,15 @@ const READ: [&str; 6] = [
 ];
 
 /// Refuses a file that cannot be understood without an extension that is not read.
-pub fn check(document: &Document) -> Result<()> {
-    if let Some(name) = document.root.extensions_required.iter().find(|n| !READ.contains(&n.as_str())) {
-        return Err(document.wrong(format!("it requires the extension {name}, which is not read; {}", cure(name))));
+pub fn check(root: &Root, path: &Path) -> Result<()> {
+    if let Some(name) = root.extensions_required.iter().find(|n| !READ.contains(&n.as_str())) {
+        return Err(DataError::input(path, format!("it requires the extension {name}, which is not read; {}", cure(name))));
     }
     Ok(())
 }
 
 /// Notes other extensions that are not read.
-pub fn note(document: &Document, notes: &mut Notes) {
-    let root = &document.root;
+pub fn note(root: &Root, notes: &mut Notes) {
     for name in root.extensions_used.iter().filter(|n| !READ.contains(&n.as_str())) {
         notes.add(format!("the extension {name} is left out"));
     }

@@ -1,10 +1,10 @@
 //! Metallic-roughness materials, and the texture coordinates that their textures use.
 
 use super::document::Document;
-use super::scene::Notes;
 use super::schema::{self, TextureInfo, TextureTransform};
 use super::texture::{self, Textures};
 use crate::error::Result;
+use crate::loaded_model::Notes;
 use diorama_geom::model::{Material, Opacity};
 
 /// The texture coordinates of a material: a set of the mesh, transformed.

@@ -1,18 +1,14 @@
 //! Primitives of meshes as triangles.
 
 use super::accessor::Vectors;
+use super::binary::{TRIANGLE_FAN, TRIANGLE_STRIP, TRIANGLES};
 use super::document::Document;
 use super::material::Coordinates;
-use super::scene::Notes;
 use super::schema::Primitive;
 use crate::error::Result;
+use crate::loaded_model::Notes;
 use diorama_geom::Mesh;
 use diorama_geom::color::srgb_from_linear;
-
-/// Primitive modes.
-pub const TRIANGLES: u32 = 4;
-const TRIANGLE_STRIP: u32 = 5;
-const TRIANGLE_FAN: u32 = 6;
 
 /// (x, y, z) of a world whose y points up, in a world whose z does.
 pub fn z_up([x, y, z]: [f32; 3]) -> [f32; 3] {

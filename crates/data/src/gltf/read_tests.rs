@@ -1,5 +1,5 @@
 use super::*;
-use crate::model_file::LoadedModel;
+use crate::loaded_model::LoadedModel;
 use crate::photo;
 use diorama_geom::ImageU8;
 use diorama_geom::color::linear_from_srgb;

@@ -4,23 +4,11 @@ use super::document::Document;
 use super::texture::Textures;
 use super::{extensions, material, placement, primitive};
 use crate::error::Result;
-use crate::model_file::LoadedModel;
+use crate::loaded_model::{LoadedModel, Notes};
 use diorama_geom::glam::DAffine3;
 use diorama_geom::model::{Instance, Material, Model, Part};
 use std::collections::HashMap;
 use std::path::Path;
-
-/// What was left out or assumed, each once.
-#[derive(Default)]
-pub struct Notes(pub Vec<String>);
-
-impl Notes {
-    pub fn add(&mut self, note: String) {
-        if !self.0.contains(&note) {
-            self.0.push(note);
-        }
-    }
-}
 
 /// Reads the scene of a `.glb` or `.gltf` file: triangles with metallic-roughness materials, without animation.
 ///
@@ -36,7 +24,7 @@ pub fn read(path: &Path) -> Result<LoadedModel> {
         materials: HashMap::new(),
         parts: HashMap::new(),
     };
-    extensions::note(&document, &mut reader.notes);
+    extensions::note(&document.root, &mut reader.notes);
     reader.place_nodes()?;
     if reader.model.instances.is_empty() {
         return Err(document.wrong("no node of its scene has triangles; export the objects as meshes"));

@@ -253,7 +253,7 @@ pub struct Primitive {
 }
 
 fn triangles() -> u32 {
-    super::primitive::TRIANGLES
+    super::binary::TRIANGLES
 }
 
 #[derive(Deserialize)]

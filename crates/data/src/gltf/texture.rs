@@ -2,9 +2,8 @@
 
 use super::binary::{CLAMP, MIRROR};
 use super::document::Document;
-use super::scene::Notes;
 use crate::error::{DataError, Result};
-use crate::model_file::decode_texture;
+use crate::loaded_model::{Notes, decode_texture};
 use crate::photo::Origin;
 use diorama_geom::ImageU8;
 use diorama_geom::model::{Texture, Wrap};

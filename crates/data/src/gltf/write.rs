@@ -1,6 +1,6 @@
 //! Writes a [`Model`] as one `.glb` file that Khronos' validator accepts without warnings.
 
-use super::binary::{Chunk, join};
+use super::binary::{Chunk, join, name};
 use super::placement;
 use super::write_materials::Materials;
 use super::write_parts::{self, Grid};
@@ -112,13 +112,6 @@ impl Writer<'_> {
             root["extensionsUsed"] = extensions.into_iter().collect();
         }
         join(&root, &self.chunk.bytes, self.path)
-    }
-}
-
-/// Names an item, if there is a name.
-pub fn name(item: &mut Value, name: &str) {
-    if !name.is_empty() {
-        item["name"] = name.into();
     }
 }
 

@@ -1,7 +1,6 @@
 //! Materials, textures and images of glTF.
 
-use super::binary::{CLAMP, Chunk, LINEAR, LINEAR_MIPMAP, MIRROR, REPEAT};
-use super::write::name;
+use super::binary::{CLAMP, Chunk, LINEAR, LINEAR_MIPMAP, MIRROR, REPEAT, name};
 use crate::error::{DataError, Result};
 use crate::photo;
 use diorama_geom::model::{Material, Model, Opacity, Texture, Wrap};

@@ -1,7 +1,7 @@
 //! Materials of `.mtl` files: matte colors, textures, normal maps, opacity and emission.
 
 use crate::error::{self, Result};
-use crate::model_file::decode_texture;
+use crate::loaded_model::{Notes, decode_texture};
 use crate::photo::Origin;
 use diorama_geom::model::{Material, Opacity, Texture, Wrap};
 use std::collections::HashMap;
@@ -34,20 +34,20 @@ impl Library {
     }
 
     /// Reads the files that `mtllib` names beside `obj`: one with blanks in its name, or several.
-    pub fn read(&mut self, names: &str, obj: &Path, notes: &mut Vec<String>) -> Result<()> {
+    pub fn read(&mut self, names: &str, obj: &Path, notes: &mut Notes) -> Result<()> {
         let whole = obj.with_file_name(names);
         let files = if whole.is_file() { vec![whole] } else { names.split_whitespace().map(|n| obj.with_file_name(n)).collect() };
         for file in files {
             if file.is_file() {
                 self.read_file(&file, notes)?;
             } else {
-                notes.push(format!("{} is missing: its materials become the default material", file.display()));
+                notes.add(format!("{} is missing: its materials become the default material", file.display()));
             }
         }
         Ok(())
     }
 
-    fn read_file(&mut self, path: &Path, notes: &mut Vec<String>) -> Result<()> {
+    fn read_file(&mut self, path: &Path, notes: &mut Notes) -> Result<()> {
         let text = String::from_utf8_lossy(&error::read(path, LIMIT)?).into_owned();
         let mut current = None;
         for line in text.lines() {
@@ -59,14 +59,14 @@ impl Library {
             }
         }
         for material in self.materials.iter_mut().filter(|m| m.base_color_texture.is_some() && m.base_color[..3] == [0.0; 3]) {
-            notes.push(format!("material \"{}\": Kd is black, which would hide its texture: it is read as white", material.name));
+            notes.add(format!("material \"{}\": Kd is black, which would hide its texture: it is read as white", material.name));
             material.base_color[..3].fill(1.0);
         }
         Ok(())
     }
 
     /// Sets one property; unknown ones are ignored.
-    fn set(&mut self, index: usize, key: &str, value: &str, path: &Path, notes: &mut Vec<String>) -> Result<()> {
+    fn set(&mut self, index: usize, key: &str, value: &str, path: &Path, notes: &mut Notes) -> Result<()> {
         let numbers: Vec<f32> = value.split_whitespace().map_while(|w| w.parse().ok()).filter(|v: &f32| v.is_finite()).collect();
         let gray = |n: &[f32]| if n.len() < 3 { [n[0]; 3] } else { [n[0], n[1], n[2]] };
         let is_map = matches!(key.to_lowercase().as_str(), "map_kd" | "map_ke" | "norm");
@@ -88,12 +88,12 @@ impl Library {
     }
 
     /// The texture of a `map_…` line, after its options.
-    fn texture(&mut self, value: &str, mtl: &Path, notes: &mut Vec<String>) -> Result<Option<usize>> {
+    fn texture(&mut self, value: &str, mtl: &Path, notes: &mut Notes) -> Result<Option<usize>> {
         let (name, wrap) = file_name(value);
         let name = name.replace('\\', "/");
         let short = Path::new(&name).file_name().unwrap_or_default();
         let Some(file) = [mtl.with_file_name(&name), mtl.with_file_name(short)].into_iter().find(|f| f.is_file()) else {
-            notes.push(format!("{}: the texture {name} is missing: it is left out", mtl.display()));
+            notes.add(format!("{}: the texture {name} is missing: it is left out", mtl.display()));
             return Ok(None);
         };
         if let Some(known) = self.files.get(&(file.clone(), wrap)) {

@@ -4,7 +4,7 @@ mod material;
 mod polygon;
 
 use crate::error::{self, DataError, Result};
-use crate::model_file::LoadedModel;
+use crate::loaded_model::{LoadedModel, Notes};
 use diorama_geom::Mesh;
 use diorama_geom::glam::{DAffine3, DVec3};
 use diorama_geom::model::{Instance, Material, Model, Part};
@@ -73,7 +73,7 @@ struct Reader<'a> {
     parts: Vec<OpenPart>,
     /// Index of a part by material, and by whether it has texture coordinates and normals.
     by_kind: HashMap<(Option<usize>, [bool; 2]), usize>,
-    notes: Vec<String>,
+    notes: Notes,
 }
 
 impl<'a> Reader<'a> {
@@ -89,7 +89,7 @@ impl<'a> Reader<'a> {
             material: None,
             parts: Vec::new(),
             by_kind: HashMap::new(),
-            notes: Vec::new(),
+            notes: Notes::default(),
         }
     }
 
@@ -123,7 +123,7 @@ impl<'a> Reader<'a> {
                 let name = rest.trim();
                 self.material = self.library.find(name);
                 if self.material.is_none() {
-                    self.notes.push(format!("material \"{name}\" is in no .mtl file: the default material, matte white, is used"));
+                    self.notes.add(format!("material \"{name}\" is in no .mtl file: the default material, matte white, is used"));
                     self.material = Some(self.library.add(Material { name: name.into(), ..Material::default() }));
                 }
             }
@@ -205,13 +205,14 @@ impl<'a> Reader<'a> {
                 mesh.colors_srgb.clear();
             }
             let mut material = material.unwrap_or_else(|| {
-                self.notes.push(format!("mesh \"{stem}\": faces without a material get the default material, matte white"));
+                self.notes.add(format!("mesh \"{stem}\": faces without a material get the default material, matte white"));
                 self.library.add(Material { name: "default".into(), ..Material::default() })
             });
             let name = self.library.materials[material].name.clone();
             if mesh.uvs.is_empty() && without_textures(&self.library.materials[material]) != self.library.materials[material] {
-                self.notes
-                    .push(format!("mesh \"{stem}\": faces of material \"{name}\" have no texture coordinates: its textures are left out"));
+                let message =
+                    format!("mesh \"{stem}\": faces of material \"{name}\" have no texture coordinates: its textures are left out");
+                self.notes.add(message);
                 material = *untextured.entry(material).or_insert_with(|| {
                     self.library.materials.push(without_textures(&self.library.materials[material]));
                     self.library.materials.len() - 1
@@ -221,8 +222,7 @@ impl<'a> Reader<'a> {
             model.parts.push(Part { name, mesh, material });
         }
         (model.materials, model.textures) = (self.library.materials, self.library.textures);
-        self.notes.dedup();
-        Ok(LoadedModel { model, notes: self.notes })
+        Ok(LoadedModel { model, notes: self.notes.0 })
     }
 }
 
