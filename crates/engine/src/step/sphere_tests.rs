@@ -143,7 +143,6 @@ fn a_hash_field_learns_the_normals_of_a_sphere() {
     let config = HashGridConfig { levels: 4, features: 2, log2_size: 14, base: 8, finest: 24 };
     let mut field = fields::ngp(config, Space::Cube(1.0), 1e-2, 0, 0, 3);
     let [before, after] = angles(&mut field, [1e-2, 4e-3], |_| DensitySlope::Exact);
-    println!("hash: {before} {after}");
     assert!(after < 5.0 && after < 0.7 * before, "{before} degrees by colors, {after} by normals");
 }
 
@@ -157,6 +156,5 @@ fn a_frequency_field_learns_from_normals_that_begin_with_taps() {
     let adam = field.weights.adam;
     field.weights = ParamGroup::dense("weights", field.net.mlp.init(&Rng::new(5, 5)), adam);
     let [before, after] = angles(&mut field, [4e-3, 4e-3], |share| DensitySlope::annealed(2.0 * share, 1.0 / 32.0, 1.0 / 128.0));
-    println!("frequency: {before} {after}");
     assert!(after < 0.7 * before, "{before} degrees by colors, {after} by normals");
 }

@@ -61,7 +61,7 @@ fn linearize(net: &FieldNet, params: &[f64], features: &[f64]) -> Linearized {
 
 /// `Jᵀ g` per sample.
 fn transposed(jacobian: &[f64], g: &[f64], n: usize) -> Vec<f64> {
-    let k = if n == 0 { 0 } else { g.len() / n };
+    let k = g.len().checked_div(n).unwrap_or(0);
     (0..n * 3).map(|e| (0..k).map(|f| jacobian[(e / 3 * k + f) * 3 + e % 3] * g[e / 3 * k + f]).sum()).collect()
 }
 

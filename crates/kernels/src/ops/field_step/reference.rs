@@ -46,7 +46,7 @@ pub fn step_with_extras(
     d: &Composited<f64>,
 ) -> Step {
     let s = p.samples();
-    let k = if s > 0 { extras.len() / s } else { (background.len() / p.rays().max(1)).saturating_sub(net.channels()) };
+    let k = (background.len() / p.rays().max(1)).saturating_sub(net.channels());
     let values = mlp::forward(&net.mlp, params, inputs, s);
     let sigma = head(net, net.density, 1, &values, s, |x| activate(net.density.activation, x));
     let c = net.channels() + k;
