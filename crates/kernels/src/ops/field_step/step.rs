@@ -129,8 +129,7 @@ pub fn run(
     let (r, s, c, k) = (input.samples.rays(), input.samples.samples(), input.channels(), input.extras.width);
     let mlp = &input.net.mlp;
     assert!(input.background.len() == r * c && input.params.len() == mlp.params_len(), "field: shapes");
-    assert_eq!(codes.len() + 1, mlp.input_widths.len(), "field: codes");
-    assert_eq!(input.extras.values.len(), s * k, "field: extras");
+    assert!(codes.len() + 1 == mlp.input_widths.len() && input.extras.values.len() == s * k, "field: codes and extras");
     assert!(c > 0 && input.net.heads().all(|(h, _)| h.activation.is_monotonic()), "field: heads");
     out.resize(r, s, c, k);
     let shared = Shared {
