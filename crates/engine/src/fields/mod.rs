@@ -1,6 +1,7 @@
 //! Radiance fields: an encoding of position, codes of rays, and a network.
 
 mod encoder;
+mod injected;
 mod normals;
 mod presets;
 mod ray_codes;
@@ -13,13 +14,15 @@ pub use presets::{baseline, mlp, nerf, ngp};
 pub use ray_codes::{Appearance, DirectionCode, RayCodes};
 pub use visible::{VisibleBuffers, VisibleSamples};
 
+use injected::Injected;
+
 use crate::params::ParamGroup;
 use crate::stages::Stages;
 use diorama_geom::contraction::Space;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::field_step::{
-    self, BatchLoss, Extras, FieldNet, InjectedGradients, RayCode, RayGradients, RayLoss, RayOutputs, StepBuffers, StepInput, StepOutput,
+    self, BatchLoss, Extras, FieldNet, RayCode, RayGradients, RayLoss, RayOutputs, StepBuffers, StepInput, StepOutput,
 };
 use diorama_kernels::ops::fused_mlp::cpu::Activations;
 use rayon::prelude::*;
@@ -211,10 +214,10 @@ impl Field {
                 Some(loss.batch(&out, &mut injected))
             }
         };
-        let given = InjectedGradients(&injected);
+        let given = Injected::new(&injected, &loss, batch.samples, self.is_unbounded());
         let rays = if let Loss::Rays(rays) = loss { rays } else { &given };
         self.train_rays(batch, encoded, rays, buf, d_positions);
-        buf.out.loss = value.unwrap_or(buf.out.loss);
+        buf.out.loss += value.unwrap_or(0.0);
         buf.injected = injected;
     }
 

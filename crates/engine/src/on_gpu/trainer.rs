@@ -222,6 +222,7 @@ fn evaluate_batch_loss(
     channels: usize,
     packed: &GpuPacked,
 ) -> Result<(GpuComposited, f64), GpuError> {
+    assert_eq!(loss.distortion(), 0.0, "the distortion of a batch loss is computed on the CPU alone");
     let (values, opacity, depth) = (gpu.read(&out.color)?, gpu.read(&out.opacity)?, gpu.read(&out.depth)?);
     let mut g = RayGradients::default();
     g.clear(packed.rays(), channels);

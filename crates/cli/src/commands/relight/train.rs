@@ -59,7 +59,7 @@ impl Verb for Train {
         let (mut folder, mut config) = match (self.resume, &self.data) {
             (true, None) => {
                 let (folder, description) = RunFolder::open(&self.out)?;
-                (folder, description.config::<Config>()?)
+                (Some(folder), description.config::<Config>()?)
             }
             (true, Some(_)) => return Err(PipelineError::Usage("--resume: the run knows its capture; leave out the folder".into())),
             (false, None) => return Err(PipelineError::Usage("give the folder of a capture, or --resume".into())),
@@ -69,15 +69,21 @@ impl Verb for Train {
                     "fast" => Preset::Fast,
                     other => return Err(PipelineError::Usage(format!("--preset {other:?}: expected ci or fast"))),
                 };
-                let config = Config::new(preset, data.clone());
-                recipe::load_capture(&config)?;
-                (RunFolder::create(&self.out, self.force)?, config)
+                (None, Config::new(preset, data.clone()))
             }
         };
         self.steps.iter().for_each(|s| config.run.steps = *s);
         self.seconds.iter().for_each(|s| config.run.seconds = *s);
         self.seed.iter().for_each(|s| config.seed = *s);
         config::set_all(&mut config, &self.set)?;
+        // Nothing is written before the request is known to be sound.
+        let mut folder = match folder.take() {
+            Some(folder) => folder,
+            None => {
+                recipe::load_capture(&config)?;
+                RunFolder::create(&self.out, self.force)?
+            }
+        };
         watch_interrupts();
         let mut progress = Progress::new();
         let trained = recipe::train(&config, &mut folder, self.resume, &INTERRUPT, &mut |e| progress.event(e))?;

@@ -201,6 +201,11 @@ impl RayGradients {
 pub trait BatchLoss: Sync {
     /// The loss; fills in its gradients, which are zero on entry.
     fn batch(&self, out: &RayOutputs, gradients: &mut RayGradients) -> f64;
+
+    /// Weight of the distortion loss besides, whose mean over the rays is added.
+    fn distortion(&self) -> f32 {
+        0.0
+    }
 }
 
 /// A loss of value 0 whose gradients were computed elsewhere.

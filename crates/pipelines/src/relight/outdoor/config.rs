@@ -65,6 +65,8 @@ pub struct LossConfig {
     pub shadow: f32,
     /// Negative irradiance.
     pub negative: f32,
+    /// Spread of a ray's weights (Barron et al. 2022).
+    pub distortion: f32,
 }
 
 /// Rates and their course.
@@ -76,6 +78,9 @@ pub struct OptimConfig {
     pub light_rate: f32,
     /// Rate at the end over the rate at the start.
     pub final_scale: f32,
+    /// Shares of the steps between which light gains its direction: before, it is even, and normals do not matter.
+    pub even_until: f32,
+    pub directed_from: f32,
     /// Share of the steps in which normals come from density differences at a distance that shrinks.
     pub anneal: f32,
 }
@@ -135,12 +140,20 @@ impl Config {
                 space: "box".into(),
             },
             light: LightConfig { of: "session".into(), gain: false },
-            loss: LossConfig { huber: 0.1, robust: 0.0, orientation: 1e-3, shadow: 1e-2, negative: 0.1 },
-            optim: OptimConfig { grid_rate: 1e-2, net_rate: 1e-3, light_rate: 5e-3, final_scale: 0.05, anneal: 0.5 },
+            loss: LossConfig { huber: 0.1, robust: 0.0, orientation: 1e-3, shadow: 1e-2, negative: 0.1, distortion: 1e-2 },
+            optim: OptimConfig {
+                grid_rate: 1e-2,
+                net_rate: 1e-3,
+                light_rate: 5e-3,
+                final_scale: 0.05,
+                even_until: 0.15,
+                directed_from: 0.4,
+                anneal: 0.6,
+            },
             sampling: SamplingConfig {
                 rays: pick(512, 4096),
                 max_samples: 256,
-                near: 0.02,
+                near: 0.05,
                 occupancy_resolution: pick(64, 128),
                 occupancy_points: pick(1 << 14, 1 << 17),
                 occupancy_every: 16,
@@ -190,7 +203,7 @@ impl Configuration for Config {
         if self.data.downscale == 0 || self.sampling.rays == 0 || self.sampling.max_samples == 0 || self.sampling.occupancy_every == 0 {
             return fault("data.downscale, sampling.rays, max_samples and occupancy_every must be at least 1");
         }
-        let weights = [self.loss.robust, self.loss.orientation, self.loss.shadow, self.loss.negative];
+        let weights = [self.loss.robust, self.loss.orientation, self.loss.shadow, self.loss.negative, self.loss.distortion];
         if !(self.loss.huber > 0.0) || weights.iter().any(|w| !(*w >= 0.0 && w.is_finite())) {
             return fault("loss: huber must be above 0, weights 0 or more");
         }

@@ -28,6 +28,7 @@ pub struct Weights {
     pub orientation: f32,
     pub shadow: f32,
     pub negative: f32,
+    pub distortion: f32,
 }
 
 /// What the rays of a step are compared with.
@@ -237,6 +238,10 @@ impl BatchLoss for SceneLoss<'_> {
         *self.out.lock().expect("no other thread holds it") = tables;
         loss
     }
+
+    fn distortion(&self) -> f32 {
+        self.weights.distortion
+    }
 }
 
 #[cfg(test)]
@@ -280,7 +285,7 @@ mod tests {
 
     fn run(c: &Case) -> (f64, RayGradients, SceneGradients) {
         let loss = SceneLoss {
-            weights: Weights { huber: 0.4, robust: 0.0, orientation: 0.3, shadow: 0.2, negative: 0.5 },
+            weights: Weights { huber: 0.4, robust: 0.0, orientation: 0.3, shadow: 0.2, negative: 0.5, distortion: 0.0 },
             target: &c.target,
             counts: &[1.0, 0.5, 1.0, 0.0, 1.0],
             dirs: &c.dirs,
@@ -346,7 +351,7 @@ mod tests {
         let c = case();
         let with = |robust: f32| {
             let loss = SceneLoss {
-                weights: Weights { huber: 1.0, robust, orientation: 0.0, shadow: 0.0, negative: 0.0 },
+                weights: Weights { huber: 1.0, robust, orientation: 0.0, shadow: 0.0, negative: 0.0, distortion: 0.0 },
                 target: &c.target,
                 counts: &[1.0; RAYS],
                 dirs: &c.dirs,

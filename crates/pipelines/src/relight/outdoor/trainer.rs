@@ -71,6 +71,11 @@ impl<'a> Trainer<'a> {
     }
 }
 
+/// Scales what depends on the direction: all but the first coefficient of each light.
+fn scale_directed(lights: &mut [f32], by: f32) {
+    lights.chunks_exact_mut(LIGHT).for_each(|l| l[3..].iter_mut().for_each(|v| *v *= by));
+}
+
 /// Luminance of a coefficient.
 pub(super) fn gray(c: &[f32]) -> f32 {
     0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2]
@@ -91,6 +96,9 @@ impl Trainee for Trainer<'_> {
         let slope = if c.optim.anneal > 0.0 { DensitySlope::annealed(share, TAPS.0, TAPS.1) } else { DensitySlope::Exact };
         self.model.field.normals = Some(Normals { slope, ..Normals::default() });
         let settled = step >= SETTLED;
+        let directed = ((progress as f32 - c.optim.even_until) / (c.optim.directed_from - c.optim.even_until).max(1e-6)).clamp(0.0, 1.0);
+        let mut lights = self.model.lights.values.clone();
+        scale_directed(&mut lights, directed);
         let loss = SceneLoss {
             weights: Weights {
                 huber: c.loss.huber,
@@ -98,13 +106,14 @@ impl Trainee for Trainer<'_> {
                 orientation: c.loss.orientation,
                 shadow: if settled { c.loss.shadow } else { 1.0 },
                 negative: c.loss.negative,
+                distortion: c.loss.distortion,
             },
             target: &target,
             counts: &counts,
             dirs: &self.batch.dirs,
             light: &light,
             image: &self.batch.images,
-            lights: &self.model.lights.values,
+            lights: &lights,
             skies: &self.model.skies.values,
             gains: &self.model.gains.values,
             out: Mutex::default(),
@@ -136,7 +145,8 @@ impl Trainee for Trainer<'_> {
         };
         let (field, occupancy) = (&mut self.model.field, Some(&mut self.model.occupancy));
         let done = self.device.step(&mut Trainees { occupancy, ..Trainees::of(field) }, None, &described, 1)?;
-        let tables = loss.out.into_inner().expect("the step is over");
+        let mut tables = loss.out.into_inner().expect("the step is over");
+        scale_directed(&mut tables.lights, directed);
         if done.shown.loss.is_finite() {
             let m = &mut self.model;
             m.rays += n as u64;

@@ -1,7 +1,0 @@
-//! stub
-use diorama_geom::{Camera,Model,Pose}; use diorama_geom::glam::*; use diorama_geom::model::*; use diorama_geom::Mesh;
-fn cube(lo:DVec3,hi:DVec3)->Mesh{ let mut m=Mesh::default(); let c=|i:usize|[if i&1==0{lo.x}else{hi.x} as f32,if i&2==0{lo.y}else{hi.y} as f32,if i&4==0{lo.z}else{hi.z} as f32];
- for (q,n) in [([0,2,3,1],[0.,0.,-1.]),([4,5,7,6],[0.,0.,1.]),([0,1,5,4],[0.,-1.,0.]),([2,6,7,3],[0.,1.,0.]),([0,4,6,2],[-1.,0.,0.]),([1,3,7,5],[1.,0.,0.])]{ let b=m.positions.len() as u32; for i in q{m.positions.push(c(i));m.normals.push(n);m.uvs.push([0.;2]);} m.faces.push([b,b+1,b+2]);m.faces.push([b,b+2,b+3]); } m }
-pub fn model(_s:u64)->Model{ let mut out=Model::default(); let b=[(DVec3::new(-6.,-6.,-0.2),DVec3::new(6.,6.,0.),[0.5,0.48,0.45]),(DVec3::new(-2.,0.,0.),DVec3::new(0.,2.,3.),[0.7,0.3,0.2]),(DVec3::new(1.,-1.,0.),DVec3::new(2.5,1.,1.5),[0.2,0.4,0.6]),(DVec3::new(-1.,-3.,0.),DVec3::new(0.2,-2.,1.0),[0.6,0.6,0.2]),(DVec3::new(-4.,-4.,0.),DVec3::new(-3.,4.,2.0),[0.3,0.5,0.3])];
- for (lo,hi,c) in b { let i=out.parts.len(); out.materials.push(Material{base_color:[c[0],c[1],c[2],1.0],..Material::default()}); out.parts.push(Part{name:format!("box{i}"),mesh:cube(lo,hi),material:i}); out.instances.push(Instance{part:i,world_from_part:DAffine3::IDENTITY}); } out }
-pub fn cameras(n:usize,w:u32,h:u32,_s:u64)->Vec<(Camera,Pose)>{ (0..n).map(|i|{ let a=i as f64/n as f64*6.283; (Camera::pinhole(w,h,1.0),Pose::look_at(DVec3::new(7.0*a.cos(),7.0*a.sin(),1.7+(i%3) as f64*1.5),DVec3::new(0.,0.,0.7),DVec3::Z)) }).collect() }
