@@ -12,6 +12,9 @@
 //! assert_eq!((photos[0].image.pixel(16, 16)[3], photos[0].image.pixel(0, 0)[3]), (255, 0));
 //! ```
 
+mod assembly;
 pub mod ray_caster;
 pub mod still_life;
 pub mod street;
+mod surface;
+mod textures;
