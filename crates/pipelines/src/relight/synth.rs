@@ -11,6 +11,7 @@ use diorama_geom::environment::Environment;
 use diorama_geom::glam::DVec3;
 use diorama_geom::sky::Sky;
 use diorama_geom::{Camera, Image, Model, Pose};
+use diorama_kernels::ops::denoise;
 use diorama_kernels::ops::path_trace::{Film, Scene, Settings, View, cpu};
 use diorama_scenes::street;
 use serde_json::json;
@@ -20,7 +21,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// Rows of the maps of the lights.
 const ROWS: usize = 128;
 /// Radiance that a white surface facing up sends to the cameras, by which photographs are exposed.
-const EXPOSED: f64 = 0.8;
+const EXPOSED: f64 = 1.1;
+/// Cameras to choose from, per view.
+const CANDIDATES: usize = 40;
+/// Least distance in meters of what the center of a view shows.
+const NEAREST: f64 = 5.0;
 /// Bounces of light.
 const BOUNCES: u32 = 6;
 /// Every so many views, one is held out.
@@ -33,11 +38,36 @@ pub struct Place {
 }
 
 impl Place {
-    /// The procedural street.
+    /// The procedural street, seen by a photographer who walks past one row of houses.
     pub fn street(options: &SynthOptions) -> Place {
         let [w, h] = [options.size.0, options.size.1];
-        Place { model: street::model(options.seed), cameras: street::cameras(options.views, w, h, options.seed) }
+        let model = street::model(options.seed);
+        let cameras = looking_at_one_place(&model, street::cameras(CANDIDATES * options.views, w, h, options.seed), options.views);
+        Place { model, cameras }
     }
+}
+
+/// Of many cameras, `n` that look at places near each other, from as many sides as there are.
+fn looking_at_one_place(model: &Model, candidates: Vec<(Camera, Pose)>, n: usize) -> Vec<(Camera, Pose)> {
+    let scene = Scene::new(model, &light(0));
+    let hit = |(_, pose): &(Camera, Pose)| cpu::first_hit(&scene, pose.translation, pose.rotation.z_axis).filter(|h| h.depth > NEAREST);
+    let looks: Vec<(usize, DVec3)> = candidates.iter().enumerate().filter_map(|(i, c)| Some((i, hit(c)?.position))).collect();
+    let near = |p: DVec3| {
+        let mut near: Vec<(usize, f64)> = looks.iter().map(|(i, q)| (*i, (*q - p).length())).collect();
+        near.sort_by(|a, b| a.1.total_cmp(&b.1));
+        near.truncate(3 * n);
+        near
+    };
+    // The place around which most cameras look.
+    let best = looks.iter().step_by(looks.len().div_ceil(200).max(1)).map(|(_, p)| near(*p)).min_by(|a, b| {
+        let farthest = |v: &Vec<(usize, f64)>| v.last().map_or(f64::MAX, |l| l.1);
+        farthest(a).total_cmp(&farthest(b))
+    });
+    let mut chosen: Vec<usize> = best.unwrap_or_default().into_iter().map(|(i, _)| i).collect();
+    let along = |i: &usize| candidates[*i].1.translation.x;
+    chosen.sort_by(|a, b| along(a).total_cmp(&along(b)));
+    let step = (chosen.len() as f64 / n as f64).max(1.0);
+    (0..n.min(chosen.len())).map(|k| candidates[chosen[(k as f64 * step) as usize]]).collect()
 }
 
 /// Size of the benchmark.
@@ -158,6 +188,7 @@ pub fn generate(
                 ..Settings::default()
             };
             cpu::render(&scene, &view, &settings, options.samples, &mut film);
+            denoise::cpu::run(&mut film);
             let name = format!("v{v:03}_{}", LIGHTS[lights[l]].0);
             save_photograph(&out.join("images").join(format!("{name}.png")), &film)?;
             truth::save_shadow(out, &name, &film)?;
