@@ -1,8 +1,9 @@
 //! List of the applications, and the application of a run. Verbs that accept any run (`eval`, `render`, `export`, `view`, `info`, `compare`,
 //! `train --resume`) match on [`Application::of_run`]: a new application does not compile until each of them says what it does with it.
 
-use crate::error::Result;
+use crate::error::{PipelineError, Result};
 use crate::object::{config::Config, run_folder};
+use crate::relight::outdoor;
 use crate::run::RunDescription;
 use crate::run::config::Configuration;
 use diorama_data::DataError;
@@ -14,16 +15,19 @@ use std::path::Path;
 pub enum Application {
     /// Photographs to a radiance field, novel views and a mesh.
     Object,
+    /// Photographs in several lights to albedo, normals, shadow and light.
+    Relight,
 }
 
 impl Application {
     /// All of them, in the order in which they are listed to users.
-    pub const ALL: [Application; 1] = [Application::Object];
+    pub const ALL: [Application; 2] = [Application::Object, Application::Relight];
 
     /// The name that `config.toml` gives.
     pub fn name(self) -> &'static str {
         match self {
             Application::Object => Config::APPLICATION,
+            Application::Relight => outdoor::config::Config::APPLICATION,
         }
     }
 
@@ -42,6 +46,11 @@ impl Application {
         })
     }
 
+    /// The error of a command that does not take runs of this application; `instead` is what does.
+    pub fn refuse(self, run: &Path, instead: &str) -> PipelineError {
+        DataError::input(run, format!("is a run of {}; use {instead}", self.name())).into()
+    }
+
     /// Description of a run of this application for `diorama info`.
     ///
     /// # Errors
@@ -49,6 +58,7 @@ impl Application {
     pub fn describe(self, run: &Path) -> Result<Value> {
         match self {
             Application::Object => run_folder::describe(run),
+            Application::Relight => outdoor::recipe::describe(run),
         }
     }
 }

@@ -34,6 +34,7 @@ impl Verb for Compare {
         for run in &self.runs {
             match Application::of_run(run)? {
                 Application::Object => {}
+                of @ Application::Relight => return Err(of.refuse(run, "diorama relight eval")),
             }
         }
         self.objects()

@@ -97,6 +97,7 @@ impl Verb for Export {
         use_threads(self.threads)?;
         match Application::of_run(&self.run)? {
             Application::Object => self.object(),
+            of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight render")),
         }
     }
 }

@@ -77,6 +77,7 @@ impl Verb for Render {
         use_threads(self.threads)?;
         match Application::of_run(&self.run)? {
             Application::Object => self.object(),
+            of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight render")),
         }
     }
 }

@@ -105,6 +105,7 @@ impl Verb for Train {
         // Runs of other applications are started and resumed by the application's own command.
         match if self.resume { Application::of_run(&self.out)? } else { Application::Object } {
             Application::Object => self.object(),
+            of @ Application::Relight => Err(of.refuse(&self.out, "diorama relight train --resume")),
         }
     }
 }

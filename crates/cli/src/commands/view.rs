@@ -130,6 +130,7 @@ fn source(a: &View) -> Result<Source> {
     if is_run || !a.path.is_dir() {
         return match Application::of_run(&a.path)? {
             Application::Object => object(a),
+            of @ Application::Relight => Err(of.refuse(&a.path, "diorama relight render")),
         };
     }
     let capture = import::import(&a.path, &ImportOptions { min_views: 1, allow_broken: true, ..ImportOptions::default() })?;

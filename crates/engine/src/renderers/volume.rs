@@ -1,7 +1,6 @@
 //! Volume rendering of views: `Σ_i T_i α_i c_i` along each ray (Mildenhall et al. 2020, equation 3).
 
 pub use super::accelerator::Accelerator;
-pub use super::layers::Layers;
 pub use super::quality::Quality;
 pub use super::traced::Traced;
 pub use super::view::View;

@@ -3,6 +3,7 @@
 mod compose;
 mod eval;
 mod light_flags;
+mod render;
 mod synth;
 mod train;
 mod turntable;
@@ -14,6 +15,7 @@ use clap::Subcommand;
 #[derive(Subcommand)]
 pub enum Relight {
     Train(train::Train),
+    Render(render::Render),
     Eval(eval::Eval),
     Compose(compose::Compose),
     Turntable(turntable::Turntable),
@@ -25,6 +27,7 @@ impl Relight {
     pub fn verb(&self) -> &dyn Verb {
         match self {
             Relight::Train(v) => v,
+            Relight::Render(v) => v,
             Relight::Eval(v) => v,
             Relight::Compose(v) => v,
             Relight::Turntable(v) => v,

@@ -5,6 +5,7 @@
 
 pub mod config;
 pub mod model;
+pub mod pictures;
 pub mod recipe;
 pub mod render;
 pub mod scores;

@@ -116,3 +116,23 @@ pub fn load(run: &Path) -> Result<(SceneModel, Vec<String>)> {
     model.restore(checkpoint, &file)?;
     Ok((model, note.into_iter().collect()))
 }
+
+/// Description of a run for `diorama info`.
+///
+/// # Errors
+/// As [`load`].
+pub fn describe(run: &Path) -> Result<serde_json::Value> {
+    let (model, notes) = load(run)?;
+    Ok(serde_json::json!({
+        "kind": "relight run",
+        "data": model.config.data.path,
+        "steps": model.origin.step,
+        "seconds": model.origin.seconds,
+        "rays": model.rays,
+        "parameters": model.field.groups().iter().map(|g| g.values.len()).sum::<usize>(),
+        "training_views": model.train.len(),
+        "held_out_views": model.capture.indices(Split::Test).len(),
+        "lights": model.lights.values.len() / super::shading::LIGHT,
+        "notes": notes,
+    }))
+}

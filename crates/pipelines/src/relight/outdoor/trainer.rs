@@ -69,6 +69,17 @@ impl<'a> Trainer<'a> {
         };
         light.iter().enumerate().flat_map(code).collect()
     }
+
+    /// Figures of a step of `n` rays.
+    fn scalars(&self, mse: f64, n: usize, samples: f64) -> Scalars {
+        Scalars::from([
+            Scalar::new("mse", mse).logged_only(),
+            Scalar::psnr("psnr", mse),
+            Scalar::count("rays", self.model.rays),
+            Scalar::rate("rays_per_s", n as f64),
+            Scalar::new("samples_per_ray", samples / n as f64).logged_only(),
+        ])
+    }
 }
 
 /// Scales what depends on the direction: all but the first coefficient of each light.
@@ -156,13 +167,7 @@ impl Trainee for Trainer<'_> {
                 group.step(step as u32 + 1, group.schedule.scale(progress as f32) * m.rate_scale);
             }
         }
-        let scalars = Scalars::from([
-            Scalar::new("mse", tables.mse).logged_only(),
-            Scalar::psnr("psnr", tables.mse),
-            Scalar::count("rays", self.model.rays),
-            Scalar::rate("rays_per_s", n as f64),
-            Scalar::new("samples_per_ray", done.shown.trained / n as f64).logged_only(),
-        ]);
+        let scalars = self.scalars(tables.mse, n, done.shown.trained);
         Ok(StepReport { loss: done.shown.loss, scalars })
     }
 

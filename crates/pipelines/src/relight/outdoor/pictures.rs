@@ -1,0 +1,168 @@
+//! Pictures of a run: views in their own light or a new one, and their layers.
+
+use super::model::SceneModel;
+use super::render::{SceneView, ViewLight};
+use crate::error::Result;
+use crate::relight::light::LightOptions;
+use diorama_data::{DataError, photo};
+use diorama_geom::Image;
+use diorama_geom::capture::Split;
+use diorama_geom::color::srgb_from_linear;
+use diorama_geom::sh_light::ShLight;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// A layer of a view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Layer {
+    Rgb,
+    Albedo,
+    Normal,
+    Shadow,
+    Irradiance,
+    Depth,
+}
+
+impl Layer {
+    fn name(self) -> &'static str {
+        match self {
+            Layer::Rgb => "rgb",
+            Layer::Albedo => "albedo",
+            Layer::Normal => "normal",
+            Layer::Shadow => "shadow",
+            Layer::Irradiance => "irradiance",
+            Layer::Depth => "depth",
+        }
+    }
+}
+
+impl std::str::FromStr for Layer {
+    type Err = String;
+
+    fn from_str(s: &str) -> std::result::Result<Layer, String> {
+        let all = [Layer::Rgb, Layer::Albedo, Layer::Normal, Layer::Shadow, Layer::Irradiance, Layer::Depth];
+        let found = all.into_iter().find(|l| l.name() == s);
+        found.ok_or_else(|| format!("{s:?}: expected {}", all.map(Layer::name).join(", ")))
+    }
+}
+
+/// What to render and where to put it.
+#[derive(Clone, Debug)]
+pub struct PicturesOptions {
+    /// None: the light that was learned for each view.
+    pub light: Option<LightOptions>,
+    /// Numbers or names of frames; none: all that were held out.
+    pub frames: Vec<String>,
+    pub layers: Vec<Layer>,
+    /// Whether pictures are EXR in linear light, or PNG.
+    pub is_linear: bool,
+    pub out: PathBuf,
+}
+
+/// What was rendered.
+#[derive(Clone, Debug, Default)]
+pub struct Pictures {
+    pub pictures: Vec<PathBuf>,
+    pub interrupted: bool,
+    pub notes: Vec<String>,
+}
+
+/// Renders pictures; `progress` gets the share that is done.
+///
+/// # Errors
+/// When a frame does not exist, the light cannot be read, a view has no light of its own, or a file cannot be written.
+pub fn render(model: &SceneModel, options: &PicturesOptions, stop: &AtomicBool, progress: &mut dyn FnMut(f64)) -> Result<Pictures> {
+    let mut made = Pictures::default();
+    let given = match &options.light {
+        None => None,
+        Some(light) => {
+            let (daylight, notes) = light.read()?;
+            made.notes = notes;
+            let mut harmonics = ShLight::of(&daylight.environment);
+            daylight.sun.iter().for_each(|s| harmonics.add_sun(s.direction, s.irradiance));
+            Some(harmonics)
+        }
+    };
+    let frames = if options.frames.is_empty() { model.capture.indices(Split::Test) } else { named(model, &options.frames)? };
+    if frames.is_empty() {
+        return Err(DataError::input(&model.config.data.path, "no photographs were held out; name some with --frame").into());
+    }
+    let lights = frames.iter().map(|f| light_of(model, *f, given.as_ref())).collect::<Result<Vec<_>>>()?;
+    std::fs::create_dir_all(&options.out).map_err(DataError::io(&options.out, "create"))?;
+    for (i, (frame, light)) in frames.iter().zip(&lights).enumerate() {
+        let view = model.view(&model.posed(*frame), light, &mut |_| {});
+        let title = model.capture.frames[*frame].name.replace(['/', '\\'], "_");
+        for layer in &options.layers {
+            let extension = if options.is_linear { "exr" } else { "png" };
+            let file = options.out.join(format!("{title}_{}.{extension}", layer.name()));
+            let image = three_channels(layer_of(&view, *layer));
+            match options.is_linear {
+                true => photo::save_exr(&file, &image)?,
+                false => photo::save_png(&file, &shown(image, *layer).to_u8())?,
+            }
+            made.pictures.push(file);
+        }
+        progress((i + 1) as f64 / frames.len() as f64);
+        if stop.load(Ordering::Relaxed) && i + 1 < frames.len() {
+            made.interrupted = true;
+            break;
+        }
+    }
+    Ok(made)
+}
+
+fn named(model: &SceneModel, names: &[String]) -> Result<Vec<usize>> {
+    let frames = &model.capture.frames;
+    let find = |name: &String| {
+        let found = match name.parse::<usize>() {
+            Ok(i) => (i < frames.len()).then_some(i),
+            Err(_) => frames.iter().position(|f| f.name == *name || f.name.rsplit('/').next() == Some(name)),
+        };
+        let what = || DataError::input(&model.config.data.path, format!("--frame {name}: there are {} frames, from 0 on", frames.len()));
+        Ok(found.ok_or_else(what)?)
+    };
+    names.iter().map(find).collect()
+}
+
+fn light_of(model: &SceneModel, frame: usize, given: Option<&ShLight>) -> Result<ViewLight> {
+    if let Some(light) = given {
+        return Ok(ViewLight::of(*light));
+    }
+    let own = model.light_of_frame(frame).ok_or_else(|| {
+        let name = &model.capture.frames[frame].name;
+        DataError::input(&model.config.data.path, format!("{name}: its light was not trained on; give --light"))
+    })?;
+    Ok(ViewLight { light: model.light(own), sky: model.sky(own).to_vec() })
+}
+
+fn layer_of(view: &SceneView, layer: Layer) -> &Image {
+    match layer {
+        Layer::Rgb => &view.color,
+        Layer::Albedo => &view.albedo,
+        Layer::Normal => &view.normal,
+        Layer::Shadow => &view.shadow,
+        Layer::Irradiance => &view.irradiance,
+        Layer::Depth => &view.depth,
+    }
+}
+
+fn three_channels(image: &Image) -> Image {
+    match image.channels {
+        3 => image.clone(),
+        _ => Image { width: image.width, height: image.height, channels: 3, data: image.data.iter().flat_map(|v| [*v; 3]).collect() },
+    }
+}
+
+/// Values between 0 and 1 as people look at them: light along the sRGB curve, normals from −1 on, depth by its largest value.
+fn shown(mut image: Image, layer: Layer) -> Image {
+    let largest = image.data.iter().copied().fold(1e-6, f32::max);
+    image.data.iter_mut().for_each(|v| {
+        *v = match layer {
+            Layer::Normal => 0.5 * *v + 0.5,
+            Layer::Shadow => *v,
+            Layer::Depth => *v / largest,
+            _ => srgb_from_linear(v.clamp(0.0, 1.0)),
+        }
+    });
+    image
+}
