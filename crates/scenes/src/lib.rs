@@ -13,8 +13,10 @@
 //! ```
 
 mod assembly;
+pub mod chair;
 pub mod ray_caster;
 pub mod still_life;
+pub mod still_life_model;
 pub mod street;
 mod surface;
 mod textures;

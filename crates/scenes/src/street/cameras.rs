@@ -33,8 +33,10 @@ fn is_free(layout: &Layout, view: &View) -> bool {
 fn draw(i: u64, u: impl Fn(u64, f64, f64) -> f64) -> View {
     let side = if i % 2 == 0 { 1.0 } else { -1.0 };
     if i % 16 == 11 {
-        let eye = dvec3(u(0, -28.0, -8.0), -FACADE - u(1, 1.4, 2.2), PAVEMENT + u(2, 1.5, 1.9));
-        return View { eye, target: dvec3(eye.x + u(3, -9.0, 9.0), FACADE, u(4, 2.0, 4.5)) };
+        // In the middle of a bay, so that no column is close in front.
+        let bay = -6.0 - 0.6 - 22.8 / 7.0 * (u(0, 0.0, 7.0).floor() + 0.5);
+        let eye = dvec3(bay, -FACADE - u(1, 1.4, 2.2), PAVEMENT + u(2, 1.5, 1.9));
+        return View { eye, target: dvec3(eye.x + u(3, -2.5, 2.5), FACADE, u(4, 2.0, 4.5)) };
     }
     if i % 8 == 5 {
         let eye = dvec3(u(0, -26.0, 26.0), -side * (FACADE - u(1, 1.5, 2.2)), u(2, 4.6, 8.2));
