@@ -166,10 +166,8 @@ pub fn seat(chair: &mut Assembly, wood: Finish, dark: Finish, gold: Finish) {
     let corner = |x: f64, y: f64| dvec3(x, y, z);
     let (fl, fr) = (corner(-FRONT, -DEEP), corner(FRONT, -DEEP));
     let (rl, rr) = (corner(-REAR, DEEP), corner(REAR, DEEP));
-    for (a, b, turn) in [(fl, fr, true), (rl, rr, true), (fl, rl, false), (fr, rr, false)] {
-        // The cross-section's first axis is x or y, whichever is not along the bar.
-        let size = if turn { half } else { half };
-        bar(rails, &line(a, b, 6), |_| size, 28);
+    for (a, b) in [(fl, fr), (rl, rr), (fl, rl), (fr, rr)] {
+        bar(rails, &line(a, b, 6), |_| half, 28);
     }
     for (x, y) in [(-FRONT, -DEEP), (FRONT, -DEEP)] {
         bar(rails, &line(dvec3(x, y, SEAT - 0.075), dvec3(x, y, SEAT + 0.006), 4), |_| DVec2::splat(0.034), 32);

@@ -1,8 +1,9 @@
 //! An arcade: round arches on columns carry the upper storeys; behind them is a covered walk. And a gate: one large arch through a house.
 
-use super::house::{DEPTH, cornice_profile};
+use super::house::cornice_profile;
 use super::joinery::{WindowStyle, door, shop, window};
 use super::materials::Materials;
+use super::roof::DEPTH;
 use super::roof::{Roof, roof};
 use super::wall::{Opening, front, ring, wall};
 use crate::assembly::{Assembly, Finish, place};

@@ -31,7 +31,7 @@ fn is_free(layout: &Layout, view: &View) -> bool {
 
 /// A candidate for view `i`: three in four from a pavement or the road, else from an upper floor or from under the arcade.
 fn draw(i: u64, u: impl Fn(u64, f64, f64) -> f64) -> View {
-    let side = if i % 2 == 0 { 1.0 } else { -1.0 };
+    let side = if i.is_multiple_of(2) { 1.0 } else { -1.0 };
     if i % 16 == 11 {
         // In the middle of a bay, so that no column is close in front.
         let bay = -6.0 - 0.6 - 22.8 / 7.0 * (u(0, 0.0, 7.0).floor() + 0.5);

@@ -205,12 +205,12 @@ fn wheel(car: &mut Assembly, m: &Materials, self_from_wheel: DAffine3) {
     ];
     let up = DAffine3::from_rotation_x(PI / 2.0);
     let mut s = Surface::default();
-    s.lathe(DVec3::ZERO, &tire.map(|p| DVec2::from(p)), 28);
+    s.lathe(DVec3::ZERO, &tire.map(DVec2::from), 28);
     car.piece("tires", m.rubber).add(&s, self_from_wheel * up);
     let mut rim = Surface::default();
     let dish = [[0.0, 0.02], [0.212, 0.02], [0.212, 0.085], [0.195, 0.092], [0.185, 0.075], [0.0, 0.072]];
-    rim.lathe(DVec3::ZERO, &dish.map(|p| DVec2::from(p)), 24);
-    rim.lathe(DVec3::ZERO, &[[0.0, 0.06], [0.055, 0.06], [0.05, 0.1], [0.0, 0.104]].map(|p| DVec2::from(p)), 12);
+    rim.lathe(DVec3::ZERO, &dish.map(DVec2::from), 24);
+    rim.lathe(DVec3::ZERO, &[[0.0, 0.06], [0.055, 0.06], [0.05, 0.1], [0.0, 0.104]].map(DVec2::from), 12);
     for k in 0..5 {
         let mut spoke = Surface::default();
         spoke.cuboid(dvec3(0.04, -0.022, 0.06), dvec3(0.19, 0.022, 0.09));

@@ -1,9 +1,10 @@
 //! A church: the gabled front of its nave with portal and rose window, and a tower with belfry, clock and spire.
 
 use super::arcade::{archivolt, portal};
-use super::house::{DEPTH, cornice_profile};
+use super::house::cornice_profile;
 use super::joinery::{WindowStyle, door, window};
 use super::materials::Materials;
+use super::roof::DEPTH;
 use super::roof::slab;
 use super::wall::{Opening, frame, pane, wall};
 use crate::assembly::Assembly;

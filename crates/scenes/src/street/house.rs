@@ -2,14 +2,11 @@
 
 use super::joinery::{WindowStyle, balcony, door, planter, shop, window};
 use super::materials::Materials;
-use super::roof::{Roof, roof};
+use super::roof::{DEPTH, Roof, roof};
 use super::wall::{Opening, front, wall};
 use crate::assembly::{Assembly, Finish};
 use crate::textures::Noise;
 use diorama_geom::glam::{DVec2, dvec2, dvec3};
-
-/// Depth of houses in meters.
-pub const DEPTH: f64 = 9.0;
 
 /// What a bay of a storey has.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -58,11 +55,6 @@ pub fn cornice_profile(out: f64, height: f64) -> Vec<DVec2> {
 }
 
 impl House {
-    /// Height of the walls.
-    pub fn height(&self) -> f64 {
-        self.storeys.iter().map(|s| s.height).sum()
-    }
-
     /// The pieces of the house.
     pub fn build(&self, m: &Materials) -> Assembly {
         let mut out = Assembly::default();

@@ -153,7 +153,7 @@ fn ends(m: &Materials) -> Vec<(House, DAffine3)> {
             vec![storey(3.7, &[Do, Wi], [1.1, 1.7]), storey(3.3, &[Wi, Wi], [1.1, 1.7]), storey(3.0, &[Wi, Wi], [1.1, 1.4])],
             seed,
         );
-        h.style.shutters = Some(m.wood[if seed % 2 == 0 { 4 } else { 3 }]);
+        h.style.shutters = Some(m.wood[if seed.is_multiple_of(2) { 4 } else { 3 }]);
         h
     };
     let west = |y: f64, x: f64| place(dvec3(x, y, PAVEMENT), 0.5 * PI);

@@ -141,6 +141,7 @@ impl Surface {
     }
 
     /// Whether, with corners at equal positions joined, every edge is crossed as often in one direction as in the other.
+    #[cfg(test)]
     pub fn is_closed(&self) -> bool {
         let mut balance = HashMap::<[[u32; 3]; 2], i64>::new();
         for face in self.corners.chunks_exact(3) {

@@ -180,9 +180,9 @@ impl SceneLoss<'_> {
         loss += (share * w.shadow * (1.0 - shadow) * (1.0 - shadow)) as f64;
         d_values[3] -= share * 2.0 * w.shadow * (1.0 - shadow);
         let facing = (0..3).map(|a| s.normal[a] * dir[a]).sum::<f32>();
-        if facing > 0.0 {
-            loss += (share * w.orientation * opacity * facing * facing) as f64;
-            (0..3).for_each(|a| d_normal[a] += share * 2.0 * w.orientation * opacity * facing * dir[a]);
+        if facing > 0.0 && s.length > 1e-12 {
+            loss += (share * w.orientation * facing * facing) as f64;
+            (0..3).for_each(|a| d_normal[a] += share * 2.0 * w.orientation * facing * dir[a]);
         }
         if s.length > 1e-12 {
             let radial: f32 = (0..3).map(|a| s.normal[a] * d_normal[a]).sum();

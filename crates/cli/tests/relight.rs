@@ -1,0 +1,141 @@
+//! The relight commands: compositions and turntables are rendered, continued after an interruption to the same bits, and refused in one line.
+
+use std::path::Path;
+use std::process::{Command, Output};
+use std::time::Duration;
+
+fn command(folder: &Path, arguments: &[&str]) -> Command {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
+    c.args(["relight"]).args(arguments).current_dir(folder);
+    c
+}
+
+fn run(folder: &Path, arguments: &[&str]) -> Output {
+    command(folder, arguments).output().unwrap()
+}
+
+const CUBE: &str = "v -1 0 -1\nv 1 0 -1\nv 1 0 1\nv -1 0 1\nv -1 2 -1\nv 1 2 -1\nv 1 2 1\nv -1 2 1\n\
+    f 1 2 3 4\nf 5 8 7 6\nf 1 5 6 2\nf 2 6 7 3\nf 3 7 8 4\nf 4 8 5 1\n";
+const FLOOR: &str = "v -9 0 -9\nv -9 0 9\nv 9 0 9\nv 9 0 -9\nf 1 2 3 4\n";
+const SCENE: &str = r#"
+[scene]
+mesh = "floor.obj"
+[[object]]
+mesh = "cube.obj"
+translate = [0, 3, 0]
+rotate_deg = [0, 30, 0]
+scale = 0.5
+snap = "ground"
+[light]
+sky = { elevation = 40, rotation = 60, intensity = 0.02 }
+[camera]
+eye = [0, 2, 6]
+target = [0, 0.5, 0]
+[render]
+size = [96, 64]
+spp = 32
+"#;
+
+fn folder() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    for (name, text) in [("cube.obj", CUBE), ("floor.obj", FLOOR), ("scene.toml", SCENE)] {
+        std::fs::write(dir.path().join(name), text).unwrap();
+    }
+    dir
+}
+
+#[track_caller]
+fn refused(folder: &Path, arguments: &[&str], expected: &[&str]) {
+    let before = std::fs::read_dir(folder).unwrap().count();
+    let o = run(folder, arguments);
+    let text = String::from_utf8_lossy(&o.stderr);
+    let errors: Vec<&str> = text.lines().filter(|l| l.starts_with("diorama: ")).collect();
+    assert!(o.status.code() == Some(2) && errors.len() == 1 && !text.contains("panicked"), "{arguments:?}: {text}");
+    assert!(expected.iter().all(|e| errors[0].contains(e)), "{expected:?} are not all in {:?}", errors[0]);
+    assert_eq!(std::fs::read_dir(folder).unwrap().count(), before, "{arguments:?} left something behind");
+}
+
+#[test]
+fn an_object_stands_on_the_ground_and_casts_a_shadow() {
+    let dir = folder();
+    let o = run(dir.path(), &["compose", "scene.toml", "-o", "a.exr", "--json"]);
+    assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+    let told: serde_json::Value = serde_json::from_slice(&o.stdout).unwrap();
+    assert_eq!((told["triangles"].as_u64(), &told["size"]), (Some(14), &serde_json::json!([96, 64])));
+    // The same, sunk into the floor by hand, is refused; floating, it is another picture.
+    let text = SCENE.replace("snap = \"ground\"", "").replace("[0, 3, 0]", "[0, -0.5, 0]");
+    std::fs::write(dir.path().join("scene.toml"), text).unwrap();
+    refused(dir.path(), &["compose", "scene.toml", "-o", "b.exr"], &["object 0", "overlap"]);
+}
+
+#[test]
+#[cfg(unix)]
+fn an_interrupted_picture_goes_on_to_the_same_bits() {
+    let dir = folder();
+    let long = ["compose", "scene.toml", "--spp", "1024", "-o"];
+    let whole = run(dir.path(), &[&long[..], &["whole.png"]].concat());
+    assert!(whole.status.success());
+    let mut interrupted = false;
+    for _ in 0..50 {
+        let mut child = command(dir.path(), &[&long[..], &["parts.png"]].concat()).spawn().unwrap();
+        std::thread::sleep(Duration::from_millis(250));
+        let _ = Command::new("kill").args(["-INT", &child.id().to_string()]).status();
+        match child.wait().unwrap().code() {
+            Some(0) => break,
+            code => {
+                // Before the handler is there, the signal ends the program.
+                assert!(code == Some(130) || code.is_none(), "{code:?}");
+                assert!(!dir.path().join("parts.png").exists());
+                interrupted |= code == Some(130);
+            }
+        }
+    }
+    assert!(interrupted, "the picture was finished before it could be interrupted");
+    let read = |name: &str| std::fs::read(dir.path().join(name)).unwrap();
+    assert_eq!(read("whole.png"), read("parts.png"));
+    assert!(!dir.path().join("parts.png.unfinished").exists());
+}
+
+#[test]
+fn a_turntable_writes_its_frames_and_keeps_those_that_are_there() {
+    let dir = folder();
+    let turn = ["turntable", "cube.obj", "--frames", "3", "--size", "32x24", "--spp", "4", "-o", "turn"];
+    assert!(run(dir.path(), &turn).status.success());
+    let frame = dir.path().join("turn/0001.png");
+    std::fs::write(&frame, b"mine").unwrap();
+    assert!(run(dir.path(), &turn).status.success());
+    assert_eq!(std::fs::read(&frame).unwrap(), b"mine");
+    assert!(run(dir.path(), &[&turn[..], &["--force"]].concat()).status.success());
+    assert_ne!(std::fs::read(&frame).unwrap(), b"mine");
+    assert!(dir.path().join("turn/0002.png").exists() && !dir.path().join("turn/0003.png").exists());
+}
+
+#[test]
+fn wrong_requests_are_refused_in_one_line() {
+    let dir = folder();
+    let at = dir.path();
+    let scene = |name: &str, from: &str, to: &str| std::fs::write(at.join(name), SCENE.replace(from, to)).unwrap();
+    scene("key.toml", "scale =", "scal =");
+    scene("missing.toml", "cube.obj", "nothing.obj");
+    scene("air.toml", "[0, 3, 0]", "[50, 3, 0]");
+    scene("hdri.toml", "sky = { elevation = 40, rotation = 60, intensity = 0.02 }", "hdri = \"square.png\"");
+    std::fs::write(at.join("short.txt"), "1 2 3\n1 2\n").unwrap();
+    let square = diorama_geom::ImageU8 { width: 2, height: 2, channels: 3, data: vec![0; 12] };
+    diorama_data::photo::save_png(&at.join("square.png"), &square).unwrap();
+    let compose = |name: &'static str| vec!["compose", name, "-o", "x.png"];
+    refused(at, &compose("key.toml"), &["key.toml", "line 8", "did you mean scale?"]);
+    refused(at, &compose("missing.toml"), &["nothing.obj", "object 0"]);
+    refused(at, &compose("air.toml"), &["cube.obj", "no ground below"]);
+    refused(at, &compose("hdri.toml"), &["square.png", "1.00 : 1"]);
+    refused(at, &["compose", "scene.toml", "-o", "x.jpg"], &["x.jpg", ".exr"]);
+    refused(at, &["compose", "scene.toml", "--denoise", "much"], &["--denoise", "atrous"]);
+    refused(at, &["turntable", "cube.obj", "--light", "short.txt"], &["short.txt", "2"]);
+    refused(at, &["turntable", "cube.obj", "--light", "sky:30"], &["--light", "sky:30,120"]);
+    refused(at, &["turntable", "cube.obj", "--sun", "1,2"], &["--sun", "POWER"]);
+    refused(at, &["turntable", "cube.stl"], &["cube.stl"]);
+    refused(at, &["synth", "--size", "huge"], &["huge", "middle"]);
+    refused(at, &["train", "nowhere", "-o", "run"], &["nowhere"]);
+    refused(at, &["train"], &["capture"]);
+    refused(at, &["eval", "."], &["run folder"]);
+    refused(at, &["render", ".", "--layers", "gloss"], &["--layers", "albedo"]);
+}

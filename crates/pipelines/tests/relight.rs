@@ -1,0 +1,162 @@
+//! The scene model on a small generated place: it learns, is interrupted and resumed to the same bits, and its layers are rendered.
+
+use diorama_engine::train::Event;
+use diorama_geom::glam::{DAffine3, DVec3};
+use diorama_geom::model::{Instance, Material, Part};
+use diorama_geom::{Camera, Mesh, Model, Pose};
+use diorama_pipelines::relight::outdoor::config::{Config, Preset};
+use diorama_pipelines::relight::outdoor::pictures::{self, Layer, PicturesOptions};
+use diorama_pipelines::relight::outdoor::{recipe, scores};
+use diorama_pipelines::relight::synth::{self, Place, SynthOptions};
+use diorama_pipelines::run::RunFolder;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// A box with flat normals.
+fn cuboid(low: [f32; 3], high: [f32; 3]) -> Mesh {
+    let corner = |i: usize| std::array::from_fn(|k| if i >> k & 1 == 0 { low[k] } else { high[k] });
+    let sides: [([usize; 4], [f32; 3]); 6] = [
+        ([0, 2, 3, 1], [0.0, 0.0, -1.0]),
+        ([4, 5, 7, 6], [0.0, 0.0, 1.0]),
+        ([0, 1, 5, 4], [0.0, -1.0, 0.0]),
+        ([2, 6, 7, 3], [0.0, 1.0, 0.0]),
+        ([0, 4, 6, 2], [-1.0, 0.0, 0.0]),
+        ([1, 3, 7, 5], [1.0, 0.0, 0.0]),
+    ];
+    let mut mesh = Mesh::default();
+    for (corners, normal) in sides {
+        let first = mesh.positions.len() as u32;
+        mesh.positions.extend(corners.map(corner));
+        mesh.normals.extend([normal; 4]);
+        mesh.faces.extend([[first, first + 1, first + 2], [first, first + 2, first + 3]]);
+    }
+    mesh
+}
+
+/// Three boxes on a plate, and cameras around them.
+fn place(views: usize, (width, height): (u32, u32)) -> Place {
+    let boxes = [
+        ([-8.0, -8.0, -0.2], [8.0, 8.0, 0.0], [0.5, 0.48, 0.45]),
+        ([-1.6, -0.4, 0.0], [-0.2, 1.2, 1.8], [0.7, 0.3, 0.2]),
+        ([0.4, -1.0, 0.0], [1.6, 0.6, 1.0], [0.2, 0.4, 0.6]),
+        ([-0.9, -1.8, 0.0], [0.0, -1.1, 0.7], [0.6, 0.6, 0.2]),
+    ];
+    let mut model = Model::default();
+    for (i, (low, high, [r, g, b])) in boxes.into_iter().enumerate() {
+        model.materials.push(Material { base_color: [r, g, b, 1.0], specular: 0.0, ..Material::default() });
+        model.parts.push(Part { name: format!("box.{i}"), mesh: cuboid(low, high), material: i });
+        model.instances.push(Instance { part: i, world_from_part: DAffine3::IDENTITY });
+    }
+    let camera = Camera::pinhole(width, height, 0.8);
+    let pose = |i: usize| {
+        let (turn, height) = (i as f64 / views as f64 * std::f64::consts::TAU, 2.2 + 1.3 * (i % 3) as f64);
+        Pose::look_at(DVec3::new(4.5 * turn.cos(), 4.5 * turn.sin(), 1.0 + height), DVec3::new(0.0, 0.0, 0.4), DVec3::Z)
+    };
+    Place { model, cameras: (0..views).map(|i| (camera, pose(i))).collect() }
+}
+
+fn generate(out: &Path, views: usize, size: (u32, u32)) {
+    let options = SynthOptions { views, lights: 3, size, samples: 16, seed: 0 };
+    let made = synth::generate(out, &place(views, size), &options, false, &AtomicBool::new(false), &mut |_| {}).unwrap();
+    assert_eq!((made.photographs + made.held_out, made.held_out), (3 * views + views / 5, 4 * (views / 5)));
+    let again = synth::generate(out, &place(views, size), &options, false, &AtomicBool::new(false), &mut |_| {});
+    assert!(again.unwrap_err().to_string().contains("--force"));
+}
+
+fn config(data: &Path, steps: u64) -> Config {
+    let mut config = Config::new(Preset::Ci, data.into());
+    (config.run.steps, config.sampling.rays) = (steps, 256);
+    config
+}
+
+#[test]
+fn an_interrupted_run_ends_as_if_it_had_not_been() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("data");
+    generate(&data, 5, (24, 16));
+    let train = |name: &str, stop_at: Option<u64>, resume: bool| {
+        let at = dir.path().join(name);
+        let mut folder = if resume { RunFolder::open(&at).unwrap().0 } else { RunFolder::create(&at, false).unwrap() };
+        let mut config = config(&data, 24);
+        config.run.log_every = 1;
+        let stop = AtomicBool::new(false);
+        let mut logged = 0;
+        let trained = recipe::train(&config, &mut folder, resume, &stop, &mut |e| {
+            if let Event::Progress { .. } = e {
+                logged += 1;
+                stop.store(stop_at.is_some_and(|at| logged >= at), Ordering::Relaxed);
+            }
+        })
+        .unwrap();
+        (trained.summary.interrupted, trained.model)
+    };
+    let (_, whole) = train("whole", None, false);
+    assert!(train("parts", Some(9), false).0);
+    let (_, resumed) = train("parts", None, true);
+    assert_eq!(whole.field.weights.values, resumed.field.weights.values);
+    assert_eq!(whole.field.encoder.table().unwrap().values, resumed.field.encoder.table().unwrap().values);
+    assert_eq!(whole.lights.values, resumed.lights.values);
+    assert_eq!(whole.skies.values, resumed.skies.values);
+}
+
+#[test]
+fn a_trained_place_is_scored_and_its_layers_are_rendered() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, run) = (dir.path().join("data"), dir.path().join("run"));
+    generate(&data, 10, (32, 24));
+    let mut folder = RunFolder::create(&run, false).unwrap();
+    let mut losses = Vec::new();
+    recipe::train(&config(&data, 200), &mut folder, false, &AtomicBool::new(false), &mut |e| {
+        if let Event::Progress { loss, .. } = e {
+            losses.push(*loss);
+        }
+    })
+    .unwrap();
+    assert!(losses.last().unwrap() < &(0.6 * losses[0]), "{losses:?}");
+    drop(folder);
+    let (model, _) = recipe::load(&run).unwrap();
+    let mut looked = 0;
+    let s = scores::judge(&model, &data, &mut |_, ours, theirs| {
+        looked += 1;
+        assert_eq!((ours.width, ours.height), (theirs.width, theirs.height));
+        Ok(())
+    })
+    .unwrap();
+    assert_eq!((s.views, looked), (2, 2));
+    // Exact layers explain more than the mean of the other lights.
+    assert!(s.oracle_psnr > s.mean_light_psnr + 2.0 && s.seen_light_psnr.is_finite(), "{s:?}");
+    let options = PicturesOptions {
+        light: None,
+        frames: vec!["0".into(), "v001_noon".into()],
+        layers: vec![Layer::Rgb, Layer::Albedo, Layer::Normal, Layer::Shadow],
+        is_linear: false,
+        out: dir.path().join("pictures"),
+    };
+    let made = pictures::render(&model, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();
+    assert!(made.pictures.len() == 8 && made.pictures.iter().all(|p| p.is_file()), "{:?}", made.pictures);
+    let unknown = PicturesOptions { frames: vec!["nothing".into()], ..options };
+    let e = pictures::render(&model, &unknown, &AtomicBool::new(false), &mut |_| {}).unwrap_err();
+    assert!(e.is_input() && e.to_string().contains("--frame nothing"), "{e}");
+}
+
+#[test]
+fn photographs_of_one_light_are_warned_about() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("data");
+    let options = SynthOptions { views: 5, lights: 1, size: (16, 12), samples: 4, seed: 0 };
+    synth::generate(&data, &place(5, (16, 12)), &options, false, &AtomicBool::new(false), &mut |_| {}).unwrap();
+    // Without the light that is held out.
+    std::fs::remove_file(data.join("transforms_test.json")).unwrap();
+    std::fs::rename(data.join("transforms_train.json"), data.join("transforms.json")).unwrap();
+    let mut config = config(&data, 1);
+    config.data.split = "every:4".into();
+    let mut folder = RunFolder::create(&dir.path().join("run"), false).unwrap();
+    let mut notes = Vec::new();
+    recipe::train(&config, &mut folder, false, &AtomicBool::new(false), &mut |e| {
+        if let Event::Note(n) = e {
+            notes.push(n.clone());
+        }
+    })
+    .unwrap();
+    assert!(notes.iter().any(|n| n.contains("ambiguous")), "{notes:?}");
+}
