@@ -6,6 +6,7 @@ use diorama_geom::color::{srgb_from_linear, u8_from_unit};
 use diorama_geom::glam::{DMat3, DVec2, DVec3, dvec2, dvec3};
 use diorama_geom::model::{Instance, Material, Model, Part, Texture, Wrap};
 use diorama_geom::{ImageU8, Mesh};
+use rayon::prelude::*;
 use std::f64::consts::{PI, TAU};
 
 /// Names of the parts, in the order of the scene's objects.
@@ -14,10 +15,10 @@ pub const NAMES: [&str; 6] = ["table", "ball.red", "box.dots", "can", "ball.viol
 /// Segments around balls and cylinders.
 const SEGMENTS: usize = 128;
 
-/// Columns and rows of charts, each a function from the unit square to the surface with its normal.
+/// A piece of a surface: columns and rows of its quads, and points with normals over the unit square.
 struct Chart {
     cells: [usize; 2],
-    at: Box<dyn Fn(f64, f64) -> (DVec3, DVec3)>,
+    at: Box<dyn Fn(f64, f64) -> (DVec3, DVec3) + Sync>,
 }
 
 /// Charts that cover a shape once; u runs to the right and v down seen from outside.
@@ -40,7 +41,7 @@ fn charts(shape: &Shape) -> Vec<Chart> {
             };
             let cap = |sign: f64| Chart {
                 cells: [SEGMENTS, 1],
-                // Disks are stored by their square: see `square_of_disk`.
+                // v is the share of the radius.
                 at: Box::new(move |u, v| {
                     (center + rim(if sign > 0.0 { u } else { 1.0 - u }, radius * v).extend(sign * half_height), DVec3::Z * sign)
                 }),
@@ -70,6 +71,9 @@ struct Slot {
     size: [usize; 2],
 }
 
+/// Pixels of the textures per unit of length.
+const PIXELS: f64 = 600.0;
+
 /// Pixels between a chart and its neighbors.
 const GUTTER: usize = 4;
 
@@ -95,7 +99,7 @@ fn point(shape: &Shape, index: usize, chart: &Chart, q: DVec2) -> DVec3 {
 
 /// Side-by-side places for the charts of a shape, and the texture's size.
 fn slots(shape: &Shape) -> (Vec<Slot>, [usize; 2]) {
-    let of = |w: f64, h: f64| [w, h].map(|v| (v * 700.0).round() as usize);
+    let of = |w: f64, h: f64| [w, h].map(|v| (v * PIXELS).round() as usize);
     let sizes: Vec<[usize; 2]> = match *shape {
         Shape::Sphere { radius, .. } => vec![of(TAU * radius, PI * radius)],
         Shape::Cylinder { radius, half_height, .. } => {
@@ -127,21 +131,24 @@ fn slots(shape: &Shape) -> (Vec<Slot>, [usize; 2]) {
 fn texture(shape: &Shape, pattern: &Pattern, charts: &[Chart], slots: &[Slot], size: [usize; 2]) -> ImageU8 {
     let mut data = vec![128u8; size[0] * size[1] * 3];
     for (index, (chart, slot)) in charts.iter().zip(slots).enumerate() {
-        for y in slot.corner[1] - GUTTER..slot.corner[1] + slot.size[1] + GUTTER {
-            for x in slot.corner[0] - GUTTER..slot.corner[0] + slot.size[0] + GUTTER {
-                let mut sum = DVec3::ZERO;
-                for s in 0..9 {
-                    let at = |v: usize, k: usize, sub: usize| {
-                        let inside = (v as f64 + (sub as f64 + 0.5) / 3.0 - slot.corner[k] as f64) / slot.size[k] as f64;
-                        inside.clamp(0.0, 1.0 - 1e-9)
-                    };
+        let [left, top] = slot.corner.map(|c| c - GUTTER);
+        let [width, height] = slot.size.map(|s| s + 2 * GUTTER);
+        // Pixels of the gutter repeat the nearest color of the chart.
+        let at = |pixel: usize, k: usize, sub: usize| {
+            let inside = (pixel as f64 + (sub as f64 + 0.5) / 3.0 - GUTTER as f64) / slot.size[k] as f64;
+            inside.clamp(0.0, 1.0 - 1e-9)
+        };
+        let rows = data.par_chunks_exact_mut(size[0] * 3).skip(top).take(height).enumerate();
+        rows.for_each(|(y, row)| {
+            for x in 0..width {
+                let color = |s: usize| {
                     let p = point(shape, index, chart, dvec2(at(x, 0, s % 3), at(y, 1, s / 3)));
-                    sum += DVec3::from_array(pattern.color(p).to_array().map(|c| srgb_from_linear(c as f32) as f64));
-                }
-                let i = 3 * (y * size[0] + x);
-                data[i..i + 3].copy_from_slice(&(sum / 9.0).to_array().map(|c| u8_from_unit(c as f32)));
+                    DVec3::from_array(pattern.color(p).to_array().map(|c| srgb_from_linear(c as f32) as f64))
+                };
+                let mean = (0..9).map(color).sum::<DVec3>() / 9.0;
+                row[3 * (left + x)..][..3].copy_from_slice(&mean.to_array().map(|c| u8_from_unit(c as f32)));
             }
-        }
+        });
     }
     ImageU8 { width: size[0], height: size[1], channels: 3, data }
 }
@@ -158,9 +165,7 @@ fn mesh(shape: &Shape, charts: &[Chart], slots: &[Slot], size: [usize; 2]) -> Me
                 let (p, n) = (chart.at)(u, v);
                 mesh.positions.push(p.as_vec3().to_array().map(|v| v + 0.0));
                 mesh.normals.push(n.as_vec3().to_array());
-                let turned = if is_disk(shape, index) && n.z < 0.0 { 1.0 - u } else { u };
-                let q = in_square(shape, index, if is_disk(shape, index) { turned } else { u }, v);
-                let q = if is_disk(shape, index) && n.z < 0.0 { in_square(shape, index, u, v) } else { q };
+                let q = in_square(shape, index, u, v);
                 mesh.uvs.push(std::array::from_fn(|k| ((slot.corner[k] as f64 + q[k] * slot.size[k] as f64) / size[k] as f64) as f32));
             }
         }
@@ -194,4 +199,48 @@ pub fn model() -> Model {
         model.instances.push(Instance { part: index, world_from_part: diorama_geom::glam::DAffine3::IDENTITY });
     }
     model
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diorama_geom::rng::Rng;
+
+    #[test]
+    fn textures_hold_the_color_of_the_surface_where_they_are_shown() {
+        let (model, rng) = (model(), Rng::new(3, 3));
+        for (part, object) in model.parts.iter().zip(still_life::scene().objects) {
+            let image = &model.textures[part.material].image;
+            let mut same = 0;
+            for k in 0..2000u64 {
+                let face = part.mesh.faces[rng.below(3 * k, part.mesh.faces.len() as u64) as usize];
+                let (mut a, mut b) = (rng.uniform(3 * k + 1), rng.uniform(3 * k + 2));
+                if a + b > 1.0 {
+                    (a, b) = (1.0 - a, 1.0 - b);
+                }
+                let weights = [1.0 - a - b, a, b];
+                let sum = |of: &dyn Fn(usize) -> f32| (0..3).map(|i| weights[i] * of(face[i] as usize)).sum::<f32>();
+                let p: [f32; 3] = std::array::from_fn(|c| sum(&|i| part.mesh.positions[i][c]));
+                let uv: [f32; 2] = std::array::from_fn(|c| sum(&|i| part.mesh.uvs[i][c]));
+                let pixel = image.pixel((uv[0] * image.width as f32) as usize, (uv[1] * image.height as f32) as usize);
+                let expected = object.texture.color(DVec3::from(p.map(f64::from))).to_array().map(|c| srgb_from_linear(c as f32) * 255.0);
+                same += (0..3).all(|c| (pixel[c] as f32 - expected[c]).abs() < 2.0) as usize;
+            }
+            // The others lie on the borders of the pattern.
+            assert!(same > 1840, "{}: {same} of 2000", part.name);
+        }
+    }
+
+    #[test]
+    fn meshes_fill_the_shapes() {
+        for (part, Object { shape, .. }) in model().parts.iter().zip(still_life::scene().objects) {
+            let exact = match shape {
+                Shape::Sphere { radius, .. } => 4.0 / 3.0 * PI * radius.powi(3),
+                Shape::Cylinder { radius, half_height, .. } => PI * radius * radius * 2.0 * half_height,
+                Shape::Box { half, .. } => 8.0 * half.x * half.y * half.z,
+            };
+            let volume = part.mesh.volume();
+            assert!((volume / exact - 1.0).abs() < 3e-3, "{}: {volume} and {exact}", part.name);
+        }
+    }
 }

@@ -58,7 +58,7 @@ fn band(surface: &mut Surface, from: DVec3, to: DVec3, at: f64, radius: f64, wid
     let d = (to - from).normalize();
     let middle = from.lerp(to, at);
     let profile = [[0.0, 0.0], [0.86 * radius, 0.0], [radius, 0.25], [radius, 0.75], [0.86 * radius, 1.0], [0.0, 1.0]];
-    turned(surface, middle - d * 0.5 * width, middle + d * 0.5 * width, &profile, 36);
+    turned(surface, middle - d * 0.5 * width, middle + d * 0.5 * width, &profile, 28);
 }
 
 /// Turned front legs, rear legs that go on as stiles, and turned stretchers.
@@ -89,7 +89,7 @@ pub fn legs(chair: &mut Assembly, wood: Finish, gold: Finish) {
     ];
     for side in [-1.0, 1.0] {
         let (foot, head) = (dvec3(side * FRONT, -DEEP, 0.035), dvec3(side * FRONT, -DEEP, SEAT - 0.015));
-        turned(chair.piece("legs", wood), foot, head, &profile, 40);
+        turned(chair.piece("legs", wood), foot, head, &profile, 32);
         let gilded = chair.piece("gilding", gold);
         gilded.ball(dvec3(side * FRONT, -DEEP, 0.026), 0.026, 28);
         for at in [0.11, 0.735] {
@@ -112,7 +112,7 @@ pub fn legs(chair: &mut Assembly, wood: Finish, gold: Finish) {
             [0.006, 0.95],
             [0.0, 1.0],
         ];
-        turned(gilded, top - up * 0.006, top + up * 0.085, &finial, 36);
+        turned(gilded, top - up * 0.006, top + up * 0.085, &finial, 24);
         gilded.ball(path[0] + dvec3(0.0, 0.0, 0.008), 0.024, 24);
     }
     let stretcher: [Turned; 14] = [
@@ -133,10 +133,10 @@ pub fn legs(chair: &mut Assembly, wood: Finish, gold: Finish) {
     ];
     let rails = chair.piece("stretchers", wood);
     for side in [-1.0, 1.0] {
-        turned(rails, dvec3(side * FRONT, -DEEP, 0.14), dvec3(side * (REAR + 0.003), DEEP + 0.028, 0.15), &stretcher, 28);
+        turned(rails, dvec3(side * FRONT, -DEEP, 0.14), dvec3(side * (REAR + 0.003), DEEP + 0.028, 0.15), &stretcher, 20);
     }
-    turned(rails, dvec3(-0.245, 0.0, 0.145), dvec3(0.245, 0.0, 0.145), &stretcher, 28);
-    turned(rails, dvec3(-REAR, DEEP + 0.012, 0.24), dvec3(REAR, DEEP + 0.012, 0.24), &stretcher, 28);
+    turned(rails, dvec3(-0.245, 0.0, 0.145), dvec3(0.245, 0.0, 0.145), &stretcher, 20);
+    turned(rails, dvec3(-REAR, DEEP + 0.012, 0.24), dvec3(REAR, DEEP + 0.012, 0.24), &stretcher, 20);
     let knob = chair.piece("gilding", gold);
     band(knob, dvec3(-0.2, 0.0, 0.145), dvec3(0.2, 0.0, 0.145), 0.5, 0.0225, 0.014);
 }
@@ -172,7 +172,8 @@ pub fn seat(chair: &mut Assembly, wood: Finish, dark: Finish, gold: Finish) {
     for (x, y) in [(-FRONT, -DEEP), (FRONT, -DEEP)] {
         bar(rails, &line(dvec3(x, y, SEAT - 0.075), dvec3(x, y, SEAT + 0.006), 4), |_| DVec2::splat(0.034), 32);
     }
-    chair.piece("board", dark).cuboid(dvec3(-REAR + 0.012, -DEEP + 0.012, SEAT - 0.03), dvec3(REAR - 0.012, DEEP - 0.012, SEAT + 0.002));
+    let board = [dvec2(-FRONT + 0.014, -DEEP), dvec2(FRONT - 0.014, -DEEP), dvec2(REAR - 0.01, DEEP), dvec2(-REAR + 0.01, DEEP)];
+    chair.piece("board", dark).prism(&board, |p, is_low| dvec3(p.x, p.y, SEAT + if is_low { -0.03 } else { -0.002 }));
     // The apron hangs from the front rail: scallops between two scrolls.
     let mut outline = Vec::new();
     let n = 72;
@@ -186,7 +187,7 @@ pub fn seat(chair: &mut Assembly, wood: Finish, dark: Finish, gold: Finish) {
     let gilded = chair.piece("gilding", gold);
     let along = |k: usize| dvec3((k as f64 / 20.0 - 1.0) * (FRONT - 0.045), -DEEP - 0.024, SEAT - 0.034);
     for k in 0..=40 {
-        gilded.ball(along(k), 0.0062, 10);
+        gilded.ball(along(k), 0.0062, 8);
     }
     rosette(gilded, dvec3(0.0, -DEEP - 0.008, SEAT - 0.093), 0.026, DVec3::NEG_Y);
     for side in [-1.0, 1.0] {
@@ -199,11 +200,11 @@ fn rosette(surface: &mut Surface, at: DVec3, radius: f64, normal: DVec3) {
     let mut own = Surface::default();
     let plate = [[0.0, -0.01], [0.62 * radius, -0.01], [0.62 * radius, 0.1 * radius], [0.0, 0.16 * radius]];
     own.lathe(DVec3::ZERO, &plate.map(DVec2::from), 24);
-    own.ball(dvec3(0.0, 0.0, 0.12 * radius), 0.26 * radius, 16);
+    own.ball(dvec3(0.0, 0.0, 0.12 * radius), 0.26 * radius, 12);
     for k in 0..8 {
         let angle = k as f64 * PI / 4.0;
         let mut petal = Surface::default();
-        petal.ball(DVec3::ZERO, 1.0, 14);
+        petal.ball(DVec3::ZERO, 1.0, 10);
         let place = DAffine3::from_rotation_z(angle)
             * DAffine3::from_translation(dvec3(0.62 * radius, 0.0, 0.03 * radius))
             * DAffine3::from_scale(dvec3(0.36, 0.2, 0.17) * radius);
@@ -260,7 +261,7 @@ pub fn back(chair: &mut Assembly, wood: Finish, dark: Finish, gold: Finish) {
     ];
     for x in [-0.17, -0.125, 0.125, 0.17] {
         let (y0, y1) = (rear_at(1.0, low).y, rear_at(1.0, high).y);
-        turned(chair.piece("spindles", wood), dvec3(x, y0, low), dvec3(x, y1, high - 0.02), &spindle, 20);
+        turned(chair.piece("spindles", wood), dvec3(x, y0, low), dvec3(x, y1, high - 0.02), &spindle, 16);
         band(chair.piece("gilding", gold), dvec3(x, y0, low), dvec3(x, y1, high - 0.02), 0.45, 0.0135, 0.007);
     }
     let middle = 0.5 * (low + high);
@@ -272,7 +273,7 @@ pub fn back(chair: &mut Assembly, wood: Finish, dark: Finish, gold: Finish) {
     rosette(&mut sun, dvec3(0.0, -0.008, -0.115), 0.026, DVec3::NEG_Y);
     for k in 0..24 {
         let angle = k as f64 * PI / 12.0;
-        sun.ball(dvec3(0.064 * angle.cos(), -0.01, 0.055 + 0.064 * angle.sin()), 0.0042, 10);
+        sun.ball(dvec3(0.064 * angle.cos(), -0.01, 0.055 + 0.064 * angle.sin()), 0.0042, 8);
     }
     chair.piece("gilding", gold).add(&sun, lean(middle));
 }
@@ -324,7 +325,7 @@ pub fn arms(chair: &mut Assembly, wood: Finish, gold: Finish) {
             [0.0, 1.0],
         ];
         let (foot, head) = (dvec3(side * FRONT, -DEEP + 0.01, SEAT), path[26] - DVec3::Z * 0.004);
-        turned(chair.piece("arms", wood), foot, head, &post, 32);
+        turned(chair.piece("arms", wood), foot, head, &post, 24);
         band(chair.piece("gilding", gold), foot, head, 0.78, 0.0225, 0.009);
     }
 }

@@ -26,7 +26,7 @@ fn column(surface: &mut Surface, at: DVec3, radius: f64, height: f64) {
     square(surface, 1.45 * r, -0.2, 0.16);
     square(surface, 1.42 * r, height - 0.14, height);
     let mut profile = vec![dvec2(0.0, 0.15), dvec2(1.36 * r, 0.15)];
-    let bulge = |z: f64, out: f64, h: f64| (0..=5).map(move |k| dvec2(out + 0.5 * h * (k as f64 / 5.0 * PI).sin(), z + h * k as f64 / 5.0));
+    let bulge = |z: f64, out: f64, h: f64| (0..=3).map(move |k| dvec2(out + 0.5 * h * (k as f64 / 3.0 * PI).sin(), z + h * k as f64 / 3.0));
     profile.extend(bulge(0.17, 1.25 * r, 0.1));
     profile.extend([dvec2(1.12 * r, 0.28), dvec2(1.12 * r, 0.32)]);
     profile.extend(bulge(0.33, 1.1 * r, 0.06));
@@ -38,7 +38,7 @@ fn column(surface: &mut Surface, at: DVec3, radius: f64, height: f64) {
     profile.extend(bulge(high + 0.01, 0.88 * r, 0.05));
     profile.extend([dvec2(0.86 * r, high + 0.08), dvec2(0.92 * r, high + 0.16), dvec2(1.05 * r, high + 0.24), dvec2(1.3 * r, high + 0.32)]);
     profile.extend([dvec2(1.36 * r, high + 0.365), dvec2(0.0, high + 0.365)]);
-    surface.lathe(at, &profile, 20);
+    surface.lathe(at, &profile, 16);
 }
 
 /// The wall above a row of arches that spring at `spring`: both faces, soffits and the feet between the arches.
@@ -190,7 +190,7 @@ impl Arcade {
     }
 }
 
-/// A gatehouse: a passage for the road under two storeys of `half_width · 2` meters.
+/// A gatehouse, `width` meters wide: a passage for the road under one storey.
 pub fn gatehouse(m: &Materials, width: f64, style: &WindowStyle, tiles: &Roof) -> Assembly {
     let mut out = Assembly::default();
     let passage = Opening::arched(0.5 * width, 6.6, -0.4, 6.0);

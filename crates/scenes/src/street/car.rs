@@ -82,10 +82,10 @@ impl CarShape {
     /// Places of the body's cross-sections, dense at the arches and at the ends.
     fn stations(&self) -> Vec<f64> {
         let half = 0.5 * self.length;
-        let mut xs: Vec<f64> = (0..=34).map(|k| -half + self.length * k as f64 / 34.0).collect();
+        let mut xs: Vec<f64> = (0..=24).map(|k| -half + self.length * k as f64 / 24.0).collect();
         for a in self.axles {
             xs.retain(|x| (x - a).abs() > ARCH + 0.03);
-            xs.extend((0..=14).map(|k| a - ARCH * (PI * k as f64 / 14.0).cos()));
+            xs.extend((0..=10).map(|k| a - ARCH * (PI * k as f64 / 10.0).cos()));
             xs.extend([a - ARCH - 0.004, a + ARCH + 0.004]);
         }
         xs.extend([-half + 0.02, -half + 0.06, half - 0.02, half - 0.06]);
@@ -106,7 +106,7 @@ fn section(shape: &CarShape, x: f64, j: usize) -> DVec3 {
     let shoulder = hi - (0.06f64).min(0.4 * (hi - lo));
     let side = |z: f64| shape.half_width(x, z);
     let (y, z) = match j {
-        0 => (0.0, lo),
+        0 => (0.0, lo - 0.01),
         1 => (side(lo) - 0.02, lo),
         2..=6 => {
             let z = lo + 0.012 + (shoulder - lo - 0.012) * (j - 2) as f64 / 4.0;
@@ -170,13 +170,13 @@ fn cabin_point(shape: &CarShape, (x, share): (f64, f64), j: usize) -> DVec3 {
     let lean = |t: f64| foot + (head - foot) * t;
     let s = (top - base) / (shape.roof - base);
     let (y, z) = match j {
-        0 => (0.0, base - 0.02),
+        0 => (0.0, base - 0.03),
         1 => (foot, base - 0.02),
         2 => (lean(0.1 * s), base + 0.1 * (top - base)),
         3 => (lean(0.86 * s), base + 0.86 * (top - base)),
-        4 => (lean(s) - 0.045, top - 0.02 * s),
-        5 => (0.5 * lean(s), top + 0.015 * s),
-        _ => (0.0, top + 0.02 * s),
+        4 => (lean(s) - 0.045, top + 0.002 - 0.02 * s),
+        5 => (0.5 * lean(s), top + 0.004 + 0.015 * s),
+        _ => (0.0, top + 0.005 + 0.02 * s),
     };
     dvec3(x, y, z)
 }
@@ -185,7 +185,7 @@ fn cabin_point(shape: &CarShape, (x, share): (f64, f64), j: usize) -> DVec3 {
 fn is_glazed(stations: usize, i: usize, j: usize, is_van: bool) -> bool {
     let windshield = i == stations - 3 && j >= 4;
     let rear = i == 1 && j >= 4 && !is_van;
-    let side = j == 2 && (i == 6 || i == 7 || (i == 4 && !is_van)) || j == 2 && i == stations - 3 && !is_van;
+    let side = j == 2 && (i == 6 || i == 7 || (!is_van && (i == 4 || i == stations - 3)));
     windshield || rear || side
 }
 
@@ -205,12 +205,12 @@ fn wheel(car: &mut Assembly, m: &Materials, self_from_wheel: DAffine3) {
     ];
     let up = DAffine3::from_rotation_x(PI / 2.0);
     let mut s = Surface::default();
-    s.lathe(DVec3::ZERO, &tire.map(DVec2::from), 28);
+    s.lathe(DVec3::ZERO, &tire.map(DVec2::from), 20);
     car.piece("tires", m.rubber).add(&s, self_from_wheel * up);
     let mut rim = Surface::default();
     let dish = [[0.0, 0.02], [0.212, 0.02], [0.212, 0.085], [0.195, 0.092], [0.185, 0.075], [0.0, 0.072]];
-    rim.lathe(DVec3::ZERO, &dish.map(DVec2::from), 24);
-    rim.lathe(DVec3::ZERO, &[[0.0, 0.06], [0.055, 0.06], [0.05, 0.1], [0.0, 0.104]].map(DVec2::from), 12);
+    rim.lathe(DVec3::ZERO, &dish.map(DVec2::from), 18);
+    rim.lathe(DVec3::ZERO, &[[0.0, 0.06], [0.055, 0.06], [0.05, 0.1], [0.0, 0.104]].map(DVec2::from), 8);
     for k in 0..5 {
         let mut spoke = Surface::default();
         spoke.cuboid(dvec3(0.04, -0.022, 0.06), dvec3(0.19, 0.022, 0.09));

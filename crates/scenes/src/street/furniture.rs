@@ -31,7 +31,7 @@ pub fn lamp(m: &Materials) -> Assembly {
         [0.09, 3.49],
         [0.0, 3.49],
     ];
-    iron.lathe(DVec3::ZERO, &post.map(DVec2::from), 14);
+    iron.lathe(DVec3::ZERO, &post.map(DVec2::from), 10);
     for side in [-1.0, 1.0] {
         iron.tube(&[dvec3(0.0, 0.0, 3.0), dvec3(0.42 * side, 0.0, 3.0)], &[0.018, 0.018], 6);
         iron.ball(dvec3(0.42 * side, 0.0, 3.0), 0.035, 8);
@@ -43,9 +43,9 @@ pub fn lamp(m: &Materials) -> Assembly {
     };
     for k in 0..4 {
         let iron = out.piece("post", m.iron);
-        iron.tube(&[corner(k, low, z0 - 0.02), corner(k, high, z1 + 0.02)], &[0.014, 0.014], 6);
-        iron.tube(&[corner(k, high, z1), corner(k + 1, high, z1)], &[0.016, 0.016], 6);
-        iron.tube(&[corner(k, low, z0), corner(k + 1, low, z0)], &[0.014, 0.014], 6);
+        iron.tube(&[corner(k, low, z0 - 0.02), corner(k, high, z1 + 0.02)], &[0.014, 0.014], 4);
+        iron.tube(&[corner(k, high, z1), corner(k + 1, high, z1)], &[0.016, 0.016], 4);
+        iron.tube(&[corner(k, low, z0), corner(k + 1, low, z0)], &[0.014, 0.014], 4);
         out.piece("glass", m.glass).polygon(&[corner(k, low, z0), corner(k + 1, low, z0), corner(k + 1, high, z1), corner(k, high, z1)]);
         let iron = out.piece("post", m.iron);
         iron.polygon(&[corner(k, 0.27, z1 + 0.01), corner(k + 1, 0.27, z1 + 0.01), dvec3(0.0, 0.0, z1 + 0.24)]);
@@ -83,7 +83,7 @@ pub fn bench(m: &Materials) -> Assembly {
 pub fn bollard(m: &Materials) -> Assembly {
     let mut out = Assembly::default();
     let profile = [[0.0, -0.1], [0.17, -0.1], [0.15, 0.62], [0.18, 0.66], [0.18, 0.72], [0.14, 0.8], [0.07, 0.85], [0.0, 0.86]];
-    out.piece("stone", m.stone[2]).lathe(DVec3::ZERO, &profile.map(DVec2::from), 16);
+    out.piece("stone", m.stone[2]).lathe(DVec3::ZERO, &profile.map(DVec2::from), 12);
     out
 }
 

@@ -64,7 +64,7 @@ pub fn ground(m: &Materials, layout: &Layout, seed: u64) -> Assembly {
 fn curbs(out: &mut Assembly, m: &Materials, seed: u64) {
     let noise = Noise::new(seed, 82);
     let stone = out.piece("curb", m.stone[2]);
-    let (length, gap) = (1.1, 0.008);
+    let (length, gap) = (1.6, 0.008);
     let n = ((BEYOND[1] - BEYOND[0]) / length) as i64;
     for k in 0..n {
         let x = BEYOND[0] + length * k as f64;
@@ -74,7 +74,7 @@ fn curbs(out: &mut Assembly, m: &Materials, seed: u64) {
             // The edge toward the road is chamfered.
             let profile = [dvec2(near, -0.3), dvec2(far, -0.3), dvec2(far, top), dvec2(near + 0.04, top), dvec2(near, top - 0.03)];
             let (a, b) = (x + 0.5 * gap, x + length - 0.5 * gap);
-            stone.prism(&profile, |p, end| dvec3(if (side < 0.0) == end { a } else { b }, side * p.x, p.y));
+            stone.prism(&profile, |p, end| dvec3(if (side > 0.0) == end { a } else { b }, side * p.x, p.y));
         }
     }
 }

@@ -41,8 +41,8 @@ pub fn window(house: &mut Assembly, m: &Materials, o: &Opening, depth: f64, styl
         let width = curtain * o.width;
         for (x, sign) in [(left, 1.0), (right, -1.0)] {
             let (a, b) = if sign > 0.0 { (x, x + width) } else { (x - width, x) };
-            cloth.grid(10, 1, |i, j| {
-                let s = i as f64 / 10.0;
+            cloth.grid(7, 1, |i, j| {
+                let s = i as f64 / 7.0;
                 let z = if j == 0 { o.bottom } else { o.top };
                 let fold = 0.03 * (s * width * 45.0).sin();
                 (dvec3(a + (b - a) * s, depth + 0.12 + fold, z), dvec2(s * width, -z))
@@ -84,10 +84,10 @@ fn surround(house: &mut Assembly, o: &Opening, style: &WindowStyle) {
 fn shutter(surface: &mut Surface, x: [f64; 2], z: [f64; 2]) {
     let outer = Opening::rectangle(0.5 * (x[0] + x[1]), x[1] - x[0], z[0], z[1]);
     frame(surface, &outer.outline(0.0), &outer.outline(0.06), [-0.075, -0.03]);
-    let slats = ((z[1] - z[0] - 0.12) / 0.09) as usize;
+    let slats = ((z[1] - z[0] - 0.12) / 0.16) as usize;
     for k in 0..slats {
         let low = z[0] + 0.06 + (z[1] - z[0] - 0.12) * k as f64 / slats as f64;
-        let outline = [dvec2(0.064, low + 0.005), dvec2(0.072, low + 0.005), dvec2(0.041, low + 0.085), dvec2(0.033, low + 0.085)];
+        let outline = [dvec2(0.064, low + 0.005), dvec2(0.072, low + 0.005), dvec2(0.041, low + 0.15), dvec2(0.033, low + 0.15)];
         surface.molding(&outline, x[0] + 0.045, x[1] - 0.045);
     }
 }
@@ -198,11 +198,11 @@ pub fn balcony(house: &mut Assembly, m: &Materials, x: [f64; 2], z: f64, trim: F
         for (height, r) in [(0.12, 0.012), (0.98, 0.022)] {
             iron.tube(&[a.extend(z + height), b.extend(z + height)], &[r, r], 6);
         }
-        let n = (a.distance(b) / 0.13).round().max(1.0) as usize;
+        let n = (a.distance(b) / 0.15).round().max(1.0) as usize;
         for k in 0..n {
             let p = a.lerp(b, (k as f64 + 0.5) / n as f64);
             iron.tube(&[p.extend(z + 0.115), p.extend(z + 0.97)], &[0.009, 0.009], 4);
-            if k % 2 == 0 {
+            if k % 4 == 0 {
                 iron.ball(p.extend(z + 0.55), 0.028, 6);
             }
         }
@@ -224,7 +224,7 @@ pub fn planter(house: &mut Assembly, m: &Materials, x: [f64; 2], y: f64, z: f64,
         let mut card = Surface::default();
         super::tree::card(&mut card, 0.32);
         house.piece("plants", m.leaves[0]).add(&card, DAffine3::from_translation(at) * turn);
-        if k % 2 == 0 {
+        if k % 3 == 0 {
             let height = 0.14 + 0.16 * noise.value(k, 0, 3) as f64;
             house.piece("flowers", m.flower).ball(at + dvec3(0.02, -0.06, height), 0.03, 6);
         }

@@ -64,10 +64,10 @@ fn saddle(out: &mut Assembly, m: &Materials, tiles: Finish, width: f64, z: f64, 
     let s = out.piece("roof", tiles);
     slab(s, [dvec3(x0, -eaves, low), dvec3(x1, -eaves, low), dvec3(x1, half, ridge), dvec3(x0, half, ridge)], 0.1);
     slab(s, [dvec3(x1, DEPTH + eaves, low), dvec3(x0, DEPTH + eaves, low), dvec3(x0, half, ridge), dvec3(x1, half, ridge)], 0.1);
-    let n = (width / 0.42) as usize;
+    let n = (width / 0.8) as usize;
     for k in 0..n {
         let at = |t: f64| dvec3(x0 + (x1 - x0) * t / n as f64, half, ridge - 0.01);
-        s.tube(&[at(k as f64), at(k as f64 + 0.98)], &[0.13, 0.105], 8);
+        s.tube(&[at(k as f64), at(k as f64 + 0.98)], &[0.13, 0.105], 6);
     }
     let gap = 0.012;
     let side = out.piece("wall", walls);
@@ -114,7 +114,7 @@ fn chimney(out: &mut Assembly, m: &Materials, x: f64, y: f64, low: f64, high: f6
     out.piece("chimney", m.stone[1]).cuboid(dvec3(x - 0.57, y - 0.37, high - 0.02), dvec3(x + 0.57, y + 0.37, high + 0.12));
     for side in [-0.24, 0.24] {
         let pot = [[0.0, 0.0], [0.14, 0.0], [0.11, 0.4], [0.14, 0.42], [0.14, 0.47], [0.1, 0.47], [0.1, 0.3], [0.0, 0.3]];
-        out.piece("chimney", m.clay).lathe(dvec3(x + side, y, high + 0.1), &pot.map(|p| p.into()), 12);
+        out.piece("chimney", m.clay).lathe(dvec3(x + side, y, high + 0.1), &pot.map(|p| p.into()), 8);
     }
 }
 

@@ -54,7 +54,7 @@ impl Growth<'_> {
         let taper = |k: usize| 1.0 - 0.55 * k as f64 / steps as f64;
         let flare = |k: usize| if limb.order == 0 && k == 0 { 1.45 } else { 1.0 };
         let radii: Vec<f64> = (0..=steps).map(|k| limb.radius * taper(k) * flare(k)).collect();
-        self.bark.tube(&path, &radii, [14, 8, 5, 3][limb.order.min(3)]);
+        self.bark.tube(&path, &radii, [14, 8, 4, 3][limb.order.min(3)]);
         if limb.order >= 2 {
             self.foliage(&path, if limb.order == 2 { 7 } else { 6 });
         }
