@@ -6,10 +6,11 @@ use crate::loaded_model::Notes;
 use std::path::Path;
 
 /// Extensions that are read.
-const READ: [&str; 6] = [
+const READ: [&str; 7] = [
     "KHR_mesh_quantization",
     "KHR_texture_transform",
     "KHR_materials_emissive_strength",
+    "KHR_materials_specular",
     "KHR_materials_transmission",
     "KHR_materials_unlit",
     "EXT_texture_webp",

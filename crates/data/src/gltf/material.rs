@@ -134,6 +134,12 @@ pub fn read(document: &Document, index: usize, has_uvs: bool, textures: &mut Tex
         out.emission = material.emissive_factor.map(|v| v.max(0.0) * strength.max(0.0));
         out.emission_texture = texture(material.emissive_texture.as_ref())?;
     }
+    if let Some(specular) = &material.extensions.specular {
+        out.specular = unit("specularFactor", specular.specular_factor)?;
+        if specular.specular_texture.is_some() || specular.specular_color_texture.is_some() || specular.specular_color_factor.is_some() {
+            notes.add(format!("{what}: the texture and the color of its reflection are left out"));
+        }
+    }
     if let Some(transmission) = &material.extensions.transmission {
         out.transmission = unit("transmissionFactor", transmission.transmission_factor)?;
         if transmission.transmission_texture.is_some() {

@@ -172,6 +172,8 @@ impl Default for MetallicRoughness {
 pub struct MaterialExtensions {
     #[serde(rename = "KHR_materials_emissive_strength")]
     pub emissive_strength: Option<EmissiveStrength>,
+    #[serde(rename = "KHR_materials_specular")]
+    pub specular: Option<Specular>,
     #[serde(rename = "KHR_materials_transmission")]
     pub transmission: Option<Transmission>,
     #[serde(rename = "KHR_materials_unlit")]
@@ -187,6 +189,16 @@ pub struct EmissiveStrength {
 
 fn one() -> f32 {
     1.0
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Specular {
+    #[serde(default = "one")]
+    pub specular_factor: f32,
+    pub specular_texture: Option<TextureInfo>,
+    pub specular_color_factor: Option<[f32; 3]>,
+    pub specular_color_texture: Option<TextureInfo>,
 }
 
 #[derive(Deserialize)]

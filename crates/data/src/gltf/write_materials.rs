@@ -89,6 +89,9 @@ impl Materials {
         if strength > 1.0 {
             extension("KHR_materials_emissive_strength", json!({ "emissiveStrength": strength }));
         }
+        if material.specular < 1.0 {
+            extension("KHR_materials_specular", json!({ "specularFactor": material.specular }));
+        }
         if material.transmission > 0.0 {
             extension("KHR_materials_transmission", json!({ "transmissionFactor": material.transmission }));
         }
@@ -125,7 +128,12 @@ fn check(material: &Material, path: &Path) -> Result<()> {
         Err(DataError::input(path, format!("material \"{}\": {what} is {v}, not {range}; correct it", material.name)))
     };
     let factors = material.base_color.iter().map(|v| ("base color", *v));
-    let others = [("roughness", material.roughness), ("metalness", material.metallic), ("transmission", material.transmission)];
+    let others = [
+        ("roughness", material.roughness),
+        ("metalness", material.metallic),
+        ("transmission", material.transmission),
+        ("reflection", material.specular),
+    ];
     if let Some((what, v)) = factors.chain(others).find(|(_, v)| !(0.0..=1.0).contains(v)) {
         return wrong(what, v, "0 to 1");
     }

@@ -59,6 +59,7 @@ fn any_material(textures: usize) -> impl Strategy<Value = Material> {
             base_color_texture: base,
             roughness,
             metallic,
+            specular: 1.0 - 0.5 * metallic,
             metallic_roughness_texture: packed,
             is_occluding: occlusion && packed.is_some(),
             normal_texture: normal,

@@ -93,7 +93,8 @@ impl Turntable {
         if self.frames == 0 || self.spp == 0 {
             return refuse("--frames and --spp: must be at least 1");
         }
-        if !(self.fov > 0.0 && self.fov < 179.0) || !(self.elevation.abs() < 90.0) {
+        let is_between = |v: f64, low: f64, high: f64| v > low && v < high;
+        if !is_between(self.fov, 0.0, 179.0) || !is_between(self.elevation, -90.0, 90.0) {
             return refuse("--fov: must lie between 0 and 179 degrees; --elevation: between -90 and 90");
         }
         let denoise = match self.denoise.as_str() {

@@ -204,7 +204,7 @@ impl Configuration for Config {
             return fault("data.downscale, sampling.rays, max_samples and occupancy_every must be at least 1");
         }
         let weights = [self.loss.robust, self.loss.orientation, self.loss.shadow, self.loss.negative, self.loss.distortion];
-        if !(self.loss.huber > 0.0) || weights.iter().any(|w| !(*w >= 0.0 && w.is_finite())) {
+        if self.loss.huber <= 0.0 || weights.iter().any(|w| !(*w >= 0.0 && w.is_finite())) {
             return fault("loss: huber must be above 0, weights 0 or more");
         }
         if self.run.steps == 0 && self.run.seconds <= 0.0 {
