@@ -1,6 +1,7 @@
-//! Procedural scenes with exact cameras and exact ground truth, rendered by a small ray caster.
+//! Procedural scenes with exact cameras and exact ground truth.
 //!
-//! [`still_life`] is the capture of `diorama quickstart`; [`ray_caster`] has the shapes, textures and the renderer for scenes of your own.
+//! - [`still_life`] is the capture of `diorama quickstart`; [`ray_caster`] has the shapes, textures and the renderer for scenes of your own.
+//! - [`street`], [`chair`] and [`still_life_model`] are triangle meshes with metallic-roughness materials, for a path tracer to light.
 //!
 //! ```
 //! use diorama_scenes::still_life;
@@ -10,6 +11,12 @@
 //! assert_eq!((photos.len(), photos[0].image.width, photos[0].image.channels), (8, 32, 4));
 //! // The object is in the center of the image, the corners are transparent.
 //! assert_eq!((photos[0].image.pixel(16, 16)[3], photos[0].image.pixel(0, 0)[3]), (255, 0));
+//!
+//! // A street, and a photographer's way through it.
+//! use diorama_scenes::street;
+//! let (model, cameras) = (street::model(1), street::cameras(12, 640, 480, 1));
+//! assert!(model.face_count() > 100_000 && cameras.len() == 12);
+//! assert!(model.parts.iter().any(|part| part.name == "car.1.body"));
 //! ```
 
 mod assembly;

@@ -57,9 +57,9 @@ fn sizes_are_within_their_bounds() {
     let unique = |m: &Model| m.parts.iter().map(|p| p.mesh.faces.len()).sum::<usize>();
     let street = the_street();
     assert!((20_000..150_000).contains(&unique(street)), "{}", unique(street));
-    assert!(street.face_count() < 180_000, "{}", street.face_count());
+    assert!(street.face_count() < 160_000, "{}", street.face_count());
     let chair = chair::model(1);
-    assert!((10_000..90_000).contains(&chair.face_count()), "{}", chair.face_count());
+    assert!((10_000..60_000).contains(&chair.face_count()), "{}", chair.face_count());
     let (lo, hi) = chair.bounds().unwrap();
     assert!(lo[2].abs() < 0.01 && (1.0..1.2).contains(&hi[2]));
 }

@@ -154,7 +154,7 @@ fn height_above_ground(ground: &Scene, object: &Model) -> Option<f64> {
     Some(low[2] - hit.position.z)
 }
 
-/// Share of an object's edges that cross the scene's surfaces, without those near its lowest point, which may touch the ground.
+/// Share of an object's edges that cross the scene's surfaces, without what is near its lowest point, which may touch the ground.
 fn pierced(ground: &Scene, object: &Model) -> f64 {
     let Some((low, high)) = object.bounds().filter(|_| ground.triangles() > 0) else { return 0.0 };
     let floor = low[2] + 0.02 * (high[2] - low[2]);
@@ -165,10 +165,14 @@ fn pierced(ground: &Scene, object: &Model) -> f64 {
         for face in &mesh.faces {
             n += 1;
             let at = |i: u32| instance.world_from_part.transform_point3(DVec3::from(mesh.positions[i as usize].map(f64::from)));
-            let (a, b) = (at(face[0]), at(face[1]));
-            if n.is_multiple_of(step) && a.z.min(b.z) > floor {
-                tested += 1;
-                crossing += cpu::is_between(ground, a, b) as usize;
+            for (i, j) in [(0, 1), (1, 2), (2, 0)].into_iter().filter(|_| n.is_multiple_of(step)) {
+                let (p, q) = (at(face[i]), at(face[j]));
+                let (low, high) = if p.z < q.z { (p, q) } else { (q, p) };
+                if high.z > floor {
+                    let low = if low.z < floor { low + (high - low) * ((floor - low.z) / (high.z - low.z)) } else { low };
+                    tested += 1;
+                    crossing += cpu::is_between(ground, low, high) as usize;
+                }
             }
         }
     }

@@ -9,7 +9,7 @@ use diorama_geom::sky::Sky;
 use std::path::{Path, PathBuf};
 
 /// Rows of maps that are computed.
-const ROWS: usize = 256;
+const ROWS: usize = 128;
 /// Angular diameter of a sun that is added by hand, in radians.
 const SUN: f64 = Sky::SUN_DIAMETER;
 

@@ -6,7 +6,7 @@ use diorama_geom::glam::{DVec3, dvec2, dvec3};
 use std::f64::consts::{PI, TAU};
 
 /// Quads along an edge of a face.
-const CELLS: usize = 56;
+const CELLS: usize = 48;
 
 /// Half of the width in front and at the back, half of the depth, in meters.
 const HALF: [f64; 3] = [0.235, 0.2, 0.22];
@@ -63,7 +63,7 @@ pub fn cushion(chair: &mut Assembly, cloth: Finish, gold: Finish) {
 
 /// A twisted cord around the seam.
 fn cord(chair: &mut Assembly, gold: Finish, seam: f64) {
-    let (steps, sides, radius) = (320usize, 8usize, 0.0058);
+    let (steps, sides, radius) = (280usize, 6usize, 0.0058);
     let center = |k: usize| {
         let (edge, f) = (k / (steps / 4) % 4, 2.0 * (k % (steps / 4)) as f64 / (steps / 4) as f64 - 1.0);
         let (s, t) = [(f, -1.0), (1.0, f), (-f, 1.0), (-1.0, -f)][edge];

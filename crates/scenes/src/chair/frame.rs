@@ -21,7 +21,7 @@ fn rounded(points: &[Turned]) -> Vec<DVec2> {
     let mut out = Vec::new();
     for pair in points.windows(2) {
         let (a, b) = (DVec2::from(pair[0]), DVec2::from(pair[1]));
-        let steps = if a.x * b.x == 0.0 || (a.y - b.y).abs() < 1e-6 { 1 } else { 4 };
+        let steps = if a.x * b.x == 0.0 || (a.y - b.y).abs() < 1e-6 { 1 } else { 3 };
         for k in 0..steps {
             let t = k as f64 / steps as f64;
             let s = t * t * (3.0 - 2.0 * t);
@@ -57,8 +57,11 @@ fn line(from: DVec3, to: DVec3, steps: usize) -> Vec<DVec3> {
 fn band(surface: &mut Surface, from: DVec3, to: DVec3, at: f64, radius: f64, width: f64) {
     let d = (to - from).normalize();
     let middle = from.lerp(to, at);
-    let profile = [[0.0, 0.0], [0.86 * radius, 0.0], [radius, 0.25], [radius, 0.75], [0.86 * radius, 1.0], [0.0, 1.0]];
-    turned(surface, middle - d * 0.5 * width, middle + d * 0.5 * width, &profile, 28);
+    let profile = [[0.0, 0.0], [0.86, 0.0], [0.97, 0.15], [1.0, 0.4], [1.0, 0.6], [0.97, 0.85], [0.86, 1.0], [0.0, 1.0]];
+    let mut own = Surface::default();
+    own.lathe(DVec3::ZERO, &profile.map(|[r, z]| dvec2(r * radius, (z - 0.5) * width)), 24);
+    let rotation = DQuat::from_rotation_arc(DVec3::Z, d);
+    surface.add(&own, DAffine3::from_rotation_translation(rotation, middle));
 }
 
 /// Turned front legs, rear legs that go on as stiles, and turned stretchers.
@@ -96,7 +99,7 @@ pub fn legs(chair: &mut Assembly, wood: Finish, gold: Finish) {
             band(gilded, foot, head, at, if at < 0.5 { 0.0265 } else { 0.0325 }, 0.011);
         }
         let path = rear_path(side);
-        bar(chair.piece("legs", wood), &path, |j| DVec2::splat(0.021 - 0.004 * (j as f64 / 24.0 - 0.45).abs() * 2.0), 28);
+        bar(chair.piece("legs", wood), &path, |j| DVec2::splat(0.021 - 0.004 * (j as f64 / 24.0 - 0.45).abs() * 2.0), 20);
         let gilded = chair.piece("gilding", gold);
         let top = path[path.len() - 1];
         let up = (top - path[path.len() - 2]).normalize();
@@ -167,7 +170,7 @@ pub fn seat(chair: &mut Assembly, wood: Finish, dark: Finish, gold: Finish) {
     let (fl, fr) = (corner(-FRONT, -DEEP), corner(FRONT, -DEEP));
     let (rl, rr) = (corner(-REAR, DEEP), corner(REAR, DEEP));
     for (a, b) in [(fl, fr), (rl, rr), (fl, rl), (fr, rr)] {
-        bar(rails, &line(a, b, 6), |_| half, 28);
+        bar(rails, &line(a, b, 6), |_| half, 20);
     }
     for (x, y) in [(-FRONT, -DEEP), (FRONT, -DEEP)] {
         bar(rails, &line(dvec3(x, y, SEAT - 0.075), dvec3(x, y, SEAT + 0.006), 4), |_| DVec2::splat(0.034), 32);
@@ -204,7 +207,7 @@ fn rosette(surface: &mut Surface, at: DVec3, radius: f64, normal: DVec3) {
     for k in 0..8 {
         let angle = k as f64 * PI / 4.0;
         let mut petal = Surface::default();
-        petal.ball(DVec3::ZERO, 1.0, 10);
+        petal.ball(DVec3::ZERO, 1.0, 8);
         let place = DAffine3::from_rotation_z(angle)
             * DAffine3::from_translation(dvec3(0.62 * radius, 0.0, 0.03 * radius))
             * DAffine3::from_scale(dvec3(0.36, 0.2, 0.17) * radius);
@@ -266,7 +269,7 @@ pub fn back(chair: &mut Assembly, wood: Finish, dark: Finish, gold: Finish) {
     }
     let middle = 0.5 * (low + high);
     let mut board = Surface::default();
-    board.plate(&splat(0.5 * (high - low) + 0.01), -0.009, 0.009);
+    board.plate(&splat(0.5 * (high - low) - 0.015), -0.009, 0.009);
     chair.piece("splat", dark).add(&board, lean(middle));
     let mut sun = Surface::default();
     rosette(&mut sun, dvec3(0.0, -0.008, 0.055), 0.05, DVec3::NEG_Y);
@@ -297,7 +300,7 @@ pub fn arms(chair: &mut Assembly, wood: Finish, gold: Finish) {
             dvec3(x, y, 0.69 - 0.035 * (PI * t).sin() + 0.012 * t)
         };
         let path: Vec<DVec3> = (0..=28).map(|k| at(k as f64 / 28.0)).collect();
-        bar(chair.piece("arms", wood), &path, |j| dvec2(0.021 + 0.006 * (j as f64 / 28.0 * PI).sin(), 0.014), 28);
+        bar(chair.piece("arms", wood), &path, |j| dvec2(0.021 + 0.006 * (j as f64 / 28.0 * PI).sin(), 0.014), 20);
         let end = path[28];
         let scroll: Vec<DVec2> = arc(DVec2::ZERO, 0.028, 0.0, 2.0 * PI, 36)[..36].to_vec();
         let mut disk = Surface::default();

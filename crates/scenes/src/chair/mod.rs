@@ -18,7 +18,7 @@ pub const CENTER: DVec3 = dvec3(0.0, 0.02, 0.55);
 pub const DISTANCE: f64 = 2.6;
 
 /// Field of view over the shorter side of the image in radians.
-pub const FOV: f64 = 0.5;
+pub const FOV: f64 = 0.59;
 
 /// The chair of a seed, which draws the grain of its wood, its gilding and its cloth.
 pub fn model(seed: u64) -> Model {

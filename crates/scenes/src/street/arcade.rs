@@ -2,8 +2,8 @@
 
 use super::house::cornice_profile;
 use super::joinery::{WindowStyle, door, shop, window};
+use super::layout::DEPTH;
 use super::materials::Materials;
-use super::roof::DEPTH;
 use super::roof::{Roof, roof};
 use super::wall::{Opening, front, ring, wall};
 use crate::assembly::{Assembly, Finish, place};
@@ -38,7 +38,7 @@ fn column(surface: &mut Surface, at: DVec3, radius: f64, height: f64) {
     profile.extend(bulge(high + 0.01, 0.88 * r, 0.05));
     profile.extend([dvec2(0.86 * r, high + 0.08), dvec2(0.92 * r, high + 0.16), dvec2(1.05 * r, high + 0.24), dvec2(1.3 * r, high + 0.32)]);
     profile.extend([dvec2(1.36 * r, high + 0.365), dvec2(0.0, high + 0.365)]);
-    surface.lathe(at, &profile, 16);
+    surface.lathe(at, &profile, 14);
 }
 
 /// The wall above a row of arches that spring at `spring`: both faces, soffits and the feet between the arches.

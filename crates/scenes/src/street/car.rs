@@ -82,10 +82,10 @@ impl CarShape {
     /// Places of the body's cross-sections, dense at the arches and at the ends.
     fn stations(&self) -> Vec<f64> {
         let half = 0.5 * self.length;
-        let mut xs: Vec<f64> = (0..=24).map(|k| -half + self.length * k as f64 / 24.0).collect();
+        let mut xs: Vec<f64> = (0..=18).map(|k| -half + self.length * k as f64 / 18.0).collect();
         for a in self.axles {
             xs.retain(|x| (x - a).abs() > ARCH + 0.03);
-            xs.extend((0..=10).map(|k| a - ARCH * (PI * k as f64 / 10.0).cos()));
+            xs.extend((0..=8).map(|k| a - ARCH * (PI * k as f64 / 8.0).cos()));
             xs.extend([a - ARCH - 0.004, a + ARCH + 0.004]);
         }
         xs.extend([-half + 0.02, -half + 0.06, half - 0.02, half - 0.06]);
@@ -191,25 +191,15 @@ fn is_glazed(stations: usize, i: usize, j: usize, is_van: bool) -> bool {
 
 /// A wheel with its outer face toward −y, its center on the origin.
 fn wheel(car: &mut Assembly, m: &Materials, self_from_wheel: DAffine3) {
-    let tire = [
-        [0.0, -0.1],
-        [0.2, -0.1],
-        [0.285, -0.095],
-        [0.305, -0.06],
-        [WHEEL, 0.0],
-        [0.305, 0.06],
-        [0.285, 0.095],
-        [0.225, 0.1],
-        [0.21, 0.07],
-        [0.0, 0.07],
-    ];
+    let tire =
+        [[0.0, -0.1], [0.2, -0.1], [0.285, -0.095], [WHEEL, -0.05], [WHEEL, 0.05], [0.285, 0.095], [0.225, 0.1], [0.21, 0.07], [0.0, 0.07]];
     let up = DAffine3::from_rotation_x(PI / 2.0);
     let mut s = Surface::default();
     s.lathe(DVec3::ZERO, &tire.map(DVec2::from), 20);
     car.piece("tires", m.rubber).add(&s, self_from_wheel * up);
     let mut rim = Surface::default();
     let dish = [[0.0, 0.02], [0.212, 0.02], [0.212, 0.085], [0.195, 0.092], [0.185, 0.075], [0.0, 0.072]];
-    rim.lathe(DVec3::ZERO, &dish.map(DVec2::from), 18);
+    rim.lathe(DVec3::ZERO, &dish.map(DVec2::from), 14);
     rim.lathe(DVec3::ZERO, &[[0.0, 0.06], [0.055, 0.06], [0.05, 0.1], [0.0, 0.104]].map(DVec2::from), 8);
     for k in 0..5 {
         let mut spoke = Surface::default();

@@ -3,8 +3,8 @@
 use super::arcade::{archivolt, portal};
 use super::house::cornice_profile;
 use super::joinery::{WindowStyle, door, window};
+use super::layout::DEPTH;
 use super::materials::Materials;
-use super::roof::DEPTH;
 use super::roof::slab;
 use super::wall::{Opening, frame, pane, wall};
 use crate::assembly::Assembly;

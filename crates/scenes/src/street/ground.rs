@@ -64,7 +64,7 @@ pub fn ground(m: &Materials, layout: &Layout, seed: u64) -> Assembly {
 fn curbs(out: &mut Assembly, m: &Materials, seed: u64) {
     let noise = Noise::new(seed, 82);
     let stone = out.piece("curb", m.stone[2]);
-    let (length, gap) = (1.6, 0.008);
+    let (length, gap) = (2.0, 0.008);
     let n = ((BEYOND[1] - BEYOND[0]) / length) as i64;
     for k in 0..n {
         let x = BEYOND[0] + length * k as f64;

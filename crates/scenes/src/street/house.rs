@@ -1,8 +1,9 @@
 //! Houses in a row: storeys of bays under a roof. A house faces −y, its left end is x = 0, it stands on z = 0.
 
 use super::joinery::{WindowStyle, balcony, door, planter, shop, window};
+use super::layout::DEPTH;
 use super::materials::Materials;
-use super::roof::{DEPTH, Roof, roof};
+use super::roof::{Roof, roof};
 use super::wall::{Opening, front, wall};
 use crate::assembly::{Assembly, Finish};
 use crate::textures::Noise;

@@ -84,10 +84,10 @@ fn surround(house: &mut Assembly, o: &Opening, style: &WindowStyle) {
 fn shutter(surface: &mut Surface, x: [f64; 2], z: [f64; 2]) {
     let outer = Opening::rectangle(0.5 * (x[0] + x[1]), x[1] - x[0], z[0], z[1]);
     frame(surface, &outer.outline(0.0), &outer.outline(0.06), [-0.075, -0.03]);
-    let slats = ((z[1] - z[0] - 0.12) / 0.16) as usize;
+    let slats = ((z[1] - z[0] - 0.12) / 0.2) as usize;
     for k in 0..slats {
         let low = z[0] + 0.06 + (z[1] - z[0] - 0.12) * k as f64 / slats as f64;
-        let outline = [dvec2(0.064, low + 0.005), dvec2(0.072, low + 0.005), dvec2(0.041, low + 0.15), dvec2(0.033, low + 0.15)];
+        let outline = [dvec2(0.064, low + 0.005), dvec2(0.072, low + 0.005), dvec2(0.041, low + 0.19), dvec2(0.033, low + 0.19)];
         surface.molding(&outline, x[0] + 0.045, x[1] - 0.045);
     }
 }
@@ -198,7 +198,7 @@ pub fn balcony(house: &mut Assembly, m: &Materials, x: [f64; 2], z: f64, trim: F
         for (height, r) in [(0.12, 0.012), (0.98, 0.022)] {
             iron.tube(&[a.extend(z + height), b.extend(z + height)], &[r, r], 6);
         }
-        let n = (a.distance(b) / 0.15).round().max(1.0) as usize;
+        let n = (a.distance(b) / 0.17).round().max(1.0) as usize;
         for k in 0..n {
             let p = a.lerp(b, (k as f64 + 0.5) / n as f64);
             iron.tube(&[p.extend(z + 0.115), p.extend(z + 0.97)], &[0.009, 0.009], 4);

@@ -10,6 +10,9 @@ pub const PAVEMENT: f64 = 0.12;
 /// Distance of the façades from the middle of the road in meters.
 pub const FACADE: f64 = 11.0;
 
+/// Depth of houses in meters.
+pub const DEPTH: f64 = 9.0;
+
 /// End of the street on both sides in meters.
 pub const END: f64 = 30.0;
 
@@ -58,12 +61,7 @@ impl Layout {
         let trees = [(-20.5, 5.9), (-7.0, 5.9), (5.2, 5.9), (17.5, 5.9), (-25.0, -6.6), (2.6, -6.0)];
         let trees = trees.into_iter().enumerate().map(|(k, (x, y))| {
             let c = 200 + 3 * k as u64;
-            Place {
-                at: dvec3(x, y, PAVEMENT),
-                angle: uniform(c, 0.0, std::f64::consts::TAU),
-                kind: k % 2,
-                size: uniform(c + 1, 0.85, 1.12),
-            }
+            Place { at: dvec3(x, y, PAVEMENT), angle: uniform(c, 0.0, 2.0 * PI), kind: k % 2, size: uniform(c + 1, 0.85, 1.12) }
         });
         let upright = |(x, y, angle): (f64, f64, f64)| Place { at: dvec3(x, y, PAVEMENT), angle, kind: 0, size: 1.0 };
         let lamps = [(-27.0, 4.3, 0.0), (-13.5, 4.3, 0.0), (-0.5, 4.3, 0.0), (12.5, 4.3, 0.0), (26.0, 4.3, 0.0)];

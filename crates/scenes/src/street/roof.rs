@@ -1,14 +1,12 @@
 //! Roofs of houses, with gutters, chimneys and dormers.
 
 use super::joinery::{WindowStyle, window};
+use super::layout::DEPTH;
 use super::materials::Materials;
 use super::wall::{Opening, wall};
 use crate::assembly::{Assembly, Finish};
 use crate::surface::Surface;
 use diorama_geom::glam::{DAffine3, DVec3, dvec2, dvec3};
-
-/// Depth of houses in meters.
-pub const DEPTH: f64 = 9.0;
 
 /// Form of a roof.
 #[derive(Clone)]

@@ -41,7 +41,7 @@ impl Growth<'_> {
     }
 
     fn limb(&mut self, limb: Limb) {
-        let steps = [7, 4, 3, 2][limb.order.min(3)];
+        let steps = [7, 4, 2, 1][limb.order.min(3)];
         let (mut p, mut d) = (limb.from, limb.direction);
         let mut path = vec![p];
         for _ in 0..steps {

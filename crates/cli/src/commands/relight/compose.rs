@@ -53,9 +53,9 @@ impl Verb for Compose {
         if self.out.exists() && !self.force {
             return Err(PipelineError::Usage(format!("{}: exists; give --force to replace it", self.out.display())));
         }
+        watch_interrupts();
         let mut composition = compose::load(&file)?;
         composition.notes.iter().for_each(|n| note(n));
-        watch_interrupts();
         let (start, kept) = (Instant::now(), picture::kept_beside(&self.out));
         let mut shown = ShareShown::new();
         let text = format!("{} triangles, {} samples per pixel", composition.scene.triangles(), file.render.spp);
