@@ -19,7 +19,8 @@ const RUN: [(&str, &[&str]); 10] = [
 ];
 
 /// Examples that are only built, with the reason.
-const BUILT: [(&str, &str); 4] = [
+const BUILT: [(&str, &str); 5] = [
+    ("density-gradient-speed", "measures for minutes"),
     ("graph-check", "needs a device; `cargo xtask gpu-check` runs it"),
     ("ops-speed", "measures for minutes"),
     ("own_picture", "serves until it is stopped; `cargo xtask viewer-check` opens its page"),
