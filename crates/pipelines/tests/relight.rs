@@ -3,10 +3,12 @@
 use diorama_engine::train::Event;
 use diorama_geom::glam::{DAffine3, DVec3};
 use diorama_geom::model::{Instance, Material, Part};
+use diorama_geom::view_controls::{ControlInput, ControlValue, ControlValues, check_lists};
+use diorama_geom::view_source::{ViewRequest, ViewSource};
 use diorama_geom::{Camera, Mesh, Model, Pose};
 use diorama_pipelines::relight::outdoor::config::{Config, Preset};
 use diorama_pipelines::relight::outdoor::pictures::{self, Layer, PicturesOptions};
-use diorama_pipelines::relight::outdoor::{recipe, scores};
+use diorama_pipelines::relight::outdoor::{recipe, scores, viewing};
 use diorama_pipelines::relight::synth::{self, Place, SynthOptions};
 use diorama_pipelines::run::RunFolder;
 use std::path::Path;
@@ -81,7 +83,7 @@ fn an_interrupted_run_ends_as_if_it_had_not_been() {
         config.run.log_every = 1;
         let stop = AtomicBool::new(false);
         let mut logged = 0;
-        let trained = recipe::train(&config, &mut folder, resume, &stop, &mut |e| {
+        let trained = recipe::train(&config, &mut folder, resume, None, &stop, &mut |e| {
             if let Event::Progress { .. } = e {
                 logged += 1;
                 stop.store(stop_at.is_some_and(|at| logged >= at), Ordering::Relaxed);
@@ -106,7 +108,7 @@ fn a_trained_place_is_scored_and_its_layers_are_rendered() {
     generate(&data, 10, (32, 24));
     let mut folder = RunFolder::create(&run, false).unwrap();
     let mut losses = Vec::new();
-    recipe::train(&config(&data, 200), &mut folder, false, &AtomicBool::new(false), &mut |e| {
+    recipe::train(&config(&data, 200), &mut folder, false, None, &AtomicBool::new(false), &mut |e| {
         if let Event::Progress { loss, .. } = e {
             losses.push(*loss);
         }
@@ -134,9 +136,43 @@ fn a_trained_place_is_scored_and_its_layers_are_rendered() {
     };
     let made = pictures::render(&model, &options, &AtomicBool::new(false), &mut |_| {}).unwrap();
     assert!(made.pictures.len() == 8 && made.pictures.iter().all(|p| p.is_file()), "{:?}", made.pictures);
+    the_viewer_shows_layers_in_any_light(&run, &data.join("truth"));
     let unknown = PicturesOptions { frames: vec!["nothing".into()], ..options };
     let e = pictures::render(&model, &unknown, &AtomicBool::new(false), &mut |_| {}).unwrap_err();
     assert!(e.is_input() && e.to_string().contains("--frame nothing"), "{e}");
+}
+
+/// Light changes what is lit and nothing else; the lists make sense; a place that is looked at has a position.
+fn the_viewer_shows_layers_in_any_light(run: &Path, truth: &Path) {
+    let (maps, _) = viewing::read_maps(&[truth.join("noon.hdr")]).unwrap();
+    let view = viewing::open(run, recipe::load(run).unwrap().0, maps, false).unwrap();
+    let scene = view.scene();
+    check_lists(&scene.layers, &scene.controls).unwrap();
+    let lights = match &scene.controls[0].input {
+        ControlInput::Pick { options, .. } => options.iter().map(|(id, _)| id.clone()).collect::<Vec<_>>(),
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(lights, ["learned:0", "learned:1", "learned:2", "map:0", "sky"]);
+    let frame = &scene.frames[0];
+    let picture = |layer: &str, given: &[(&str, ControlValue)]| {
+        let values = ControlValues::checked(&scene.controls, given.iter().map(|(id, v)| (id.to_string(), v.clone()))).unwrap();
+        let (camera, world_from_camera) = (frame.camera, frame.world_from_camera);
+        view.view(&ViewRequest { camera, world_from_camera, layer: layer.into(), values, clip: None }).unwrap()
+    };
+    let choice = |id: &str| ("light", ControlValue::Choice(id.into()));
+    let plain: Vec<_> = scene.layers.iter().map(|l| picture(&l.id, &[])).collect();
+    for (i, a) in plain.iter().enumerate() {
+        assert_eq!((a.width, a.height, a.channels), (32, 24, 3));
+        assert!(i == 0 || a.data != plain[0].data, "layer {i} looks like the first");
+    }
+    for changed in [vec![choice("map:0")], vec![choice("sky")], vec![("sun_power", ControlValue::Number(2.0))]] {
+        assert_ne!(picture("rgb", &changed).data, plain[0].data, "{changed:?}");
+        assert_eq!(picture("albedo", &changed).data, plain[1].data, "{changed:?}");
+    }
+    let evening = ("sun_azimuth", ControlValue::Number(-90.0));
+    assert_ne!(picture("rgb", &[choice("sky"), evening]).data, picture("rgb", &[choice("sky")]).data);
+    let dark = picture("rgb", &[choice("map:0"), ("strength", ControlValue::Number(0.0))]);
+    assert!(dark.data.iter().all(|v| *v == 0), "there is no light");
 }
 
 #[test]
@@ -152,7 +188,7 @@ fn photographs_of_one_light_are_warned_about() {
     config.data.split = "every:4".into();
     let mut folder = RunFolder::create(&dir.path().join("run"), false).unwrap();
     let mut notes = Vec::new();
-    recipe::train(&config, &mut folder, false, &AtomicBool::new(false), &mut |e| {
+    recipe::train(&config, &mut folder, false, None, &AtomicBool::new(false), &mut |e| {
         if let Event::Note(n) = e {
             notes.push(n.clone());
         }

@@ -7,6 +7,7 @@ use diorama_data::import::{self, ImportOptions};
 use diorama_geom::view_source::ViewSource;
 use diorama_pipelines::object::viewing::{self, RunView};
 use diorama_pipelines::object::{device, run_folder};
+use diorama_pipelines::relight::outdoor;
 use diorama_pipelines::run::viewing_points::PointsView;
 use diorama_pipelines::run::{description, folder, kept_capture};
 use diorama_pipelines::{Application, PipelineError, Result};
@@ -41,7 +42,7 @@ impl ListenFlags {
 /// Show a run in the browser: views, cameras, crop box, scale, camera paths, meshes; or a data set's cameras and points
 #[derive(Args, Clone, Debug)]
 #[command(
-    after_help = "Examples:\n  diorama view runs/chair\n  diorama view data/chair\n  diorama view splats.ply\n  diorama view runs/chair --host 0.0.0.0 --port 8080"
+    after_help = "Examples:\n  diorama view runs/chair\n  diorama view data/chair\n  diorama view splats.ply\n  diorama view runs/street --light dusk.hdr\n  diorama view runs/chair --host 0.0.0.0 --port 8080"
 )]
 pub struct View {
     /// Folder of a run or of a data set, or a PLY file of points or Gaussian splats
@@ -52,6 +53,9 @@ pub struct View {
     /// auto, cpu, cuda, vulkan, metal or webgpu
     #[arg(long, default_value = "auto")]
     device: String,
+    /// For a run of relight: a light to choose from, as an environment map or spherical harmonics; may be repeated
+    #[arg(long, value_name = "FILE")]
+    light: Vec<PathBuf>,
     #[command(flatten)]
     listen: ListenFlags,
     /// Number of CPU threads [default: all]
@@ -96,6 +100,7 @@ impl Verb for View {
 
 enum Source {
     Run(Arc<RunView>),
+    Scene(Arc<outdoor::viewing::RunView>),
     Points(Arc<PointsView>),
 }
 
@@ -103,6 +108,7 @@ impl Source {
     fn shown(&self) -> Arc<dyn ViewSource> {
         match self {
             Source::Run(r) => r.clone(),
+            Source::Scene(r) => r.clone(),
             Source::Points(p) => p.clone(),
         }
     }
@@ -111,7 +117,7 @@ impl Source {
     fn check_device(&self) -> Result<()> {
         match self {
             Source::Run(r) => r.check_device(),
-            Source::Points(_) => Ok(()),
+            Source::Scene(_) | Source::Points(_) => Ok(()),
         }
     }
 }
@@ -122,6 +128,10 @@ fn source(a: &View) -> Result<Source> {
     if a.data.is_some() && !is_run {
         return Err(PipelineError::Usage(format!("--data: {} is not a run; give --data only for runs", a.path.display())));
     }
+    let has_lights = is_run && Application::of_run(&a.path)? == Application::Relight;
+    if !a.light.is_empty() && !has_lights {
+        return Err(PipelineError::Usage(format!("--light: {} is not a run of relight", a.path.display())));
+    }
     if a.path.is_file() && a.path.extension().is_some_and(|e| e.eq_ignore_ascii_case("ply")) {
         let view = PointsView::of_file(&a.path)?;
         eprintln!("{} points or splats", view.points());
@@ -130,7 +140,7 @@ fn source(a: &View) -> Result<Source> {
     if is_run || !a.path.is_dir() {
         return match Application::of_run(&a.path)? {
             Application::Object => object(a),
-            of @ Application::Relight => Err(of.refuse(&a.path, "diorama relight render")),
+            Application::Relight => scene(a),
         };
     }
     let capture = import::import(&a.path, &ImportOptions { min_views: 1, allow_broken: true, ..ImportOptions::default() })?;
@@ -149,4 +159,15 @@ fn object(a: &View) -> Result<Source> {
     }
     device::accelerate(&mut model, &a.device, Box::new(note))?;
     Ok(Source::Run(viewing::open(&a.path, model, false)?))
+}
+
+/// The view source of a run of the scene model.
+fn scene(a: &View) -> Result<Source> {
+    let (maps, notes) = outdoor::viewing::read_maps(&a.light)?;
+    let (model, of_run) = outdoor::recipe::load_of(&a.path, a.data.as_deref())?;
+    notes.iter().chain(&of_run).for_each(|n| note(n));
+    if let Err(e) = kept_capture::require_photographs(&model.capture) {
+        note(&format!("photographs cannot be shown: {e}"));
+    }
+    Ok(Source::Scene(outdoor::viewing::open(&a.path, model, maps, false)?))
 }

@@ -1,14 +1,20 @@
 //! `diorama relight train`
 
+use crate::commands::view::ListenFlags;
 use crate::commands::process::{INTERRUPT, use_threads, watch_interrupts};
 use crate::commands::{Outcome, Verb};
 use crate::terminal::Progress;
 use clap::Args;
 use diorama_pipelines::relight::outdoor::config::{Config, Preset};
+use diorama_geom::Capture;
+use diorama_pipelines::relight::outdoor::model::SceneModel;
 use diorama_pipelines::relight::outdoor::recipe;
+use diorama_pipelines::relight::outdoor::viewing::{self, RunView};
 use diorama_pipelines::run::{RunFolder, config};
 use diorama_pipelines::{PipelineError, Result};
+use diorama_viewer::Server;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 /// Train the scene model: photographs of a place in several lights to albedo, normals, shadow and light
 #[derive(Args, Clone, Debug)]
@@ -41,6 +47,11 @@ pub struct Train {
     /// Replace an earlier run
     #[arg(long)]
     force: bool,
+    /// Serve a page that shows the model while it is trained
+    #[arg(long)]
+    view: bool,
+    #[command(flatten)]
+    listen: ListenFlags,
     /// Number of CPU threads [default: all]
     #[arg(long)]
     threads: Option<usize>,
@@ -77,16 +88,22 @@ impl Verb for Train {
         self.seed.iter().for_each(|s| config.seed = *s);
         config::set_all(&mut config, &self.set)?;
         // Nothing is written before the request is known to be sound.
-        let mut folder = match folder.take() {
-            Some(folder) => folder,
-            None => {
-                recipe::load_capture(&config)?;
-                RunFolder::create(&self.out, self.force)?
-            }
-        };
+        let capture = folder.as_ref().map_or_else(|| recipe::load_capture(&config), RunFolder::capture)?;
+        let existed = self.out.exists();
+        // The port is opened before the run folder is created.
+        let viewing = if self.view { Some(self.watch(&config, capture)?) } else { None };
+        let mut folder = folder.take().map_or_else(|| RunFolder::create(&self.out, self.force), Ok)?;
         watch_interrupts();
         let mut progress = Progress::new();
-        let trained = recipe::train(&config, &mut folder, self.resume, &INTERRUPT, &mut |e| progress.event(e))?;
+        let viewing = viewing.map(|(view, server)| (view, std::thread::spawn(move || server.run(&INTERRUPT))));
+        let view = viewing.as_ref().map(|v| &*v.0);
+        let trained = recipe::train(&config, &mut folder, self.resume, view, &INTERRUPT, &mut |e| progress.event(e));
+        if trained.is_err() && !existed && !folder.checkpoints().exists() {
+            // A run that never started leaves nothing behind.
+            drop(folder);
+            let _ = std::fs::remove_dir_all(&self.out);
+        }
+        let trained = trained?;
         let s = &trained.summary;
         if self.json {
             println!(
@@ -97,6 +114,20 @@ impl Verb for Train {
             println!("{} steps in {:.0} s, loss {:.5}", s.step, s.seconds, s.loss);
             println!("{}", self.out.display());
         }
+        if let Some((_, server)) = viewing {
+            eprintln!("the viewer keeps running until Ctrl-C");
+            let _ = server.join();
+        }
         Ok(if s.interrupted { Outcome::Interrupted } else { Outcome::Done })
+    }
+}
+
+impl Train {
+    /// The view source of the run, and a bound server that does not serve yet.
+    fn watch(&self, config: &Config, capture: Capture) -> Result<(Arc<RunView>, Server)> {
+        let view = viewing::open(&self.out, SceneModel::new(config.clone(), capture)?, Vec::new(), true)?;
+        let server = self.listen.bind(view.clone())?;
+        eprintln!("view: {}", server.address());
+        Ok((view, server))
     }
 }

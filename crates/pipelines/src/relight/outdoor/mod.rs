@@ -11,3 +11,4 @@ pub mod render;
 pub mod scores;
 pub mod shading;
 mod trainer;
+pub mod viewing;

@@ -169,6 +169,19 @@ impl SceneModel {
         ShLight(std::array::from_fn(|i| std::array::from_fn(|k| values[3 * i + k] as f64)))
     }
 
+    /// Number of lights that are learned.
+    pub fn light_count(&self) -> usize {
+        self.lights.values.len() / LIGHT
+    }
+
+    /// Name of a learned light: its session, or its photograph.
+    pub fn light_name(&self, index: usize) -> String {
+        match self.sessions.get(index) {
+            Some(session) => format!("Session {session}"),
+            None => self.capture.frames[self.train[index]].name.clone(),
+        }
+    }
+
     /// The sky of a session or photograph, `[16, 3]`.
     pub fn sky(&self, index: usize) -> &[f32] {
         &self.skies.values[index * SKY..][..SKY]
@@ -180,6 +193,27 @@ impl SceneModel {
             Some(i) => Some(self.light_of[i] as usize),
             None if self.config.light.of == "image" => None,
             None => self.sessions.iter().position(|s| Some(*s) == self.capture.frames[frame].session.or(Some(0))),
+        }
+    }
+
+    /// A copy that renders: without gradients and moments.
+    pub fn for_rendering(&self) -> SceneModel {
+        SceneModel {
+            config: self.config.clone(),
+            capture: self.capture.clone(),
+            model_from_world: self.model_from_world,
+            field: self.field.for_rendering(),
+            occupancy: self.occupancy.clone(),
+            lights: self.lights.values_only(),
+            skies: self.skies.values_only(),
+            gains: self.gains.values_only(),
+            train: self.train.clone(),
+            light_of: self.light_of.clone(),
+            sessions: self.sessions.clone(),
+            origin: self.origin,
+            rays: self.rays,
+            median: self.median,
+            rate_scale: self.rate_scale,
         }
     }
 

@@ -95,9 +95,9 @@ pub fn render(model: &SceneModel, options: &PicturesOptions, stop: &AtomicBool, 
         for layer in &options.layers {
             let extension = if options.is_linear { "exr" } else { "png" };
             let file = options.out.join(format!("{title}_{}.{extension}", layer.name()));
-            let image = three_channels(layer_of(&view, *layer));
+            let image = layer_of(&view, *layer);
             match options.is_linear {
-                true => photo::save_exr(&file, &image)?,
+                true => photo::save_exr(&file, &three_channels(image))?,
                 false => photo::save_png(&file, &shown(image, *layer).to_u8())?,
             }
             made.pictures.push(file);
@@ -135,7 +135,7 @@ fn light_of(model: &SceneModel, frame: usize, given: Option<&ShLight>) -> Result
     Ok(ViewLight { light: model.light(own), sky: model.sky(own).to_vec() })
 }
 
-fn layer_of(view: &SceneView, layer: Layer) -> &Image {
+pub(super) fn layer_of(view: &SceneView, layer: Layer) -> &Image {
     match layer {
         Layer::Rgb => &view.color,
         Layer::Albedo => &view.albedo,
@@ -153,8 +153,9 @@ fn three_channels(image: &Image) -> Image {
     }
 }
 
-/// Values between 0 and 1 as people look at them: light along the sRGB curve, normals from −1 on, depth by its largest value.
-fn shown(mut image: Image, layer: Layer) -> Image {
+/// Values between 0 and 1 as people look at them, `[H, W, 3]`: light along the sRGB curve, normals from −1 on, depth by its largest value.
+pub(super) fn shown(image: &Image, layer: Layer) -> Image {
+    let mut image = three_channels(image);
     let largest = image.data.iter().copied().fold(1e-6, f32::max);
     image.data.iter_mut().for_each(|v| {
         *v = match layer {

@@ -3,6 +3,7 @@
 use super::config::Config;
 use super::model::SceneModel;
 use super::trainer::Trainer;
+use super::viewing::RunView;
 use crate::error::{PipelineError, Result};
 use crate::run::photographs::StoredPhotographs;
 use crate::run::{RunDescription, RunFolder, folder, kept_capture};
@@ -21,7 +22,7 @@ pub struct Trained {
     pub summary: Summary,
 }
 
-/// Trains into `folder`, from the start or from its checkpoint.
+/// Trains into `folder`, from the start or from its checkpoint; `view` shows the run in the viewer.
 ///
 /// # Errors
 /// When the capture or a checkpoint cannot be read, or training diverges.
@@ -29,6 +30,7 @@ pub fn train(
     config: &Config,
     folder: &mut RunFolder,
     resume: bool,
+    view: Option<&RunView>,
     interrupt: &AtomicBool,
     events: &mut dyn FnMut(&Event),
 ) -> Result<Trained> {
@@ -49,6 +51,7 @@ pub fn train(
     }
     let (origin, checkpoints) = (model.origin, folder.checkpoints());
     let mut trainer = Trainer::new(model, photographs, &checkpoints)?;
+    trainer.view = view;
     let r = &config.run;
     let options = RunOptions {
         steps: (r.steps > 0).then_some(r.steps),
@@ -63,6 +66,7 @@ pub fn train(
         if let Err(e) = folder.log(e) {
             log_error.get_or_insert(e);
         }
+        view.into_iter().for_each(|v| v.update(e));
         events(e);
     });
     if let Some(e) = log_error {
@@ -74,6 +78,7 @@ pub fn train(
             PipelineError::Diverged { first, again, kept: format!("{} may hold a checkpoint", checkpoints.display()) }
         }
     })?;
+    trainer.show();
     folder.draw_curves()?;
     Ok(Trained { model: trainer.model, summary })
 }
@@ -109,8 +114,16 @@ fn load_pixels(config: &Config, capture: &Capture) -> Result<StoredPhotographs> 
 /// # Errors
 /// When the folder holds no run of this application, or its checkpoint is damaged.
 pub fn load(run: &Path) -> Result<(SceneModel, Vec<String>)> {
+    load_of(run, None)
+}
+
+/// The same, where `data` says to what folder the photographs moved.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_of(run: &Path, data: Option<&Path>) -> Result<(SceneModel, Vec<String>)> {
     let config: Config = RunDescription::read(run)?.config()?;
-    let capture = kept_capture::read(run, None, &config.data.path)?;
+    let capture = kept_capture::read(run, data, &config.data.path)?;
     let (checkpoint, file, note) = folder::last_checkpoint(run)?;
     let mut model = SceneModel::new(config, capture)?;
     model.restore(checkpoint, &file)?;

@@ -4,7 +4,7 @@ use super::model::SceneModel;
 use super::shading::{self, CHANNELS};
 use super::trainer::gray;
 use diorama_engine::renderers::layers::Layers;
-use diorama_engine::renderers::volume::Quality;
+use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_geom::Image;
 use diorama_geom::glam::DVec3;
 use diorama_geom::sh_light::ShLight;
@@ -48,9 +48,14 @@ pub struct SceneView {
 impl SceneModel {
     /// Renders a camera that stands in model space under a light; `progress` receives rows.
     pub fn view(&self, camera: &PosedCamera, light: &ViewLight, progress: &mut dyn FnMut(usize)) -> SceneView {
+        self.view_with(self.tracer(Quality::Full), camera, light, progress)
+    }
+
+    /// The same by a tracer of this model, such as one that shows only what lies in a box.
+    pub fn view_with(&self, tracer: Tracer, camera: &PosedCamera, light: &ViewLight, progress: &mut dyn FnMut(usize)) -> SceneView {
         let numbers = light.numbers();
         let code: Vec<f32> = numbers.chunks_exact(3).map(gray).collect();
-        let Layers { values, opacity, depth } = self.tracer(Quality::Full).layers(camera, &[&code], progress);
+        let Layers { values, opacity, depth } = tracer.layers(camera, &[&code], progress);
         let (w, h) = (values.width, values.height);
         let pixels: Vec<f32> = (0..w * h).flat_map(|i| [(i % w) as f32 + 0.5, (i / w) as f32 + 0.5]).collect();
         let (mut origins, mut dirs) = (vec![0.0; 3 * w * h], vec![0.0; 3 * w * h]);

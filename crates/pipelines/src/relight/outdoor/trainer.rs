@@ -2,6 +2,7 @@
 
 use super::model::SceneModel;
 use super::shading::{LIGHT, SceneLoss, Weights};
+use super::viewing::RunView;
 use crate::error::Result;
 use crate::run::device::Device;
 use crate::run::photographs::StoredPhotographs;
@@ -38,6 +39,7 @@ pub(super) struct Trainer<'a> {
     device: Device,
     batch: RayBatch,
     checkpoints: &'a Path,
+    pub view: Option<&'a RunView>,
     recovered: bool,
 }
 
@@ -47,7 +49,12 @@ impl<'a> Trainer<'a> {
         let mut device = Device::cpu(None);
         let occupancy = Some(&mut model.occupancy);
         device.begin(&Trainees { occupancy, ..Trainees::of(&mut model.field) }, scene, None)?;
-        Ok(Trainer { model, photographs, cameras, device, batch: RayBatch::default(), checkpoints, recovered: false })
+        Ok(Trainer { model, photographs, cameras, device, batch: RayBatch::default(), checkpoints, view: None, recovered: false })
+    }
+
+    /// Shows the model in the viewer.
+    pub fn show(&self) {
+        self.view.into_iter().for_each(|v| v.show_model(self.model.for_rendering()));
     }
 
     /// Fills the batch with random training pixels.
@@ -96,6 +103,9 @@ impl Trainee for Trainer<'_> {
     type Error = crate::error::PipelineError;
 
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport> {
+        if self.view.is_some_and(RunView::wants_update) {
+            self.show();
+        }
         self.draw();
         let n = self.batch.len();
         let c = self.model.config.clone();
