@@ -35,12 +35,18 @@ pub fn texels(mesh: &Mesh, size: usize) -> Texels {
     out
 }
 
-/// A texture with the texels' colors `[N, 3]`. All other texels, and those with a negative color, get the nearest color, so that texture
-/// filtering does not blend a background color across seams.
+/// A texture with the texels' colors `[N, 3]`, spread as [`spread`] does.
 pub fn texture(texels: &Texels, rgb_srgb: &[[f32; 3]], size: usize) -> ImageU8 {
+    let data = spread(texels, rgb_srgb, size).iter().flatten().map(|v| diorama_geom::color::u8_from_unit(*v)).collect();
+    ImageU8 { width: size, height: size, channels: 3, data }
+}
+
+/// Values `[size, size, 3]` of all texels. Those beside the texels, and those with a negative first value, get the nearest value, so that
+/// texture filtering does not blend a background across seams.
+pub fn spread(texels: &Texels, values: &[[f32; 3]], size: usize) -> Vec<[f32; 3]> {
     let mut color = vec![[0.0f32; 3]; size * size];
     let mut known = vec![false; size * size];
-    for (i, c) in texels.index.iter().zip(rgb_srgb).filter(|(_, c)| c[0] >= 0.0) {
+    for (i, c) in texels.index.iter().zip(values).filter(|(_, c)| c[0] >= 0.0) {
         color[*i as usize] = *c;
         known[*i as usize] = true;
     }
@@ -72,8 +78,7 @@ pub fn texture(texels: &Texels, rgb_srgb: &[[f32; 3]], size: usize) -> ImageU8 {
             }
         }
     }
-    let data = color.iter().flatten().map(|v| diorama_geom::color::u8_from_unit(*v)).collect();
-    ImageU8 { width: size, height: size, channels: 3, data }
+    color
 }
 
 /// Depth map of a camera: distance to the first surface in each pixel.

@@ -3,7 +3,7 @@
 
 use crate::error::{PipelineError, Result};
 use crate::object::{config::Config, run_folder};
-use crate::relight::outdoor;
+use crate::relight::{object as relit, outdoor};
 use crate::run::RunDescription;
 use crate::run::config::Configuration;
 use diorama_data::DataError;
@@ -17,17 +17,20 @@ pub enum Application {
     Object,
     /// Photographs in several lights to albedo, normals, shadow and light.
     Relight,
+    /// Photographs of an object to a mesh with materials, and its light.
+    RelightObject,
 }
 
 impl Application {
     /// All of them, in the order in which they are listed to users.
-    pub const ALL: [Application; 2] = [Application::Object, Application::Relight];
+    pub const ALL: [Application; 3] = [Application::Object, Application::Relight, Application::RelightObject];
 
     /// The name that `config.toml` gives.
     pub fn name(self) -> &'static str {
         match self {
             Application::Object => Config::APPLICATION,
             Application::Relight => outdoor::config::Config::APPLICATION,
+            Application::RelightObject => relit::config::Config::APPLICATION,
         }
     }
 
@@ -59,6 +62,7 @@ impl Application {
         match self {
             Application::Object => run_folder::describe(run),
             Application::Relight => outdoor::recipe::describe(run),
+            Application::RelightObject => relit::recipe::describe(run),
         }
     }
 }

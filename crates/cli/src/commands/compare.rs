@@ -35,6 +35,7 @@ impl Verb for Compare {
             match Application::of_run(run)? {
                 Application::Object => {}
                 of @ Application::Relight => return Err(of.refuse(run, "diorama relight eval")),
+                of @ Application::RelightObject => return Err(of.refuse(run, "diorama relight eval")),
             }
         }
         self.objects()

@@ -65,6 +65,7 @@ impl Verb for Eval {
         match Application::of_run(&self.run)? {
             Application::Object => self.object(),
             of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight eval")),
+            of @ Application::RelightObject => Err(of.refuse(&self.run, "diorama relight eval")),
         }
     }
 }

@@ -98,6 +98,7 @@ impl Verb for Export {
         match Application::of_run(&self.run)? {
             Application::Object => self.object(),
             of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight render")),
+            of @ Application::RelightObject => Err(of.refuse(&self.run, "diorama relight object --resume, which writes the GLB again")),
         }
     }
 }

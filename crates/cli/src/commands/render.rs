@@ -78,6 +78,7 @@ impl Verb for Render {
         match Application::of_run(&self.run)? {
             Application::Object => self.object(),
             of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight render")),
+            of @ Application::RelightObject => Err(of.refuse(&self.run, "diorama relight turntable with its GLB")),
         }
     }
 }

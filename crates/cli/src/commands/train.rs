@@ -106,6 +106,7 @@ impl Verb for Train {
         match if self.resume { Application::of_run(&self.out)? } else { Application::Object } {
             Application::Object => self.object(),
             of @ Application::Relight => Err(of.refuse(&self.out, "diorama relight train --resume")),
+            of @ Application::RelightObject => Err(of.refuse(&self.out, "diorama relight object --resume")),
         }
     }
 }

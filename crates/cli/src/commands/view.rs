@@ -141,6 +141,7 @@ fn source(a: &View) -> Result<Source> {
         return match Application::of_run(&a.path)? {
             Application::Object => object(a),
             Application::Relight => scene(a),
+            of @ Application::RelightObject => Err(of.refuse(&a.path, "the GLB file that diorama relight object wrote")),
         };
     }
     let capture = import::import(&a.path, &ImportOptions { min_views: 1, allow_broken: true, ..ImportOptions::default() })?;

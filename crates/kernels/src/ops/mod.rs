@@ -8,6 +8,7 @@ pub mod attention;
 pub mod composite;
 pub mod conv2d;
 pub mod conv_transpose2d;
+pub mod cube_prefilter;
 pub mod denoise;
 pub mod density_gradient;
 pub mod depth_loss;
@@ -47,6 +48,7 @@ pub mod scan;
 pub mod sign_change_loss;
 pub mod softmax;
 pub mod spherical_harmonics;
+pub mod split_sum;
 pub mod ssim;
 pub mod strata;
 pub mod sum;
@@ -55,6 +57,7 @@ pub mod tetrahedral_surface;
 pub mod texture;
 pub mod triangle_wave;
 pub mod trilinear_corner_grid;
+pub mod vertex_normals;
 pub mod weight_step;
 
 #[cfg(test)]

@@ -6,6 +6,7 @@
 
 pub mod compose;
 pub mod light;
+pub mod object;
 pub mod outdoor;
 pub mod picture;
 pub mod scene_file;

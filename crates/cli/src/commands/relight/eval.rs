@@ -4,11 +4,15 @@ use crate::commands::process::{note, use_threads};
 use crate::commands::{Outcome, Verb};
 use clap::Args;
 use diorama_data::{DataError, photo};
-use diorama_pipelines::Result;
+use diorama_pipelines::relight::object;
 use diorama_pipelines::relight::outdoor::{recipe, scores};
+use diorama_pipelines::{Application, Result};
 use std::path::PathBuf;
 
-/// Score a run of the scene model on a generated benchmark
+/// Samples per pixel of path-traced scores.
+const SAMPLES: u32 = 32;
+
+/// Score a run of the scene model or of the object model on a generated benchmark
 #[derive(Args, Clone, Debug)]
 pub struct Eval {
     /// Folder of the run
@@ -31,6 +35,9 @@ impl Verb for Eval {
 
     fn run(&self) -> Result<Outcome> {
         use_threads(self.threads)?;
+        if Application::of_run(&self.run)? == Application::RelightObject {
+            return self.object();
+        }
         let (model, notes) = recipe::load(&self.run)?;
         notes.iter().for_each(|n| note(n));
         let out = self.out.clone().unwrap_or_else(|| self.run.join("eval"));
@@ -50,6 +57,25 @@ impl Verb for Eval {
             println!("normals          {:.1}° median", s.normal_median_deg);
             println!("shadow           {:.2} correlation", s.shadow_correlation);
             println!("{} views in {}", s.views, out.display());
+        }
+        Ok(Outcome::Done)
+    }
+}
+
+impl Eval {
+    /// Scores of a run of the object model.
+    fn object(&self) -> Result<Outcome> {
+        let (model, capture, notes) = object::recipe::load(&self.run)?;
+        notes.iter().for_each(|n| note(n));
+        let out = self.out.clone().unwrap_or_else(|| self.run.join("eval"));
+        std::fs::create_dir_all(&out).map_err(DataError::io(&out, "create"))?;
+        let look = &mut |name: &str, image: &diorama_geom::ImageU8| Ok(photo::save_png(&out.join(format!("{name}.png")), image)?);
+        let scores = object::scores::judge(&model, &capture, SAMPLES, look)?;
+        if self.json {
+            println!("{}", serde_json::to_string(&scores).expect("plain values"));
+        } else {
+            super::object::print(&scores);
+            println!("{} views in {}", scores.views, out.display());
         }
         Ok(Outcome::Done)
     }

@@ -3,6 +3,7 @@
 mod compose;
 mod eval;
 mod light_flags;
+mod object;
 mod render;
 mod synth;
 mod train;
@@ -16,6 +17,7 @@ use clap::Subcommand;
 pub enum Relight {
     Train(train::Train),
     Render(render::Render),
+    Object(object::Object),
     Eval(eval::Eval),
     Compose(compose::Compose),
     Turntable(turntable::Turntable),
@@ -28,6 +30,7 @@ impl Relight {
         match self {
             Relight::Train(v) => v,
             Relight::Render(v) => v,
+            Relight::Object(v) => v,
             Relight::Eval(v) => v,
             Relight::Compose(v) => v,
             Relight::Turntable(v) => v,

@@ -1,28 +1,41 @@
 //! `diorama relight synth`
 
-use crate::commands::process::{INTERRUPT, use_threads, watch_interrupts};
+use super::light_flags::LightFlags;
+use crate::commands::process::{INTERRUPT, usage, use_threads, watch_interrupts};
 use crate::commands::{Outcome, Verb};
 use crate::terminal::ShareShown;
 use clap::Args;
+use diorama_pipelines::relight::light::LightOptions;
+use diorama_pipelines::relight::object::synth::{self as object_synth, ObjectSynth};
 use diorama_pipelines::relight::synth::{self, Place, SynthOptions};
 use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
 use std::time::Instant;
 
-/// Generate a street photographed in several lights, with exact albedo, normals, depth, shadow and light
+/// Generate a street photographed in several lights, or an object from all sides, with what is exact of them
 #[derive(Args, Clone, Debug)]
-#[command(after_help = "Example:\n  diorama relight synth --size ci -o data/street")]
+#[command(
+    after_help = "Examples:\n  diorama relight synth --size ci -o data/street\n  diorama relight synth --object chair --views 60 --size 256x256 --light a.hdr --unseen-light b.hdr -o data/chair"
+)]
 pub struct Synth {
-    /// ci (10 views of 64×48), middle (60 of 320×180) or gpu (88 of 640×360)
+    /// ci (10 views of 64×48), middle (60 of 320×180) or gpu (88 of 640×360); of objects WIDTHxHEIGHT
     #[arg(long, default_value = "ci")]
     size: String,
-    /// Views [default: by size]
+    /// An object in place of the street: chair, still-life, or the file of a model
+    #[arg(long)]
+    object: Option<String>,
+    #[command(flatten)]
+    light: LightFlags,
+    /// Light of an object's held-out views besides their own, as --light
+    #[arg(long, default_value = "sky:15,300")]
+    unseen_light: String,
+    /// Views [default: by size; of objects 60]
     #[arg(long)]
     views: Option<usize>,
     /// Lights of training, 1 to 4; one more is held out
     #[arg(long, default_value_t = 4)]
     lights: usize,
-    /// Samples per pixel [default: by size]
+    /// Samples per pixel [default: by size; of objects 64]
     #[arg(long)]
     spp: Option<u32>,
     #[arg(long, default_value_t = 0)]
@@ -48,6 +61,9 @@ impl Verb for Synth {
 
     fn run(&self) -> Result<Outcome> {
         use_threads(self.threads)?;
+        if let Some(object) = &self.object {
+            return self.object(object);
+        }
         let mut options = SynthOptions::named(&self.size)?;
         (options.lights, options.seed) = (self.lights, self.seed);
         self.views.iter().for_each(|v| options.views = *v);
@@ -59,6 +75,39 @@ impl Verb for Synth {
         let (start, mut shown) = (Instant::now(), ShareShown::new());
         let made =
             synth::generate(&self.out, &Place::street(&options), &options, self.force, &INTERRUPT, &mut |s| shown.show(s, "photographs"))?;
+        shown.finish();
+        if self.json {
+            println!("{}", serde_json::to_string(&made).expect("plain values"));
+        } else {
+            let seconds = start.elapsed().as_secs_f64();
+            println!("{} photographs, {} held out, of {} triangles in {seconds:.1} s", made.photographs, made.held_out, made.triangles);
+            println!("{}", self.out.display());
+        }
+        Ok(if made.interrupted { Outcome::Interrupted } else { Outcome::Done })
+    }
+}
+
+impl Synth {
+    /// Photographs of an object.
+    fn object(&self, object: &str) -> Result<Outcome> {
+        let of = |text: &str| text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+        let size: (u32, u32) = if self.size == "ci" { (64, 64) } else { of(&self.size).unwrap_or((0, 0)) };
+        if !(16..=8192).contains(&size.0) || !(16..=8192).contains(&size.1) {
+            return Err(usage(format!("size {}: of an object give WIDTHxHEIGHT from 16 to 8192, for example 256x256", self.size)));
+        }
+        let unseen = self.unseen_light.parse().map_err(|e: String| usage(format!("unseen-light {e}")))?;
+        let options = ObjectSynth {
+            object: object.into(),
+            views: self.views.unwrap_or(60),
+            size,
+            samples: self.spp.unwrap_or(64),
+            light: self.light.options()?,
+            unseen: LightOptions::of(unseen),
+            seed: self.seed,
+        };
+        watch_interrupts();
+        let (start, mut shown) = (Instant::now(), ShareShown::new());
+        let made = object_synth::generate(&self.out, &options, self.force, &INTERRUPT, &mut |s| shown.show(s, "photographs"))?;
         shown.finish();
         if self.json {
             println!("{}", serde_json::to_string(&made).expect("plain values"));

@@ -112,6 +112,12 @@ const FACES: [Face; 6] = [
     [[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]],
 ];
 
+/// Direction of a point (s, t) of a cube map's face; not of length 1.
+pub fn cube_direction(face: usize, s: f32, t: f32) -> [f32; 3] {
+    let [major, across, down] = FACES[face];
+    std::array::from_fn(|k| major[k] + (2.0 * s - 1.0) * across[k] + (2.0 * t - 1.0) * down[k])
+}
+
 /// The face that a direction meets.
 #[inline(always)]
 fn face_of(d: [f32; 3]) -> usize {

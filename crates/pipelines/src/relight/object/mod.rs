@@ -1,0 +1,25 @@
+//! Object model: photographs of an object with opacity → a mesh with textures of base color, roughness, metalness and normals, and the light
+//! that it stood in.
+//!
+//! Munkberg et al. 2022, "Extracting Triangular 3D Models, Materials, and Lighting From Images", from their equations: [`topology`] finds a
+//! surface on a tetrahedral grid with a material by position, [`textured`] refines it as a mesh with textures; both are drawn by [`raster`],
+//! lit by [`probe`], and compared by [`loss`]. Shapes begin with the hull of the masks ([`hull`]).
+//!
+//! Adam does not depend on the scale of gradients, so the factors of gradients that others give (64 for light, ⅛ for hash tables) are left out.
+
+pub mod capture;
+pub mod config;
+mod export;
+pub mod hull;
+pub mod loss;
+pub mod material;
+pub mod model;
+pub mod probe;
+pub mod raster;
+pub mod recipe;
+pub mod scores;
+pub mod synth;
+pub mod textured;
+pub mod topology;
+mod trainer;
+pub mod truth;

@@ -1,0 +1,132 @@
+//! Training recipe of the object model, to be read from top to bottom.
+
+use super::capture::{self, ObjectCapture};
+use super::config::Config;
+use super::export;
+use super::model::{ObjectModel, Stage};
+use super::trainer::Trainer;
+use crate::error::{PipelineError, Result};
+use crate::run::{RunDescription, RunFolder, folder, kept_capture};
+use diorama_data::gltf::{self, WriteOptions};
+use diorama_data::{checkpoint, environment};
+use diorama_engine::train::{self, Event, RunError, RunOptions, Summary};
+use diorama_geom::Capture;
+use diorama_geom::capture::Split;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+/// Result of training.
+pub struct Trained {
+    pub model: ObjectModel,
+    pub capture: ObjectCapture,
+    pub summary: Summary,
+}
+
+/// Trains into `folder`, from the start or from its checkpoint.
+///
+/// # Errors
+/// When the capture or a checkpoint cannot be read, or training diverges.
+pub fn train(
+    config: &Config,
+    imported: &Capture,
+    folder: &mut RunFolder,
+    resume: bool,
+    interrupt: &AtomicBool,
+    events: &mut dyn FnMut(&Event),
+) -> Result<Trained> {
+    imported.notes.iter().for_each(|n| events(&Event::Note(n.clone())));
+    let photographs = capture::load(config, imported)?;
+    let mut model = ObjectModel::new(config.clone(), &photographs)?;
+    if resume {
+        if checkpoint::exists(&folder.checkpoints()) {
+            let (c, note) = checkpoint::load(&folder.checkpoints())?;
+            model.restore(c, &checkpoint::latest(&folder.checkpoints()))?;
+            note.into_iter().for_each(|n| events(&Event::Note(n)));
+        }
+        folder.cut_metrics(model.origin.step)?;
+    } else {
+        folder.write_description(&model.config, imported)?;
+    }
+    let (origin, checkpoints) = (model.origin, folder.checkpoints());
+    let mut trainer = Trainer::new(model, photographs, &checkpoints);
+    let options = RunOptions {
+        steps: Some(config.steps()),
+        seconds: None,
+        log_every: config.run.log_every,
+        save_every_seconds: config.run.save_every_seconds,
+        save_every_steps: None,
+        evaluate_every: None,
+    };
+    let mut log_error = None;
+    let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
+        if let Err(e) = folder.log(e) {
+            log_error.get_or_insert(e);
+        }
+        events(e);
+    });
+    if let Some(e) = log_error {
+        return Err(e);
+    }
+    let summary = result.map_err(|e| match e {
+        RunError::Failed(e) => e,
+        RunError::Diverged { first, again } => {
+            PipelineError::Diverged { first, again, kept: format!("{} may hold a checkpoint", checkpoints.display()) }
+        }
+    })?;
+    folder.draw_curves()?;
+    let Trainer { mut model, capture, .. } = trainer;
+    model.probe.update();
+    Ok(Trained { model, capture, summary })
+}
+
+/// Writes the object as GLB, and its light beside it as `NAME.probe.hdr`; returns the latter's name.
+///
+/// # Errors
+/// When training has not reached the second stage, or a file cannot be written.
+pub fn export(model: &ObjectModel, out: &Path) -> Result<PathBuf> {
+    let Stage::Textured(textured) = &model.stage else {
+        return Err(PipelineError::Usage("training has not reached the stage with textures; go on with --resume".into()));
+    };
+    let name = out.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    gltf::save(out, &export::model(textured, &model.placement, &name), WriteOptions::default())?;
+    let probe = out.with_extension("probe.hdr");
+    environment::save_hdr(&probe, &model.probe.environment())?;
+    Ok(probe)
+}
+
+/// A trained model with its photographs, and notes.
+///
+/// # Errors
+/// When the folder holds no run of this application, or its checkpoint is damaged.
+pub fn load(run: &Path) -> Result<(ObjectModel, ObjectCapture, Vec<String>)> {
+    let config: Config = RunDescription::read(run)?.config()?;
+    let imported = kept_capture::read(run, None, &config.data.path)?;
+    let (checkpoint, file, note) = folder::last_checkpoint(run)?;
+    let photographs = capture::load(&config, &imported)?;
+    let mut model = ObjectModel::new(config, &photographs)?;
+    model.restore(checkpoint, &file)?;
+    Ok((model, photographs, note.into_iter().collect()))
+}
+
+/// Description of a run for `diorama info`.
+///
+/// # Errors
+/// As [`load`].
+pub fn describe(run: &Path) -> Result<serde_json::Value> {
+    let (model, photographs, notes) = load(run)?;
+    let (stage, faces) = match &model.stage {
+        Stage::Topology(m) => ("topology", m.mesh().faces.len()),
+        Stage::Textured(m) => ("textured", m.layout.faces.len()),
+    };
+    Ok(serde_json::json!({
+        "kind": "relight object run",
+        "data": model.config.data.path,
+        "steps": model.origin.step,
+        "seconds": model.origin.seconds,
+        "stage": stage,
+        "faces": faces,
+        "training_views": photographs.indices(Split::Train).len(),
+        "held_out_views": photographs.indices(Split::Test).len(),
+        "notes": notes,
+    }))
+}

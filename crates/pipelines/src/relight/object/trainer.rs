@@ -1,0 +1,146 @@
+//! Training of the object model: chooses photographs, steps through both stages, and begins again when a surface is lost.
+
+use super::capture::ObjectCapture;
+use super::config::Config;
+use super::model::{ObjectModel, Stage};
+use super::scores;
+use super::topology::{StepInput, StepLoss};
+use crate::error::{PipelineError, Result};
+use diorama_data::checkpoint;
+use diorama_engine::train::{Scalar, Scalars, Scores, StepReport, Trainee};
+use diorama_geom::capture::Split;
+use diorama_geom::rng::Rng;
+use diorama_mesh::surface_limits::SurfaceFault;
+use std::path::Path;
+
+/// Streams of random numbers.
+const ORDER: u64 = 32;
+const STEP: u64 = 33;
+/// How often the first stage may begin.
+const BEGINNINGS: u32 = 4;
+/// What is added to the distances, in cells, when the surface vanished, and taken off when it exploded.
+const BIAS: f32 = 0.3;
+/// Held-out photographs that are compared during training.
+const COMPARED: usize = 4;
+
+/// A model in training.
+pub(super) struct Trainer<'a> {
+    pub model: ObjectModel,
+    pub capture: ObjectCapture,
+    train: Vec<usize>,
+    checkpoints: &'a Path,
+    fault: Option<SurfaceFault>,
+    recovered: bool,
+}
+
+impl<'a> Trainer<'a> {
+    pub fn new(model: ObjectModel, capture: ObjectCapture, checkpoints: &'a Path) -> Trainer<'a> {
+        let train = capture.indices(Split::Train);
+        Trainer { model, capture, train, checkpoints, fault: None, recovered: false }
+    }
+
+    /// The photographs of a step: each once before any comes again.
+    fn chosen(&self, step: u64) -> Vec<usize> {
+        let (n, batch) = (self.train.len() as u64, self.model.config.run.batch as u64);
+        let rng = Rng::new(self.model.config.seed, ORDER);
+        let of = |draw: u64| {
+            let (round, place) = (draw / n, (draw % n) as usize);
+            let mut order: Vec<usize> = (0..n as usize).collect();
+            order.sort_by_key(|i| rng.bits(round * n + *i as u64));
+            self.train[order[place]]
+        };
+        (step * batch..(step + 1) * batch).map(of).collect()
+    }
+
+    fn report(loss: &StepLoss, n: usize) -> StepReport {
+        let scalars = Scalars::from([
+            Scalar::psnr("psnr", loss.mse),
+            Scalar::new("mask_loss", loss.mask).logged_only(),
+            Scalar::new("regularizers", loss.regularizers).logged_only(),
+            Scalar::new("faces", loss.faces as f64),
+            Scalar::rate("views_per_s", n as f64),
+        ]);
+        StepReport { loss: loss.total(), scalars }
+    }
+}
+
+/// The share of a stage that is done, and the step within it, from 1.
+fn place(config: &Config, step: u64) -> (f32, u32) {
+    let first = config.topology_steps();
+    let (done, of) = if step < first { (step, first) } else { (step - first, config.run.texture_steps) };
+    (done as f32 / of.max(1) as f32, done as u32 + 1)
+}
+
+impl Trainee for Trainer<'_> {
+    type Error = PipelineError;
+
+    fn step(&mut self, step: u64, _: f64) -> Result<StepReport> {
+        if step >= self.model.config.topology_steps() {
+            self.model.give_texture(&self.capture)?;
+        }
+        let photos: Vec<_> = self.chosen(step).into_iter().map(|i| &self.capture.photos[i]).collect();
+        let (progress, t) = place(&self.model.config, step);
+        let rng = Rng::new(Rng::new(self.model.config.seed, STEP).bits(step), 0);
+        let input = StepInput { photos, rng, progress, t, rate_scale: self.model.rate_scale };
+        let n = input.photos.len();
+        let ObjectModel { config, stage, probe, .. } = &mut self.model;
+        let loss = match stage {
+            Stage::Textured(m) => m.step(config, &input, probe),
+            Stage::Topology(m) => match m.step(config, &input, probe) {
+                Ok(loss) => loss,
+                Err(fault) => {
+                    self.fault = Some(fault);
+                    StepLoss { color: f64::NAN, ..StepLoss::default() }
+                }
+            },
+        };
+        Ok(Trainer::report(&loss, n))
+    }
+
+    fn save(&mut self, step: u64, seconds: f64) -> Result<bool> {
+        if self.model.params().is_broken() {
+            return Ok(false);
+        }
+        (self.model.origin.step, self.model.origin.seconds) = (step, seconds);
+        self.model.save(self.checkpoints)?;
+        Ok(true)
+    }
+
+    fn recover(&mut self) -> Result<Option<(u64, String)>> {
+        if let Some(fault) = self.fault.take() {
+            let m = &mut self.model;
+            if m.beginnings >= BEGINNINGS {
+                let cure = "check that masks and poses belong together, or lower optim.shape_rate";
+                return Err(PipelineError::Usage(format!("{fault}, and did so {} times before: {cure}", m.beginnings - 1)));
+            }
+            let by = if fault.is_vanished() { BIAS } else { -BIAS };
+            let (bias, rate_scale) = (m.bias + by, 0.5 * m.rate_scale);
+            m.begin_again(&self.capture, bias, rate_scale)?;
+            return Ok(Some((0, format!("{fault}; the first stage begins again, {by:+.1} cells larger and at half the rate"))));
+        }
+        if self.recovered {
+            return Ok(None);
+        }
+        self.recovered = true;
+        let mut fresh = ObjectModel::new(self.model.config.clone(), &self.capture)?;
+        if checkpoint::exists(self.checkpoints) {
+            let (c, _) = checkpoint::load(self.checkpoints)?;
+            fresh.restore(c, &checkpoint::latest(self.checkpoints))?;
+        }
+        fresh.rate_scale = 0.3 * self.model.rate_scale;
+        self.model = fresh;
+        Ok(Some((self.model.origin.step, "the loss was not finite; the rate is lowered".into())))
+    }
+
+    fn evaluate(&mut self) -> Result<Option<Scores>> {
+        let held_out = self.capture.indices(Split::Test);
+        if held_out.is_empty() {
+            return Ok(None);
+        }
+        self.model.probe.update();
+        let of = |i: &usize| scores::squared_error(&self.model.picture(&self.capture.photos[*i].view), &self.capture.photos[*i].rgba.data);
+        let step = held_out.len().div_ceil(COMPARED);
+        let all: Vec<f64> = held_out.iter().step_by(step).map(of).collect();
+        Ok(Some(Scores::from([Scalar::psnr("psnr", all.iter().sum::<f64>() / all.len() as f64)])))
+    }
+}
