@@ -2,7 +2,10 @@
 
 mod compose;
 mod eval;
+mod fit_light;
 mod light_flags;
+mod mesh;
+mod prepare;
 mod render;
 mod synth;
 mod train;
@@ -14,9 +17,12 @@ use clap::Subcommand;
 /// Put models under other light: composed scenes and turntables, path-traced
 #[derive(Subcommand)]
 pub enum Relight {
+    Prepare(prepare::Prepare),
     Train(train::Train),
     Render(render::Render),
     Eval(eval::Eval),
+    Mesh(mesh::Mesh),
+    FitLight(fit_light::FitLight),
     Compose(compose::Compose),
     Turntable(turntable::Turntable),
     Synth(synth::Synth),
@@ -26,9 +32,12 @@ impl Relight {
     /// The chosen command.
     pub fn verb(&self) -> &dyn Verb {
         match self {
+            Relight::Prepare(v) => v,
             Relight::Train(v) => v,
             Relight::Render(v) => v,
             Relight::Eval(v) => v,
+            Relight::Mesh(v) => v,
+            Relight::FitLight(v) => v,
             Relight::Compose(v) => v,
             Relight::Turntable(v) => v,
             Relight::Synth(v) => v,
