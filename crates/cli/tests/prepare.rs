@@ -372,3 +372,56 @@ fn broken_photographs_are_named_or_left_out() {
     assert_eq!((&made["images"], &made["registered"]), (&(VIEWS as u64).into(), &(VIEWS as u64).into()));
     assert!(!out.join("images/view_99.jpg").exists());
 }
+
+#[test]
+fn photographs_in_several_lights_become_a_data_set_for_relighting() {
+    let dir = tempfile::tempdir().unwrap();
+    let (photos, model, out, colmap) =
+        (dir.path().join("photos"), dir.path().join("model"), dir.path().join("data"), dir.path().join("colmap"));
+    capture(&photos, &model);
+    stand_in(&colmap, &model);
+    let (masks, list) = (dir.path().join("masks"), dir.path().join("sessions.txt"));
+    std::fs::create_dir(&masks).unwrap();
+    let mut lines = String::new();
+    for i in 0..VIEWS {
+        let data = (0..SIZE * SIZE).map(|k| if k % SIZE < 20 { 0 } else { 255 }).collect();
+        let mask = ImageU8 { width: SIZE as usize, height: SIZE as usize, channels: 1, data };
+        photo::save_png(&masks.join(format!("view_{i:02}.png")), &mask).unwrap();
+        lines += &format!("view_{i:02}.jpg {}\n", if i % 2 == 0 { "noon" } else { "dusk" });
+    }
+    std::fs::write(&list, lines).unwrap();
+    let prepare = |out: &Path, more: &[&str]| {
+        let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
+        c.env("DIORAMA_COLMAP", &colmap).args(["relight", "prepare"]).arg(&photos).arg("-o").arg(out).args(more).arg("--json");
+        let o = c.output().unwrap();
+        let text = String::from_utf8_lossy(&o.stderr).into_owned();
+        (o.status.code(), text, serde_json::from_slice::<serde_json::Value>(&o.stdout).unwrap_or_default())
+    };
+    let (masks_flag, list_flag) = (masks.display().to_string(), list.display().to_string());
+    let (code, text, made) = prepare(&out, &["--masks", &masks_flag, "--sessions", &list_flag]);
+    assert_eq!(code, Some(0), "{text}");
+    assert_eq!((&made["photographs"], &made["sessions"]), (&(VIEWS as u64).into(), &2.into()));
+    assert!((made["static_share"].as_f64().unwrap() - 0.9).abs() < 1e-6);
+    let read = import::import(&out, &Default::default()).unwrap();
+    for f in &read.frames {
+        let number: u32 = f.name[f.name.len() - 2..].parse().unwrap();
+        assert_eq!(f.session, Some(1 - number % 2), "{}", f.name);
+        let mask = photo::load_mask(f.mask.as_ref().unwrap()).unwrap();
+        assert!(mask.data[0] == 0 && mask.data[100] == 255);
+        assert!(f.world_from_camera.translation.length() < 0.91 + 1e-6);
+    }
+    assert!(read.points.len() > 100 && read.scene.aabb_scale == 1);
+
+    // Without exposure times, from one light, with a mask too few, or over another folder.
+    let other = dir.path().join("other");
+    let (code, text, _) = prepare(&other, &["--sessions", "exif"]);
+    assert!(code == Some(2) && text.contains("has no time") && text.contains("--sessions"), "{text}");
+    std::fs::remove_dir_all(&other).unwrap();
+    let (code, text, made) = prepare(&other, &["--sessions", "names"]);
+    assert!(code == Some(0) && made["sessions"] == 1 && text.contains("ambiguous"), "{text}");
+    std::fs::remove_file(masks.join("view_03.png")).unwrap();
+    let (code, text, _) = prepare(&out, &["--masks", &masks_flag, "--force"]);
+    assert!(code == Some(2) && text.contains("15 of 16") && text.contains("view_03"), "{text}");
+    let (code, text, _) = prepare(&photos, &[]);
+    assert!(code == Some(2) && text.contains("choose another --out"), "{text}");
+}

@@ -283,6 +283,9 @@ pub fn write(path: &Path, root: &Path, capture: &diorama_geom::Capture, points: 
             if let Some(m) = &f.mask {
                 frame["mask_path"] = m.strip_prefix(root).unwrap_or(m).to_string_lossy().into();
             }
+            if let Some(session) = f.session {
+                frame["session"] = session.into();
+            }
             frame
         })
         .collect();

@@ -140,6 +140,11 @@ impl DepthMap {
         d <= first + slack + 2.5 * d / self.camera.fx.min(self.camera.fy) as f32
     }
 
+    /// Distance to the first surface in each pixel, row by row; infinite where there is none.
+    pub fn depth(&self) -> &[f32] {
+        &self.depth
+    }
+
     /// Center of the camera in the world.
     pub fn eye(&self) -> DVec3 {
         self.camera_from_world.inverse().translation

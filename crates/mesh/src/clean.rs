@@ -72,6 +72,34 @@ pub fn remove_unseen(mesh: &mut Mesh, cameras: &[(Camera, Pose)], slack: f32) ->
     removed
 }
 
+/// Removes connected components with less than `share` of the whole area; returns how many faces were removed.
+pub fn remove_small_area(mesh: &mut Mesh, share: f64) -> usize {
+    let parts = components(mesh);
+    let area = |p: &Vec<u32>| p.iter().map(|f| face_area(mesh, *f)).sum::<f64>();
+    let areas: Vec<f64> = parts.iter().map(area).collect();
+    let least = share * areas.iter().sum::<f64>();
+    let small: Vec<&Vec<u32>> = parts.iter().zip(&areas).filter(|(_, a)| **a < least).map(|(p, _)| p).collect();
+    remove(mesh, small.into_iter())
+}
+
+/// Removes faces none of whose corners `least` of the cameras see (all, if there are fewer); returns how many. `slack` is the error of the
+/// surface in units of the mesh.
+pub fn remove_rarely_seen(mesh: &mut Mesh, cameras: &[(Camera, Pose)], least: usize, slack: f32) -> usize {
+    let least = least.min(cameras.len());
+    let views: Vec<CameraVisibility> = cameras.par_iter().map(|(c, pose)| CameraVisibility::new(mesh, c, pose)).collect();
+    let is_seen = |p: &[f32; 3]| views.iter().filter(|v| v.sees(*p, slack)).take(least).count() == least;
+    let seen: Vec<bool> = mesh.positions.par_iter().map(is_seen).collect();
+    let before = mesh.faces.len();
+    mesh.faces.retain(|f| f.iter().any(|i| seen[*i as usize]));
+    mesh.compact();
+    before - mesh.faces.len()
+}
+
+fn face_area(mesh: &Mesh, face: u32) -> f64 {
+    let [a, b, c] = mesh.faces[face as usize].map(|i| glam::DVec3::from(mesh.positions[i as usize].map(f64::from)));
+    0.5 * (b - a).cross(c - a).length()
+}
+
 /// Visibility of the tested faces from one camera.
 struct View {
     /// Distance of each face of each part, if the camera sees it.
@@ -160,6 +188,20 @@ fn remove<'a>(mesh: &mut Mesh, parts: impl Iterator<Item = &'a Vec<u32>>) -> usi
 mod tests {
     use super::*;
     use glam::DVec3;
+
+    #[test]
+    fn components_go_by_their_area_and_not_by_their_faces() {
+        let mut m = Mesh::default();
+        // One large triangle, and a fan of many small ones.
+        m.positions.extend([[0.0; 3], [10.0, 0.0, 0.0], [0.0, 10.0, 0.0]]);
+        m.faces.push([0, 1, 2]);
+        let first = m.positions.len() as u32;
+        m.positions.push([20.0, 0.0, 0.0]);
+        m.positions.extend((0..20).map(|i| [20.0 + 0.05 * (i as f32 * 0.1).cos(), 0.05 * (i as f32 * 0.1).sin(), 0.0]));
+        m.faces.extend((1..20).map(|i| [first, first + i, first + i + 1]));
+        assert_eq!(remove_small_area(&mut m, 1e-3), 19);
+        assert_eq!((m.faces.len(), m.positions.len()), (1, 3));
+    }
 
     #[test]
     fn small_islands_go_and_large_ones_stay() {

@@ -17,7 +17,7 @@ pub enum Method {
 }
 
 impl Method {
-    fn table(self) -> CaseTable {
+    pub(crate) fn table(self) -> CaseTable {
         match self {
             Method::Cubes => marching_cubes::case_table(),
             Method::Tetrahedra => marching_tetrahedra::case_table(),

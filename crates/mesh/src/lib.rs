@@ -47,6 +47,7 @@ pub mod extract;
 pub mod normal_map;
 pub mod repair;
 pub mod simplify;
+pub mod sparse_grid;
 pub mod surface_limits;
 pub mod tetrahedral_fit;
 pub mod tetrahedral_grid;

@@ -1,6 +1,7 @@
 //! Procedural scenes with exact cameras and exact ground truth.
 //!
 //! - [`still_life`] is the capture of `diorama quickstart`; [`ray_caster`] has the shapes, textures and the renderer for scenes of your own.
+//! - [`hills`] is a surface with exact distances and floaters, to measure meshing.
 //! - [`street`], [`chair`] and [`still_life_model`] are triangle meshes with metallic-roughness materials, for a path tracer to light.
 //!
 //! ```
@@ -21,6 +22,7 @@
 
 mod assembly;
 pub mod chair;
+pub mod hills;
 pub mod ray_caster;
 pub mod still_life;
 pub mod still_life_model;

@@ -6,6 +6,7 @@
 mod bench;
 mod clip;
 mod compare;
+mod count;
 mod doctor;
 mod eval;
 mod export;

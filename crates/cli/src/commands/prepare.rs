@@ -7,7 +7,7 @@ use clap::Args;
 use diorama_data::split::SplitRule;
 use diorama_data::video::Choice;
 use diorama_pipelines::Result;
-use diorama_pipelines::object::prepare::{self, Finish, PrepareOptions, Prepared, Sfm};
+use diorama_pipelines::run::prepare::{self, Finish, PrepareOptions, Prepared, Sfm};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 

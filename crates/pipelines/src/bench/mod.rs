@@ -6,7 +6,9 @@ pub mod gpu_ops;
 pub mod mesh;
 pub mod nets;
 pub mod ops;
+pub mod reduce;
 pub mod render;
+pub mod tetrahedra;
 pub mod train;
 
 use std::time::Instant;

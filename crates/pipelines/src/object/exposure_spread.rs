@@ -3,8 +3,8 @@
 
 use super::config::Auto;
 use super::model::ObjectModel;
-use super::prepare::finish::exposure::gains;
 use crate::error::Result;
+use crate::run::prepare::finish::exposure::gains;
 use diorama_engine::samplers::pixels::{Observation, PixelSource};
 use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::DVec3;

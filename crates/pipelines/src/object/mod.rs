@@ -19,7 +19,6 @@ mod model_state;
 mod nearest;
 mod observations;
 pub mod points;
-pub mod prepare;
 pub mod quickstart;
 pub mod recipe;
 pub mod render;

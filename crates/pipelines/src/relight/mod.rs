@@ -2,13 +2,17 @@
 //!
 //! [`scene_file`] describes a composition, [`compose`] renders it, [`turntable`] renders a model from all sides. [`light`] reads environment
 //! maps, skies and spherical harmonics, [`picture`] refines a picture in passes that can be interrupted. [`outdoor`] is the scene model,
-//! [`synth`] generates a benchmark for it, [`truth`] its exact layers.
+//! [`synth`] generates a benchmark for it, [`truth`] its exact layers, [`meshing`] makes a mesh of it,
+//! [`fit_light`] finds the light of a new photograph. [`prepare`] makes data sets for it.
 
 pub mod compose;
+pub mod fit_light;
 pub mod light;
+pub mod meshing;
 pub mod object;
 pub mod outdoor;
 pub mod picture;
+pub mod prepare;
 pub mod scene_file;
 pub mod synth;
 pub mod truth;

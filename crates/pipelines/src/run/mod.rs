@@ -9,6 +9,7 @@ pub mod kept_capture;
 pub mod metrics;
 pub mod param_state;
 pub mod photographs;
+pub mod prepare;
 pub mod profile;
 pub mod summary;
 pub mod viewer_files;

@@ -4,7 +4,9 @@ mod check;
 mod mesh;
 mod nets;
 mod ops;
+mod reduce;
 mod render;
+mod tetrahedra;
 mod train;
 
 use super::Verb;
@@ -17,6 +19,8 @@ pub enum Bench {
     Train(train::Train),
     Render(render::Render),
     Mesh(mesh::Mesh),
+    Reduce(reduce::Reduce),
+    Tetrahedra(tetrahedra::Tetrahedra),
     Nets(nets::Nets),
     Check(check::Check),
 }
@@ -29,6 +33,8 @@ impl Bench {
             Bench::Train(v) => v,
             Bench::Render(v) => v,
             Bench::Mesh(v) => v,
+            Bench::Reduce(v) => v,
+            Bench::Tetrahedra(v) => v,
             Bench::Nets(v) => v,
             Bench::Check(v) => v,
         }

@@ -2,8 +2,11 @@
 
 mod compose;
 mod eval;
+mod fit_light;
 mod light_flags;
+mod mesh;
 mod object;
+mod prepare;
 mod render;
 mod synth;
 mod train;
@@ -15,10 +18,13 @@ use clap::Subcommand;
 /// Put models under other light: composed scenes and turntables, path-traced
 #[derive(Subcommand)]
 pub enum Relight {
+    Prepare(prepare::Prepare),
     Train(train::Train),
     Render(render::Render),
     Object(object::Object),
     Eval(eval::Eval),
+    Mesh(mesh::Mesh),
+    FitLight(fit_light::FitLight),
     Compose(compose::Compose),
     Turntable(turntable::Turntable),
     Synth(synth::Synth),
@@ -28,10 +34,13 @@ impl Relight {
     /// The chosen command.
     pub fn verb(&self) -> &dyn Verb {
         match self {
+            Relight::Prepare(v) => v,
             Relight::Train(v) => v,
             Relight::Render(v) => v,
             Relight::Object(v) => v,
             Relight::Eval(v) => v,
+            Relight::Mesh(v) => v,
+            Relight::FitLight(v) => v,
             Relight::Compose(v) => v,
             Relight::Turntable(v) => v,
             Relight::Synth(v) => v,

@@ -1,7 +1,8 @@
 //! Scene model: photographs of one place in several lights → albedo, normals, shadow, and the light of each session.
 //!
 //! Rudnev et al. 2022, "NeRF for Outdoor Scene Relighting": `C = S(x, L) · A ⊙ (Lᵀ b(N))` with spherical harmonics `L` per session, on a
-//! hash grid, in linear light. [`recipe`] trains, [`shading`] is the loss, [`render`] shows layers under any light.
+//! hash grid, in linear light. [`recipe`] trains, [`shading`] is the loss, [`render`] shows layers under any light, [`surface_field`] is what
+//! meshing sees.
 
 pub mod config;
 pub mod model;
@@ -10,5 +11,6 @@ pub mod recipe;
 pub mod render;
 pub mod scores;
 pub mod shading;
+pub mod surface_field;
 mod trainer;
 pub mod viewing;

@@ -10,8 +10,9 @@ use std::collections::HashMap;
 use std::path::PathBuf;
 
 /// Method that separates foreground and background.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub enum Background {
+    #[default]
     Keep,
     /// GrabCut, seeded with the points of structure from motion.
     Auto,

@@ -392,7 +392,7 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
 }
 
 /// Unique file stems, one per file.
-fn stems(files: &[PathBuf]) -> Vec<String> {
+pub fn stems(files: &[PathBuf]) -> Vec<String> {
     let mut taken = HashSet::new();
     let stem = |(i, f): (usize, &PathBuf)| {
         let own = f.file_stem().unwrap_or_default().to_string_lossy().into_owned();

@@ -46,8 +46,8 @@ impl std::str::FromStr for Crop {
     }
 }
 
-/// Options of [`finish`].
-#[derive(Clone, Debug)]
+/// Options of [`finish`]; by default, nothing is done.
+#[derive(Clone, Debug, Default)]
 pub struct Finish {
     pub crop: Option<Crop>,
     /// Keep only this many photographs, those that differ most.
