@@ -13,6 +13,7 @@ pub mod object;
 pub mod outdoor;
 pub mod picture;
 pub mod prepare;
+pub mod quickstart;
 pub mod scene_file;
 pub mod synth;
 pub mod truth;

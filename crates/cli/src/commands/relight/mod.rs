@@ -7,6 +7,7 @@ mod light_flags;
 mod mesh;
 mod object;
 mod prepare;
+mod quickstart;
 mod render;
 mod synth;
 mod train;
@@ -15,9 +16,10 @@ mod turntable;
 use super::Verb;
 use clap::Subcommand;
 
-/// Put models under other light: composed scenes and turntables, path-traced
+/// Take the light out of photographs, and put places and objects under another
 #[derive(Subcommand)]
 pub enum Relight {
+    Quickstart(quickstart::Quickstart),
     Prepare(prepare::Prepare),
     Train(train::Train),
     Render(render::Render),
@@ -34,6 +36,7 @@ impl Relight {
     /// The chosen command.
     pub fn verb(&self) -> &dyn Verb {
         match self {
+            Relight::Quickstart(v) => v,
             Relight::Prepare(v) => v,
             Relight::Train(v) => v,
             Relight::Render(v) => v,

@@ -5,7 +5,7 @@ use super::render::{SceneView, ViewLight};
 use crate::error::Result;
 use crate::relight::light::LightOptions;
 use diorama_data::{DataError, photo};
-use diorama_geom::Image;
+use diorama_geom::{Image, ImageU8};
 use diorama_geom::capture::Split;
 use diorama_geom::color::srgb_from_linear;
 use diorama_geom::sh_light::ShLight;
@@ -144,6 +144,14 @@ pub(super) fn layer_of(view: &SceneView, layer: Layer) -> &Image {
         Layer::Irradiance => &view.irradiance,
         Layer::Depth => &view.depth,
     }
+}
+
+/// Color, albedo, normals and shadow of a frame side by side, in its own light or, where that was not trained on, in the first.
+pub fn layer_row(model: &SceneModel, frame: usize) -> Vec<ImageU8> {
+    let own = model.light_of_frame(frame).unwrap_or(0);
+    let light = ViewLight { light: model.light(own), sky: model.sky(own).to_vec() };
+    let view = model.view(&model.posed(frame), &light, &mut |_| {});
+    [Layer::Rgb, Layer::Albedo, Layer::Normal, Layer::Shadow].map(|l| shown(layer_of(&view, l), l).to_u8()).to_vec()
 }
 
 fn three_channels(image: &Image) -> Image {

@@ -1,0 +1,340 @@
+//! Everything at once on data that the project generates: a street in several lights and a chair, both trained, meshed and composed under a
+//! light that neither was photographed in.
+
+mod page;
+
+use super::compose::{self, Z_UP};
+use super::light::{LightOptions, Source};
+use super::meshing::{self, MeshOptions};
+use super::object::{self, scores::ObjectScores, synth::ObjectSynth};
+use super::outdoor::scores::SceneScores;
+use super::outdoor::{self, model::SceneModel};
+use super::synth::{self, Place, SynthOptions};
+use super::{picture, scene_file};
+use crate::error::Result;
+use crate::run::RunFolder;
+use crate::run::config::Configuration;
+use diorama_data::{DataError, atomic, model_file, photo};
+use diorama_engine::train::Event;
+use diorama_geom::capture::Split;
+use diorama_geom::glam::DVec3;
+use diorama_geom::{Image, ImageU8};
+use diorama_kernels::ops::path_trace::{Scene, cpu};
+use diorama_mesh::extract::Method;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Meshes in the folder.
+const SITE: &str = "site.glb";
+const CHAIR: &str = "chair.glb";
+/// Samples per pixel of the composition, and of pictures of the object that are path-traced for its scores.
+const COMPOSED_SAMPLES: u32 = 64;
+const SCORED_SAMPLES: u32 = 16;
+/// Size of the composition.
+const COMPOSED_SIZE: (u32, u32) = (480, 270);
+/// Cells along the street's mesh, its most faces, and the edge of its texture.
+const MESH: (usize, usize, usize) = (192, 60_000, 1024);
+/// Where in a picture the chair may stand: shares of its width and height, the best first.
+const SPOTS: [[f64; 2]; 6] = [[0.5, 0.8], [0.5, 0.9], [0.35, 0.85], [0.65, 0.85], [0.5, 0.7], [0.5, 0.6]];
+/// Least cosine between the ground's normal and the vertical, and distances from the camera, in meters.
+const LEVEL: f64 = 0.9;
+const NEAR_AND_FAR: (f64, f64) = (2.0, 12.0);
+
+/// How much is generated and trained.
+#[derive(Clone, Debug)]
+pub struct QuickstartOptions {
+    pub street: SynthOptions,
+    pub scene_steps: u64,
+    pub chair_views: usize,
+    pub chair_size: (u32, u32),
+    pub object: object::config::Preset,
+    /// Steps of each of the object's stages; none: those of its preset.
+    pub object_steps: Option<u64>,
+}
+
+impl Default for QuickstartOptions {
+    /// About a quarter of an hour on two cores.
+    fn default() -> Self {
+        QuickstartOptions {
+            street: SynthOptions { views: 20, lights: 4, size: (96, 54), samples: 48, seed: 0 },
+            scene_steps: 2500,
+            chair_views: 32,
+            chair_size: (128, 128),
+            object: object::config::Preset::Fast,
+            object_steps: Some(250),
+        }
+    }
+}
+
+/// Figures, and where everything is.
+#[derive(Clone, Debug, Serialize)]
+pub struct Made {
+    pub folder: PathBuf,
+    pub unseen_light_psnr: f64,
+    pub albedo_psnr: f64,
+    pub normal_median_deg: f64,
+    pub object_psnr: f64,
+    pub object_relight_psnr: f64,
+    /// The object, and the street.
+    pub glb: PathBuf,
+    pub site_glb: PathBuf,
+    pub composed: PathBuf,
+    pub report: PathBuf,
+    pub scene: SceneScores,
+    pub object: ObjectScores,
+    pub notes: Vec<String>,
+}
+
+/// Generates, trains, scores, meshes, composes and reports into `folder`; none when stopped. What is done already is kept: the same command
+/// goes on after an interruption.
+///
+/// # Errors
+/// When a stage fails, or the folder cannot be written.
+pub fn quickstart(
+    folder: &Path,
+    o: &QuickstartOptions,
+    stop: &AtomicBool,
+    note: &mut dyn FnMut(&str),
+    events: &mut dyn FnMut(&Event),
+) -> Result<Option<Made>> {
+    std::fs::create_dir_all(folder).map_err(DataError::io(folder, "create"))?;
+    let mut q = Quickstart { folder, o, stop, notes: Vec::new(), events };
+    note("photographing a street in four lights");
+    if !q.street()? {
+        return Ok(None);
+    }
+    note("training the scene: albedo, normals, shadow and light");
+    let Some(model) = q.scene()? else { return Ok(None) };
+    note("scoring the scene");
+    let scene = q.score_scene(&model)?;
+    note("photographing a chair");
+    if !q.chair()? {
+        return Ok(None);
+    }
+    note("training the chair: shape and materials");
+    let Some((glb, object)) = q.object()? else { return Ok(None) };
+    note("meshing the street");
+    let Some(site_glb) = q.mesh(&model)? else { return Ok(None) };
+    note("composing both under a light of no photograph");
+    let Some(composed) = q.compose(&model, &site_glb)? else { return Ok(None) };
+    let made = Made {
+        folder: folder.to_path_buf(),
+        unseen_light_psnr: scene.unseen_light_psnr,
+        albedo_psnr: scene.albedo_psnr,
+        normal_median_deg: scene.normal_median_deg,
+        object_psnr: object.object_psnr,
+        object_relight_psnr: object.truth.as_ref().map_or(f64::NAN, |t| t.object_relight_psnr),
+        glb,
+        site_glb,
+        composed,
+        report: folder.join("report.html"),
+        scene,
+        object,
+        notes: q.notes,
+    };
+    atomic::write(&made.report, page::html(&made).as_bytes())?;
+    Ok(Some(made))
+}
+
+struct Quickstart<'a> {
+    folder: &'a Path,
+    o: &'a QuickstartOptions,
+    stop: &'a AtomicBool,
+    notes: Vec<String>,
+    events: &'a mut dyn FnMut(&Event),
+}
+
+impl Quickstart<'_> {
+    fn at(&self, name: &str) -> PathBuf {
+        self.folder.join(name)
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    /// A run folder, and whether it goes on with an earlier run.
+    fn run(&self, name: &str) -> Result<(RunFolder, bool)> {
+        let at = self.at(name);
+        if at.exists() { Ok((RunFolder::open(&at)?.0, true)) } else { Ok((RunFolder::create(&at, false)?, false)) }
+    }
+
+    /// Whether the street is there.
+    fn street(&mut self) -> Result<bool> {
+        let (out, street) = (self.at("street"), &self.o.street);
+        if out.join("transforms_train.json").exists() {
+            return Ok(true);
+        }
+        let made = synth::generate(&out, &Place::street(street), street, false, self.stop, &mut |_| {})?;
+        Ok(!made.interrupted)
+    }
+
+    fn scene(&mut self) -> Result<Option<SceneModel>> {
+        let mut config = outdoor::config::Config::new(outdoor::config::Preset::Ci, self.at("street"));
+        config.run.steps = self.o.scene_steps;
+        config.check()?;
+        let (mut folder, resume) = self.run("scene")?;
+        let trained = outdoor::recipe::train(&config, &mut folder, resume, None, self.stop, self.events)?;
+        Ok((!trained.summary.interrupted).then_some(trained.model))
+    }
+
+    /// Scores, with pictures of the held-out views and of their layers in `pictures/`.
+    fn score_scene(&mut self, model: &SceneModel) -> Result<SceneScores> {
+        let pictures = self.at("pictures");
+        std::fs::create_dir_all(&pictures).map_err(DataError::io(&pictures, "create"))?;
+        let mut pairs: Vec<Vec<ImageU8>> = vec![Vec::new(), Vec::new()];
+        let scores = outdoor::scores::judge(model, &self.at("street"), &mut |_, ours, theirs| {
+            pairs[0].push(three_channels(ours));
+            pairs[1].push(three_channels(theirs));
+            Ok(())
+        })?;
+        photo::save_png(&pictures.join("unseen_light.png"), &tiled(&pairs))?;
+        let frames = model.capture.indices(Split::Test);
+        let rows = frames.iter().step_by(frames.len().div_ceil(3).max(1)).map(|f| outdoor::pictures::layer_row(model, *f));
+        photo::save_png(&pictures.join("layers.png"), &tiled(&rows.collect::<Vec<_>>()))?;
+        Ok(scores)
+    }
+
+    /// Whether the photographs of the chair are there.
+    fn chair(&mut self) -> Result<bool> {
+        let out = self.at("chair");
+        if out.join("transforms_train.json").exists() {
+            return Ok(true);
+        }
+        let options = ObjectSynth {
+            object: "chair".into(),
+            views: self.o.chair_views,
+            size: self.o.chair_size,
+            samples: 48,
+            light: LightOptions::of(Source::Sky { elevation: 35.0, rotation: 140.0 }),
+            unseen: LightOptions::of(Source::File(self.at("street").join("truth").join("unseen.hdr"))),
+            seed: 0,
+        };
+        Ok(!object::synth::generate(&out, &options, false, self.stop, &mut |_| {})?.interrupted)
+    }
+
+    fn object(&mut self) -> Result<Option<(PathBuf, ObjectScores)>> {
+        let mut config = object::config::Config::new(self.o.object, self.at("chair"));
+        self.o.object_steps.iter().for_each(|s| (config.run.topology_steps, config.run.texture_steps) = (*s, *s));
+        config.check()?;
+        let imported = object::capture::import(&config)?;
+        let (mut folder, resume) = self.run("object")?;
+        let trained = object::recipe::train(&config, &imported, &mut folder, resume, self.stop, self.events)?;
+        if trained.summary.interrupted {
+            return Ok(None);
+        }
+        let glb = self.at(CHAIR);
+        object::recipe::export(&trained.model, &glb)?;
+        let pictures = self.at("pictures");
+        let scores = object::scores::judge(&trained.model, &trained.capture, SCORED_SAMPLES, &mut |name, image| {
+            Ok(photo::save_png(&pictures.join(format!("chair_{name}.png")), image)?)
+        })?;
+        Ok(Some((glb, scores)))
+    }
+
+    fn mesh(&mut self, model: &SceneModel) -> Result<Option<PathBuf>> {
+        let (resolution, target, bake) = MESH;
+        let out = self.at(SITE);
+        let options = MeshOptions {
+            out: out.clone(),
+            method: Method::Cubes,
+            resolution,
+            level: None,
+            interpolate: true,
+            target,
+            bake,
+            lods: 0,
+            quantize: false,
+        };
+        let made = meshing::mesh(model, &options, self.stop, &mut |_, _, _| {})?;
+        Ok(made.map(|m| {
+            self.notes.extend(m.notes);
+            out
+        }))
+    }
+
+    /// The chair in the street under the unseen light.
+    fn compose(&mut self, model: &SceneModel, site: &Path) -> Result<Option<PathBuf>> {
+        let (spot, frame) = self.spot(model, site)?;
+        let text = scene_toml(spot, &frame);
+        let description = self.at("scene.toml");
+        atomic::write(&description, text.as_bytes())?;
+        let file = scene_file::read(&description)?;
+        let mut composition = compose::load(&file)?;
+        self.notes.append(&mut composition.notes);
+        let out = self.at("composed.png");
+        let kept = picture::kept_beside(&out);
+        let composed = compose::render(&mut composition, &file, &kept, self.stop, &mut |_| {})?;
+        if composed.interrupted || self.is_stopped() {
+            return Ok(None);
+        }
+        picture::save(&out, &composed.rgba, file.render.exposure)?;
+        picture::discard(&kept)?;
+        Ok(Some(out))
+    }
+
+    /// Level ground before a held-out camera (y up, in the street's coordinates), and the camera's frame.
+    fn spot(&mut self, model: &SceneModel, site: &Path) -> Result<([f64; 3], String)> {
+        let street = model_file::read(site)?.model;
+        let scene = Scene::new(&street, &LightOptions::of(Source::Uniform(1.0)).read()?.0);
+        let frames = &model.capture.frames;
+        let to_input = model.capture.world_from_capture.inverse();
+        for [u, v] in SPOTS {
+            for f in model.capture.indices(Split::Test) {
+                let (camera, pose) = (&frames[f].camera, to_input.pose(&frames[f].world_from_camera));
+                let direction = pose.rotation * camera.direction(u * camera.width as f64, v * camera.height as f64);
+                let Some(hit) = cpu::first_hit(&scene, pose.translation, direction) else { continue };
+                if (NEAR_AND_FAR.0..NEAR_AND_FAR.1).contains(&hit.depth) && level_around(&scene, hit.position) {
+                    return Ok(((Z_UP.transpose() * hit.position).to_array(), frames[f].name.clone()));
+                }
+            }
+        }
+        let text = "the mesh of the street has no level ground before a held-out camera; train longer";
+        Err(DataError::input(site, text).into())
+    }
+}
+
+/// Whether the ground around a point is level: points half a meter away are about as high.
+fn level_around(scene: &Scene, p: DVec3) -> bool {
+    const AWAY: f64 = 0.4;
+    [DVec3::X, DVec3::Y, DVec3::NEG_X, DVec3::NEG_Y].into_iter().all(|d| {
+        let above = p + AWAY * d + DVec3::new(0.0, 0.0, 1.0);
+        let most = AWAY * (1.0 / (LEVEL * LEVEL) - 1.0f64).sqrt();
+        cpu::first_hit(scene, above, DVec3::NEG_Z).is_some_and(|h| (h.position.z - p.z).abs() < most)
+    })
+}
+
+/// The composition of what the stages before wrote.
+fn scene_toml([x, y, z]: [f64; 3], frame: &str) -> String {
+    let (width, height) = COMPOSED_SIZE;
+    format!(
+        "# The chair in the street under a light of no photograph: diorama relight compose scene.toml\n\
+[scene]\nmesh = \"{SITE}\"\n\
+[[object]]\nmesh = \"{CHAIR}\"\ntranslate = [{x:.4}, {y:.4}, {z:.4}]\nsnap = \"ground\"\noverlap = true\n\
+[light]\nhdri = \"street/truth/unseen.hdr\"\n\
+[camera]\nframe = \"scene:{frame}\"\n\
+[render]\nsize = [{width}, {height}]\nspp = {COMPOSED_SAMPLES}\ndenoise = \"atrous\"\n"
+    )
+}
+
+fn three_channels(image: &ImageU8) -> ImageU8 {
+    let data = image.data.chunks_exact(image.channels).flat_map(|p| [p[0], p[1], p[2]]).collect();
+    Image { width: image.width, height: image.height, channels: 3, data }
+}
+
+/// Rows of pictures of one size, as one picture.
+fn tiled(rows: &[Vec<ImageU8>]) -> ImageU8 {
+    let Some(first) = rows.iter().flatten().next() else { return Image { width: 0, height: 0, channels: 3, data: Vec::new() } };
+    let (w, h, columns) = (first.width, first.height, rows.iter().map(Vec::len).max().unwrap_or(0));
+    let mut out = Image { width: w * columns, height: h * rows.len(), channels: 3, data: vec![0; 3 * w * columns * h * rows.len()] };
+    for (r, row) in rows.iter().enumerate() {
+        for (c, picture) in row.iter().enumerate() {
+            for y in 0..h {
+                let at = 3 * ((r * h + y) * out.width + c * w);
+                out.data[at..at + 3 * w].copy_from_slice(&picture.data[3 * y * w..3 * (y + 1) * w]);
+            }
+        }
+    }
+    out
+}
