@@ -4,6 +4,8 @@ mod check;
 mod mesh;
 mod nets;
 mod ops;
+mod path_trace;
+mod raster;
 mod render;
 mod train;
 
@@ -18,6 +20,8 @@ pub enum Bench {
     Render(render::Render),
     Mesh(mesh::Mesh),
     Nets(nets::Nets),
+    PathTrace(path_trace::PathTrace),
+    Raster(raster::RasterBench),
     Check(check::Check),
 }
 
@@ -30,6 +34,8 @@ impl Bench {
             Bench::Render(v) => v,
             Bench::Mesh(v) => v,
             Bench::Nets(v) => v,
+            Bench::PathTrace(v) => v,
+            Bench::Raster(v) => v,
             Bench::Check(v) => v,
         }
     }

@@ -4,6 +4,7 @@ mod compose;
 mod eval;
 mod light_flags;
 mod render;
+mod scenario;
 mod synth;
 mod train;
 mod turntable;
@@ -19,6 +20,7 @@ pub enum Relight {
     Eval(eval::Eval),
     Compose(compose::Compose),
     Turntable(turntable::Turntable),
+    Scenario(scenario::Scenario),
     Synth(synth::Synth),
 }
 
@@ -31,6 +33,7 @@ impl Relight {
             Relight::Eval(v) => v,
             Relight::Compose(v) => v,
             Relight::Turntable(v) => v,
+            Relight::Scenario(v) => v,
             Relight::Synth(v) => v,
         }
     }
