@@ -1,4 +1,5 @@
-//! `diorama bench`: each op against the machine's measured limits, the stages of a training step, networks, and the speed of rendering.
+//! `diorama bench`: each op against the machine's measured limits, the stages of a training step, networks, and the speed of rendering,
+//! path tracing and rasterization.
 
 pub mod check;
 #[cfg(feature = "gpu")]
@@ -6,6 +7,8 @@ pub mod gpu_ops;
 pub mod mesh;
 pub mod nets;
 pub mod ops;
+pub mod path_trace;
+pub mod raster;
 pub mod reduce;
 pub mod render;
 pub mod tetrahedra;

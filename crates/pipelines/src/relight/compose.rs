@@ -6,6 +6,7 @@ use super::scene_file::{Backplate, Denoise, Focus, SceneFile, Snap, object_of};
 use crate::error::{PipelineError, Result};
 use crate::run::{RunDescription, kept_capture};
 use diorama_data::{DataError, model_file, photo};
+use diorama_geom::daylight::Daylight;
 use diorama_geom::glam::{DAffine3, DMat3, DVec3};
 use diorama_geom::{Camera, Image, Model, Pose};
 use diorama_kernels::ops::denoise;
@@ -30,6 +31,7 @@ pub struct Composition {
     pub place: usize,
     pub scene: Scene,
     pub view: View,
+    pub light: Daylight,
     pub settings: Settings,
     /// Photograph behind the objects, `[H, W, 3]`, linear.
     pub photograph: Option<Image>,
@@ -101,7 +103,7 @@ pub fn load(file: &SceneFile) -> Result<Composition> {
         ..Settings::default()
     };
     let key = key(file, &view)?;
-    Ok(Composition { model, place, scene, view, settings, photograph, notes, key })
+    Ok(Composition { model, place, scene, view, light, settings, photograph, notes, key })
 }
 
 /// Renders a composition with `samples` per pixel. Unfinished pictures are in `kept`. `progress` gets the share that is done.
@@ -129,9 +131,8 @@ pub fn render(c: &mut Composition, file: &SceneFile, kept: &Path, stop: &AtomicB
     };
     let mut empty = c.model.clone();
     empty.instances.truncate(c.place);
-    let light = light_options(file)?.read()?.0;
     let (mut without, interrupted) =
-        picture::render(&job(&Scene::new(&empty, &light), "without"), stop, &mut |s| progress(0.5 + s / passes))?;
+        picture::render(&job(&Scene::new(&empty, &c.light), "without"), stop, &mut |s| progress(0.5 + s / passes))?;
     if file.render.denoise == Denoise::Atrous && !interrupted {
         denoise::cpu::run(&mut without);
     }
@@ -204,7 +205,13 @@ fn camera(file: &SceneFile) -> Result<(View, Option<Image>)> {
         (None, Some(eye), Some(target)) => {
             let (eye, target) = (Z_UP * DVec3::from(eye), Z_UP * DVec3::from(target));
             let up = if (target - eye).normalize().z.abs() > 0.9999 { DVec3::Y } else { DVec3::Z };
-            (Camera::pinhole(960, 540, part.fov_deg.to_radians()), Pose::look_at(eye, target, up), None)
+            let (mut size, mut photograph) = ((960, 540), None);
+            if let Some(path) = &part.photograph {
+                require_file(path, "camera.photograph")?;
+                size = photo::size(path)?;
+                photograph = (file.render.backplate == Backplate::Photo).then(|| path.clone());
+            }
+            (Camera::pinhole(size.0, size.1, part.fov_deg.to_radians()), Pose::look_at(eye, target, up), photograph)
         }
         _ => return Err(PipelineError::Usage("camera: give eye and target, or frame".into())),
     };
@@ -225,7 +232,7 @@ fn camera(file: &SceneFile) -> Result<(View, Option<Image>)> {
 }
 
 /// Camera, pose in the coordinates of the run's input, and photograph of `RUN:NUMBER` or `RUN:NAME`.
-fn frame_of_run(frame: &str) -> Result<(Camera, Pose, PathBuf)> {
+pub(super) fn frame_of_run(frame: &str) -> Result<(Camera, Pose, PathBuf)> {
     let (run, which) = frame.rsplit_once(':').unwrap_or((frame, "0"));
     let run = Path::new(run);
     let capture = kept_capture::read(run, None, &RunDescription::read(run)?.data_set())?;
@@ -246,7 +253,7 @@ fn lens(
     view: &View,
     objects: &[Option<([f64; 3], [f64; 3])>],
     model: &Model,
-    light: &diorama_geom::daylight::Daylight,
+    light: &Daylight,
 ) -> Result<Option<ThinLens>> {
     let Some(f_stop) = file.camera.f_stop else { return Ok(None) };
     let in_camera = view.world_from_camera.inverse();
@@ -301,7 +308,7 @@ fn key(file: &SceneFile, view: &View) -> Result<String> {
     description.render.spp = 0;
     mix(format!("{description:?} {view:?}").as_bytes());
     let meshes = file.scene.iter().map(|s| &s.mesh).chain(file.objects.iter().map(|o| &o.mesh));
-    for path in meshes.chain(&file.light.hdri) {
+    for path in meshes.chain(&file.light.hdri).chain(&file.camera.photograph) {
         mix(&std::fs::read(path).map_err(DataError::io(path, "read"))?);
     }
     Ok(format!("{hash:016x}"))

@@ -103,6 +103,9 @@ pub struct CameraPart {
     pub eye: Option<[f64; 3]>,
     #[serde(default)]
     pub target: Option<[f64; 3]>,
+    /// What this camera photographed, with eye and target.
+    #[serde(default)]
+    pub photograph: Option<PathBuf>,
     /// Horizontal.
     #[serde(default = "field_of_view")]
     pub fov_deg: f64,
@@ -174,7 +177,7 @@ pub enum Backplate {
     /// The rendered scene and the light.
     #[default]
     Light,
-    /// The photograph of the camera's frame, changed by the objects' shadows and reflections.
+    /// The photograph of the camera, changed by the objects' shadows and reflections.
     Photo,
     /// Nothing: transparent.
     None,
@@ -206,7 +209,7 @@ pub fn read(path: &Path) -> Result<SceneFile> {
     let mut file: SceneFile = toml::from_str(&text).map_err(|e| DataError::input(path, explain(&text, &e)))?;
     let folder = path.parent().unwrap_or(Path::new(""));
     let meshes = file.scene.iter_mut().map(|s| &mut s.mesh).chain(file.objects.iter_mut().map(|o| &mut o.mesh));
-    meshes.chain(&mut file.light.hdri).for_each(|p| *p = folder.join(&*p));
+    meshes.chain(&mut file.light.hdri).chain(&mut file.camera.photograph).for_each(|p| *p = folder.join(&*p));
     if let Some((run, frame)) = file.camera.frame.as_deref().and_then(|f| f.rsplit_once(':')) {
         file.camera.frame = Some(format!("{}:{frame}", folder.join(run).display()));
     }
@@ -257,6 +260,9 @@ fn check(file: &SceneFile) -> std::result::Result<(), (&'static str, String)> {
         (Some(_), ..) => return fault("camera.frame", "give frame, or eye and target"),
         _ => return fault("camera", "give eye and target, or frame = \"RUN:NUMBER\""),
     }
+    if c.photograph.is_some() && c.frame.is_some() {
+        return fault("camera.photograph", "the frame has a photograph of its own; give one of them");
+    }
     if c.eye.is_some() && c.eye == c.target {
         return fault("camera.target", "is where the eye is");
     }
@@ -279,8 +285,8 @@ fn check(file: &SceneFile) -> std::result::Result<(), (&'static str, String)> {
     if file.render.spp == 0 || file.render.bounces == 0 {
         return fault("render.spp", "spp and bounces must be at least 1");
     }
-    if file.render.backplate == Backplate::Photo && (c.frame.is_none() || file.scene.is_none()) {
-        return fault("render.backplate", "a photograph needs camera.frame, and [scene] to catch shadows");
+    if file.render.backplate == Backplate::Photo && (c.frame.is_none() && c.photograph.is_none() || file.scene.is_none()) {
+        return fault("render.backplate", "a photograph needs camera.frame or camera.photograph, and [scene] to catch shadows");
     }
     Ok(())
 }

@@ -73,10 +73,7 @@ pub fn render(
         return Err(DataError::input(model, "holds no triangles").into());
     };
     let mut output = Output::open(&options.out, options.size, force)?;
-    let (center, radius) = (0.5 * (low + high), 0.5 * (high - low).length());
     let camera = Camera::pinhole(options.size.0, options.size.1, options.fov);
-    let narrow = (options.size.0.min(options.size.1) as f64 / options.size.0 as f64 * (0.5 * options.fov).tan()).atan();
-    let distance = radius / (FILLED * narrow).sin();
     let mut scene = Scene::new(&geometry, &light);
     let settings = Settings { shows_light: options.background, ..Settings::default() };
     let mut made = Turntable {
@@ -89,10 +86,6 @@ pub fn render(
     };
     for i in 0..options.frames {
         let turn = i as f64 / options.frames as f64 * std::f64::consts::TAU;
-        // The first frame looks along glTF's −z, at the front of the model.
-        let ahead = turn - std::f64::consts::FRAC_PI_2;
-        let (up, level) = options.elevation.sin_cos();
-        let eye = center + distance * DVec3::new(level * ahead.cos(), level * ahead.sin(), up);
         if options.turn_model {
             // Seen from a camera that moves, a light that moves along stands still.
             scene.set_light(&light.clone().turned(turn, 1.0));
@@ -100,7 +93,7 @@ pub fn render(
         let rgba = if output.has(i) {
             None
         } else {
-            let view = View { camera, world_from_camera: Pose::look_at(eye, center, DVec3::Z), lens: None };
+            let view = View { camera, world_from_camera: orbit(&camera, [low, high], options.elevation, turn), lens: None };
             let job = Job { scene: &scene, view, settings, samples: options.samples, kept: None, key: String::new() };
             let (mut film, interrupted) = picture::render(&job, stop, &mut |s| progress((i as f64 + s) / options.frames as f64))?;
             if interrupted {
@@ -127,6 +120,17 @@ pub fn render(
     output.finish(made.frames)?;
     progress(1.0);
     Ok(made)
+}
+
+/// Pose of a camera that sees a box as a whole from an elevation, `turn` from its front; angles in radians.
+pub(crate) fn orbit(camera: &Camera, [low, high]: [DVec3; 2], elevation: f64, turn: f64) -> Pose {
+    let (center, radius) = (0.5 * (low + high), 0.5 * (high - low).length());
+    let narrow = (0.5 * camera.width.min(camera.height) as f64 / camera.fx).atan();
+    let distance = radius / (FILLED * narrow).sin();
+    // Without a turn, the camera looks along glTF's −z, at the front of the model.
+    let ahead = turn - std::f64::consts::FRAC_PI_2;
+    let (up, level) = elevation.sin_cos();
+    Pose::look_at(center + distance * DVec3::new(level * ahead.cos(), level * ahead.sin(), up), center, DVec3::Z)
 }
 
 enum Output {

@@ -4,6 +4,8 @@ mod check;
 mod mesh;
 mod nets;
 mod ops;
+mod path_trace;
+mod raster;
 mod reduce;
 mod render;
 mod tetrahedra;
@@ -22,6 +24,8 @@ pub enum Bench {
     Reduce(reduce::Reduce),
     Tetrahedra(tetrahedra::Tetrahedra),
     Nets(nets::Nets),
+    PathTrace(path_trace::PathTrace),
+    Raster(raster::RasterBench),
     Check(check::Check),
 }
 
@@ -36,6 +40,8 @@ impl Bench {
             Bench::Reduce(v) => v,
             Bench::Tetrahedra(v) => v,
             Bench::Nets(v) => v,
+            Bench::PathTrace(v) => v,
+            Bench::Raster(v) => v,
             Bench::Check(v) => v,
         }
     }

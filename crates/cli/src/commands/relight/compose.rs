@@ -5,7 +5,7 @@ use crate::commands::{Outcome, Verb};
 use crate::terminal::ShareShown;
 use clap::Args;
 use diorama_pipelines::relight::scene_file::Denoise;
-use diorama_pipelines::relight::{compose, picture, scene_file};
+use diorama_pipelines::relight::{compose, export_blender, picture, scene_file};
 use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -30,6 +30,9 @@ pub struct Compose {
     /// off or atrous [default: that of the description]
     #[arg(long)]
     denoise: Option<String>,
+    /// Also write the composition for Blender: model, light, and a script that opens them
+    #[arg(long, value_name = "DIR")]
+    export_blender: Option<PathBuf>,
     /// Replace the picture
     #[arg(long)]
     force: bool,
@@ -56,6 +59,10 @@ impl Verb for Compose {
         watch_interrupts();
         let mut composition = compose::load(&file)?;
         composition.notes.iter().for_each(|n| note(n));
+        if let Some(folder) = &self.export_blender {
+            export_blender::write(folder, &composition, &file, self.force)?.iter().for_each(|n| note(n));
+            note(&format!("to render it with Cycles: {}", export_blender::hint(folder)));
+        }
         let (start, kept) = (Instant::now(), picture::kept_beside(&self.out));
         let mut shown = ShareShown::new();
         let text = format!("{} triangles, {} samples per pixel", composition.scene.triangles(), file.render.spp);

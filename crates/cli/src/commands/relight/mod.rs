@@ -9,6 +9,7 @@ mod object;
 mod prepare;
 mod quickstart;
 mod render;
+mod scenario;
 mod synth;
 mod train;
 mod turntable;
@@ -29,6 +30,7 @@ pub enum Relight {
     FitLight(fit_light::FitLight),
     Compose(compose::Compose),
     Turntable(turntable::Turntable),
+    Scenario(scenario::Scenario),
     Synth(synth::Synth),
 }
 
@@ -46,6 +48,7 @@ impl Relight {
             Relight::FitLight(v) => v,
             Relight::Compose(v) => v,
             Relight::Turntable(v) => v,
+            Relight::Scenario(v) => v,
             Relight::Synth(v) => v,
         }
     }

@@ -10,7 +10,9 @@ use super::{Film, FirstHit, Pixel, Scene, Settings, Strategy, View};
 use crate::ops::ray_triangles::Ray;
 use crate::tasks::{self, Parts};
 use diorama_geom::glam::DVec3;
+use std::cell::Cell;
 use std::f32::consts::PI;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Rows of a task.
 const STRIP: usize = 4;
@@ -21,19 +23,20 @@ const PASSED: usize = 64;
 /// Reflectance of a pane at normal incidence (index of refraction 1.5).
 const PANE: f32 = 0.04;
 
-/// Adds `samples` samples to each pixel of a film.
+/// Adds `samples` samples to each pixel of a film, and returns how many rays that took.
 ///
 /// # Panics
 /// When film and camera differ in size.
-pub fn render(scene: &Scene, view: &View, settings: &Settings, samples: u32, film: &mut Film) {
+pub fn render(scene: &Scene, view: &View, settings: &Settings, samples: u32, film: &mut Film) -> u64 {
     let (w, h) = (view.camera.width as usize, view.camera.height as usize);
     assert_eq!((w, h), (film.width, film.height), "path_trace: film and camera differ in size");
-    let (first, tracer) = (film.samples, Tracer { scene, settings });
+    let (first, rays) = (film.samples, AtomicU64::new(0));
     let parts = Parts::new(&mut film.pixels);
     tasks::run(h.div_ceil(STRIP), usize::MAX, |strip| {
         // SAFETY: each task has a strip of its own.
         let pixels = unsafe { parts.chunk(strip, STRIP * w) };
         let rows = pixels.len() / w;
+        let tracer = Tracer::new(scene, settings);
         // Columns of few rows, so that neighboring paths meet the same triangles.
         for x in 0..w {
             for row in 0..rows {
@@ -49,8 +52,10 @@ pub fn render(scene: &Scene, view: &View, settings: &Settings, samples: u32, fil
                 *pixel = Pixel::of(std::array::from_fn(|k| before[k] + share * (sums[k] / samples as f32 - before[k])));
             }
         }
+        rays.fetch_add(tracer.rays.get(), Ordering::Relaxed);
     });
     film.samples += samples;
+    rays.into_inner()
 }
 
 /// The first surface behind each pixel's center, `[H, W]`; panes and holes count as surfaces if `porous`.
@@ -67,7 +72,7 @@ pub fn first_hits(scene: &Scene, view: &View, porous: bool) -> Vec<Option<FirstH
             let found = if porous {
                 scene.geometry.nearest(&ray).map(|f| (scene.geometry.point(&f), f.hit.t))
             } else {
-                Tracer { scene, settings: &Settings::default() }.meet(ray, &mut sampler).found.map(|m| (m.point, m.t))
+                Tracer::new(scene, &Settings::default()).meet(ray, &mut sampler).found.map(|m| (m.point, m.t))
             };
             *out = found.map(|(point, t)| FirstHit {
                 instance: point.instance,
@@ -132,6 +137,8 @@ fn heuristic(a: f32, b: f32) -> f32 {
 struct Tracer<'a> {
     scene: &'a Scene,
     settings: &'a Settings,
+    /// Rays that were traced.
+    rays: Cell<u64>,
 }
 
 /// What a ray comes to, after it passed holes and panes.
@@ -194,11 +201,20 @@ fn through(surface: &Surface, cosine: f32) -> V3 {
     scale(surface.material.base_color, surface.transmission * (1.0 - reflected))
 }
 
-impl Tracer<'_> {
+impl<'a> Tracer<'a> {
+    fn new(scene: &'a Scene, settings: &'a Settings) -> Tracer<'a> {
+        Tracer { scene, settings, rays: Cell::new(0) }
+    }
+
+    fn count_ray(&self) {
+        self.rays.set(self.rays.get() + 1);
+    }
+
     /// Follows a ray to the surface that scatters it; holes and panes let it pass by chance.
     fn meet(&self, mut ray: Ray, sampler: &mut Sampler) -> Meeting {
         let mut passed = [1.0; 3];
         for _ in 0..PASSED {
+            self.count_ray();
             let Some(found) = self.scene.geometry.nearest(&ray) else { return Meeting { passed, found: None } };
             let point = self.scene.geometry.point(&found);
             let surface = self.scene.surfaces.at(&point);
@@ -227,6 +243,7 @@ impl Tracer<'_> {
     /// Share of distant light that arrives from a direction.
     fn visible(&self, origin: V3, direction: V3) -> V3 {
         let mut ray = Ray { origin, direction, range: [0.0, f32::INFINITY] };
+        self.count_ray();
         if self.scene.geometry.is_blocked(&ray) {
             return [0.0; 3];
         }
