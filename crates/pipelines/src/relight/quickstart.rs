@@ -3,31 +3,27 @@
 
 mod page;
 
-use super::compose::{self, Z_UP};
+use super::compose;
 use super::light::{LightOptions, Source};
 use super::meshing::{self, MeshOptions};
 use super::object::{self, scores::ObjectScores, synth::ObjectSynth};
 use super::outdoor::scores::SceneScores;
 use super::outdoor::{self, model::SceneModel};
+use super::scenario::{self, Scenario, ScenarioOptions};
 use super::synth::{self, Place, SynthOptions};
 use super::{picture, scene_file};
-use crate::error::Result;
+use crate::error::{PipelineError, Result};
 use crate::run::RunFolder;
 use crate::run::config::Configuration;
-use diorama_data::{DataError, atomic, model_file, photo};
+use diorama_data::{DataError, atomic, photo};
 use diorama_engine::train::Event;
 use diorama_geom::capture::Split;
-use diorama_geom::glam::DVec3;
 use diorama_geom::{Image, ImageU8};
-use diorama_kernels::ops::path_trace::{Scene, cpu};
 use diorama_mesh::extract::Method;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
-/// Meshes in the folder.
-const SITE: &str = "site.glb";
-const CHAIR: &str = "chair.glb";
 /// Samples per pixel of the composition, and of pictures of the object that are path-traced for its scores.
 const COMPOSED_SAMPLES: u32 = 64;
 const SCORED_SAMPLES: u32 = 16;
@@ -35,12 +31,6 @@ const SCORED_SAMPLES: u32 = 16;
 const COMPOSED_SIZE: (u32, u32) = (480, 270);
 /// Cells along the street's mesh, its most faces, and the edge of its texture.
 const MESH: (usize, usize, usize) = (192, 60_000, 1024);
-/// Where in a picture the chair may stand: shares of its width and height, the best first.
-const SPOTS: [[f64; 2]; 6] = [[0.5, 0.8], [0.5, 0.9], [0.35, 0.85], [0.65, 0.85], [0.5, 0.7], [0.5, 0.6]];
-/// Least cosine between the ground's normal and the vertical, and distances from the camera, in meters.
-const LEVEL: f64 = 0.9;
-const NEAR_AND_FAR: (f64, f64) = (2.0, 12.0);
-
 /// How much is generated and trained.
 #[derive(Clone, Debug)]
 pub struct QuickstartOptions {
@@ -117,7 +107,7 @@ pub fn quickstart(
     note("meshing the street");
     let Some(site_glb) = q.mesh(&model)? else { return Ok(None) };
     note("composing both under a light of no photograph");
-    let Some(composed) = q.compose(&model, &site_glb)? else { return Ok(None) };
+    let Some(composed) = q.compose(&model, &site_glb, &glb)? else { return Ok(None) };
     let made = Made {
         folder: folder.to_path_buf(),
         unseen_light_psnr: scene.unseen_light_psnr,
@@ -148,10 +138,6 @@ struct Quickstart<'a> {
 impl Quickstart<'_> {
     fn at(&self, name: &str) -> PathBuf {
         self.folder.join(name)
-    }
-
-    fn is_stopped(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
     }
 
     /// A run folder, and whether it goes on with an earlier run.
@@ -208,7 +194,7 @@ impl Quickstart<'_> {
             size: self.o.chair_size,
             samples: 48,
             light: LightOptions::of(Source::Sky { elevation: 35.0, rotation: 140.0 }),
-            unseen: LightOptions::of(Source::File(self.at("street").join("truth").join("unseen.hdr"))),
+            unseen: LightOptions::of(Source::File(self.unseen_light())),
             seed: 0,
         };
         Ok(!object::synth::generate(&out, &options, false, self.stop, &mut |_| {})?.interrupted)
@@ -224,7 +210,7 @@ impl Quickstart<'_> {
         if trained.summary.interrupted {
             return Ok(None);
         }
-        let glb = self.at(CHAIR);
+        let glb = self.at("chair.glb");
         object::recipe::export(&trained.model, &glb)?;
         let pictures = self.at("pictures");
         let scores = object::scores::judge(&trained.model, &trained.capture, SCORED_SAMPLES, &mut |name, image| {
@@ -235,7 +221,7 @@ impl Quickstart<'_> {
 
     fn mesh(&mut self, model: &SceneModel) -> Result<Option<PathBuf>> {
         let (resolution, target, bake) = MESH;
-        let out = self.at(SITE);
+        let out = self.at("site.glb");
         let options = MeshOptions {
             out: out.clone(),
             method: Method::Cubes,
@@ -255,18 +241,15 @@ impl Quickstart<'_> {
     }
 
     /// The chair in the street under the unseen light.
-    fn compose(&mut self, model: &SceneModel, site: &Path) -> Result<Option<PathBuf>> {
-        let (spot, frame) = self.spot(model, site)?;
-        let text = scene_toml(spot, &frame);
-        let description = self.at("scene.toml");
-        atomic::write(&description, text.as_bytes())?;
+    fn compose(&mut self, model: &SceneModel, site: &Path, chair: &Path) -> Result<Option<PathBuf>> {
+        let description = self.describe(model, site, chair)?;
         let file = scene_file::read(&description)?;
         let mut composition = compose::load(&file)?;
         self.notes.append(&mut composition.notes);
         let out = self.at("composed.png");
         let kept = picture::kept_beside(&out);
         let composed = compose::render(&mut composition, &file, &kept, self.stop, &mut |_| {})?;
-        if composed.interrupted || self.is_stopped() {
+        if composed.interrupted {
             return Ok(None);
         }
         picture::save(&out, &composed.rgba, file.render.exposure)?;
@@ -274,48 +257,33 @@ impl Quickstart<'_> {
         Ok(Some(out))
     }
 
-    /// Level ground before a held-out camera (y up, in the street's coordinates), and the camera's frame.
-    fn spot(&mut self, model: &SceneModel, site: &Path) -> Result<([f64; 3], String)> {
-        let street = model_file::read(site)?.model;
-        let scene = Scene::new(&street, &LightOptions::of(Source::Uniform(1.0)).read()?.0);
-        let frames = &model.capture.frames;
-        let to_input = model.capture.world_from_capture.inverse();
-        for [u, v] in SPOTS {
-            for f in model.capture.indices(Split::Test) {
-                let (camera, pose) = (&frames[f].camera, to_input.pose(&frames[f].world_from_camera));
-                let direction = pose.rotation * camera.direction(u * camera.width as f64, v * camera.height as f64);
-                let Some(hit) = cpu::first_hit(&scene, pose.translation, direction) else { continue };
-                if (NEAR_AND_FAR.0..NEAR_AND_FAR.1).contains(&hit.depth) && level_around(&scene, hit.position) {
-                    return Ok(((Z_UP.transpose() * hit.position).to_array(), frames[f].name.clone()));
-                }
+    /// Writes `scene.toml`: the first held-out camera that sees free ground, for the chair as it is, else for one that fits.
+    fn describe(&self, model: &SceneModel, site: &Path, chair: &Path) -> Result<PathBuf> {
+        let scenario = Scenario::named("real-in-synthetic")?;
+        let frames = model.capture.indices(Split::Test);
+        let mut failed = None;
+        for (scale, frame) in [Some(1.0), None].into_iter().flat_map(|scale| frames.iter().map(move |f| (scale, *f))) {
+            let options = ScenarioOptions {
+                site: Some(site.to_path_buf()),
+                object: Some(chair.to_path_buf()),
+                frame: Some(format!("{}:{}", self.at("scene").display(), model.capture.frames[frame].name)),
+                hdri: Some(self.unseen_light()),
+                rotate_deg: 0.0,
+                scale,
+                size: COMPOSED_SIZE,
+                samples: COMPOSED_SAMPLES,
+            };
+            match scenario::prepare(self.folder, &scenario, &options, true, self.stop) {
+                Ok((description, _)) => return Ok(description),
+                Err(e) => failed = Some(e),
             }
         }
-        let text = "the mesh of the street has no level ground before a held-out camera; train longer";
-        Err(DataError::input(site, text).into())
+        Err(failed.unwrap_or_else(|| PipelineError::Usage("the street has no held-out photographs".into())))
     }
-}
 
-/// Whether the ground around a point is level: points half a meter away are about as high.
-fn level_around(scene: &Scene, p: DVec3) -> bool {
-    const AWAY: f64 = 0.4;
-    [DVec3::X, DVec3::Y, DVec3::NEG_X, DVec3::NEG_Y].into_iter().all(|d| {
-        let above = p + AWAY * d + DVec3::new(0.0, 0.0, 1.0);
-        let most = AWAY * (1.0 / (LEVEL * LEVEL) - 1.0f64).sqrt();
-        cpu::first_hit(scene, above, DVec3::NEG_Z).is_some_and(|h| (h.position.z - p.z).abs() < most)
-    })
-}
-
-/// The composition of what the stages before wrote.
-fn scene_toml([x, y, z]: [f64; 3], frame: &str) -> String {
-    let (width, height) = COMPOSED_SIZE;
-    format!(
-        "# The chair in the street under a light of no photograph: diorama relight compose scene.toml\n\
-[scene]\nmesh = \"{SITE}\"\n\
-[[object]]\nmesh = \"{CHAIR}\"\ntranslate = [{x:.4}, {y:.4}, {z:.4}]\nsnap = \"ground\"\noverlap = true\n\
-[light]\nhdri = \"street/truth/unseen.hdr\"\n\
-[camera]\nframe = \"scene:{frame}\"\n\
-[render]\nsize = [{width}, {height}]\nspp = {COMPOSED_SAMPLES}\ndenoise = \"atrous\"\n"
-    )
+    fn unseen_light(&self) -> PathBuf {
+        self.at("street").join("truth").join("unseen.hdr")
+    }
 }
 
 fn three_channels(image: &ImageU8) -> ImageU8 {

@@ -79,7 +79,7 @@ pub struct ScenarioOptions {
     pub site: Option<PathBuf>,
     /// Model of the object.
     pub object: Option<PathBuf>,
-    /// `RUN:NUMBER`, a photograph of the place.
+    /// `RUN:NUMBER`, a photograph of the place: the camera, and what is behind the object where the place is photographed.
     pub frame: Option<String>,
     pub hdri: Option<PathBuf>,
     pub rotate_deg: f64,
@@ -110,8 +110,8 @@ pub fn prepare(out: &Path, scenario: &Scenario, o: &ScenarioOptions, force: bool
     if scenario.is_photographed && o.site.is_some() && o.frame.is_none() {
         return Err(PipelineError::Usage(format!("{}: --site needs a photograph of it: --frame RUN:NUMBER", scenario.name)));
     }
-    if o.frame.is_some() && (o.site.is_none() || !scenario.is_photographed) {
-        return Err(PipelineError::Usage("--frame: is for a photographed place, whose mesh --site gives".into()));
+    if o.frame.is_some() && o.site.is_none() {
+        return Err(PipelineError::Usage("--frame: is for a place whose mesh --site gives".into()));
     }
     let object = match &o.object {
         Some(path) => {

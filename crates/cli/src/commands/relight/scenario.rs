@@ -21,7 +21,7 @@ pub struct Scenario {
     /// Model of the place [default: a generated street]
     #[arg(long)]
     site: Option<PathBuf>,
-    /// Photograph of the place, RUN:NUMBER, for scenarios in real places [default: a picture of the street]
+    /// Photograph of the place that --site is a mesh of, RUN:NUMBER: its camera, and in real places the picture [default: of the generated street]
     #[arg(long)]
     frame: Option<String>,
     /// Model of the object [default: a generated chair]
