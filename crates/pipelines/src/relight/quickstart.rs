@@ -18,7 +18,7 @@ use crate::run::config::Configuration;
 use diorama_data::{DataError, atomic, photo};
 use diorama_engine::train::Event;
 use diorama_geom::capture::Split;
-use diorama_geom::{Image, ImageU8};
+use diorama_geom::ImageU8;
 use diorama_mesh::extract::Method;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -85,11 +85,11 @@ pub fn quickstart(
     folder: &Path,
     o: &QuickstartOptions,
     stop: &AtomicBool,
-    note: &mut dyn FnMut(&str),
-    events: &mut dyn FnMut(&Event),
+    listeners: Listeners,
 ) -> Result<Option<Made>> {
     std::fs::create_dir_all(folder).map_err(DataError::io(folder, "create"))?;
-    let mut q = Quickstart { folder, o, stop, notes: Vec::new(), events };
+    let Listeners { stage: note, share, events } = listeners;
+    let mut q = Quickstart { folder, o, stop, notes: Vec::new(), share, events };
     note("photographing a street in four lights");
     if !q.street()? {
         return Ok(None);
@@ -127,11 +127,19 @@ pub fn quickstart(
     Ok(Some(made))
 }
 
+/// Receivers of progress: the name of a stage that begins, the share of it that is done, events of training.
+pub struct Listeners<'a> {
+    pub stage: &'a mut dyn FnMut(&str),
+    pub share: &'a mut dyn FnMut(f64),
+    pub events: &'a mut dyn FnMut(&Event),
+}
+
 struct Quickstart<'a> {
     folder: &'a Path,
     o: &'a QuickstartOptions,
     stop: &'a AtomicBool,
     notes: Vec<String>,
+    share: &'a mut dyn FnMut(f64),
     events: &'a mut dyn FnMut(&Event),
 }
 
@@ -152,7 +160,7 @@ impl Quickstart<'_> {
         if out.join("transforms_train.json").exists() {
             return Ok(true);
         }
-        let made = synth::generate(&out, &Place::street(street), street, false, self.stop, &mut |_| {})?;
+        let made = synth::generate(&out, &Place::street(street), street, false, self.stop, self.share)?;
         Ok(!made.interrupted)
     }
 
@@ -197,7 +205,7 @@ impl Quickstart<'_> {
             unseen: LightOptions::of(Source::File(self.unseen_light())),
             seed: 0,
         };
-        Ok(!object::synth::generate(&out, &options, false, self.stop, &mut |_| {})?.interrupted)
+        Ok(!object::synth::generate(&out, &options, false, self.stop, self.share)?.interrupted)
     }
 
     fn object(&mut self) -> Result<Option<(PathBuf, ObjectScores)>> {
@@ -233,7 +241,7 @@ impl Quickstart<'_> {
             lods: 0,
             quantize: false,
         };
-        let made = meshing::mesh(model, &options, self.stop, &mut |_, _, _| {})?;
+        let made = meshing::mesh(model, &options, self.stop, &mut |_, i, n| (self.share)(i as f64 / n.max(1) as f64))?;
         Ok(made.map(|m| {
             self.notes.extend(m.notes);
             out
@@ -248,7 +256,7 @@ impl Quickstart<'_> {
         self.notes.append(&mut composition.notes);
         let out = self.at("composed.png");
         let kept = picture::kept_beside(&out);
-        let composed = compose::render(&mut composition, &file, &kept, self.stop, &mut |_| {})?;
+        let composed = compose::render(&mut composition, &file, &kept, self.stop, self.share)?;
         if composed.interrupted {
             return Ok(None);
         }
@@ -288,14 +296,14 @@ impl Quickstart<'_> {
 
 fn three_channels(image: &ImageU8) -> ImageU8 {
     let data = image.data.chunks_exact(image.channels).flat_map(|p| [p[0], p[1], p[2]]).collect();
-    Image { width: image.width, height: image.height, channels: 3, data }
+    ImageU8 { width: image.width, height: image.height, channels: 3, data }
 }
 
 /// Rows of pictures of one size, as one picture.
 fn tiled(rows: &[Vec<ImageU8>]) -> ImageU8 {
-    let Some(first) = rows.iter().flatten().next() else { return Image { width: 0, height: 0, channels: 3, data: Vec::new() } };
+    let Some(first) = rows.iter().flatten().next() else { return ImageU8 { width: 0, height: 0, channels: 3, data: Vec::new() } };
     let (w, h, columns) = (first.width, first.height, rows.iter().map(Vec::len).max().unwrap_or(0));
-    let mut out = Image { width: w * columns, height: h * rows.len(), channels: 3, data: vec![0; 3 * w * columns * h * rows.len()] };
+    let mut out = ImageU8 { width: w * columns, height: h * rows.len(), channels: 3, data: vec![0; 3 * w * columns * h * rows.len()] };
     for (r, row) in rows.iter().enumerate() {
         for (c, picture) in row.iter().enumerate() {
             for y in 0..h {

@@ -2,11 +2,12 @@
 
 use crate::commands::process::{INTERRUPT, note, use_threads, watch_interrupts};
 use crate::commands::{Outcome, Verb};
-use crate::terminal::Progress;
+use crate::terminal::{Progress, ShareShown};
 use clap::Args;
 use diorama_data::DataError;
 use diorama_pipelines::Result;
-use diorama_pipelines::relight::quickstart::{self, QuickstartOptions};
+use diorama_pipelines::relight::quickstart::{self, Listeners, QuickstartOptions};
+use std::cell::RefCell;
 use std::path::PathBuf;
 
 /// Run every step on a street and a chair that the program generates itself
@@ -45,9 +46,17 @@ impl Verb for Quickstart {
             std::fs::remove_dir_all(&self.out).map_err(DataError::io(&self.out, "remove"))?;
         }
         watch_interrupts();
-        let mut progress = Progress::new();
-        let options = QuickstartOptions::default();
-        let made = quickstart::quickstart(&self.out, &options, &INTERRUPT, &mut |n| eprintln!("{n}"), &mut |e| progress.event(e))?;
+        let (mut progress, shown) = (Progress::new(), RefCell::new(ShareShown::new()));
+        let listeners = Listeners {
+            stage: &mut |name| {
+                shown.replace(ShareShown::new()).finish();
+                eprintln!("{name}");
+            },
+            share: &mut |share| shown.borrow_mut().show(share, "done"),
+            events: &mut |e| progress.event(e),
+        };
+        let made = quickstart::quickstart(&self.out, &QuickstartOptions::default(), &INTERRUPT, listeners)?;
+        shown.into_inner().finish();
         let Some(made) = made else {
             eprintln!("interrupted: the same command goes on");
             return Ok(Outcome::Interrupted);
