@@ -100,6 +100,8 @@ pub struct LossConfig {
 pub struct OptimConfig {
     pub shape_rate: f32,
     pub material_rate: f32,
+    /// Share of the first stage during which light alone is learned, besides the shape.
+    pub material_from: f32,
     pub light_rate: f32,
     /// Textures in the second stage.
     pub texture_rate: f32,
@@ -156,21 +158,22 @@ impl Config {
                 finest: pick(256, 2048) as u32,
                 width: 32,
                 color: [0.0, 1.0],
-                texture: pick(128, 1024),
+                texture: pick(128, 512),
             },
             light: LightConfig { cube: pick(32, 64), fixed: PathBuf::new() },
             loss: LossConfig {
                 mask: 1.0,
                 sign_change: [0.2, 0.01],
-                color_smoothness: 0.03,
-                white_light: 0.005,
+                color_smoothness: 0.3,
+                white_light: 0.0,
                 laplacian: 3e3,
                 normal_consistency: 0.0,
             },
             optim: OptimConfig {
                 shape_rate: 0.01,
                 material_rate: 0.01,
-                light_rate: 0.03,
+                material_from: 0.0,
+                light_rate: 0.1,
                 texture_rate: 0.01,
                 vertex_rate: 0.001,
                 final_scale: 0.1,
@@ -248,7 +251,7 @@ impl Configuration for Config {
             return fault("loss: weights must be 0 or more");
         }
         let o = &self.optim;
-        let rates = [o.shape_rate, o.material_rate, o.light_rate, o.texture_rate, o.vertex_rate, o.final_scale];
+        let rates = [o.shape_rate, o.material_from, o.material_rate, o.light_rate, o.texture_rate, o.vertex_rate, o.final_scale];
         if rates.iter().any(|r| !(*r >= 0.0 && r.is_finite())) || o.final_scale == 0.0 {
             return fault("optim: rates must be 0 or more, final_scale above 0");
         }

@@ -97,6 +97,13 @@ impl Material {
         d_points
     }
 
+    /// Drops the gradients.
+    pub fn forget(&mut self) {
+        self.table.grads.fill(0.0);
+        self.table.touched.fill(0);
+        self.weights.grads.fill(0.0);
+    }
+
     /// One optimizer step.
     pub fn step(&mut self, t: u32, rate_scale: f32) {
         self.table.step(t, rate_scale);
@@ -109,13 +116,18 @@ fn inputs(encoded: &[f32], n: usize) -> Vec<&[f32]> {
     encoded.chunks_exact((2 * n).max(1)).collect()
 }
 
-/// Adds the gradient of `weight · mean |a − b|` over values `[P, 3]`, and returns it.
+/// Difference beyond which colors count as an edge of the material.
+const EDGE: f32 = 0.05;
+
+/// Adds the gradient of `weight · mean ρ(|a − b|)` over values `[P, 3]`, and returns it. `ρ(d) = d e / (d + e)` tells shading from material as
+/// Retinex does (Land and McCann 1971): small differences cost what they are, edges hardly more the higher they are.
 pub fn smoothness(a: &[f32], b: &[f32], weight: f32, mut to: impl FnMut(usize, f32)) -> f64 {
     let scale = weight / a.len().max(1) as f32;
     let mut sum = 0.0;
     for (i, (a, b)) in a.iter().zip(b).enumerate().filter(|(_, (a, b))| a != b) {
-        sum += (a - b).abs() as f64;
-        to(i, scale * (a - b).signum());
+        let d = (a - b).abs();
+        sum += (d * EDGE / (d + EDGE)) as f64;
+        to(i, scale * (a - b).signum() * (EDGE / (d + EDGE)).powi(2));
     }
     scale as f64 * sum
 }
@@ -125,6 +137,24 @@ mod tests {
     use super::*;
     use crate::relight::object::config::Preset;
     use diorama_testkit::random;
+
+    #[test]
+    fn smoothness_has_its_gradient_and_spares_edges() {
+        let (a, b) = (random(6, 1), random(6, 2));
+        let mut d = [0.0; 6];
+        smoothness(&a, &b, 2.0, |i, v| d[i] = v);
+        for i in 0..6 {
+            let at = |by: f32| {
+                let mut a = a.clone();
+                a[i] += by;
+                smoothness(&a, &b, 2.0, |_, _| {})
+            };
+            let want = (at(1e-3) - at(-1e-3)) / 2e-3;
+            assert!((d[i] as f64 - want).abs() < 1e-4, "{} {want}", d[i]);
+        }
+        let of = |d: f32| smoothness(&[d], &[0.0], 1.0, |_, _| {});
+        assert!(of(0.6) < 1.2 * of(0.3) && of(0.002) > 1.9 * of(0.001));
+    }
 
     #[test]
     fn gradients_match_central_differences() {

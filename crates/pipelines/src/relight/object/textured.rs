@@ -26,7 +26,7 @@ const ATTRIBUTES: usize = 6;
 /// Of so many surface points, one is compared with a texel nearby.
 const SPARSITY: usize = 4;
 /// Standard deviation of the way to that texel, in texture coordinates.
-const JITTER: f32 = 0.005;
+const JITTER: f32 = 0.01;
 /// Steps over which rates rise.
 const WARMUP: f32 = 100.0;
 const OCCLUSION: f32 = 0.001;

@@ -26,7 +26,7 @@ const NEAR: f64 = 1.0;
 /// Of so many surface points, one is compared with a point nearby.
 const SPARSITY: usize = 4;
 /// Standard deviation of the way to that point.
-const JITTER: f32 = 0.01;
+const JITTER: f32 = 0.03;
 /// Share of the stage over which smoothness of the color sets in.
 const RAMP: f32 = 0.1;
 /// Share of the stage after which the sign-change loss has its last weight.
@@ -186,7 +186,12 @@ impl Topology {
         let rate = input.rate_scale * config.optim.final_scale.powf(input.progress);
         self.distances.step(input.t, rate);
         self.offsets.step(input.t, rate);
-        self.material.step(input.t, rate);
+        // What light can explain, it shall: the material follows later.
+        if input.progress >= config.optim.material_from {
+            self.material.step(input.t, rate);
+        } else {
+            self.material.forget();
+        }
         probe.step(input.t, rate);
         Ok(loss)
     }
