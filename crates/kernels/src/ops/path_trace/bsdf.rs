@@ -5,7 +5,7 @@
 //! gets the share that the first one transmits. Directions are in the frame of the shading normal, which is +z, and point away
 //! from the surface.
 
-use super::vector::{dot, luminance, unit};
+use super::vector::{dot, luminance, sin_cos_turns, unit};
 use std::sync::OnceLock;
 
 /// Reflectance of dielectrics at normal incidence (index of refraction 1.5).
@@ -39,6 +39,8 @@ pub struct Bsdf {
     diffuse: [f32; 3],
     /// Probability of the microfacets' lobe.
     glossy: f32,
+    /// Whether there are no microfacets.
+    is_matte: bool,
 }
 
 /// A drawn direction.
@@ -52,6 +54,7 @@ pub struct Drawn {
 }
 
 /// `(1 − cos)⁵`
+#[inline(always)]
 fn schlick(cosine: f32) -> f32 {
     let m = (1.0 - cosine).clamp(0.0, 1.0);
     m * m * m * m * m
@@ -59,12 +62,18 @@ fn schlick(cosine: f32) -> f32 {
 
 impl Bsdf {
     /// Scattering of light towards `outgoing`; none if that is below the surface.
+    #[inline(always)]
     pub fn new(m: &Material, outgoing: [f32; 3]) -> Option<Bsdf> {
         if outgoing[2] <= 0.0 {
             return None;
         }
         let alpha = (m.roughness * m.roughness).clamp(SHARPEST, 1.0);
         let (metallic, base) = (m.metallic.clamp(0.0, 1.0), m.base_color.map(|c| c.clamp(0.0, 1.0)));
+        if m.specular <= 0.0 && metallic == 0.0 {
+            let none = [0.0; 3];
+            let glossy = if luminance(base) > 0.0 { 0.0 } else { 1.0 };
+            return Some(Bsdf { outgoing, alpha, straight: none, grazing: none, diffuse: base, glossy, is_matte: glossy == 0.0 });
+        }
         let [scale, offset] = shares().at(outgoing[2], alpha);
         // Of white microfacets the share `scale` is left; the rest meets others, and is colored once more.
         let gain = |f0: f32| 1.0 + f0 * (1.0 / scale - 1.0);
@@ -77,14 +86,19 @@ impl Bsdf {
         let diffuse = base.map(|c| c * (1.0 - metallic) * (1.0 - surface).max(0.0));
         let (glossy, matte) = (luminance(reflected), luminance(diffuse));
         let glossy = if glossy + matte > 0.0 { glossy / (glossy + matte) } else { 1.0 };
-        Some(Bsdf { outgoing, alpha, straight, grazing, diffuse, glossy })
+        Some(Bsdf { outgoing, alpha, straight, grazing, diffuse, glossy, is_matte: false })
     }
 
     /// Reflection times the cosine of `incoming`, and the density with which [`Bsdf::draw`] draws it.
+    #[inline(always)]
     pub fn evaluate(&self, incoming: [f32; 3]) -> ([f32; 3], f32) {
         let (o, i) = (self.outgoing, incoming);
         if i[2] <= 0.0 {
             return ([0.0; 3], 0.0);
+        }
+        if self.is_matte {
+            let matte = i[2] / std::f32::consts::PI;
+            return (self.diffuse.map(|d| matte * d), matte);
         }
         let half = unit(std::array::from_fn(|k| o[k] + i[k]));
         let d = self.distribution(half);
@@ -98,6 +112,7 @@ impl Bsdf {
     }
 
     /// Draws a direction from two numbers in `[0, 1)`; none if it is below the surface.
+    #[inline(always)]
     pub fn draw(&self, [choice, random]: [f32; 2]) -> Option<Drawn> {
         let incoming = if choice < self.glossy {
             let half = self.draw_normal([choice / self.glossy, random]);
@@ -105,7 +120,7 @@ impl Bsdf {
             unit(std::array::from_fn(|k| twice * half[k] - self.outgoing[k]))
         } else {
             let squared = (choice - self.glossy) / (1.0 - self.glossy);
-            let (radius, (y, x)) = (squared.sqrt(), (std::f32::consts::TAU * random).sin_cos());
+            let (radius, [y, x]) = (squared.sqrt(), sin_cos_turns(random));
             [radius * x, radius * y, (1.0 - squared).max(0.0).sqrt()]
         };
         let (value, density) = self.evaluate(incoming);
@@ -113,6 +128,7 @@ impl Bsdf {
     }
 
     /// GGX: density of the microfacets' normals.
+    #[inline(always)]
     fn distribution(&self, half: [f32; 3]) -> f32 {
         let a2 = self.alpha * self.alpha;
         // `cos² (α² − 1) + 1`, without the difference that cancels near the normal.
@@ -122,18 +138,20 @@ impl Bsdf {
     }
 
     /// Smith's auxiliary function Λ.
+    #[inline(always)]
     fn lambda(&self, v: [f32; 3]) -> f32 {
         let tan2 = (v[0] * v[0] + v[1] * v[1]) / (v[2] * v[2]);
         0.5 * ((1.0 + self.alpha * self.alpha * tan2).sqrt() - 1.0)
     }
 
     /// A normal among those that are visible (Dupuy and Benyoub 2023, spherical caps).
+    #[inline(always)]
     fn draw_normal(&self, random: [f32; 2]) -> [f32; 3] {
         let stretched = unit([self.alpha * self.outgoing[0], self.alpha * self.outgoing[1], self.outgoing[2]]);
-        let angle = std::f32::consts::TAU * random[0];
+        let [sine_of_angle, cosine_of_angle] = sin_cos_turns(random[0]);
         let z = (1.0 - random[1]) * (1.0 + stretched[2]) - stretched[2];
         let sine = (1.0 - z * z).clamp(0.0, 1.0).sqrt();
-        let half = [sine * angle.cos() + stretched[0], sine * angle.sin() + stretched[1], z + stretched[2]];
+        let half = [sine * cosine_of_angle + stretched[0], sine * sine_of_angle + stretched[1], z + stretched[2]];
         unit([self.alpha * half[0], self.alpha * half[1], half[2].max(0.0)])
     }
 }
@@ -145,6 +163,7 @@ struct Shares {
 
 impl Shares {
     /// Bilinear between entries.
+    #[inline(always)]
     fn at(&self, cosine: f32, alpha: f32) -> [f32; 2] {
         let place = |v: f32| {
             let x = v.clamp(0.0, 1.0) * (SIZE - 1) as f32;
@@ -176,6 +195,7 @@ fn shares() -> &'static Shares {
                 grazing: [0.0; 3],
                 diffuse: [0.0; 3],
                 glossy: 1.0,
+                is_matte: false,
             };
             let mut sums = [0.0f64; 2];
             for draw in 0..DRAWS * DRAWS {

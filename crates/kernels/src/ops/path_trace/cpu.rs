@@ -7,11 +7,13 @@ use super::sampler::Sampler;
 use super::surface::Surface;
 use super::vector::{V3, along, dot, frame, luminance, scale, times, unit};
 use super::{Film, FirstHit, Pixel, Scene, Settings, Strategy, View};
+use crate::math::multiversion;
 use crate::ops::ray_triangles::Ray;
 use crate::tasks::{self, Parts};
 use diorama_geom::glam::DVec3;
 use std::cell::Cell;
 use std::f32::consts::PI;
+use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Rows of a task.
@@ -35,27 +37,40 @@ pub fn render(scene: &Scene, view: &View, settings: &Settings, samples: u32, fil
     tasks::run(h.div_ceil(STRIP), usize::MAX, |strip| {
         // SAFETY: each task has a strip of its own.
         let pixels = unsafe { parts.chunk(strip, STRIP * w) };
-        let rows = pixels.len() / w;
         let tracer = Tracer::new(scene, settings);
-        // Columns of few rows, so that neighboring paths meet the same triangles.
-        for x in 0..w {
-            for row in 0..rows {
-                let (pixel, y) = (&mut pixels[row * w + x], strip * STRIP + row);
-                let mut sums = [0.0; Pixel::LEN];
-                for sample in first..first + samples {
-                    let mut sampler = Sampler::new(settings.seed, (y * w + x) as u32, sample);
-                    let ray = camera_ray(view, [x, y], &mut sampler);
-                    let values = tracer.path(ray, &mut sampler).values();
-                    (0..Pixel::LEN).for_each(|k| sums[k] += values[k]);
-                }
-                let (before, share) = (pixel.values(), samples as f32 / (first + samples) as f32);
-                *pixel = Pixel::of(std::array::from_fn(|k| before[k] + share * (sums[k] / samples as f32 - before[k])));
-            }
-        }
+        render_strip(&tracer, view, strip * STRIP, first..first + samples, pixels);
         rays.fetch_add(tracer.rays.get(), Ordering::Relaxed);
     });
     film.samples += samples;
     rays.into_inner()
+}
+
+multiversion! {
+    /// Adds samples to the pixels of whole rows from `top` on.
+    fn render_strip(tracer: &Tracer, view: &View, top: usize, samples: Range<u32>, pixels: &mut [Pixel]) {
+        let w = view.camera.width as usize;
+        // Columns of few rows, so that neighboring paths meet the same triangles.
+        for x in 0..w {
+            for row in 0..pixels.len() / w {
+                let (pixel, y) = (&mut pixels[row * w + x], top + row);
+                let (mut sums, mut mean) = ([0.0; Pixel::LEN], pixel.values());
+                for sample in samples.clone() {
+                    let mut sampler = Sampler::new(tracer.settings.seed, (y * w + x) as u32, sample);
+                    let ray = camera_ray(view, [x, y], &mut sampler);
+                    let values = tracer.path(ray, &mut sampler).values();
+                    for k in 0..Pixel::LEN {
+                        sums[k] += values[k];
+                    }
+                }
+                let added = samples.len() as f32;
+                let share = added / samples.end as f32;
+                for k in 0..Pixel::LEN {
+                    mean[k] += share * (sums[k] / added - mean[k]);
+                }
+                *pixel = Pixel::of(mean);
+            }
+        }
+    }
 }
 
 /// The first surface behind each pixel's center, `[H, W]`; panes and holes count as surfaces if `porous`.
@@ -99,11 +114,13 @@ pub fn is_between(scene: &Scene, from: DVec3, to: DVec3) -> bool {
     scene.geometry.is_blocked(&ray) || scene.geometry.nearest_porous(&ray).is_some()
 }
 
+#[inline(always)]
 fn narrow(v: DVec3) -> V3 {
     [v.x as f32, v.y as f32, v.z as f32]
 }
 
 /// A ray through a random point of a pixel and of the lens.
+#[inline(always)]
 fn camera_ray(view: &View, [x, y]: [usize; 2], sampler: &mut Sampler) -> Ray {
     let [dx, dy] = sampler.pair();
     let pose = &view.world_from_camera;
@@ -118,6 +135,7 @@ fn camera_ray(view: &View, [x, y]: [usize; 2], sampler: &mut Sampler) -> Ray {
 }
 
 /// A point beside a surface, on the side that `normal` points to, from which rays do not meet it again (Wächter and Binder 2019).
+#[inline(always)]
 fn beside(p: V3, normal: V3) -> V3 {
     std::array::from_fn(|k| {
         if p[k].abs() < 1.0 / 32.0 {
@@ -129,6 +147,7 @@ fn beside(p: V3, normal: V3) -> V3 {
 }
 
 /// `(a / (a + b))` of squares: the power heuristic.
+#[inline(always)]
 fn heuristic(a: f32, b: f32) -> f32 {
     let q = b / a;
     1.0 / (1.0 + q * q)
@@ -163,6 +182,7 @@ struct Vertex {
 }
 
 impl Vertex {
+    #[inline(always)]
     fn new(met: &Met, direction: V3) -> Option<Vertex> {
         let toward = scale(direction, -1.0);
         let flip = |n: V3| if dot(met.point.flat_normal, toward) < 0.0 { scale(n, -1.0) } else { n };
@@ -184,10 +204,12 @@ impl Vertex {
         Some(Vertex { position: beside(met.point.position, flat), flat, frame, bsdf })
     }
 
+    #[inline(always)]
     fn local(&self, d: V3) -> V3 {
         self.frame.map(|axis| dot(axis, d))
     }
 
+    #[inline(always)]
     fn world(&self, d: V3) -> V3 {
         let [s, t, n] = self.frame;
         std::array::from_fn(|k| d[0] * s[k] + d[1] * t[k] + d[2] * n[k])
@@ -195,6 +217,7 @@ impl Vertex {
 }
 
 /// Share of the light that a thin pane lets pass: neither reflected nor absorbed.
+#[inline(always)]
 fn through(surface: &Surface, cosine: f32) -> V3 {
     let m = (1.0 - cosine.abs()).clamp(0.0, 1.0);
     let reflected = PANE + (1.0 - PANE) * m * m * m * m * m;
@@ -206,11 +229,13 @@ impl<'a> Tracer<'a> {
         Tracer { scene, settings, rays: Cell::new(0) }
     }
 
+    #[inline(always)]
     fn count_ray(&self) {
         self.rays.set(self.rays.get() + 1);
     }
 
     /// Follows a ray to the surface that scatters it; holes and panes let it pass by chance.
+    #[inline(always)]
     fn meet(&self, mut ray: Ray, sampler: &mut Sampler) -> Meeting {
         let mut passed = [1.0; 3];
         for _ in 0..PASSED {
@@ -241,6 +266,7 @@ impl<'a> Tracer<'a> {
     }
 
     /// Share of distant light that arrives from a direction.
+    #[inline(always)]
     fn visible(&self, origin: V3, direction: V3) -> V3 {
         let mut ray = Ray { origin, direction, range: [0.0, f32::INFINITY] };
         self.count_ray();
@@ -262,6 +288,7 @@ impl<'a> Tracer<'a> {
     }
 
     /// One sample of a pixel.
+    #[inline(always)]
     fn path(&self, mut ray: Ray, sampler: &mut Sampler) -> Pixel {
         let mut out = Pixel::default();
         let (mut throughput, mut density) = ([1.0; 3], f32::INFINITY);
@@ -317,6 +344,7 @@ impl<'a> Tracer<'a> {
     }
 
     /// Adds the light that a path escapes to.
+    #[inline(always)]
     fn escape(&self, ray: &Ray, bounce: u32, density: f32, throughput: V3, out: &mut Pixel) {
         if bounce == 0 && !self.settings.shows_light {
             return;
@@ -332,6 +360,7 @@ impl<'a> Tracer<'a> {
     }
 
     /// Light from a direction that is drawn from the light.
+    #[inline(always)]
     fn direct(&self, vertex: &Vertex, sampler: &mut Sampler) -> V3 {
         let Drawn { direction, radiance, density } = self.scene.light.draw(sampler.pair());
         if dot(direction, vertex.flat) <= 0.0 || density <= 0.0 {
@@ -347,6 +376,7 @@ impl<'a> Tracer<'a> {
     }
 
     /// Irradiance with and without shadows, and the sun's visibility.
+    #[inline(always)]
     fn light_layers(&self, vertex: &Vertex, sampler: &mut Sampler, out: &mut Pixel) {
         let drawn = self.scene.light.draw(sampler.pair());
         let cosine = dot(vertex.frame[2], drawn.direction);
@@ -366,6 +396,7 @@ impl<'a> Tracer<'a> {
 }
 
 /// Beginning of a ray behind a surface that it passed.
+#[inline(always)]
 fn beyond(t: f32) -> f32 {
     t + t.abs() * 4e-7 + 1e-7
 }

@@ -93,12 +93,24 @@ pub struct Point {
     pub instance: u32,
 }
 
+/// Triangles of copies that are stored one by one in the world, because one hierarchy is faster than one per copy; more stay shared.
+const SPREAD_OUT: usize = 1 << 21;
+
 impl Geometry {
     /// # Panics
     /// When a part, material or vertex that is referred to does not exist.
     pub fn new(model: &Model) -> Geometry {
+        Geometry::with_copies(model, SPREAD_OUT)
+    }
+
+    /// The same, with the number of triangles of copies up to which these are stored one by one.
+    pub fn with_copies(model: &Model, spread_out: usize) -> Geometry {
         let mut uses = vec![0usize; model.parts.len()];
         model.instances.iter().for_each(|i| uses[i.part] += 1);
+        let copied: usize = model.parts.iter().zip(&uses).filter(|(_, n)| **n > 1).map(|(p, n)| p.mesh.faces.len() * n).sum();
+        if copied <= spread_out {
+            uses.fill(1);
+        }
         let is_porous = |part: usize| {
             let m = &model.materials[model.parts[part].material];
             m.opacity != Opacity::Opaque || m.transmission > 0.0
@@ -164,6 +176,7 @@ impl Geometry {
     }
 
     /// Properties of a surface that was found.
+    #[inline(always)]
     pub fn point(&self, found: &Found) -> Point {
         let tree = if found.is_porous { &self.porous } else { &self.solid };
         let placed = &tree.placed[found.placed as usize];
@@ -201,6 +214,7 @@ impl Geometry {
 }
 
 /// Direction of u across a triangle, and the sign of the direction against v; zero where texture coordinates do not span it.
+#[inline(always)]
 fn tangent_of(p: [V3; 3], uv: [[f32; 2]; 3]) -> [f32; 4] {
     let (e, f) = (sub(p[1], p[0]), sub(p[2], p[0]));
     let (a, b) = ([uv[1][0] - uv[0][0], uv[1][1] - uv[0][1]], [uv[2][0] - uv[0][0], uv[2][1] - uv[0][1]]);
@@ -300,24 +314,37 @@ impl Tree {
         let inverse = ray.direction.map(|d| 1.0 / if d.abs() < 1e-30 { 1e-30f32.copysign(d) } else { d });
         let mut best: Option<Found> = None;
         let mut range = ray.range;
-        let mut stack = [0u32; 64];
-        let mut size = if self.nodes.is_empty() { 0 } else { 1 };
-        while size > 0 {
-            size -= 1;
-            let node = &self.nodes[stack[size] as usize];
+        // Where the ray enters a node's box, unless it misses it or something nearer was found.
+        let entry = |node: &Node, range: [f32; 2]| {
             let (mut near, mut far) = (range[0], range[1]);
             for k in 0..3 {
                 let (a, b) = ((node.low[k] - ray.origin[k]) * inverse[k], (node.high[k] - ray.origin[k]) * inverse[k]);
                 near = near.max(a.min(b));
                 far = far.min(a.max(b) * 1.000_000_4);
             }
-            if near > far {
+            (near <= far).then_some(near)
+        };
+        let mut stack = [(0u32, 0.0f32); 64];
+        let mut size = self.nodes.first().and_then(|n| entry(n, range)).is_some() as usize;
+        while size > 0 {
+            size -= 1;
+            let (at, near) = stack[size];
+            if near > range[1] {
                 continue;
             }
+            let node = &self.nodes[at as usize];
             if node.content & LEAF == 0 {
-                stack[size] = node.content;
-                stack[size + 1] = node.content + 1;
-                size += 2;
+                let mut children = [0, 1].map(|i| (node.content + i, entry(&self.nodes[(node.content + i) as usize], range)));
+                if children[0].1 < children[1].1 {
+                    children.swap(0, 1);
+                }
+                // The nearer one on top.
+                for (child, near) in children {
+                    if let Some(near) = near {
+                        stack[size] = (child, near);
+                        size += 1;
+                    }
+                }
                 continue;
             }
             let index = node.content & !LEAF;

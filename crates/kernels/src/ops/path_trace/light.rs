@@ -1,9 +1,9 @@
 //! Distant light as the path tracer draws from it: an environment map in proportion to its radiance (Pharr, Jakob and Humphreys 2023,
 //! section 12.5), and the sun's disc.
 
-use super::vector::{V3, along, dot, frame, luminance, scale, sub};
+use super::vector::{V3, along, arc_cosine, dot, frame, luminance, scale, sin_cos_turns, sub, turns_of};
 use diorama_geom::daylight::Daylight;
-use std::f32::consts::{PI, TAU};
+use std::f32::consts::PI;
 
 /// Share of draws that either light gets at least where there are two.
 const LEAST: f32 = 0.1;
@@ -37,6 +37,7 @@ struct Disc {
 }
 
 impl Disc {
+    #[inline(always)]
     fn contains(&self, direction: V3) -> bool {
         // The squared chord is `2 (1 − cos)`, without cancellation.
         let chord = sub(self.direction, direction);
@@ -85,16 +86,20 @@ impl Steps {
         Steps { sums, guide }
     }
 
+    #[inline(always)]
     fn share(&self, i: usize) -> f32 {
         self.sums[i + 1] - self.sums[i]
     }
 
     /// The interval that a number in `[0, 1)` falls into, and where in it.
+    #[inline(always)]
     fn find(&self, random: f32) -> (usize, f32) {
         let n = self.guide.len();
-        let mut i = self.guide[((random * n as f32) as usize).min(n - 1)] as usize;
-        while i + 1 < n && self.sums[i + 1] <= random {
-            i += 1;
+        let k = ((random * n as f32) as usize).min(n - 1);
+        let (mut i, mut last) = (self.guide[k] as usize, self.guide.get(k + 1).map_or(n - 1, |g| *g as usize));
+        while i < last {
+            let middle = (i + last) / 2;
+            (i, last) = if self.sums[middle + 1] <= random { (middle + 1, last) } else { (i, middle) };
         }
         let size = self.share(i);
         (i, if size > 0.0 { ((random - self.sums[i]) / size).clamp(0.0, 1.0) } else { 0.5 })
@@ -154,16 +159,19 @@ impl DistantLight {
     }
 
     /// Draws a direction from the sun's disc.
+    #[inline(always)]
     pub fn draw_sun(&self, random: [f32; 2]) -> Option<V3> {
         self.sun.map(|sun| {
             let cosine = 1.0 - random[0] * sun.cap;
             let sine = (random[0] * sun.cap * (1.0 + cosine)).sqrt();
             let [s, t, n] = frame(sun.direction);
-            along(along(scale(n, cosine), sine * (TAU * random[1]).cos(), s), sine * (TAU * random[1]).sin(), t)
+            let [y, x] = sin_cos_turns(random[1]);
+            along(along(scale(n, cosine), sine * x, s), sine * y, t)
         })
     }
 
     /// Draws a direction from two numbers in `[0, 1)`.
+    #[inline(always)]
     pub fn draw(&self, random: [f32; 2]) -> Drawn {
         let [mut a, b] = random;
         let is_sun = a < self.sun_share;
@@ -177,29 +185,32 @@ impl DistantLight {
         }
     }
 
+    #[inline(always)]
     fn draw_map(&self, random: [f32; 2]) -> Drawn {
         let (y, fy) = self.rows.find(random[0]);
         let (x, fx) = self.columns[y].find(random[1]);
         // Even in solid angle, not in the polar angle.
         let z = self.edges[y] + fy * (self.edges[y + 1] - self.edges[y]);
         let sine = (1.0 - z * z).max(0.0).sqrt();
-        let (column, row) = (x as f32 + fx, z.clamp(-1.0, 1.0).acos() / PI * self.height as f32);
-        let (right, ahead) = (TAU * (column / self.width as f32 - 0.5 - self.turn)).sin_cos();
+        let (column, row) = (x as f32 + fx, arc_cosine(z) / PI * self.height as f32);
+        let [right, ahead] = sin_cos_turns(column / self.width as f32 - 0.5 - self.turn);
         let direction = [sine * right, sine * ahead, z];
         let (radiance, density) = self.with_sun(direction, self.bilinear(column, row, (x, y)));
         Drawn { direction, radiance, density }
     }
 
     /// Linear radiance from a direction of length 1, and the density per steradian with which it is drawn.
+    #[inline(always)]
     pub fn evaluate(&self, direction: V3) -> (V3, f32) {
-        let u = 0.5 + direction[0].atan2(direction[1]) / TAU + self.turn;
-        let v = direction[2].clamp(-1.0, 1.0).acos() / PI;
+        let u = 0.5 + turns_of(direction[0], direction[1]) + self.turn;
+        let v = arc_cosine(direction[2]) / PI;
         let (x, y) = ((u - u.floor()) * self.width as f32, v * self.height as f32);
         let (column, row) = ((x as usize).min(self.width - 1), (y as usize).min(self.height - 1));
         self.with_sun(direction, self.bilinear(x, y, (column, row)))
     }
 
     /// Adds the sun's radiance and density where a direction points into it.
+    #[inline(always)]
     fn with_sun(&self, direction: V3, (radiance, density): (V3, f32)) -> (V3, f32) {
         match &self.sun {
             Some(sun) if sun.contains(direction) => (along(radiance, 1.0, sun.radiance), density + sun.density * self.sun_share),
@@ -208,6 +219,7 @@ impl DistantLight {
     }
 
     /// Radiance at pixel coordinates, and the density of the pixel that they lie in.
+    #[inline(always)]
     fn bilinear(&self, x: f32, y: f32, (column, row): (usize, usize)) -> (V3, f32) {
         let (x, y) = (x - 0.5, y - 0.5);
         let (left, top) = (x.floor(), y.floor());

@@ -143,6 +143,7 @@ impl Pixel {
     /// Numbers of a pixel.
     pub const LEN: usize = 19;
 
+    #[inline(always)]
     fn values(&self) -> [f32; Pixel::LEN] {
         let mut v = [0.0; Pixel::LEN];
         v[..3].copy_from_slice(&self.color);
@@ -154,6 +155,7 @@ impl Pixel {
         v
     }
 
+    #[inline(always)]
     fn of(v: [f32; Pixel::LEN]) -> Pixel {
         Pixel {
             color: [v[0], v[1], v[2]],

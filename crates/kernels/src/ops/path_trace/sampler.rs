@@ -10,6 +10,7 @@ pub struct Sampler {
 }
 
 /// A hash of good avalanche (Wellons 2018, "lowbias32").
+#[inline(always)]
 fn hash(mut x: u32) -> u32 {
     x = (x ^ (x >> 16)).wrapping_mul(0x7feb_352d);
     x = (x ^ (x >> 15)).wrapping_mul(0x846c_a68b);
@@ -17,6 +18,7 @@ fn hash(mut x: u32) -> u32 {
 }
 
 /// Owen scrambling of reversed bits: each bit is flipped by a hash of those below it (Laine and Karras 2011, constants of Burley).
+#[inline(always)]
 fn scramble_reversed(mut x: u32, seed: u32) -> u32 {
     x = x.wrapping_add(seed);
     x ^= x.wrapping_mul(0x6c50_b47c);
@@ -26,6 +28,7 @@ fn scramble_reversed(mut x: u32, seed: u32) -> u32 {
 }
 
 /// Sobol's second dimension with reversed bits: the Pascal matrix modulo 2, factor by factor.
+#[inline(always)]
 fn pascal(mut x: u32) -> u32 {
     x ^= (x >> 1) & 0x5555_5555;
     x ^= (x >> 2) & 0x3333_3333;
@@ -35,17 +38,20 @@ fn pascal(mut x: u32) -> u32 {
 }
 
 /// The highest 24 bits as a number in `[0, 1)`.
+#[inline(always)]
 fn unit(bits: u32) -> f32 {
     (bits >> 8) as f32 * (1.0 / (1 << 24) as f32)
 }
 
 impl Sampler {
+    #[inline(always)]
     pub fn new(seed: u64, pixel: u32, sample: u32) -> Sampler {
         let seed = hash(seed as u32 ^ hash((seed >> 32) as u32 ^ 0x9e37_79b9));
         Sampler { seed: hash(pixel ^ seed), index: sample, dimension: 0 }
     }
 
     /// The next two numbers in `[0, 1)`; over the samples of a pixel they fill the square evenly.
+    #[inline(always)]
     pub fn pair(&mut self) -> [f32; 2] {
         self.dimension = self.dimension.wrapping_add(1);
         let seed = hash(self.seed ^ self.dimension.wrapping_mul(0x9e37_79b9));
@@ -57,6 +63,7 @@ impl Sampler {
     }
 
     /// The next number in `[0, 1)`, without regard to the other samples: for decisions between two ways.
+    #[inline(always)]
     pub fn one(&mut self) -> f32 {
         self.dimension = self.dimension.wrapping_add(1);
         unit(hash(self.seed ^ self.index.wrapping_mul(0x85eb_ca6b) ^ self.dimension.wrapping_mul(0x9e37_79b9)))

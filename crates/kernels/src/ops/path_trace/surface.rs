@@ -49,6 +49,7 @@ impl Surfaces {
     }
 
     /// Whether the material has holes, or lets light pass; only then are `opacity` and `transmission` other than 1 and 0.
+    #[inline(always)]
     pub fn at(&self, point: &Point) -> Surface {
         let m = &self.materials[point.material as usize];
         let mut base = m.base_color;
@@ -85,6 +86,7 @@ impl Surfaces {
     }
 
     /// The interpolated normal, turned by the normal map.
+    #[inline(always)]
     fn normal(&self, m: &Material, point: &Point) -> V3 {
         let n = point.normal;
         let tangent = [point.tangent[0], point.tangent[1], point.tangent[2]];
@@ -97,6 +99,7 @@ impl Surfaces {
 }
 
 /// Values between the four nearest texels, decoded one by one; the fourth channel is 0 to 1, and 1 where there is none.
+#[inline(always)]
 fn bilinear(texture: &Texture, uv: [f32; 2], decode: impl Fn(u8) -> f32) -> [f32; 4] {
     let image = &texture.image;
     let (x, y) = (uv[0] * image.width as f32 - 0.5, uv[1] * image.height as f32 - 0.5);
@@ -119,6 +122,7 @@ fn bilinear(texture: &Texture, uv: [f32; 2], decode: impl Fn(u8) -> f32) -> [f32
 }
 
 /// Index of a texel that lies within the image.
+#[inline(always)]
 fn wrapped(i: i64, n: usize, wrap: Wrap) -> usize {
     let n = n as i64;
     let i = match wrap {

@@ -179,7 +179,8 @@ fn copies_of_a_part_look_like_parts_of_their_own() {
     let view = balls_view(32);
     let settings = Settings { bounces: 2, light_layers: true, ..Settings::default() };
     let [a, b] = [copies, parts].map(|m| {
-        let scene = Scene::new(&m, &day());
+        // No copy is stored one by one.
+        let scene = Scene { geometry: Geometry::with_copies(&m, 0), ..Scene::new(&m, &day()) };
         (render(&scene, &view, &settings, 16), cpu::first_hits(&scene, &view, true))
     });
     let difference = |f: &dyn Fn(&Pixel) -> f32| {

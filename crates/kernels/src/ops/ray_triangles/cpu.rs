@@ -4,7 +4,7 @@ use super::octet::{self, Octet};
 use super::{Bvh, Hit, LEAF, Node, Packet, Ray, WIDTH};
 use crate::simd::{self, Level};
 use crate::tasks::{self, Parts};
-use std::cell::RefCell;
+use std::mem::MaybeUninit;
 
 /// Rays per task.
 const BLOCK: usize = 256;
@@ -16,9 +16,8 @@ const TINY: f32 = 1e-30;
 /// A node or packet to visit, and the distance of its box.
 type Entry = (u32, f32);
 
-thread_local! {
-    static STACK: RefCell<Vec<Entry>> = RefCell::new(Vec::with_capacity(128));
-}
+/// Entries at most: seven for each level of the deepest tree, which has 40 levels by area and 28 by halves.
+const DEEPEST: usize = 512;
 
 /// What the tests of a ray share.
 struct Prepared {
@@ -129,38 +128,80 @@ fn each(mut bits: u32) -> impl Iterator<Item = usize> {
     })
 }
 
+/// What a ray still has to visit.
+struct Stack {
+    entries: [MaybeUninit<Entry>; DEEPEST],
+    size: usize,
+}
+
+impl Stack {
+    #[inline(always)]
+    fn new() -> Stack {
+        Stack { entries: [const { MaybeUninit::uninit() }; DEEPEST], size: 0 }
+    }
+
+    #[inline(always)]
+    fn push(&mut self, entry: Entry) {
+        self.entries[self.size].write(entry);
+        self.size += 1;
+    }
+
+    /// Moves the entry on top below those that are nearer, down to `first`.
+    #[inline(always)]
+    fn sink(&mut self, first: usize) {
+        let mut at = self.size - 1;
+        // SAFETY: entries below `size` are written.
+        while at > first && unsafe { self.entries[at - 1].assume_init().1 < self.entries[at].assume_init().1 } {
+            self.entries.swap(at - 1, at);
+            at -= 1;
+        }
+    }
+
+    /// The entry on top that is not farther than `most`.
+    #[inline(always)]
+    fn pop(&mut self, most: f32) -> Option<u32> {
+        while self.size > 0 {
+            self.size -= 1;
+            // SAFETY: entries below `size` are written.
+            let (content, distance) = unsafe { self.entries[self.size].assume_init() };
+            if distance <= most {
+                return Some(content);
+            }
+        }
+        None
+    }
+}
+
 impl Bvh {
     #[inline(always)]
-    unsafe fn trace<O: Octet>(&self, ray: &Ray, any: bool, stack: &mut Vec<Entry>) -> Hit {
-        let (prepared, mut best) = (Prepared::new(ray), Hit::NONE);
-        stack.clear();
-        if !self.nodes.is_empty() {
-            stack.push((0, ray.range[0]));
-        }
-        while let Some((content, distance)) = stack.pop() {
-            if distance > best.t {
-                continue;
-            }
+    unsafe fn trace<O: Octet>(&self, ray: &Ray, any: bool) -> Hit {
+        let (prepared, mut best, mut stack) = (Prepared::new(ray), Hit::NONE, Stack::new());
+        let mut next = if self.nodes.is_empty() { None } else { Some(0) };
+        while let Some(content) = next {
             if content & LEAF != 0 {
                 // SAFETY: as the caller guarantees.
                 unsafe { prepared.triangles::<O>(&self.packets[(content & !LEAF) as usize], ray.range, &mut best) };
                 if any && best.is_some() {
                     return best;
                 }
+                next = stack.pop(best.t);
                 continue;
             }
             let node = &self.nodes[content as usize];
             // SAFETY: as the caller guarantees.
             let (near, met) = unsafe { prepared.boxes::<O>(node, [ray.range[0], ray.range[1].min(best.t)]) };
-            let first = stack.len();
-            for i in each(met) {
-                // Sorted, the farthest at the bottom.
-                let mut at = stack.len();
-                stack.push((node.content[i], near[i]));
-                while at > first && stack[at - 1].1 < near[i] {
-                    stack.swap(at - 1, at);
-                    at -= 1;
+            if met == 0 {
+                next = stack.pop(best.t);
+            } else if met & (met - 1) == 0 {
+                next = Some(node.content[met.trailing_zeros() as usize % WIDTH]);
+            } else {
+                let first = stack.size;
+                for i in each(met) {
+                    stack.push((node.content[i], near[i]));
+                    // Sorted, the farthest at the bottom.
+                    stack.sink(first);
                 }
+                next = stack.pop(best.t);
             }
         }
         best
@@ -168,30 +209,27 @@ impl Bvh {
 
     #[inline(always)]
     unsafe fn trace_block<O: Octet>(&self, rays: &[Ray], any: bool, hits: &mut [Hit]) {
-        let mut stack = Vec::with_capacity(128);
         for (ray, hit) in rays.iter().zip(hits) {
             // SAFETY: as the caller guarantees.
-            *hit = unsafe { self.trace::<O>(ray, any, &mut stack) };
+            *hit = unsafe { self.trace::<O>(ray, any) };
         }
     }
 
     /// The nearest hit of one ray, or with `any` some hit; [`Hit::NONE`] if nothing is in its way.
     pub fn trace_one(&self, ray: &Ray, any: bool) -> Hit {
-        STACK.with_borrow_mut(|stack| {
-            // SAFETY: `level()` only names sets that this CPU has.
-            match simd::level() {
-                #[cfg(target_arch = "x86_64")]
-                Level::Avx512 | Level::Avx2 => unsafe { self.trace_one_avx2(ray, any, stack) },
-                _ => unsafe { self.trace::<octet::Plain>(ray, any, stack) },
-            }
-        })
+        // SAFETY: `level()` only names sets that this CPU has.
+        match simd::level() {
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 | Level::Avx2 => unsafe { self.trace_one_avx2(ray, any) },
+            _ => unsafe { self.trace::<octet::Plain>(ray, any) },
+        }
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    unsafe fn trace_one_avx2(&self, ray: &Ray, any: bool, stack: &mut Vec<Entry>) -> Hit {
+    unsafe fn trace_one_avx2(&self, ray: &Ray, any: bool) -> Hit {
         // SAFETY: compiled for the set.
-        unsafe { self.trace::<octet::Avx2>(ray, any, stack) }
+        unsafe { self.trace::<octet::Avx2>(ray, any) }
     }
 
     #[cfg(target_arch = "x86_64")]

@@ -42,6 +42,7 @@ const WIDTH: usize = 8;
 
 /// A node: boxes and contents of up to eight children. Boxes of absent children are empty.
 #[derive(Clone, Debug)]
+#[repr(align(64))]
 struct Node {
     /// Lowest and highest corner by axis, `[axis][lowest, highest][child]`.
     bounds: [[[f32; WIDTH]; 2]; 3],
@@ -54,6 +55,7 @@ const LEAF: u32 = 1 << 31;
 
 /// Up to eight triangles, `[corner][axis][triangle]`. Absent ones are not numbers, and never hit.
 #[derive(Clone, Debug)]
+#[repr(align(64))]
 struct Packet {
     corners: [[[f32; WIDTH]; 3]; 3],
     ids: [u32; WIDTH],
