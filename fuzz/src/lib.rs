@@ -45,6 +45,8 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "obj", run: models::obj, seeds: models::obj_seeds },
     Parser { name: "environment", run: models::environment, seeds: models::environment_seeds },
     Parser { name: "sh_text", run: models::sh_text, seeds: models::sh_seeds },
+    Parser { name: "osr_matrix", run: models::osr_matrix, seeds: models::osr_seeds },
+    Parser { name: "session_list", run: models::session_list, seeds: models::session_seeds },
 ];
 
 /// The parser with a given name.

@@ -2,12 +2,13 @@
 
 use crate::file;
 use diorama_data::gltf::{self, WriteOptions};
-use diorama_data::{environment, model_file, obj, photo, sh_text};
+use diorama_data::{environment, model_file, nerf_osr, obj, photo, sessions, sh_text};
 use diorama_geom::environment::Environment;
 use diorama_geom::glam::{DAffine3, DVec3};
 use diorama_geom::model::{Instance, Material, Model, Opacity, Texture, Wrap};
 use diorama_geom::sh_light::ShLight;
 use diorama_geom::{ImageU8, Mesh};
+use std::path::Path;
 
 /// Reads a `.glb` or `.gltf`; a model that was read can be written and read again.
 pub fn gltf(data: &[u8]) {
@@ -128,4 +129,26 @@ pub fn sh_seeds() -> Vec<Vec<u8>> {
     let path = file("light.txt", b"");
     sh_text::save(&path, &ShLight(std::array::from_fn(|i| [i as f64, 0.25, -1e-3]))).expect("a scratch file");
     vec![std::fs::read(path).expect("a scratch file"), b"# light\n1,2,3\n4 5 6\n".to_vec()]
+}
+
+/// Reads a matrix of NeRF-OSR.
+pub fn osr_matrix(data: &[u8]) {
+    if let Ok(matrix) = nerf_osr::parse_matrix(data, Path::new("pose.txt")) {
+        assert!(matrix.iter().all(|v| v.is_finite()));
+    }
+}
+
+pub fn osr_seeds() -> Vec<Vec<u8>> {
+    vec![b"1 0 0 0.5\n0 1 0 -2e1\n0 0 1 0\n0 0 0 1\n".to_vec(), b"1 2 nan".to_vec()]
+}
+
+/// Reads a list of sessions.
+pub fn session_list(data: &[u8]) {
+    if let Ok(list) = sessions::parse_list(data, Path::new("sessions.txt")) {
+        assert!(list.values().all(|session| !session.contains(char::is_whitespace)));
+    }
+}
+
+pub fn session_seeds() -> Vec<Vec<u8>> {
+    vec![b"# names\na.jpg noon\nb c.jpg, dusk\r\n".to_vec(), b"alone\n".to_vec()]
 }

@@ -7,11 +7,11 @@ pub mod solve;
 
 use super::outdoor::model::SceneModel;
 use super::outdoor::render::{SceneView, ViewLight};
-use super::outdoor::shading::LIGHT;
+use super::outdoor::shading::{LIGHT, SKY};
 use crate::error::{PipelineError, Result};
 use diorama_data::{DataError, masks, photo, transforms_json};
 use diorama_geom::capture::Frame;
-use diorama_geom::color::srgb_from_linear;
+use diorama_geom::color::{linear_from_srgb, srgb_from_linear};
 use diorama_geom::sh_light::ShLight;
 use diorama_geom::{Camera, Image, ImageU8, Similarity};
 use diorama_kernels::ops::ray_generation::PosedCamera;
@@ -23,11 +23,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const ROUNDS: usize = 4;
 const FIT_PX: u32 = 256;
 /// Opacity from which a pixel shows a surface.
-const SURFACE: f32 = 0.9;
+const SURFACE: f32 = 0.5;
 /// Values from here on are overexposed, and values up to here underexposed: they say little about the light.
 const EXPOSED: (u8, u8) = (3, 252);
-/// Fewest pixels that tell a light.
+/// Fewest pixels that tell a light, or a sky.
 const FEWEST: usize = 50;
+/// Value of the first spherical harmonic.
+const FIRST: f32 = 0.282_094_8;
 
 /// Part of a photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -135,6 +137,21 @@ impl Shot {
     }
 }
 
+/// The even sky that the region's pixels show as far as the model is transparent there; none where it is opaque.
+fn even_sky(shot: &Shot, view: &SceneView, region: &Region) -> Option<Vec<f32>> {
+    let size = (shot.photo.width, shot.photo.height);
+    let (mut sum, mut total) = ([0.0f32; 3], 0.0);
+    for i in (0..size.0 * size.1).filter(|i| shot.is_kept(*i) && region.holds((i % size.0, i / size.0), size, shot.full)) {
+        // Squared, because what shines through hardly shows the sky.
+        let weight = (1.0 - view.opacity.data[i]).powi(2);
+        let rgb = shot.rgb(i);
+        (0..3).for_each(|k| sum[k] += weight * linear_from_srgb(rgb[k] as f32 / 255.0));
+        total += weight;
+    }
+    let constant = |i: usize| if i < 3 { sum[i] / total / FIRST } else { 0.0 };
+    (total > FEWEST as f32).then(|| (0..SKY).map(constant).collect())
+}
+
 /// Finds the light of a photograph; none when stopped. `progress` receives the share that is done.
 ///
 /// # Errors
@@ -143,10 +160,16 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
     let shot = shot(model, o)?;
     let mean = mean_light(model);
     let small = shot.resized(FIT_PX);
-    let (mut light, mut pixels) = (None, Vec::new());
+    let (mut light, mut sky, mut pixels) = (None, None, Vec::new());
+    let lit_by = |light: ShLight, sky: &Option<Vec<f32>>| {
+        let even = ViewLight::of(light);
+        ViewLight { sky: sky.clone().unwrap_or(even.sky), light: even.light }
+    };
     for round in 0..ROUNDS {
-        let view = model.view(&small.camera, &ViewLight::of(light.unwrap_or(mean)), &mut |_| {});
-        pixels = lit_pixels(&small, &view, &o.region);
+        let own = lit_by(light.unwrap_or(mean), &sky);
+        let view = model.view(&small.camera, &own, &mut |_| {});
+        sky = sky.or_else(|| even_sky(&small, &view, &o.region));
+        pixels = lit_pixels(&small, &view, &lit_by(own.light, &sky), &o.region);
         if pixels.len() < FEWEST {
             let why = "the region shows hardly any well-exposed surface that the model knows; give another --region or --camera";
             return Err(DataError::input(&o.photo, why).into());
@@ -158,9 +181,9 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
         }
     }
     let light = light.unwrap_or(mean);
-    let view = model.view(&shot.camera, &ViewLight::of(light), &mut |_| {});
+    let view = model.view(&shot.camera, &lit_by(light, &sky), &mut |_| {});
     progress((ROUNDS + 1) as f64 / (ROUNDS + 2) as f64);
-    let plain = model.view(&shot.camera, &ViewLight::of(mean), &mut |_| {});
+    let plain = model.view(&shot.camera, &lit_by(mean, &sky), &mut |_| {});
     let (fitted, rest) = (psnr(&shot, &view, &o.region, true), psnr(&shot, &view, &o.region, false));
     let (mean_fitted, mean_rest) = (psnr(&shot, &plain, &o.region, true), psnr(&shot, &plain, &o.region, false));
     Ok(Some(FittedLight {
@@ -199,7 +222,7 @@ fn encoded(linear: &Image) -> ImageU8 {
 }
 
 /// Well-exposed pixels of a region that show surfaces.
-fn lit_pixels(shot: &Shot, view: &SceneView, region: &Region) -> Vec<LitPixel> {
+fn lit_pixels(shot: &Shot, view: &SceneView, light: &ViewLight, region: &Region) -> Vec<LitPixel> {
     let size = (shot.photo.width, shot.photo.height);
     let is_used = |i: &usize| {
         let rgb = shot.rgb(*i);
@@ -213,6 +236,7 @@ fn lit_pixels(shot: &Shot, view: &SceneView, region: &Region) -> Vec<LitPixel> {
         let through = view.opacity.data[i] * view.shadow.data[i];
         LitPixel {
             reflected: std::array::from_fn(|k| view.albedo.data[3 * i + k] * through),
+            behind: std::array::from_fn(|k| (1.0 - view.opacity.data[i]) * (light.sky[k] * FIRST).max(0.0)),
             normal: std::array::from_fn(|k| view.normal.data[3 * i + k]),
             target_srgb: shot.rgb(i).map(|v| v as f32 / 255.0),
         }

@@ -1,7 +1,7 @@
 //! Spherical harmonics of a light from pixels whose albedo, shadow and normal are known: robust least squares in sRGB.
 //!
-//! Minimizes `Σ ρ(enc(a · max(0, Lᵀ b(n))) − y) + λ ‖L − s L̄‖²` by Gauss–Newton steps, with the weights of Geman and McClure for ρ. The second
-//! term holds what the pixels do not determine (few normals) to the mean light L̄ of training, scaled by the best factor s per channel.
+//! Minimizes `Σ ρ(enc(a · max(0, Lᵀ b(n)) + c) − y) + λ ‖L − s L̄‖²` by Gauss–Newton steps, first with Huber's ρ, then with that of Geman and
+//! McClure, from which outliers hardly count; `c` is light from behind. The second term holds what the pixels do not determine (few normals) to the mean light L̄ of training, scaled by the best factor s per channel.
 
 use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::DVec3;
@@ -12,13 +12,15 @@ use diorama_geom::sh_light::{self, ShLight};
 pub struct LitPixel {
     /// Linear albedo times shadow and opacity.
     pub reflected: [f32; 3],
+    /// Linear light from behind, as far as the surface is not opaque.
+    pub behind: [f32; 3],
     /// Of unit length.
     pub normal: [f32; 3],
     pub target_srgb: [f32; 3],
 }
 
-/// Gauss–Newton steps.
-const STEPS: usize = 15;
+/// Gauss–Newton steps with each loss.
+const STEPS: usize = 10;
 /// Weight of the mean light, as a share of the mean curvature of the data term.
 const PRIOR: f64 = 3e-3;
 /// Linear value below which the slope of sRGB's curve counts as it is there.
@@ -35,6 +37,32 @@ fn encode(linear: f64) -> (f64, f64) {
     (curve(linear.clamp(0.0, 1.0)), 1.055 / 2.4 * linear.clamp(DARK, 1.0).powf(1.0 / 2.4 - 1.0))
 }
 
+/// Loss of an error.
+#[derive(Clone, Copy)]
+enum Robust {
+    Huber,
+    GemanMcClure,
+}
+
+impl Robust {
+    /// Loss of an error of a size, both over the scale.
+    fn cost(self, e: f64) -> f64 {
+        match self {
+            Robust::Huber if e <= 1.0 => e * e,
+            Robust::Huber => 2.0 * e - 1.0,
+            Robust::GemanMcClure => e * e / (e * e + 1.0),
+        }
+    }
+
+    /// Weight of a squared error with the same slope.
+    fn weight(self, e: f64) -> f64 {
+        match self {
+            Robust::Huber => 1.0 / e.max(1.0),
+            Robust::GemanMcClure => 1.0 / (e * e + 1.0).powi(2),
+        }
+    }
+}
+
 struct Problem<'a> {
     pixels: &'a [LitPixel],
     bases: Vec<[f64; 9]>,
@@ -47,7 +75,7 @@ impl Problem<'_> {
         let error = |(p, b): (&LitPixel, &[f64; 9])| {
             std::array::from_fn(|k| {
                 let lit: f64 = (0..9).map(|i| light.0[i][k] * b[i]).sum();
-                encode(p.reflected[k] as f64 * lit.max(0.0)).0 - p.target_srgb[k] as f64
+                encode(p.reflected[k] as f64 * lit.max(0.0) + p.behind[k] as f64).0 - p.target_srgb[k] as f64
             })
         };
         self.pixels.iter().zip(&self.bases).map(error).collect()
@@ -61,24 +89,24 @@ impl Problem<'_> {
     }
 
     /// Sum of the robust errors.
-    fn cost(errors: &[[f64; 3]], scale: f64) -> f64 {
-        errors.iter().map(|e| size(e).powi(2) / (size(e).powi(2) + scale * scale)).sum()
+    fn cost(errors: &[[f64; 3]], robust: Robust, scale: f64) -> f64 {
+        errors.iter().map(|e| robust.cost(size(e) / scale)).sum()
     }
 
     /// The light after a full Gauss–Newton step.
-    fn step(&self, light: &ShLight, errors: &[[f64; 3]], scale: f64) -> ShLight {
+    fn step(&self, light: &ShLight, errors: &[[f64; 3]], robust: Robust, scale: f64) -> ShLight {
         let mut next = *light;
         let channel = |k: usize| {
             let (mut a, mut rhs) = ([[0.0; 9]; 9], [0.0; 9]);
             for ((p, b), e) in self.pixels.iter().zip(&self.bases).zip(errors) {
-                let trust = (scale * scale / (scale * scale + size(e).powi(2))).powi(2);
+                let trust = robust.weight(size(e) / scale);
                 let reflected = p.reflected[k] as f64;
                 let lit: f64 = (0..9).map(|i| light.0[i][k] * b[i]).sum();
                 // A surface that the light leaves dark says so, unless it is not dark.
                 if lit <= 0.0 && e[k] >= -LEAST {
                     continue;
                 }
-                let slope = encode(reflected * lit.max(0.0)).1 * reflected;
+                let slope = encode(reflected * lit.max(0.0) + p.behind[k] as f64).1 * reflected;
                 for i in 0..9 {
                     rhs[i] -= trust * slope * b[i] * e[k];
                     (0..9).for_each(|j| a[i][j] += trust * slope * slope * b[i] * b[j]);
@@ -130,7 +158,7 @@ fn first(pixels: &[LitPixel], bases: &[[f64; 9]], mean: &ShLight) -> ShLight {
         let ratio = |(p, b): (&LitPixel, &[f64; 9])| {
             let lit: f64 = (0..9).map(|i| mean.0[i][k] * b[i]).sum();
             let shown = p.reflected[k] as f64 * lit;
-            (shown > 1e-4).then(|| linear_from_srgb(p.target_srgb[k]) as f64 / shown)
+            (shown > 1e-4).then(|| (linear_from_srgb(p.target_srgb[k]) - p.behind[k]).max(0.0) as f64 / shown)
         };
         let mut ratios: Vec<f64> = pixels.iter().zip(bases).filter_map(ratio).collect();
         if !ratios.is_empty() {
@@ -150,14 +178,16 @@ pub fn light(pixels: &[LitPixel], mean: &ShLight, begin: Option<&ShLight>) -> Sh
     let bases: Vec<[f64; 9]> = pixels.iter().map(|p| sh_light::basis(DVec3::from(p.normal.map(f64::from)))).collect();
     let mut light = begin.copied().unwrap_or_else(|| first(pixels, &bases, mean));
     let problem = Problem { pixels, bases, mean };
-    for _ in 0..STEPS {
-        let errors = problem.errors(&light);
-        let scale = problem.scale(&errors);
-        let (cost, full) = (Problem::cost(&errors, scale), problem.step(&light, &errors, scale));
-        let shorter = |n: usize| light.mix(&full, 0.5f64.powi(n as i32));
-        match (0..HALVINGS).map(shorter).find(|l| Problem::cost(&problem.errors(l), scale) < cost) {
-            Some(better) => light = better,
-            None => break,
+    for robust in [Robust::Huber, Robust::GemanMcClure] {
+        for _ in 0..STEPS {
+            let errors = problem.errors(&light);
+            let scale = problem.scale(&errors);
+            let (cost, full) = (Problem::cost(&errors, robust, scale), problem.step(&light, &errors, robust, scale));
+            let shorter = |n: usize| light.mix(&full, 0.5f64.powi(n as i32));
+            match (0..HALVINGS).map(shorter).find(|l| Problem::cost(&problem.errors(l), robust, scale) < cost) {
+                Some(better) => light = better,
+                None => break,
+            }
         }
     }
     light
@@ -187,9 +217,9 @@ mod tests {
                 let lit = truth().shade(n);
                 let target_srgb = match i.is_multiple_of(odd) {
                     true => [0.05, 0.9, 0.1],
-                    false => std::array::from_fn(|k| srgb_from_linear((reflected[k] * lit[k].max(0.0) as f32).min(1.0))),
+                    false => std::array::from_fn(|k| srgb_from_linear((reflected[k] * lit[k].max(0.0) as f32 + 0.02).min(1.0))),
                 };
-                LitPixel { reflected, normal: n.as_vec3().to_array(), target_srgb }
+                LitPixel { reflected, behind: [0.02; 3], normal: n.as_vec3().to_array(), target_srgb }
             })
             .collect()
     }
@@ -232,7 +262,12 @@ mod tests {
         let wall: Vec<LitPixel> = (0..200)
             .map(|i| {
                 let reflected = [0.2 + 0.002 * i as f32; 3];
-                LitPixel { reflected, normal: [0.0, -1.0, 0.0], target_srgb: reflected.map(|r| srgb_from_linear(0.5 * r)) }
+                LitPixel {
+                    reflected,
+                    behind: [0.0; 3],
+                    normal: [0.0, -1.0, 0.0],
+                    target_srgb: reflected.map(|r| srgb_from_linear(0.5 * r)),
+                }
             })
             .collect();
         let got = light(&wall, &mean, None);

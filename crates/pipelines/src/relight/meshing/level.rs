@@ -9,8 +9,8 @@ use diorama_mesh::extract::{Grid, Method};
 use diorama_mesh::sparse_grid::{self, SparseGrid};
 use serde::Serialize;
 
-/// Candidates, as multiples of the middle one.
-const FACTORS: [f32; 5] = [0.25, 0.5, 1.0, 2.0, 4.0];
+/// Candidates, as multiples of the density that an even slab would have.
+const FACTORS: [f32; 5] = [0.25, 1.0, 4.0, 16.0, 64.0];
 /// Cells along the longest side of the grid on which candidates are compared.
 const RESOLUTION: usize = 160;
 /// Cameras that compare, and pixels along the longer side of their views.
@@ -80,7 +80,7 @@ pub(super) fn depth_views(field: &SurfaceField, frames: &[&Frame], cameras: usiz
 
 /// The density at which a slab of 1/128 of the longest side transmits half the light, but at most half of what the densest of fifty points
 /// has.
-fn middle(coarse: &SparseGrid) -> f32 {
+fn base(coarse: &SparseGrid) -> f32 {
     let grid = coarse.grid();
     let half_slab = std::f32::consts::LN_2 / (grid.cell() * grid.resolution as f32 / 128.0);
     half_slab.min(0.5 * coarse.quantile(0.98)).max(1e-6)
@@ -91,9 +91,9 @@ pub(super) fn candidates(field: &SurfaceField, grid: &Grid, frames: &[&Frame]) -
     let coarse = Grid { resolution: grid.resolution.min(RESOLUTION), ..*grid };
     let blocks = sparse_grid::candidates(&coarse, &|lo, hi| field.may_hold(lo, hi));
     let sampled = SparseGrid::sample(field, &coarse, &blocks, &mut |_, _| {});
-    let (views, middle) = (depth_views(field, frames, CAMERAS, VIEW_PX), middle(&sampled));
+    let (views, base) = (depth_views(field, frames, CAMERAS, VIEW_PX), base(&sampled));
     let of = |factor: &f32| {
-        let level = middle * factor;
+        let level = base * factor;
         let mesh = sampled.surface(level, Method::Cubes, true);
         let (sum, n) = views.iter().map(|v| v.error(&mesh, grid)).fold((0.0, 0), |(s, n), (ds, dn)| (s + ds, n + dn));
         Candidate { level, depth_error: sum / n.max(1) as f64 }
@@ -111,14 +111,18 @@ mod tests {
     use super::*;
     use diorama_geom::Pose;
 
-    /// A square of edge 2 at height `z`, seen from above by a camera at height 3 that rendered a plane at height 0.
+    /// A square of edge 2 at height `z` of many small faces, whose depth is exact.
+    fn square(z: f32) -> Mesh {
+        let n = 32;
+        let at = |i: u32| [2.0 * (i % (n + 1)) as f32 / n as f32 - 1.0, 2.0 * (i / (n + 1)) as f32 / n as f32 - 1.0, z];
+        let corners = (0..n * n).map(|i| i / n * (n + 1) + i % n);
+        let faces = corners.flat_map(|i| [[i, i + 1, i + n + 2], [i, i + n + 2, i + n + 1]]).collect();
+        Mesh { positions: (0..(n + 1) * (n + 1)).map(at).collect(), faces, ..Mesh::default() }
+    }
+
+    /// Seen from above by a camera at height 3 that rendered a plane at height 0.
     #[test]
     fn the_error_is_that_of_the_depth_and_of_what_is_missing() {
-        let square = |z: f32| Mesh {
-            positions: vec![[-1.0, -1.0, z], [1.0, -1.0, z], [1.0, 1.0, z], [-1.0, 1.0, z]],
-            faces: vec![[0, 1, 2], [0, 2, 3]],
-            ..Mesh::default()
-        };
         let camera = Camera::pinhole(20, 20, 0.4);
         let pose = Pose::look_at(DVec3::new(0.0, 0.0, 3.0), DVec3::ZERO, DVec3::Y);
         let depth: Vec<f32> = (0..400)
