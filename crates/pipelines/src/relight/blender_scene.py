@@ -16,7 +16,7 @@ import bpy
 import numpy
 from mathutils import Matrix, Vector
 
-if not hasattr(numpy, "bool"):
+if "bool" not in vars(numpy):
     # The glTF importer of Blender 3.4 asks for it, and newer versions of NumPy lack it.
     numpy.bool = bool
 
