@@ -28,6 +28,7 @@ def main():
     parser.add_argument("--diorama", default="target/release/diorama")
     parser.add_argument("--blender", default="blender")
     parser.add_argument("--spp", type=int, default=512)
+    parser.add_argument("--principled", action="store_true", help="materials as Blender imports them")
     parser.add_argument("--keep", metavar="DIR", help="where the two pictures go")
     options = parser.parse_args()
     mi.set_variant("scalar_rgb")
@@ -40,7 +41,7 @@ def main():
         compose = [options.diorama, "relight", "compose", options.scene, "--spp", str(options.spp), "--denoise", "off", "--force", "-o", ours]
         subprocess.run(compose, stderr=subprocess.DEVNULL, **quiet)
         script = os.path.join(folder, "scene.py")
-        subprocess.run([options.blender, "-b", "-P", script, "--", "--render", theirs, "--samples", str(options.spp)], **quiet)
+        subprocess.run([options.blender, "-b", "--python-exit-code", "1", "-P", script, "--", "--render", theirs, "--samples", str(options.spp), *(["--principled"] if options.principled else [])], **quiet)
         a, b = read(ours)[..., :3], read(theirs)[..., :3]
         decibels, ratio = psnr(a, b)
         print(f"{options.scene}: {decibels:.2f} dB, mean x {ratio:.4f} at {options.spp} samples per pixel")

@@ -71,14 +71,14 @@ def matrix(node):
 
 
 def write_ply(path, matrix, positions, normals, uvs, triangles):
-    """Binary PLY in the world, with normals and texture coordinates (v upward) where there are some."""
+    """Binary PLY in the world, with normals and texture coordinates (v downward) where there are some."""
     count = len(positions)
     columns = {"x y z": positions @ matrix[:3, :3].T + matrix[:3, 3]}
     if normals is not None:
         turned = normals @ np.linalg.inv(matrix[:3, :3])
         columns["nx ny nz"] = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-20)
     if uvs is not None:
-        columns["u v"] = np.stack([uvs[:, 0], 1 - uvs[:, 1]], 1)
+        columns["u v"] = uvs
     names = " ".join(columns).split()
     if np.linalg.det(matrix[:3, :3]) < 0:
         triangles = triangles[:, [0, 2, 1]]

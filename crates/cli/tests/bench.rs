@@ -73,6 +73,29 @@ fn layers_and_networks_are_measured_forward_and_in_training() {
     assert!(String::from_utf8_lossy(&[o.stdout, o.stderr].concat()).contains("vit_b_32"), "known names are listed");
 }
 
+#[test]
+fn tracing_and_rasterizing_are_measured() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("a.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").unwrap();
+    let model = dir.path().join("a.obj");
+    let small = ["--size", "64x32", "--spp", "2", "--repeats", "1", "--threads", "2", "--json"];
+    let v = json(&diorama(&[&["bench", "path-trace", model.to_str().unwrap()], &small[..]].concat()));
+    assert_eq!((v["triangles"].as_u64(), &v["size"], &v["threads"]), (Some(1), &serde_json::json!([64, 32]), &2.into()));
+    let samples = 64.0 * 32.0 * 2.0 / v["seconds"].as_f64().unwrap();
+    assert!((v["samples_per_s"].as_f64().unwrap() / samples - 1.0).abs() < 1e-6, "{v}");
+    // Each sample is one ray from the camera at least.
+    assert!(v["rays_per_s"].as_f64().unwrap() > samples, "{v}");
+    let v = json(&diorama(&["bench", "raster", "--size", "64", "--repeats", "1", "--threads", "2", "--json"]));
+    assert!(
+        ["rasterize_ms", "interpolate_ms", "texture_ms", "pixels_per_s", "trilinear_pixels_per_s"]
+            .iter()
+            .all(|k| v[k].as_f64().unwrap() > 0.0),
+        "{v}"
+    );
+    assert_eq!(diorama(&["bench", "path-trace", "/nowhere.glb"]).status.code(), Some(2));
+    assert_eq!(diorama(&["bench", "raster", "--repeats", "0"]).status.code(), Some(2));
+}
+
 fn listing(dir: &Path) -> Vec<String> {
     let mut names: Vec<String> = std::fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
     names.sort();

@@ -13,7 +13,12 @@ import os
 import sys
 
 import bpy
+import numpy
 from mathutils import Matrix, Vector
+
+if "bool" not in vars(numpy):
+    # The glTF importer of Blender 3.4 asks for it, and newer versions of NumPy lack it.
+    numpy.bool = bool
 
 FOLDER = os.path.dirname(os.path.abspath(__file__))
 
@@ -22,24 +27,57 @@ def is_value(socket, value):
     return not socket.is_linked and abs(socket.default_value - value) < 1e-6
 
 
-def adapt_material(material):
-    """Keeps the light that is scattered several times between microfacets; surfaces without any reflection become Lambertian."""
+def adapt_material(material, specular):
+    """Makes opaque surfaces without metalness those of glTF: a Lambertian one below a reflection.
+
+    Blender's Principled shader is brighter there, because its diffuse part reflects back toward the light.
+    """
     tree = material.node_tree
-    if tree is None:
-        return
     for node in [n for n in tree.nodes if n.type == "BSDF_PRINCIPLED"]:
+        # Keeps the light that is scattered several times between microfacets.
         node.distribution = "MULTI_GGX"
-        if not (is_value(node.inputs["Specular"], 0) and is_value(node.inputs["Metallic"], 0)):
+        inputs = node.inputs
+        node.inputs["Specular"].default_value = 0.5 * specular
+        if not (is_value(inputs["Metallic"], 0) and is_value(inputs["Alpha"], 1) and is_value(inputs["Transmission"], 0)):
             continue
+        targets = [link.to_socket for link in node.outputs["BSDF"].links]
         diffuse = tree.nodes.new("ShaderNodeBsdfDiffuse")
-        for name in ("Color", "Normal"):
-            source = node.inputs["Base Color" if name == "Color" else name]
-            if source.is_linked:
-                tree.links.new(source.links[0].from_socket, diffuse.inputs[name])
-            elif name == "Color":
-                diffuse.inputs[name].default_value = source.default_value
-        for link in list(node.outputs["BSDF"].links):
-            tree.links.new(diffuse.outputs["BSDF"], link.to_socket)
+        copy_input(tree, inputs["Base Color"], diffuse.inputs["Color"])
+        copy_input(tree, inputs["Normal"], diffuse.inputs["Normal"])
+        shader = diffuse if specular == 0 else below_reflection(tree, node, diffuse, specular)
+        for target in targets:
+            tree.links.new(shader.outputs[0], target)
+
+
+def copy_input(tree, source, target):
+    if source.is_linked:
+        tree.links.new(source.links[0].from_socket, target)
+    elif source.name != "Normal":
+        target.default_value = source.default_value
+
+
+def below_reflection(tree, principled, diffuse, specular):
+    """What the reflection leaves of the diffuse light, and the reflection: Fresnel's share, and one in twenty of the roughest surfaces'."""
+    reflected, share = tree.nodes.new("ShaderNodeFresnel"), tree.nodes.new("ShaderNodeMixRGB")
+    dimmed, both = tree.nodes.new("ShaderNodeMixShader"), tree.nodes.new("ShaderNodeAddShader")
+    reflected.inputs["IOR"].default_value = 1.5
+    copy_input(tree, principled.inputs["Normal"], reflected.inputs["Normal"])
+    copy_input(tree, principled.inputs["Roughness"], share.inputs["Fac"])
+    tree.links.new(reflected.outputs[0], share.inputs["Color1"])
+    share.inputs["Color2"].default_value = (0.05, 0.05, 0.05, 1)
+    scaled = tree.nodes.new("ShaderNodeMath")
+    scaled.operation = "MULTIPLY"
+    scaled.inputs[1].default_value = specular
+    tree.links.new(share.outputs[0], scaled.inputs[0])
+    tree.links.new(scaled.outputs[0], dimmed.inputs[0])
+    tree.links.new(diffuse.outputs[0], dimmed.inputs[1])
+    color = principled.inputs["Base Color"]
+    for link in list(color.links):
+        tree.links.remove(link)
+    color.default_value = (0, 0, 0, 1)
+    tree.links.new(dimmed.outputs[0], both.inputs[0])
+    tree.links.new(principled.outputs["BSDF"], both.inputs[1])
+    return both
 
 
 def add_world(scene, light):
@@ -130,13 +168,16 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--render", metavar="PICTURE", help=".exr or .png")
     parser.add_argument("--samples", type=int, help="samples per pixel")
+    parser.add_argument("--principled", action="store_true", help="leave the materials as Blender imports them")
     options = parser.parse_args(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else [])
     with open(os.path.join(FOLDER, "scene.json"), encoding="utf-8") as f:
         told = json.load(f)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.import_scene.gltf(filepath=os.path.join(FOLDER, told["model"]))
-    for material in bpy.data.materials:
-        adapt_material(material)
+    if not options.principled:
+        for material in bpy.data.materials:
+            # Blender's importer reads no KHR_materials_specular that is the same everywhere.
+            adapt_material(material, told["specular"].get(material.name, 1.0))
     scene = bpy.context.scene
     add_world(scene, told["light"])
     if told["light"]["sun"]:

@@ -5,6 +5,7 @@ use super::scene_file::{Backplate, SceneFile};
 use crate::error::{PipelineError, Result};
 use diorama_data::gltf::{self, WriteOptions};
 use diorama_data::{DataError, atomic, environment, process};
+use diorama_geom::Model;
 use diorama_geom::camera::Lens;
 use diorama_geom::daylight::Daylight;
 use diorama_kernels::ops::path_trace::View;
@@ -33,9 +34,12 @@ pub fn write(folder: &Path, c: &Composition, file: &SceneFile, force: bool) -> R
     if file.render.backplate == Backplate::Photo {
         notes.push("the photograph and its shadow catcher are left out of the export to Blender".to_string());
     }
-    let description = describe(c, file);
+    // Blender knows materials by their names.
+    let mut named = c.model.clone();
+    named.materials.iter_mut().enumerate().for_each(|(i, m)| m.name = format!("{i} {}", m.name).trim().to_string());
+    let description = describe(c, &named, file);
     let model = folder.join("scene.glb");
-    let glb = gltf::encode(&c.model, WriteOptions::default(), &model)?;
+    let glb = gltf::encode(&named, WriteOptions::default(), &model)?;
     std::fs::create_dir_all(folder).map_err(DataError::io(folder, "create"))?;
     atomic::write(&model, &glb)?;
     let mut still = c.light.environment.clone();
@@ -47,9 +51,11 @@ pub fn write(folder: &Path, c: &Composition, file: &SceneFile, force: bool) -> R
 }
 
 /// Everything that `scene.py` reads; positions have z up, as in Blender.
-fn describe(c: &Composition, file: &SceneFile) -> Value {
+fn describe(c: &Composition, model: &Model, file: &SceneFile) -> Value {
+    let specular: serde_json::Map<String, Value> = model.materials.iter().map(|m| (m.name.clone(), m.specular.into())).collect();
     json!({
         "model": "scene.glb",
+        "specular": specular,
         "size": [c.view.camera.width, c.view.camera.height],
         "spp": file.render.spp,
         "seed": file.render.seed,

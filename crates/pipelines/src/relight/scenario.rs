@@ -27,6 +27,8 @@ const FILLED: f64 = 0.3;
 const FOV: f64 = 50.0;
 /// Directions in which an object needs room.
 const AROUND: usize = 16;
+/// Columns of the picture in which places are tried.
+const TRIED: usize = 96;
 
 /// One of the four compositions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -90,9 +92,8 @@ pub struct ScenarioOptions {
     pub samples: u32,
 }
 
-/// A place with a camera in it.
-struct Stage {
-    scene: Scene,
+/// A camera in a place.
+struct Framing {
     view: View,
     /// Lines of `[camera]`.
     camera: String,
@@ -130,11 +131,21 @@ pub fn prepare(out: &Path, scenario: &Scenario, o: &ScenarioOptions, force: bool
             (place.model, Some(place.cameras))
         }
     };
-    let stage = stage(&site, generated.as_deref(), o)?;
-    let spot = spot(&stage, &object, o)?;
+    let scene = Scene::new(&site, &LightOptions::of(Source::Uniform(1.0)).read()?.0);
+    // The camera before which the object finds the best place.
+    let mut best: Option<(Framing, Spot)> = None;
+    for framing in framings(&site, generated.as_deref(), o)? {
+        let found = spot(&scene, &framing.view, &object, o)?;
+        if let Some(found) = found.filter(|f| best.as_ref().is_none_or(|b| f.cost < b.1.cost)) {
+            best = Some((framing, found));
+        }
+    }
+    let (framing, spot) = best.ok_or_else(|| {
+        PipelineError::Usage("the object finds no level, free ground in the lower half of the picture; give a smaller --scale".into())
+    })?;
     let light = light(o)?;
     std::fs::create_dir_all(out).map_err(DataError::io(out, "create"))?;
-    if scenario.is_photographed && o.frame.is_none() && photograph(out, &stage, o, stop)? {
+    if scenario.is_photographed && o.frame.is_none() && photograph(out, scene, &framing.view, o, stop)? {
         return Ok((description, true));
     }
     let mut text = String::new();
@@ -153,7 +164,7 @@ pub fn prepare(out: &Path, scenario: &Scenario, o: &ScenarioOptions, force: bool
     let backplate = if scenario.is_photographed { "photo" } else { "light" };
     let photograph = if scenario.is_photographed && o.frame.is_none() { "photograph = \"photograph.png\"\n" } else { "" };
     let (w, h) = o.size;
-    let _ = write!(text, "[light]\n{light}[camera]\n{}{photograph}", stage.camera);
+    let _ = write!(text, "[light]\n{light}[camera]\n{}{photograph}", framing.camera);
     let _ = writeln!(text, "[render]\nsize = [{w}, {h}]\nspp = {}\ndenoise = \"atrous\"\nbackplate = \"{backplate}\"", o.samples);
     atomic::write(&description, text.as_bytes())?;
     Ok((description, false))
@@ -171,65 +182,67 @@ fn light(o: &ScenarioOptions) -> Result<String> {
     Ok(format!("{source}\nrotate_deg = {}\n", o.rotate_deg))
 }
 
-/// The camera of the frame, of the generated street, or one that sees the whole place.
-fn stage(site: &Model, generated: Option<&[(Camera, Pose)]>, o: &ScenarioOptions) -> Result<Stage> {
-    let scene = Scene::new(site, &LightOptions::of(Source::Uniform(1.0)).read()?.0);
+/// The camera of the frame, those of the generated street, or one that sees the whole place.
+fn framings(site: &Model, generated: Option<&[(Camera, Pose)]>, o: &ScenarioOptions) -> Result<Vec<Framing>> {
     if let Some(frame) = &o.frame {
         let (camera, world_from_camera, _) = compose::frame_of_run(frame)?;
         let view = View { camera: camera.resized(o.size.0, o.size.1), world_from_camera, lens: None };
         let (run, which) = frame.rsplit_once(':').unwrap_or((frame, "0"));
         let run = std::path::absolute(run).map_err(DataError::io(Path::new(run), "find"))?;
-        return Ok(Stage { scene, view, camera: format!("frame = {:?}\n", format!("{}:{which}", run.display())) });
+        return Ok(vec![Framing { view, camera: format!("frame = {:?}\n", format!("{}:{which}", run.display())) }]);
     }
-    let (camera, pose) = match (generated, site.bounds()) {
-        (Some(cameras), _) => cameras[cameras.len() / 2],
+    let cameras = match (generated, site.bounds()) {
+        (Some(cameras), _) => cameras.to_vec(),
         (None, Some((low, high))) => {
             let camera = Camera::pinhole(o.size.0, o.size.1, FOV.to_radians());
-            (camera, turntable::orbit(&camera, [DVec3::from(low), DVec3::from(high)], 15f64.to_radians(), 0.4))
+            vec![(camera, turntable::orbit(&camera, [DVec3::from(low), DVec3::from(high)], 15f64.to_radians(), 0.4))]
         }
         (None, None) => return Err(PipelineError::Usage("--site: holds no triangles".into())),
     };
-    let fov = 2.0 * (0.5 * camera.width as f64 / camera.fx).atan();
-    let [eye, target] = [pose.translation, pose.point(DVec3::Z)].map(|p| (Z_UP.transpose() * p).to_array());
-    // What is rendered is seen exactly as the description says.
-    let world_from_camera = Pose::look_at(pose.translation, pose.point(DVec3::Z), DVec3::Z);
-    let view = View { camera: Camera::pinhole(o.size.0, o.size.1, fov), world_from_camera, lens: None };
-    Ok(Stage { scene, view, camera: format!("eye = {eye:?}\ntarget = {target:?}\nfov_deg = {:?}\n", fov.to_degrees()) })
+    let framing = |(camera, pose): (Camera, Pose)| {
+        let fov = 2.0 * (0.5 * camera.width as f64 / camera.fx).atan();
+        let [eye, target] = [pose.translation, pose.point(DVec3::Z)].map(|p| (Z_UP.transpose() * p).to_array());
+        // What is rendered is seen exactly as the description says.
+        let world_from_camera = Pose::look_at(pose.translation, pose.point(DVec3::Z), DVec3::Z);
+        let view = View { camera: Camera::pinhole(o.size.0, o.size.1, fov), world_from_camera, lens: None };
+        Framing { view, camera: format!("eye = {eye:?}\ntarget = {target:?}\nfov_deg = {:?}\n", fov.to_degrees()) }
+    };
+    Ok(cameras.into_iter().map(framing).collect())
 }
 
 /// Where an object stands.
 struct Spot {
     at: DVec3,
     scale: f64,
+    /// How far it is from where and as large as it should be in the picture.
+    cost: f64,
 }
 
-/// A place on level, free ground in the lower middle of the picture.
-fn spot(stage: &Stage, object: &Model, o: &ScenarioOptions) -> Result<Spot> {
+/// The best place on level, free ground in the lower middle of the picture.
+fn spot(scene: &Scene, view: &View, object: &Model, o: &ScenarioOptions) -> Result<Option<Spot>> {
     let Some((low, high)) = object.bounds().map(|(l, h)| (DVec3::from(l), DVec3::from(h))) else {
         return Err(PipelineError::Usage("--object: holds no triangles".into()));
     };
-    let (extent, camera) = (high - low, &stage.view.camera);
-    let hits = cpu::first_hits(&stage.scene, &stage.view, true);
-    let [w, h] = [camera.width as usize, camera.height as usize];
-    let mut best: Option<(f64, Spot)> = None;
-    for (y, x) in (h / 2..h).step_by((h / 48).max(1)).flat_map(|y| (w / 8..7 * w / 8).step_by((w / 48).max(1)).map(move |x| (y, x))) {
+    let extent = high - low;
+    let [w, h] = [TRIED, (TRIED * o.size.1 as usize / o.size.0 as usize).max(8)];
+    let camera = view.camera.resized(w as u32, h as u32);
+    let hits = cpu::first_hits(scene, &View { camera, ..*view }, true);
+    let is_generated = o.site.is_none() && o.object.is_none();
+    let mut best: Option<Spot> = None;
+    for (y, x) in (h / 2..h).flat_map(|y| (w / 8..7 * w / 8).map(move |x| (y, x))) {
         let Some(hit) = hits[y * w + x] else { continue };
-        let is_generated = o.site.is_none() && o.object.is_none();
         let fitting = FILLED * h as f64 * hit.depth / (camera.fy * extent.z.max(1e-9));
         let scale = o.scale.unwrap_or(if is_generated { 1.0 } else { fitting });
-        // Farther from the wished place in the picture, or much smaller or larger than wished, is worse.
         let (dx, dy) = ((x as f64 / w as f64 - 0.5) * 2.0, y as f64 / h as f64 - 0.75);
         let cost = dx * dx + 4.0 * dy * dy + 0.3 * (scale / fitting).ln().powi(2);
-        if best.as_ref().is_none_or(|b| cost < b.0) && is_free(&stage.scene, hit.position, scale * extent) {
+        if best.as_ref().is_none_or(|b| cost < b.cost) && is_free(scene, hit.position, scale * extent) {
             // The center of the object's box comes over the place; `snap` finds the height.
             let center = 0.5 * (low + high) * DVec3::new(1.0, 1.0, 0.0);
             let at = hit.position - scale * center + DVec3::Z * (scale * (extent.z - low.z));
-            best = Some((cost, Spot { at, scale }));
+            best = Some(Spot { at, scale, cost });
         }
     }
-    best.map(|b| b.1).ok_or_else(|| {
-        PipelineError::Usage("the object finds no level, free ground in the lower half of the picture; give a smaller --scale".into())
-    })
+    Ok(best)
 }
 
 /// Whether the ground around a point is level, and nothing stands or hangs where an object of an extent would be.
@@ -247,15 +260,14 @@ fn is_free(scene: &Scene, at: DVec3, extent: DVec3) -> bool {
 }
 
 /// Renders the photograph of a generated place, and whether that was interrupted.
-fn photograph(out: &Path, stage: &Stage, o: &ScenarioOptions, stop: &AtomicBool) -> Result<bool> {
-    let mut scene = stage.scene.clone();
+fn photograph(out: &Path, mut scene: Scene, view: &View, o: &ScenarioOptions, stop: &AtomicBool) -> Result<bool> {
     let source = match &o.hdri {
         Some(path) => LightOptions::of(Source::File(path.clone())),
         None => LightOptions { strength: SKY.2, ..LightOptions::of(Source::Sky { elevation: SKY.0, rotation: SKY.1 }) },
     };
     scene.set_light(&LightOptions { rotate_deg: o.rotate_deg, ..source }.read()?.0);
     let settings = Settings { bounces: 8, seed: 1, ..Settings::default() };
-    let job = Job { scene: &scene, view: stage.view, settings, samples: o.samples, kept: None, key: String::new() };
+    let job = Job { scene: &scene, view: *view, settings, samples: o.samples, kept: None, key: String::new() };
     let (mut film, interrupted) = picture::render(&job, stop, &mut |_| {})?;
     if interrupted {
         return Ok(true);

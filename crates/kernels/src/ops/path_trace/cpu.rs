@@ -58,14 +58,14 @@ multiversion! {
                     let mut sampler = Sampler::new(tracer.settings.seed, (y * w + x) as u32, sample);
                     let ray = camera_ray(view, [x, y], &mut sampler);
                     let values = tracer.path(ray, &mut sampler).values();
-                    for k in 0..Pixel::LEN {
-                        sums[k] += values[k];
+                    for (sum, value) in sums.iter_mut().zip(values) {
+                        *sum += value;
                     }
                 }
                 let added = samples.len() as f32;
                 let share = added / samples.end as f32;
-                for k in 0..Pixel::LEN {
-                    mean[k] += share * (sums[k] / added - mean[k]);
+                for (mean, sum) in mean.iter_mut().zip(sums) {
+                    *mean += share * (sum / added - *mean);
                 }
                 *pixel = Pixel::of(mean);
             }

@@ -103,13 +103,13 @@ pub fn sin_cos_turns(turns: f32) -> [f32; 2] {
 pub fn arc_cosine(x: f32) -> f32 {
     let size = x.abs().min(1.0);
     let p = -0.001_262_491_1;
-    let p = 0.006_670_090_1 + size * p;
+    let p = 0.006_670_09 + size * p;
     let p = -0.017_088_126 + size * p;
-    let p = 0.030_891_881 + size * p;
+    let p = 0.030_891_88 + size * p;
     let p = -0.050_174_303 + size * p;
-    let p = 0.088_978_987 + size * p;
+    let p = 0.088_978_98 + size * p;
     let p = -0.214_598_8 + size * p;
-    let p = 1.570_796_3 + size * p;
+    let p = std::f32::consts::FRAC_PI_2 + size * p;
     let angle = (1.0 - size).sqrt() * p;
     if x < 0.0 { std::f32::consts::PI - angle } else { angle }
 }
@@ -121,14 +121,14 @@ pub fn turns_of(sine: f32, cosine: f32) -> f32 {
     let (low, high) = if s <= c { (s, c) } else { (c, s) };
     let x = low / high.max(f32::MIN_POSITIVE);
     let x2 = x * x;
-    let p = 0.002_866_225_7;
+    let p = 0.002_866_225_8;
     let p = -0.016_165_737 + x2 * p;
-    let p = 0.042_909_614 + x2 * p;
+    let p = 0.042_909_615 + x2 * p;
     let p = -0.075_289_64 + x2 * p;
     let p = 0.106_562_64 + x2 * p;
     let p = -0.142_089 + x2 * p;
     let p = 0.199_935_51 + x2 * p;
-    let p = -0.333_331_45 + x2 * p;
+    let p = -0.333_331_44 + x2 * p;
     let eighth = (x + x * x2 * p) * (0.5 / std::f32::consts::PI);
     let quarter = if s <= c { eighth } else { 0.25 - eighth };
     let half = if cosine < 0.0 { 0.5 - quarter } else { quarter };
