@@ -61,7 +61,7 @@ pub fn run(resolution: usize, target: usize, folder: &Path) -> Result<ReduceRepo
     };
     let may_hold = |lo: [f32; 3], hi: [f32; 3]| {
         let center = std::array::from_fn(|k| 0.5 * (lo[k] + hi[k]));
-        let radius = 0.5 * (0..3).map(|k| (hi[k] - lo[k]).powi(2)).sum::<f32>().sqrt() + 0.05;
+        let radius = 0.5 * (0..3).map(|k| (hi[k] - lo[k]).powi(2)).sum::<f32>().sqrt() + 0.02;
         hills.distance(center).min(hills.floater_distance(center)) < radius
     };
     let blocks = sparse_grid::candidates(&grid, &may_hold);
