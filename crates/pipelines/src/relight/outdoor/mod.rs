@@ -10,4 +10,8 @@ pub mod recipe;
 pub mod render;
 pub mod scores;
 pub mod shading;
+#[cfg(test)]
+mod shading_tests;
+pub mod sun;
 mod trainer;
+pub mod visibility;
