@@ -7,12 +7,17 @@ use diorama_geom::view_controls::{ControlInput, ControlValue, ControlValues, che
 use diorama_geom::view_source::{ViewRequest, ViewSource};
 use diorama_geom::{Camera, Mesh, Model, Pose};
 use diorama_pipelines::relight::outdoor::config::{Config, Preset};
+use diorama_pipelines::relight::outdoor::model::SceneModel;
 use diorama_pipelines::relight::outdoor::pictures::{self, Layer, PicturesOptions};
 use diorama_pipelines::relight::outdoor::{recipe, scores, viewing};
 use diorama_pipelines::relight::synth::{self, Place, SynthOptions};
+use diorama_pipelines::relight::truth::Truth;
 use diorama_pipelines::run::RunFolder;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Steps after which the boxes are known.
+const STEPS: u64 = 500;
 
 /// A box with flat normals.
 fn cuboid(low: [f32; 3], high: [f32; 3]) -> Mesh {
@@ -81,6 +86,8 @@ fn an_interrupted_run_ends_as_if_it_had_not_been() {
         let mut folder = if resume { RunFolder::open(&at).unwrap().0 } else { RunFolder::create(&at, false).unwrap() };
         let mut config = config(&data, 24);
         config.run.log_every = 1;
+        // Suns are found before the interruption and after it.
+        (config.light.model, config.light.sun_from, config.light.sun_cells) = ("sun".into(), 0.2, 32);
         let stop = AtomicBool::new(false);
         let mut logged = 0;
         let trained = recipe::train(&config, &mut folder, resume, None, &stop, &mut |e| {
@@ -99,6 +106,9 @@ fn an_interrupted_run_ends_as_if_it_had_not_been() {
     assert_eq!(whole.field.encoder.table().unwrap().values, resumed.field.encoder.table().unwrap().values);
     assert_eq!(whole.lights.values, resumed.lights.values);
     assert_eq!(whole.skies.values, resumed.skies.values);
+    assert_eq!(whole.suns.values, resumed.suns.values);
+    let solid = |m: &SceneModel| m.visibility.as_ref().map(|v| v.numbers());
+    assert!(solid(&whole).is_some() && solid(&whole) == solid(&resumed));
 }
 
 #[test]
@@ -108,7 +118,7 @@ fn a_trained_place_is_scored_and_its_layers_are_rendered() {
     generate(&data, 10, (32, 24));
     let mut folder = RunFolder::create(&run, false).unwrap();
     let mut losses = Vec::new();
-    recipe::train(&config(&data, 200), &mut folder, false, None, &AtomicBool::new(false), &mut |e| {
+    recipe::train(&config(&data, STEPS), &mut folder, false, None, &AtomicBool::new(false), &mut |e| {
         if let Event::Progress { loss, .. } = e {
             losses.push(*loss);
         }
@@ -118,13 +128,15 @@ fn a_trained_place_is_scored_and_its_layers_are_rendered() {
     drop(folder);
     let (model, _) = recipe::load(&run).unwrap();
     let mut looked = 0;
-    let s = scores::judge(&model, &data, &mut |_, ours, theirs| {
+    let s = scores::judge(&model, &data, &mut |_, sheet| {
         looked += 1;
-        assert_eq!((ours.width, ours.height), (theirs.width, theirs.height));
+        assert!(sheet.ours.iter().zip(&sheet.exact).all(|(a, b)| (a.width, a.height) == (b.width, b.height)));
         Ok(())
     })
     .unwrap();
     assert_eq!((s.views, looked), (2, 2));
+    // Normals of noise have a median of 90 degrees.
+    assert!(s.normal_median_deg < 30.0 && s.unseen_light_psnr > s.mean_light_psnr, "{s:?}");
     // Exact layers explain more than the mean of the other lights.
     assert!(s.oracle_psnr > s.mean_light_psnr + 2.0 && s.seen_light_psnr.is_finite(), "{s:?}");
     let options = PicturesOptions {
@@ -173,6 +185,28 @@ fn the_viewer_shows_layers_in_any_light(run: &Path, truth: &Path) {
     assert_ne!(picture("rgb", &[choice("sky"), evening]).data, picture("rgb", &[choice("sky")]).data);
     let dark = picture("rgb", &[choice("map:0"), ("strength", ControlValue::Number(0.0))]);
     assert!(dark.data.iter().all(|v| *v == 0), "there is no light");
+}
+
+#[test]
+fn suns_are_found_and_cast_the_shadows_of_learned_surfaces() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, run) = (dir.path().join("data"), dir.path().join("run"));
+    generate(&data, 10, (32, 24));
+    let mut folder = RunFolder::create(&run, false).unwrap();
+    let mut config = config(&data, STEPS);
+    (config.light.model, config.light.sun_cells) = ("sun".into(), 96);
+    recipe::train(&config, &mut folder, false, None, &AtomicBool::new(false), &mut |_| {}).unwrap();
+    drop(folder);
+    let (model, _) = recipe::load(&run).unwrap();
+    let truth = Truth::read(&data).unwrap();
+    let angle = |l: usize| {
+        let found = model.sun(l).unwrap();
+        DVec3::new(found[0] as f64, found[1] as f64, found[2] as f64).angle_between(truth.lights[l].sun.unwrap().0.into()).to_degrees()
+    };
+    let angles = [0, 1, 2].map(angle);
+    let s = scores::judge(&model, &data, &mut |_, _| Ok(())).unwrap();
+    assert!(angles.iter().all(|a| *a < 15.0), "{angles:?} {s:?}");
+    assert!(s.light == "sun" && s.shadow_correlation > 0.4 && s.unseen_light_psnr > s.mean_light_psnr, "{s:?}");
 }
 
 #[test]

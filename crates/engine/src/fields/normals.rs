@@ -24,7 +24,8 @@ pub struct Normals {
 pub enum DensitySlope {
     /// By the derivatives of encoding and network.
     Exact,
-    /// From the densities at the corners of a tetrahedron at this distance, in model space: smoother than the field itself.
+    /// From the opacities `1 − exp(−σ · distance)` at the corners of a tetrahedron at this distance, in model space: smoother than the
+    /// field itself, and even where densities differ by orders of magnitude.
     Taps { distance: f32 },
 }
 
@@ -45,9 +46,9 @@ impl Default for Normals {
 }
 
 impl DensitySlope {
-    /// Taps whose distance falls geometrically from `first` to `last` while `share` grows from 0 to 1, exact from then on.
+    /// Taps whose distance falls geometrically from `first` to `last` while `share` grows from 0 to 1, and stays there.
     pub fn annealed(share: f32, first: f32, last: f32) -> DensitySlope {
-        if share < 1.0 { DensitySlope::Taps { distance: first * (last / first).powf(share.max(0.0)) } } else { DensitySlope::Exact }
+        DensitySlope::Taps { distance: first * (last / first).powf(share.clamp(0.0, 1.0)) }
     }
 }
 
@@ -163,7 +164,10 @@ impl Field {
                 let model: Vec<f32> = b.positions.chunks_exact(3).flat_map(taps).flatten().collect();
                 self.encode(&model, &mut b.encoded);
                 density::forward(&net, &self.weights.values, &self.density_points(&b.encoded), false, &mut b.density);
-                let slope = |s: &[f32]| [0, 1, 2].map(|a| 0.75 / distance * (0..4).map(|t| s[t] * TAPS[t][a]).sum::<f32>());
+                let slope = |s: &[f32]| {
+                    let opacity: [f32; 4] = std::array::from_fn(|t| -(-s[t] * distance).exp_m1());
+                    [0, 1, 2].map(|a| 0.75 / distance * (0..4).map(|t| opacity[t] * TAPS[t][a]).sum::<f32>())
+                };
                 b.slopes.clear();
                 b.slopes.extend(b.density.sigma.chunks_exact(4).flat_map(slope));
             }
@@ -209,9 +213,11 @@ impl Field {
                 DensityGradients { sigma: &[], gradient: &b.slopes }
             }
             DensitySlope::Taps { distance } => {
-                let tap = |d: &[f32]| TAPS.map(|k| 0.75 / distance * (k[0] * d[0] + k[1] * d[1] + k[2] * d[2]));
+                let tap = |(d, s): (&[f32], &[f32])| -> [f32; 4] {
+                    std::array::from_fn(|t| 0.75 * (-s[t] * distance).exp() * (0..NORMAL).map(|a| TAPS[t][a] * d[a]).sum::<f32>())
+                };
                 b.d_sigma.clear();
-                b.d_sigma.extend(b.slopes.chunks_exact(NORMAL).flat_map(tap));
+                b.d_sigma.extend(b.slopes.chunks_exact(NORMAL).zip(b.density.sigma.chunks_exact(4)).flat_map(tap));
                 DensityGradients { sigma: &b.d_sigma, gradient: &[] }
             }
         };

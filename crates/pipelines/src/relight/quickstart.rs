@@ -177,16 +177,12 @@ impl Quickstart<'_> {
     fn score_scene(&mut self, model: &SceneModel) -> Result<SceneScores> {
         let pictures = self.at("pictures");
         std::fs::create_dir_all(&pictures).map_err(DataError::io(&pictures, "create"))?;
-        let mut pairs: Vec<Vec<ImageU8>> = vec![Vec::new(), Vec::new()];
-        let scores = outdoor::scores::judge(model, &self.at("street"), &mut |_, ours, theirs| {
-            pairs[0].push(three_channels(ours));
-            pairs[1].push(three_channels(theirs));
+        let mut rows = Vec::new();
+        let scores = outdoor::scores::judge(model, &self.at("street"), &mut |_, sheet| {
+            rows.extend([&sheet.ours, &sheet.exact].map(|row| row.iter().map(three_channels).collect()));
             Ok(())
         })?;
-        photo::save_png(&pictures.join("unseen_light.png"), &tiled(&pairs))?;
-        let frames = model.capture.indices(Split::Test);
-        let rows = frames.iter().step_by(frames.len().div_ceil(3).max(1)).map(|f| outdoor::pictures::layer_row(model, *f));
-        photo::save_png(&pictures.join("layers.png"), &tiled(&rows.collect::<Vec<_>>()))?;
+        photo::save_png(&pictures.join("layers.png"), &tiled(&rows))?;
         Ok(scores)
     }
 

@@ -4,6 +4,7 @@ use crate::commands::process::{note, use_threads};
 use crate::commands::{Outcome, Verb};
 use clap::Args;
 use diorama_data::{DataError, photo};
+use diorama_geom::ImageU8;
 use diorama_pipelines::relight::object;
 use diorama_pipelines::relight::outdoor::{recipe, scores};
 use diorama_pipelines::{Application, Result};
@@ -17,7 +18,7 @@ const SAMPLES: u32 = 32;
 pub struct Eval {
     /// Folder of the run
     run: PathBuf,
-    /// Folder for pictures of the held-out views, each beside its photograph [default: RUN/eval]
+    /// Folder for pictures of the held-out views, each above the exact picture, with its layers [default: RUN/eval]
     #[arg(short, long)]
     out: Option<PathBuf>,
     /// Number of CPU threads [default: all]
@@ -42,8 +43,8 @@ impl Verb for Eval {
         notes.iter().for_each(|n| note(n));
         let out = self.out.clone().unwrap_or_else(|| self.run.join("eval"));
         std::fs::create_dir_all(&out).map_err(DataError::io(&out, "create"))?;
-        let s = scores::judge(&model, &model.config.data.path, &mut |name, ours, theirs| {
-            Ok(photo::save_png(&out.join(format!("{name}.png")), &beside(ours, theirs))?)
+        let s = scores::judge(&model, &model.config.data.path, &mut |name, sheet| {
+            Ok(photo::save_png(&out.join(format!("{name}.png")), &rows(&[&sheet.ours, &sheet.exact]))?)
         })?;
         if self.json {
             println!("{}", serde_json::to_string(&s).expect("plain values"));
@@ -52,9 +53,10 @@ impl Verb for Eval {
                 "unseen light     {:.2} dB (exact layers {:.2}, mean light {:.2})",
                 s.unseen_light_psnr, s.oracle_psnr, s.mean_light_psnr
             );
-            println!("seen lights      {:.2} dB", s.seen_light_psnr);
+            println!("seen lights      {:.2} dB (with a sun {:.2}), light {}", s.seen_light_psnr, s.sunlit_psnr, s.light);
             println!("albedo           {:.2} dB", s.albedo_psnr);
             println!("normals          {:.1}° median", s.normal_median_deg);
+            println!("distance         {:.1} % median", 100.0 * s.depth_median);
             println!("shadow           {:.2} correlation", s.shadow_correlation);
             println!("{} views in {}", s.views, out.display());
         }
@@ -69,7 +71,7 @@ impl Eval {
         notes.iter().for_each(|n| note(n));
         let out = self.out.clone().unwrap_or_else(|| self.run.join("eval"));
         std::fs::create_dir_all(&out).map_err(DataError::io(&out, "create"))?;
-        let look = &mut |name: &str, image: &diorama_geom::ImageU8| Ok(photo::save_png(&out.join(format!("{name}.png")), image)?);
+        let look = &mut |name: &str, image: &ImageU8| Ok(photo::save_png(&out.join(format!("{name}.png")), image)?);
         let scores = object::scores::judge(&model, &capture, SAMPLES, look)?;
         if self.json {
             println!("{}", serde_json::to_string(&scores).expect("plain values"));
@@ -81,10 +83,14 @@ impl Eval {
     }
 }
 
-/// Two pictures side by side.
-fn beside(a: &diorama_geom::ImageU8, b: &diorama_geom::ImageU8) -> diorama_geom::ImageU8 {
-    let rows = a.data.chunks_exact(a.width * a.channels).zip(b.data.chunks_exact(b.width * b.channels));
-    let rgb = |row: &[u8], c: usize| row.chunks_exact(c).flat_map(|p| [p[0], p[1], p[2]]).collect::<Vec<u8>>();
-    let data = rows.flat_map(|(p, q)| [rgb(p, a.channels), rgb(q, b.channels)].concat()).collect();
-    diorama_geom::ImageU8 { width: a.width + b.width, height: a.height, channels: 3, data }
+/// Rows of pictures of one size.
+fn rows(of: &[&[ImageU8]]) -> ImageU8 {
+    let (w, h, n) = (of[0][0].width, of[0][0].height, of[0].len());
+    let pixel = |x: usize, y: usize| {
+        let image = &of[y / h][x / w];
+        let at = image.channels * ((y % h) * w + x % w);
+        [image.data[at], image.data[at + 1], image.data[at + 2]]
+    };
+    let data = (0..h * of.len()).flat_map(|y| (0..w * n).flat_map(move |x| pixel(x, y))).collect();
+    ImageU8 { width: w * n, height: h * of.len(), channels: 3, data }
 }

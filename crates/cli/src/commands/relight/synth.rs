@@ -32,6 +32,9 @@ pub struct Synth {
     /// Views [default: by size; of objects 60]
     #[arg(long)]
     views: Option<usize>,
+    /// Width and height of the photographs, for example 160x90 [default: by size]
+    #[arg(long)]
+    pixels: Option<String>,
     /// Lights of training, 1 to 4; one more is held out
     #[arg(long, default_value_t = 4)]
     lights: usize,
@@ -67,6 +70,12 @@ impl Verb for Synth {
         let mut options = SynthOptions::named(&self.size)?;
         (options.lights, options.seed) = (self.lights, self.seed);
         self.views.iter().for_each(|v| options.views = *v);
+        if let Some(pixels) = &self.pixels {
+            let numbers = pixels.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+            options.size = numbers
+                .filter(|(w, h)| (8..=8192).contains(w) && (8..=8192).contains(h))
+                .ok_or_else(|| PipelineError::Usage(format!("--pixels {pixels:?}: expected WIDTHxHEIGHT, each from 8 to 8192")))?;
+        }
         self.spp.iter().for_each(|s| options.samples = *s);
         if options.samples == 0 {
             return Err(PipelineError::Usage("--spp: must be at least 1".into()));

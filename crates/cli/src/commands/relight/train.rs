@@ -19,7 +19,7 @@ use std::sync::Arc;
 /// Train the scene model: photographs of a place in several lights to albedo, normals, shadow and light
 #[derive(Args, Clone, Debug)]
 #[command(
-    after_help = "Examples:\n  diorama relight train data/street --preset ci -o runs/street\n  diorama relight train --resume -o runs/street"
+    after_help = "Examples:\n  diorama relight train data/street --preset ci -o runs/street\n  diorama relight train data/street --light sun -o runs/street\n  diorama relight train --resume -o runs/street"
 )]
 pub struct Train {
     /// Folder of the capture
@@ -27,6 +27,9 @@ pub struct Train {
     /// ci or fast
     #[arg(long, default_value = "fast")]
     preset: String,
+    /// sh: harmonics and a learned shadow; sun: a sun apart, whose shadows are those of the learned surfaces
+    #[arg(long)]
+    light: Option<String>,
     /// Run folder
     #[arg(short, long, default_value = "runs/relight")]
     out: PathBuf,
@@ -86,6 +89,12 @@ impl Verb for Train {
         self.steps.iter().for_each(|s| config.run.steps = *s);
         self.seconds.iter().for_each(|s| config.run.seconds = *s);
         self.seed.iter().for_each(|s| config.seed = *s);
+        if let Some(light) = &self.light {
+            if self.resume {
+                return Err(PipelineError::Usage("--resume: the run knows how it takes light; leave out --light".into()));
+            }
+            config.set("light.model", light)?;
+        }
         config::set_all(&mut config, &self.set)?;
         // Nothing is written before the request is known to be sound.
         let capture = folder.as_ref().map_or_else(|| recipe::load_capture(&config), RunFolder::capture)?;

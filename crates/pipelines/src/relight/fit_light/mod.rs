@@ -163,7 +163,7 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
     let (mut light, mut sky, mut pixels) = (None, None, Vec::new());
     let lit_by = |light: ShLight, sky: &Option<Vec<f32>>| {
         let even = ViewLight::of(light);
-        ViewLight { sky: sky.clone().unwrap_or(even.sky), light: even.light }
+        ViewLight { sky: sky.clone().unwrap_or_else(|| even.sky.clone()), ..even }
     };
     for round in 0..ROUNDS {
         let own = lit_by(light.unwrap_or(mean), &sky);
@@ -200,12 +200,16 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
     }))
 }
 
-/// Mean of the lights of training.
+/// Mean of the lights of training, with their suns.
 pub fn mean_light(model: &SceneModel) -> ShLight {
     let n = model.lights.values.len() / LIGHT;
     let mut sum = ShLight::DARK;
     for l in 0..n {
-        let light = model.light(l);
+        let mut light = model.light(l);
+        if let Some(sun) = model.sun(l) {
+            let [x, y, z, r, g, b] = std::array::from_fn(|i| sun[i] as f64);
+            light.add_sun(DVec3::new(x, y, z), [r, g, b].map(|power| power * std::f64::consts::PI));
+        }
         (0..9).for_each(|i| (0..3).for_each(|k| sum.0[i][k] += light.0[i][k] / n as f64));
     }
     sum

@@ -2,6 +2,7 @@
 
 use crate::error::{PipelineError, Result};
 use crate::run::config::{self, Configuration};
+use diorama_engine::fields::{DensitySlope, Normals};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -39,6 +40,8 @@ pub struct FieldConfig {
     pub width: usize,
     /// `box` or `unbounded`.
     pub space: String,
+    /// Density before anything is learned, per inner cube.
+    pub first_density: f32,
 }
 
 /// Light of the photographs.
@@ -49,6 +52,14 @@ pub struct LightConfig {
     pub of: String,
     /// Whether each photograph has a gain of its own, by channel.
     pub gain: bool,
+    /// `sh`: spherical harmonics and a learned shadow; `sun`: a sun apart, whose shadows are those of the learned surfaces.
+    pub model: String,
+    /// Share of the steps before the sun is told apart.
+    pub sun_from: f32,
+    /// Times that suns and shadows are brought up to date with the surfaces.
+    pub sun_updates: u64,
+    /// Cells per axis in which surfaces are solid or not.
+    pub sun_cells: usize,
 }
 
 /// Weights of the loss.
@@ -67,6 +78,12 @@ pub struct LossConfig {
     pub negative: f32,
     /// Spread of a ray's weights (Barron et al. 2022).
     pub distortion: f32,
+    /// Opacity where a mask says that there is nothing but sky.
+    pub masked_sky: f32,
+    /// Opacity of rays above the horizon whose color is that of the sky.
+    pub likely_sky: f32,
+    /// Brightest twentieth of the albedo beyond a luminance of 0.9.
+    pub gauge: f32,
 }
 
 /// Rates and their course.
@@ -81,8 +98,23 @@ pub struct OptimConfig {
     /// Shares of the steps between which light gains its direction: before, it is even, and normals do not matter.
     pub even_until: f32,
     pub directed_from: f32,
-    /// Share of the steps in which normals come from density differences at a distance that shrinks.
-    pub anneal: f32,
+    /// Share of the steps in which noise stands for the sky: a sky that learns at once explains surfaces, and the field stays empty.
+    pub sky_from: f32,
+}
+
+/// Normals: a head of the network says them, and they are tied to the slope of the density.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NormalsConfig {
+    /// Distances at which opacities are compared for the slope, at first and from `until` on, in inner cubes.
+    pub first: f32,
+    pub last: f32,
+    /// Share of the steps in which the distance shrinks.
+    pub until: f32,
+    /// Weight of the angle between normal and slope.
+    pub tie: f32,
+    /// Share of the tie's gradient that the density gets.
+    pub push: f32,
 }
 
 /// Rays and samples.
@@ -119,8 +151,39 @@ pub struct Config {
     pub light: LightConfig,
     pub loss: LossConfig,
     pub optim: OptimConfig,
+    pub normals: NormalsConfig,
     pub sampling: SamplingConfig,
     pub run: RunConfig,
+}
+
+impl OptimConfig {
+    /// How much of the direction of light counts when a share of the steps is done.
+    pub fn directed(&self, progress: f32) -> f32 {
+        ((progress - self.even_until) / (self.directed_from - self.even_until).max(1e-6)).clamp(0.0, 1.0)
+    }
+}
+
+impl LightConfig {
+    /// Whether the sun is apart.
+    pub fn has_sun(&self) -> bool {
+        self.model == "sun"
+    }
+
+    /// Updates of suns and shadows that are due when a share of the steps is done.
+    pub fn sun_updates_by(&self, progress: f32) -> u64 {
+        if !self.has_sun() || progress < self.sun_from {
+            return 0;
+        }
+        (((progress - self.sun_from) / (1.0 - self.sun_from) * self.sun_updates as f32) as u64 + 1).min(self.sun_updates)
+    }
+}
+
+impl NormalsConfig {
+    /// How slopes are computed when a share of the steps is done.
+    pub fn of(&self, progress: f32) -> Normals {
+        let slope = DensitySlope::annealed(progress / self.until.max(1e-6), self.first, self.last);
+        Normals { slope, ..Normals::default() }
+    }
 }
 
 impl Config {
@@ -138,18 +201,37 @@ impl Config {
                 finest: pick(256, 2048) as u32,
                 width: pick(32, 64),
                 space: "box".into(),
+                first_density: 1.0,
             },
-            light: LightConfig { of: "session".into(), gain: false },
-            loss: LossConfig { huber: 0.1, robust: 0.0, orientation: 1e-3, shadow: 1e-2, negative: 0.1, distortion: 1e-2 },
+            light: LightConfig {
+                of: "session".into(),
+                gain: false,
+                model: "sh".into(),
+                sun_from: 0.5,
+                sun_updates: 4,
+                sun_cells: pick(128, 256),
+            },
+            loss: LossConfig {
+                huber: 0.1,
+                robust: 0.0,
+                orientation: 1e-4,
+                shadow: 1e-2,
+                negative: 0.1,
+                distortion: 1e-4,
+                masked_sky: 0.01,
+                likely_sky: 0.02,
+                gauge: 0.1,
+            },
             optim: OptimConfig {
                 grid_rate: 1e-2,
                 net_rate: 1e-3,
-                light_rate: 5e-3,
+                light_rate: 2e-2,
                 final_scale: 0.05,
                 even_until: 0.15,
                 directed_from: 0.4,
-                anneal: 0.6,
+                sky_from: 0.4,
             },
+            normals: NormalsConfig { first: 1.0 / 64.0, last: 1.0 / 256.0, until: 0.6, tie: 3e-4, push: 0.0 },
             sampling: SamplingConfig {
                 rays: pick(512, 4096),
                 max_samples: 256,
@@ -190,6 +272,16 @@ impl Configuration for Config {
         if !["session", "image"].contains(&&self.light.of[..]) {
             return fault("light.of: expected session or image");
         }
+        if !["sh", "sun"].contains(&&self.light.model[..]) {
+            return fault("light.model: expected sh or sun");
+        }
+        if !(0.0..1.0).contains(&self.light.sun_from) || self.light.sun_updates == 0 || !(16..=512).contains(&self.light.sun_cells) {
+            return fault("light: sun_from must lie between 0 and 1, sun_updates be at least 1, sun_cells from 16 to 512");
+        }
+        let n = &self.normals;
+        if !(n.last > 0.0 && n.first >= n.last && n.tie >= 0.0 && n.push >= 0.0) {
+            return fault("normals: last must be above 0, first at least last, tie and push 0 or more");
+        }
         if self.field.width == 0 || !self.field.width.is_multiple_of(16) || self.field.width > 512 {
             return fault("field.width: must be a multiple of 16 up to 512");
         }
@@ -200,10 +292,22 @@ impl Configuration for Config {
         {
             return fault("field: levels and base must be at least 1, finest at least base, log2_size from 4 to 24");
         }
+        if !(self.field.first_density > 0.0 && self.field.first_density.is_finite()) {
+            return fault("field.first_density: must be above 0");
+        }
         if self.data.downscale == 0 || self.sampling.rays == 0 || self.sampling.max_samples == 0 || self.sampling.occupancy_every == 0 {
             return fault("data.downscale, sampling.rays, max_samples and occupancy_every must be at least 1");
         }
-        let weights = [self.loss.robust, self.loss.orientation, self.loss.shadow, self.loss.negative, self.loss.distortion];
+        let weights = [
+            self.loss.robust,
+            self.loss.orientation,
+            self.loss.shadow,
+            self.loss.negative,
+            self.loss.distortion,
+            self.loss.masked_sky,
+            self.loss.likely_sky,
+            self.loss.gauge,
+        ];
         if self.loss.huber <= 0.0 || weights.iter().any(|w| !(*w >= 0.0 && w.is_finite())) {
             return fault("loss: huber must be above 0, weights 0 or more");
         }

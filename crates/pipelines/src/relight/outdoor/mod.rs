@@ -11,6 +11,10 @@ pub mod recipe;
 pub mod render;
 pub mod scores;
 pub mod shading;
+#[cfg(test)]
+mod shading_tests;
+pub mod sun;
 pub mod surface_field;
 mod trainer;
 pub mod viewing;
+pub mod visibility;

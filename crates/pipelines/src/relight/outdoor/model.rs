@@ -2,10 +2,12 @@
 
 use super::config::Config;
 use super::shading::{LIGHT, SKY};
+use super::sun::SUN;
+use super::visibility::{self, Visibility};
 use crate::error::{PipelineError, Result};
 use crate::run::param_state::{self, entry};
 use diorama_data::checkpoint::{Checkpoint, Entry};
-use diorama_engine::fields::{DirectionCode, Encoder, Field, Normals, Pruning, RayCodes};
+use diorama_engine::fields::{DirectionCode, Encoder, Field, Pruning, RayCodes};
 use diorama_engine::params::{ParamGroup, ParamSet, Schedule};
 use diorama_engine::renderers::volume::{Backdrop, Quality, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
@@ -14,6 +16,7 @@ use diorama_engine::step::Scene;
 use diorama_engine::train::Origin;
 use diorama_geom::capture::Split;
 use diorama_geom::contraction::Space;
+use diorama_geom::glam::DVec3;
 use diorama_geom::rng::Rng;
 use diorama_geom::sh_light::ShLight;
 use diorama_geom::{Capture, Similarity};
@@ -49,6 +52,10 @@ pub struct SceneModel {
     pub skies: ParamGroup,
     /// Logarithms of gains, `[train, 3]`; empty without gains.
     pub gains: ParamGroup,
+    /// Suns apart, `[lights, 9]`, empty without; and once they are told apart, what hides them.
+    pub suns: ParamGroup,
+    pub visibility: Option<Visibility>,
+    pub sun_updates: u64,
     /// Training frames, as indices into the capture, and the light of each.
     pub train: Vec<usize>,
     pub light_of: Vec<u32>,
@@ -89,6 +96,7 @@ impl SceneModel {
         let n = sessions.len().max(light_of.iter().map(|l| *l as usize + 1).max().unwrap_or(0));
         let rate = config.optim.light_rate;
         let gains = if config.light.gain { vec![0.0; 3 * train.len()] } else { Vec::new() };
+        let suns = vec![0.0; if config.light.has_sun() { SUN * n } else { 0 }];
         let mut field = field(&config, space, edge)?;
         field.weights.schedule = schedule;
         field.encoder.table_mut().into_iter().for_each(|t| t.schedule = schedule);
@@ -99,6 +107,9 @@ impl SceneModel {
             lights: group("lights", first_lights(n), rate),
             skies: group("skies", first_skies(n), rate),
             gains: group("gains", gains, rate),
+            suns: group("suns", suns, rate),
+            visibility: None,
+            sun_updates: 0,
             train,
             light_of,
             sessions,
@@ -207,6 +218,9 @@ impl SceneModel {
             lights: self.lights.values_only(),
             skies: self.skies.values_only(),
             gains: self.gains.values_only(),
+            suns: self.suns.values_only(),
+            visibility: self.visibility.clone(),
+            sun_updates: self.sun_updates,
             train: self.train.clone(),
             light_of: self.light_of.clone(),
             sessions: self.sessions.clone(),
@@ -221,25 +235,50 @@ impl SceneModel {
     pub fn params(&mut self) -> ParamSet<'_> {
         let mut params = ParamSet::default();
         params.add("field", self.field.groups_mut());
-        params.add("", [&mut self.lights, &mut self.skies, &mut self.gains]);
+        params.add("", [&mut self.lights, &mut self.skies, &mut self.gains, &mut self.suns]);
         params
     }
 
-    /// Everything that a checkpoint holds.
-    pub fn entries(&mut self) -> (Vec<Entry<'_>>, HashMap<String, String>) {
+    /// Lowest corner and edge of the cube in which surfaces hide light: all of a bounded space, else some of what is around the inner cube.
+    pub fn shaded_cube(&self) -> (f32, f32) {
+        if self.field.is_unbounded() { (-0.5, 2.0) } else { self.cube() }
+    }
+
+    /// The sun of a session or photograph; none while it is not told apart.
+    pub fn sun(&self, index: usize) -> Option<[f32; SUN]> {
+        self.visibility.as_ref().map(|_| std::array::from_fn(|i| self.suns.values[index * SUN + i]))
+    }
+
+    /// Light that surfaces send to each other over the light that a horizontal white surface receives, by channel, in all lights together.
+    pub fn bounced(&self) -> [f32; 3] {
+        let n = self.lights.values.len() / LIGHT;
+        std::array::from_fn(|k| {
+            let (mut bounced, mut received) = (0.0, 0.0);
+            for sun in (0..n).filter_map(|l| self.sun(l)).zip(0..n) {
+                bounced += sun.0[6 + k];
+                received += sun.0[3 + k] * sun.0[2].max(0.0) + self.light(sun.1).shade(DVec3::Z)[k].max(0.0) as f32;
+            }
+            if received > 0.0 { bounced / received } else { 0.0 }
+        })
+    }
+
+    /// Everything that a checkpoint holds; `solid` are the solid cells where suns are apart.
+    pub fn entries<'a>(&'a mut self, solid: &'a [f32]) -> (Vec<Entry<'a>>, HashMap<String, String>) {
         let metadata = HashMap::from([
             ("method".to_string(), "relight".to_string()),
             ("step".into(), self.origin.step.to_string()),
             ("rays".into(), self.rays.to_string()),
+            ("sun_updates".into(), self.sun_updates.to_string()),
             ("seconds_bits".into(), self.origin.seconds.to_bits().to_string()),
             ("median_bits".into(), self.median.to_bits().to_string()),
             ("rate_scale_bits".into(), self.rate_scale.to_bits().to_string()),
         ]);
         let mut params = ParamSet::default();
         params.add("field", self.field.groups_mut());
-        params.add("", [&mut self.lights, &mut self.skies, &mut self.gains]);
+        params.add("", [&mut self.lights, &mut self.skies, &mut self.gains, &mut self.suns]);
         let mut entries = param_state::entries(params);
         entries.extend([entry("occupancy", &self.occupancy.grid.density), entry("occupancy.fresh", &self.occupancy.grid.fresh)]);
+        entries.extend((!solid.is_empty()).then(|| entry("solid", solid)));
         (entries, metadata)
     }
 
@@ -254,12 +293,20 @@ impl SceneModel {
         }
         self.origin = Origin { step: number(&c, "step", file)?, seconds: f64::from_bits(number(&c, "seconds_bits", file)?) };
         self.rays = number(&c, "rays", file)?;
+        self.sun_updates = number(&c, "sun_updates", file)?;
         self.median = f32::from_bits(number(&c, "median_bits", file)?);
         self.rate_scale = f32::from_bits(number(&c, "rate_scale_bits", file)?);
         param_state::restore(&mut self.params(), &mut c, file)?;
         param_state::take(&mut self.occupancy.grid.density, "occupancy", &mut c, file)?;
         param_state::take(&mut self.occupancy.grid.fresh, "occupancy.fresh", &mut c, file)?;
         self.occupancy.grid.refresh();
+        if let Some(solid) = c.take("solid") {
+            let cells = self.config.light.sun_cells;
+            if solid.len() != visibility::numbers_len(cells) {
+                return Err(PipelineError::Usage(format!("{}: solid does not have {cells} cells per axis", file.display())));
+            }
+            self.visibility = Some(Visibility::from_numbers(&solid, self.shaded_cube(), cells));
+        }
         Ok(())
     }
 }
@@ -289,7 +336,7 @@ fn first_skies(n: usize) -> Vec<f32> {
     (0..n).flat_map(|_| (0..SKY).map(|i| if i < 3 { 0.5 / 0.282_094_8 } else { 0.0 })).collect()
 }
 
-/// Hash grid → density and features; features → albedo; features and gray light → shadow.
+/// Hash grid → density and features; features → albedo and normal; features and gray light → shadow.
 fn field(config: &Config, space: Space, edge: u32) -> Result<Field> {
     use Source::{Input, Layer as L};
     let f = &config.field;
@@ -304,13 +351,16 @@ fn field(config: &Config, space: Space, edge: u32) -> Result<Field> {
         layer(vec![L(2)], PADDED, Activation::None),
         layer(vec![L(1), Input(1)], f.width, Activation::Relu),
         layer(vec![L(4)], PADDED, Activation::None),
+        layer(vec![L(1)], f.width, Activation::Relu),
+        layer(vec![L(6)], PADDED, Activation::None),
     ];
     let head = |layer, activation, shift| Head { layer, channel: 0, activation, shift };
     let net = FieldNet {
-        density: head(1, Activation::TruncatedExp, 0.0),
+        density: head(1, Activation::TruncatedExp, f.first_density.ln()),
         outputs: vec![
             Output { head: head(3, Activation::Sigmoid, 0.0), channels: 3 },
             Output { head: head(5, Activation::Sigmoid, LIT), channels: 1 },
+            Output { head: head(7, Activation::Tanh, 0.0), channels: 3 },
         ],
         mlp: Mlp::new(vec![grid.output_dims(), 9], layers),
     };
@@ -326,6 +376,6 @@ fn field(config: &Config, space: Space, edge: u32) -> Result<Field> {
         space,
         normals: None,
     };
-    field.set_normals(Some(Normals::default())).map_err(|e| PipelineError::Usage(e.to_string()))?;
+    field.set_normals(Some(config.normals.of(1.0))).map_err(|e| PipelineError::Usage(e.to_string()))?;
     Ok(field)
 }

@@ -5,9 +5,10 @@ use super::render::{SceneView, ViewLight};
 use crate::error::Result;
 use crate::relight::light::LightOptions;
 use diorama_data::{DataError, photo};
-use diorama_geom::{Image, ImageU8};
+use diorama_geom::Image;
 use diorama_geom::capture::Split;
 use diorama_geom::color::srgb_from_linear;
+use diorama_geom::glam::DVec3;
 use diorama_geom::sh_light::ShLight;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -78,9 +79,8 @@ pub fn render(model: &SceneModel, options: &PicturesOptions, stop: &AtomicBool, 
         Some(light) => {
             let (daylight, notes) = light.read()?;
             made.notes = notes;
-            let mut harmonics = ShLight::of(&daylight.environment);
-            daylight.sun.iter().for_each(|s| harmonics.add_sun(s.direction, s.irradiance));
-            Some(harmonics)
+            let daylight = daylight.sun_apart();
+            Some((ShLight::of(&daylight.environment), daylight.sun.map(|s| (s.direction, s.irradiance))))
         }
     };
     let frames = if options.frames.is_empty() { model.capture.indices(Split::Test) } else { named(model, &options.frames)? };
@@ -124,15 +124,15 @@ fn named(model: &SceneModel, names: &[String]) -> Result<Vec<usize>> {
     names.iter().map(find).collect()
 }
 
-fn light_of(model: &SceneModel, frame: usize, given: Option<&ShLight>) -> Result<ViewLight> {
-    if let Some(light) = given {
-        return Ok(ViewLight::of(*light));
+fn light_of(model: &SceneModel, frame: usize, given: Option<&(ShLight, Option<(DVec3, [f64; 3])>)>) -> Result<ViewLight> {
+    if let Some((harmonics, sun)) = given {
+        return Ok(ViewLight::new(model, *harmonics, *sun));
     }
     let own = model.light_of_frame(frame).ok_or_else(|| {
         let name = &model.capture.frames[frame].name;
         DataError::input(&model.config.data.path, format!("{name}: its light was not trained on; give --light"))
     })?;
-    Ok(ViewLight { light: model.light(own), sky: model.sky(own).to_vec() })
+    Ok(ViewLight::learned(model, own))
 }
 
 pub(super) fn layer_of(view: &SceneView, layer: Layer) -> &Image {
@@ -144,14 +144,6 @@ pub(super) fn layer_of(view: &SceneView, layer: Layer) -> &Image {
         Layer::Irradiance => &view.irradiance,
         Layer::Depth => &view.depth,
     }
-}
-
-/// Color, albedo, normals and shadow of a frame side by side, in its own light or, where that was not trained on, in the first.
-pub fn layer_row(model: &SceneModel, frame: usize) -> Vec<ImageU8> {
-    let own = model.light_of_frame(frame).unwrap_or(0);
-    let light = ViewLight { light: model.light(own), sky: model.sky(own).to_vec() };
-    let view = model.view(&model.posed(frame), &light, &mut |_| {});
-    [Layer::Rgb, Layer::Albedo, Layer::Normal, Layer::Shadow].map(|l| shown(layer_of(&view, l), l).to_u8()).to_vec()
 }
 
 fn three_channels(image: &Image) -> Image {

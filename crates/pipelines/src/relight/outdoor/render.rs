@@ -1,8 +1,8 @@
 //! Views of the scene model under any light, and its layers.
 
 use super::model::SceneModel;
-use super::shading::{self, CHANNELS};
-use super::trainer::gray;
+use super::shading::{self, CHANNELS, NORMAL, Sunlit, gray};
+use super::sun::SUN;
 use diorama_engine::renderers::layers::Layers;
 use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_geom::Image;
@@ -15,6 +15,8 @@ pub struct ViewLight {
     pub light: ShLight,
     /// `[16, 3]`
     pub sky: Vec<f32>,
+    /// A sun apart, whose light the harmonics then lack: direction, power, light from surfaces.
+    pub sun: Option<[f32; SUN]>,
 }
 
 impl ViewLight {
@@ -22,7 +24,32 @@ impl ViewLight {
     pub fn of(light: ShLight) -> ViewLight {
         let above = light.shade(DVec3::Z);
         let sky = (0..shading::SKY).map(|i| if i < 3 { above[i].max(0.0) as f32 / 0.282_094_8 } else { 0.0 }).collect();
-        ViewLight { light, sky }
+        ViewLight { light, sky, sun: None }
+    }
+
+    /// Harmonics, and a sun (direction and irradiance) besides, as a model takes them: apart, if it tells suns apart.
+    pub fn new(model: &SceneModel, mut light: ShLight, sun: Option<(DVec3, [f64; 3])>) -> ViewLight {
+        if model.visibility.is_none() {
+            sun.iter().for_each(|(direction, irradiance)| light.add_sun(*direction, *irradiance));
+            return ViewLight::of(light);
+        }
+        let mut out = ViewLight::of(light);
+        let (direction, irradiance) = sun.unwrap_or((DVec3::Z, [0.0; 3]));
+        let (up, bounced) = (light.shade(DVec3::Z), model.bounced());
+        let mut numbers = [0.0; SUN];
+        numbers[..3].copy_from_slice(&direction.as_vec3().to_array());
+        for k in 0..3 {
+            let power = irradiance[k] / std::f64::consts::PI;
+            numbers[3 + k] = power as f32;
+            numbers[6 + k] = bounced[k] * (up[k].max(0.0) + power * direction.z.max(0.0)) as f32;
+        }
+        out.sun = Some(numbers);
+        out
+    }
+
+    /// The light that a model learned.
+    pub fn learned(model: &SceneModel, index: usize) -> ViewLight {
+        ViewLight { light: model.light(index), sky: model.sky(index).to_vec(), sun: model.sun(index) }
     }
 
     fn numbers(&self) -> Vec<f32> {
@@ -68,17 +95,22 @@ impl SceneModel {
             let o = out.opacity.data[i];
             // The shadow is composited before 1.
             v[3] += 1.0 - o;
-            let rgb = shading::color(&v, o, &dirs[3 * i..3 * i + 3], &numbers, &light.sky);
-            let length = v[4..].iter().map(|n| n * n).sum::<f32>().sqrt().max(1e-20);
-            let normal: [f32; 3] = std::array::from_fn(|k| v[4 + k] / length);
-            let lit = light.light.shade(DVec3::from(normal.map(f64::from)));
+            let at = 3 * i..3 * i + 3;
+            let ray = (o, out.depth.data[i] * o);
+            let reach = |sun: &[f32]| {
+                let visibility = self.visibility.as_ref().expect("suns are told apart");
+                shading::reach(visibility, sun, &v, ray, &origins[at.clone()], &dirs[at.clone()])
+            };
+            let sunlit = light.sun.as_ref().map(|sun| Sunlit { sun, reach: reach(sun) });
+            let color = shading::color(&v, o, &dirs[at.clone()], &numbers, &light.sky, sunlit);
+            let length = v[NORMAL..NORMAL + 3].iter().map(|n| n * n).sum::<f32>().sqrt().max(1e-20);
             for k in 0..3 {
-                out.color.data[3 * i + k] = rgb[k];
+                out.color.data[3 * i + k] = color.rgb[k];
                 out.albedo.data[3 * i + k] = if o > 1e-3 { v[k] / o } else { 0.0 };
-                out.normal.data[3 * i + k] = normal[k];
-                out.irradiance.data[3 * i + k] = v[3] * lit[k].max(0.0) as f32;
+                out.normal.data[3 * i + k] = v[NORMAL + k] / length;
+                out.irradiance.data[3 * i + k] = color.irradiance[k];
             }
-            out.shadow.data[i] = v[3];
+            out.shadow.data[i] = color.shadow;
         }
         out
     }

@@ -1,9 +1,9 @@
 //! Scores of the scene model against a generated benchmark.
 
 use super::model::SceneModel;
-use super::render::ViewLight;
+use super::render::{SceneView, ViewLight};
 use crate::error::{PipelineError, Result};
-use crate::relight::truth::{self, Truth, ViewLayers};
+use crate::relight::truth::{self, LightTruth, Truth, ViewLayers};
 use diorama_data::photo;
 use diorama_geom::capture::Split;
 use diorama_geom::color::{linear_from_srgb, srgb_from_linear};
@@ -24,12 +24,24 @@ pub struct SceneScores {
     pub mean_light_psnr: f64,
     /// Views that were held out in the lights of training.
     pub seen_light_psnr: f64,
+    /// Those of them whose light has a sun.
+    pub sunlit_psnr: f64,
+    /// How the model takes light: `sh` or `sun`.
+    pub light: String,
     /// Of linear albedo after one factor per channel.
     pub albedo_psnr: f64,
     pub normal_median_deg: f64,
+    /// Median error of the distance, as a share of it.
+    pub depth_median: f64,
     /// Correlation of the shadow with the share of direct light that arrives.
     pub shadow_correlation: f64,
     pub views: usize,
+}
+
+/// A held-out view in the unseen light, layer by layer: picture, albedo, normal, shadow and depth.
+pub struct Sheet {
+    pub ours: Vec<ImageU8>,
+    pub exact: Vec<ImageU8>,
 }
 
 /// Sum of squares of errors in sRGB.
@@ -53,18 +65,19 @@ impl Errors {
     }
 }
 
-/// Judges a model; `look` receives the name of each held-out photograph in the unseen light, the model's picture and the photograph.
+/// Judges a model; `look` receives the name of each held-out photograph in the unseen light, and its layers.
 ///
 /// # Errors
 /// When the data set has no truth, or files are missing.
-pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &ImageU8, &ImageU8) -> Result<()>) -> Result<SceneScores> {
+pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &Sheet) -> Result<()>) -> Result<SceneScores> {
     if !Truth::exists(data) {
         return Err(PipelineError::Usage(format!("{}: has no truth; only generated benchmarks do", data.display())));
     }
     let truth = Truth::read(data)?;
     let gauge = gauge(model, &truth);
-    let (mut unseen, mut oracle, mut mean, mut seen) = <(Errors, Errors, Errors, Errors)>::default();
-    let (mut albedos, mut angles, mut shadows) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut unseen, mut oracle, mut mean, mut seen, mut sunlit) = <(Errors, Errors, Errors, Errors, Errors)>::default();
+    let (mut albedos, mut angles, mut shadows, mut depths) = <(Vec<_>, Vec<_>, Vec<_>, Vec<_>)>::default();
+    let per_meter = model.model_from_world.scale as f32;
     let mut views = 0;
     for frame in model.capture.indices(Split::Test) {
         let name = &model.capture.frames[frame].name;
@@ -73,8 +86,8 @@ pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &ImageU
         let layers = truth::read_view(data, &of.view)?;
         let (light, is_unseen) = (&truth.lights[of.light], of.light == truth.unseen);
         let view_light = match model.light_of_frame(frame).filter(|_| !is_unseen) {
-            Some(l) => ViewLight { light: model.light(l), sky: model.sky(l).to_vec() },
-            None => ViewLight::of(scaled(&light.light(), gauge)),
+            Some(l) => ViewLight::learned(model, l),
+            None => given(model, light, gauge),
         };
         let view = model.view(&model.posed(frame), &view_light, &mut |_| {});
         let shadow = truth::read_shadow(data, &of.photograph)?;
@@ -86,6 +99,9 @@ pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &ImageU
             let (got, normal) = (rgb(&view.color), rgb(&view.normal));
             let n = DVec3::from(rgb(&layers.normal).map(f64::from)).normalize_or_zero();
             (if is_unseen { &mut unseen } else { &mut seen }).add(got, photo);
+            if !is_unseen && light.sun.is_some() {
+                sunlit.add(got, photo);
+            }
             shadows.push((view.shadow.data[i] as f64, shadow.data[3 * i] as f64));
             if is_unseen {
                 let lit = exact.shade(n);
@@ -93,25 +109,63 @@ pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &ImageU
                 oracle.add(std::array::from_fn(|k| albedo[k] * lit[k].max(0.0) as f32 * shadow.data[3 * i]), photo);
                 others.iter().for_each(|o| mean.add(rgb(o), photo));
                 albedos.push((rgb(&view.albedo), albedo));
+                let depth = per_meter * layers.depth.data[i];
+                depths.push(((view.depth.data[i] - depth) / depth).abs() as f64);
                 angles.push(n.dot(DVec3::from(normal.map(f64::from))).clamp(-1.0, 1.0).acos().to_degrees());
             }
         }
         if is_unseen {
             views += 1;
-            look(&of.photograph, &encoded(&view.color), &photograph)?;
+            look(&of.photograph, &sheet(&view, &photograph, &layers, &shadow, per_meter))?;
         }
     }
-    angles.sort_by(f64::total_cmp);
     Ok(SceneScores {
         unseen_light_psnr: unseen.psnr(),
         oracle_psnr: oracle.psnr(),
         mean_light_psnr: mean.psnr(),
         seen_light_psnr: seen.psnr(),
+        sunlit_psnr: sunlit.psnr(),
+        light: if model.visibility.is_some() { "sun" } else { "sh" }.into(),
         albedo_psnr: scaled_psnr(&albedos),
-        normal_median_deg: angles.get(angles.len() / 2).copied().unwrap_or(f64::NAN),
+        normal_median_deg: median(angles),
+        depth_median: median(depths),
         shadow_correlation: correlation(&shadows),
         views,
     })
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+}
+
+fn sheet(view: &SceneView, photograph: &ImageU8, layers: &ViewLayers, shadow: &Image, per_meter: f32) -> Sheet {
+    let farthest = layers.depth.data.iter().zip(&layers.valid.data).filter(|(_, v)| **v > 0.5).map(|(d, _)| *d).fold(1e-6, f32::max);
+    // Three channels of each pixel, as people look at them.
+    let shown = |image: &Image, of: &dyn Fn(f32) -> f32| {
+        let c = image.channels;
+        let pixels = image.data.chunks_exact(c).flat_map(|p| [0, 1, 2].map(|k| of(p[if c == 3 { k } else { 0 }])));
+        Image { width: image.width, height: image.height, channels: 3, data: pixels.collect() }.to_u8()
+    };
+    let srgb = |v: f32| srgb_from_linear(v.clamp(0.0, 1.0));
+    let normal = |v: f32| 0.5 * v + 0.5;
+    let first = Image { channels: 1, data: shadow.data.iter().step_by(3).copied().collect(), ..*shadow };
+    Sheet {
+        ours: vec![
+            encoded(&view.color),
+            shown(&view.albedo, &srgb),
+            shown(&view.normal, &normal),
+            shown(&view.shadow, &|v| v),
+            shown(&view.depth, &|v| v / (per_meter * farthest)),
+        ],
+        exact: vec![
+            photograph.clone(),
+            shown(&layers.albedo, &srgb),
+            shown(&layers.normal, &normal),
+            shown(&first, &|v| v),
+            shown(&layers.depth, &|v| v / farthest),
+        ],
+    }
 }
 
 fn valid(layers: &ViewLayers) -> impl Iterator<Item = usize> + '_ {
@@ -130,7 +184,11 @@ fn gauge(model: &SceneModel, truth: &Truth) -> [f64; 3] {
         let (mut both, mut own) = (0.0, 0.0);
         for (l, session) in model.sessions.iter().enumerate() {
             let Some(exact) = truth.lights.get(*session as usize) else { continue };
-            let learned = model.light(l);
+            let mut learned = model.light(l);
+            if let Some(s) = model.sun(l) {
+                let irradiance = [3, 4, 5].map(|k| s[k] as f64 * std::f64::consts::PI);
+                learned.add_sun(DVec3::new(s[0] as f64, s[1] as f64, s[2] as f64), irradiance);
+            }
             for i in 0..9 {
                 both += learned.0[i][k] * exact.harmonics[i][k];
                 own += exact.harmonics[i][k] * exact.harmonics[i][k];
@@ -140,8 +198,13 @@ fn gauge(model: &SceneModel, truth: &Truth) -> [f64; 3] {
     })
 }
 
-fn scaled(light: &ShLight, by: [f64; 3]) -> ShLight {
-    ShLight(light.0.map(|c| std::array::from_fn(|k| c[k] * by[k])))
+/// An exact light, scaled.
+fn given(model: &SceneModel, exact: &LightTruth, by: [f64; 3]) -> ViewLight {
+    let mut sky = exact.light();
+    let sun = exact.sun.map(|(direction, irradiance)| (DVec3::from(direction), irradiance));
+    sun.iter().for_each(|(direction, irradiance)| sky.add_sun(*direction, irradiance.map(|v| -v)));
+    let scaled = |c: [f64; 3]| std::array::from_fn(|k| c[k] * by[k]);
+    ViewLight::new(model, ShLight(sky.0.map(scaled)), sun.map(|(direction, irradiance)| (direction, scaled(irradiance))))
 }
 
 /// Mean in linear light of the photographs of a view in the lights of training.

@@ -1,12 +1,16 @@
-//! Loss of the scene model: `C = S · A ⊙ max(0, Lᵀ b(N)) + (1 − o) · sky(d)` in linear light, compared in sRGB, and its gradient.
+//! Loss of the scene model: `C = S · A ⊙ max(0, Lᵀ b(N)) + (1 − o) · sky(d)` in linear light, compared in sRGB, and its gradient. With a
+//! sun apart, its light, the sky's and that of surfaces (see [`super::sun`]) take the place of `S · max(0, Lᵀ b(N))`.
 //!
-//! Per ray, the field composites albedo `A` (premultiplied by the opacity `o`), shadow `S` (1 where nothing is hit) and the normal
-//! `−Σ w ∇σ`, whose direction `N` counts. Light `L` `[9, 3]` and sky `[16, 3]` are of the ray's session.
+//! Per ray, the field composites albedo `A` (premultiplied by the opacity `o`), shadow `S` (1 where nothing is hit), the normal that a head
+//! of the network says, whose direction `N` counts, and the slope `−Σ w ∇σ`, to which the normal is tied (Verbin et al. 2022). Light `L` `[9, 3]` and sky `[16, 3]` are of the ray's session.
 
-use diorama_geom::glam::DVec3;
+use super::sun::SUN;
+use super::visibility::{Visibility, spread};
+use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
 use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
 use diorama_kernels::ops::spherical_harmonics;
+use rayon::prelude::*;
 use std::sync::Mutex;
 
 /// Numbers of a light, `[9, 3]`.
@@ -14,8 +18,21 @@ pub const LIGHT: usize = 27;
 /// Degree of the sky's spherical harmonics, and its numbers `[16, 3]`.
 const SKY_DEGREE: usize = 4;
 pub const SKY: usize = 48;
-/// Channels: albedo, shadow, normal.
-pub const CHANNELS: usize = 7;
+/// Channels: albedo, shadow, normal, slope.
+pub const CHANNELS: usize = 10;
+/// First channel of the normal and of the slope.
+pub const NORMAL: usize = 4;
+const SLOPE: usize = 7;
+/// Luminance of linear RGB.
+const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
+/// Luminance of albedo that few surfaces exceed.
+const BRIGHTEST: f32 = 0.9;
+/// Difference in sRGB at which a color is hardly that of the sky any more.
+const ALIKE: f32 = 0.05;
+/// Opacity below which a ray shows no surface.
+const FAINT: f32 = 0.05;
+/// Length below which a vector has no direction.
+const SHORTEST: f32 = 1e-12;
 /// Directions in which irradiance must not be negative.
 const DIRECTIONS: usize = 64;
 
@@ -29,6 +46,14 @@ pub struct Weights {
     pub shadow: f32,
     pub negative: f32,
     pub distortion: f32,
+    /// Opacity where the target has none, and where the target has the sky's color.
+    pub masked_sky: f32,
+    pub likely_sky: f32,
+    /// Albedos beyond what surfaces have.
+    pub gauge: f32,
+    /// Angle between normal and slope, and the share of its gradient that the slope gets.
+    pub tie: f32,
+    pub push: f32,
 }
 
 /// What the rays of a step are compared with.
@@ -36,6 +61,10 @@ pub struct SceneLoss<'a> {
     pub weights: Weights,
     /// sRGB, `[R, 3]`.
     pub target: &'a [f32],
+    /// Opacity of the target: 0 where a mask says that there is sky, `[R]`.
+    pub alpha: &'a [f32],
+    /// Gray in place of the sky, `[R]`; empty: the sky.
+    pub noise: &'a [f32],
     /// Share with which each ray counts, `[R]`.
     pub counts: &'a [f32],
     /// Of unit length, `[R, 3]`.
@@ -47,7 +76,38 @@ pub struct SceneLoss<'a> {
     pub lights: &'a [f32],
     pub skies: &'a [f32],
     pub gains: &'a [f32],
+    /// Suns apart; none: the shadow that the field says.
+    pub suns: Option<Suns<'a>>,
     pub out: Mutex<SceneGradients>,
+}
+
+/// Suns of the lights, and what hides them.
+#[derive(Clone, Copy)]
+pub struct Suns<'a> {
+    /// `[lights, 9]`: direction, power, light from surfaces.
+    pub values: &'a [f32],
+    pub visibility: &'a Visibility,
+    /// Of the rays, `[R, 3]`.
+    pub origins: &'a [f32],
+}
+
+/// Sun of a surface point, and the shares of its light and the sky's that reach the point.
+#[derive(Clone, Copy)]
+pub struct Sunlit<'a> {
+    pub sun: &'a [f32],
+    pub reach: [f32; 2],
+}
+
+/// Shares of a sun's and the sky's light that reach what a ray shows, `[sun, sky]`; `depth` is `Σ w t`.
+pub fn reach(visibility: &Visibility, sun: &[f32], values: &[f32], (opacity, depth): (f32, f32), origin: &[f32], dir: &[f32]) -> [f32; 2] {
+    if opacity < FAINT {
+        return [1.0; 2];
+    }
+    let normal = Vec3::from(unit(&values[NORMAL..]).0);
+    let point = Vec3::from_slice(origin) + Vec3::from_slice(dir) * (depth / opacity);
+    let toward = Vec3::from_slice(sun);
+    let direct = if normal.dot(toward) > 0.0 { visibility.from_sun(point, normal, toward) } else { 1.0 };
+    [direct, visibility.from_sky(point, normal)]
 }
 
 /// Gradients of the tables, and figures of the step.
@@ -56,6 +116,7 @@ pub struct SceneGradients {
     pub lights: Vec<f32>,
     pub skies: Vec<f32>,
     pub gains: Vec<f32>,
+    pub suns: Vec<f32>,
     /// Mean squared error in sRGB of the pixels that count.
     pub mse: f64,
     /// Median over the pixels of the greatest error of a channel.
@@ -63,7 +124,7 @@ pub struct SceneGradients {
 }
 
 /// sRGB of linear light and its derivative; beyond 0 and 1 the curve goes on.
-fn encode(linear: f32) -> (f32, f32) {
+pub(super) fn encode(linear: f32) -> (f32, f32) {
     if linear <= 0.003_130_8 {
         return (12.92 * linear, 12.92);
     }
@@ -92,11 +153,23 @@ struct Shaded {
     sky_basis: [f32; 16],
 }
 
+/// Direction and length of a vector; straight up if there is none.
+fn unit(v: &[f32]) -> ([f32; 3], f32) {
+    let length = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
+    (if length > SHORTEST { [v[0] / length, v[1] / length, v[2] / length] } else { [0.0, 0.0, 1.0] }, length)
+}
+
+/// Adds the gradient of a vector of which only the direction counts.
+fn add_direction(d: &mut [f32], gradient: [f32; 3], (direction, length): ([f32; 3], f32)) {
+    if length > SHORTEST {
+        let radial: f32 = (0..3).map(|a| direction[a] * gradient[a]).sum();
+        (0..3).for_each(|a| d[a] += (gradient[a] - radial * direction[a]) / length);
+    }
+}
+
 /// Normal, light and sky of a ray.
 fn shade(values: &[f32], dir: &[f32], light: &[f32], sky: &[f32]) -> Shaded {
-    let n = [values[4], values[5], values[6]];
-    let length = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
-    let normal = if length > 1e-12 { n.map(|v| v / length) } else { [0.0, 0.0, 1.0] };
+    let (normal, length) = unit(&values[NORMAL..]);
     let basis = sh_light::basis(DVec3::from(normal.map(f64::from)));
     let mut sky_basis = [0.0; 16];
     spherical_harmonics::cpu::forward(SKY_DEGREE, dir, &mut sky_basis);
@@ -104,10 +177,45 @@ fn shade(values: &[f32], dir: &[f32], light: &[f32], sky: &[f32]) -> Shaded {
     Shaded { normal, length, basis, lit: irradiance(light, &basis), sky: of_sky, sky_basis }
 }
 
-/// Linear color of composited values `[7]` under a light and before a sky.
-pub fn color(values: &[f32], opacity: f32, dir: &[f32], light: &[f32], sky: &[f32]) -> [f32; 3] {
+/// Light that a white surface sends, with its shadow.
+fn received(values: &[f32], s: &Shaded, sunlit: Option<Sunlit>, k: usize) -> f32 {
+    match sunlit {
+        None => values[3] * s.lit[k].max(0.0),
+        Some(Sunlit { sun, reach }) => {
+            let facing = (0..3).map(|a| s.normal[a] * sun[a]).sum::<f32>().max(0.0);
+            sun[3 + k] * reach[0] * facing + reach[1] * s.lit[k].max(0.0) + (1.0 - reach[1]) * sun[6 + k]
+        }
+    }
+}
+
+/// Color of a ray, and what makes it.
+pub struct RayColor {
+    /// Linear.
+    pub rgb: [f32; 3],
+    /// Light that a white surface would send, shadow included.
+    pub irradiance: [f32; 3],
+    /// Share of the light that arrives.
+    pub shadow: f32,
+}
+
+/// Linear color of composited values under a light and before a sky.
+pub fn color(values: &[f32], opacity: f32, dir: &[f32], light: &[f32], sky: &[f32], sunlit: Option<Sunlit>) -> RayColor {
     let s = shade(values, dir, light, sky);
-    std::array::from_fn(|k| values[3] * values[k] * s.lit[k].max(0.0) + (1.0 - opacity) * s.sky[k].max(0.0))
+    let irradiance: [f32; 3] = std::array::from_fn(|k| received(values, &s, sunlit, k));
+    let rgb = std::array::from_fn(|k| values[k] * irradiance[k] + (1.0 - opacity) * s.sky[k].max(0.0));
+    let shadow = sunlit.map_or(values[3], |l| {
+        let bare = |reach| {
+            let sun: [f32; 9] = std::array::from_fn(|i| if i < 6 { l.sun[i] } else { 0.0 });
+            gray(&[0, 1, 2].map(|k| received(values, &s, Some(Sunlit { sun: &sun, reach }), k)))
+        };
+        if opacity < FAINT { 1.0 } else { (bare(l.reach) / bare([1.0; 2]).max(1e-6)).clamp(0.0, 1.0) }
+    });
+    RayColor { rgb, irradiance, shadow }
+}
+
+/// Luminance of a color or coefficient.
+pub fn gray(c: &[f32]) -> f32 {
+    (0..3).map(|k| LUMINANCE[k] * c[k]).sum()
 }
 
 /// Gradient of the basis functions with respect to the normal, `[9]` rows of `[x, y, z]`.
@@ -127,20 +235,53 @@ fn basis_gradient(n: [f32; 3]) -> [[f32; 3]; 9] {
     ]
 }
 
+/// Adds the gradients of a sun's numbers and of the normal, for one channel and the gradient `d` of the light that a surface receives.
+fn sun_gradient(l: &Sunlit, normal: [f32; 3], d: f32, k: usize, d_sun: &mut [f32], d_normal: &mut [f32; 3]) {
+    let facing = (0..3).map(|a| normal[a] * l.sun[a]).sum::<f32>();
+    if facing > 0.0 {
+        d_sun[3 + k] += d * l.reach[0] * facing;
+        (0..3).for_each(|a| d_normal[a] += d * l.reach[0] * l.sun[3 + k] * l.sun[a]);
+    }
+    d_sun[6 + k] += d * (1.0 - l.reach[1]);
+}
+
+/// What the loss of a ray reads.
+#[derive(Clone, Copy)]
+struct RayIn<'a> {
+    values: &'a [f32],
+    opacity: f32,
+    sunlit: Option<Sunlit<'a>>,
+}
+
 impl SceneLoss<'_> {
+    /// Sun of a ray and what of its light arrives.
+    fn sunlit(&self, r: usize, out: &RayOutputs) -> Option<Sunlit<'_>> {
+        let s = self.suns.as_ref()?;
+        let sun = &s.values[SUN * self.light[r] as usize..][..SUN];
+        let (values, at) = (&out.values[r * CHANNELS..][..CHANNELS], 3 * r..3 * r + 3);
+        let reach = reach(s.visibility, sun, values, (out.opacity[r], out.depth[r]), &s.origins[at.clone()], &self.dirs[at]);
+        Some(Sunlit { sun, reach })
+    }
+
     /// One ray: its loss; adds gradients. `share` is its part of the sum. Returns the loss, the squared error and the largest error.
-    fn ray(&self, r: usize, out: &RayOutputs, d: &mut RayGradients, tables: &mut SceneGradients, share: f32) -> (f64, f64, f32) {
-        let (values, opacity, dir) = (&out.values[r * CHANNELS..][..CHANNELS], out.opacity[r], &self.dirs[3 * r..3 * r + 3]);
-        let (l, image) = (self.light[r] as usize, self.image[r] as usize);
-        let (light, sky) = (&self.lights[l * LIGHT..][..LIGHT], &self.skies[l * SKY..][..SKY]);
-        let s = shade(values, dir, light, sky);
+    fn ray(&self, r: usize, ray: &RayIn, d: &mut RayGradients, tables: &mut SceneGradients, share: f32) -> (f64, f64, f32) {
+        let RayIn { values, opacity, sunlit } = *ray;
+        let dir = &self.dirs[3 * r..3 * r + 3];
+        let (light_of, image) = (self.light[r] as usize, self.image[r] as usize);
+        let (light, sky) = (&self.lights[light_of * LIGHT..][..LIGHT], &self.skies[light_of * SKY..][..SKY]);
+        let mut s = shade(values, dir, light, sky);
+        if let Some(noise) = self.noise.get(r) {
+            (s.sky, s.sky_basis) = ([*noise; 3], [0.0; 16]);
+        }
         let (shadow, gain) = (values[3], self.gains.get(3 * image..3 * image + 3));
         let w = self.weights;
         let (mut errors, mut d_colors) = ([0.0; 3], [0.0; 3]);
-        let (mut lit, mut plain) = ([0.0; 3], [0.0; 3]);
+        let (mut white, mut plain) = ([0.0; 3], [0.0; 3]);
+        // Share of the light of the harmonics that arrives.
+        let arrives = sunlit.map_or(shadow, |l| l.reach[1]);
         for k in 0..3 {
-            lit[k] = s.lit[k].max(0.0);
-            plain[k] = shadow * values[k] * lit[k] + (1.0 - opacity) * s.sky[k].max(0.0);
+            white[k] = received(values, &s, sunlit, k);
+            plain[k] = values[k] * white[k] + (1.0 - opacity) * s.sky[k].max(0.0);
             let factor = gain.map_or(1.0, |g| g[k].exp());
             let (srgb, slope) = encode(factor * plain[k]);
             errors[k] = srgb - self.target[3 * r + k];
@@ -160,35 +301,72 @@ impl SceneLoss<'_> {
             if gain.is_some() {
                 tables.gains[3 * image + k] += dc * plain[k];
             }
-            d_values[k] += dc * shadow * lit[k];
-            d_values[3] += dc * values[k] * lit[k];
+            d_values[k] += dc * white[k];
+            match sunlit {
+                None => d_values[3] += dc * values[k] * s.lit[k].max(0.0),
+                Some(l) => sun_gradient(&l, s.normal, dc * values[k], k, &mut tables.suns[SUN * light_of..][..SUN], &mut d_normal),
+            }
             if s.lit[k] > 0.0 {
-                let d_lit = dc * shadow * values[k];
+                let d_lit = dc * arrives * values[k];
                 for i in 0..9 {
-                    tables.lights[l * LIGHT + 3 * i + k] += d_lit * s.basis[i] as f32;
+                    tables.lights[light_of * LIGHT + 3 * i + k] += d_lit * s.basis[i] as f32;
                     (0..3).for_each(|a| d_normal[a] += d_lit * light[3 * i + k] * slopes[i][a]);
                 }
             }
             if s.sky[k] > 0.0 {
                 d.opacity[r] -= dc * s.sky[k];
-                (0..16).for_each(|i| tables.skies[l * SKY + 3 * i + k] += dc * (1.0 - opacity) * s.sky_basis[i]);
+                (0..16).for_each(|i| tables.skies[light_of * SKY + 3 * i + k] += dc * (1.0 - opacity) * s.sky_basis[i]);
             } else {
                 // Light is never negative; the pull brings it back.
-                (0..16).for_each(|i| tables.skies[l * SKY + 3 * i + k] += share * 0.1 * s.sky[k] * s.sky_basis[i]);
+                (0..16).for_each(|i| tables.skies[light_of * SKY + 3 * i + k] += share * 0.1 * s.sky[k] * s.sky_basis[i]);
             }
         }
-        loss += (share * w.shadow * (1.0 - shadow) * (1.0 - shadow)) as f64;
-        d_values[3] -= share * 2.0 * w.shadow * (1.0 - shadow);
+        if sunlit.is_none() {
+            loss += (share * w.shadow * (1.0 - shadow) * (1.0 - shadow)) as f64;
+            d_values[3] -= share * 2.0 * w.shadow * (1.0 - shadow);
+        }
+        let sky = share * (w.masked_sky * (1.0 - self.alpha[r]) + w.likely_sky * self.likely_sky(r, &s, dir));
+        loss += (sky * opacity * opacity) as f64;
+        d.opacity[r] += 2.0 * sky * opacity;
         let facing = (0..3).map(|a| s.normal[a] * dir[a]).sum::<f32>();
-        if facing > 0.0 && s.length > 1e-12 {
+        if facing > 0.0 && s.length > SHORTEST {
             loss += (share * w.orientation * facing * facing) as f64;
             (0..3).for_each(|a| d_normal[a] += share * 2.0 * w.orientation * facing * dir[a]);
         }
-        if s.length > 1e-12 {
-            let radial: f32 = (0..3).map(|a| s.normal[a] * d_normal[a]).sum();
-            (0..3).for_each(|a| d_values[4 + a] += (d_normal[a] - radial * s.normal[a]) / s.length);
+        let slope = unit(&values[SLOPE..]);
+        if slope.1 > SHORTEST {
+            let tie = share * w.tie;
+            loss += (tie * (1.0 - (0..3).map(|a| s.normal[a] * slope.0[a]).sum::<f32>())) as f64;
+            (0..3).for_each(|a| d_normal[a] -= tie * slope.0[a]);
+            add_direction(&mut d_values[SLOPE..], s.normal.map(|n| -w.push * tie * n), slope);
         }
+        add_direction(&mut d_values[NORMAL..], d_normal, (s.normal, s.length));
         (loss, squared as f64 / 3.0, errors.iter().fold(0.0, |m, e| m.max(e.abs())))
+    }
+
+    /// How well the sky alone explains a ray above the horizon, 0 to 1, held constant.
+    fn likely_sky(&self, r: usize, s: &Shaded, dir: &[f32]) -> f32 {
+        if dir[2] <= 0.0 || !self.noise.is_empty() {
+            return 0.0;
+        }
+        let squared: f32 = (0..3).map(|k| (encode(s.sky[k].max(0.0)).0.min(1.0) - self.target[3 * r + k]).powi(2)).sum();
+        (-0.5 * squared / (ALIKE * ALIKE)).exp()
+    }
+
+    /// Penalty of albedos so bright that light would have to be dark: of the brightest twentieth, where that begins above [`BRIGHTEST`].
+    fn gauge(&self, out: &RayOutputs, gradients: &mut RayGradients, share: f32) -> f64 {
+        let luminance = |r: usize| gray(&out.values[r * CHANNELS..][..3]);
+        let surfaces: Vec<usize> = (0..out.opacity.len()).filter(|r| self.counts[*r] > 0.0 && out.opacity[*r] > 0.5).collect();
+        let mut sorted: Vec<f32> = surfaces.iter().map(|r| luminance(*r)).collect();
+        sorted.sort_by(f32::total_cmp);
+        let Some(from) = sorted.get(sorted.len() * 19 / 20).filter(|l| **l > BRIGHTEST) else { return 0.0 };
+        let mut loss = 0.0;
+        for r in surfaces.into_iter().filter(|r| luminance(*r) >= *from) {
+            let (e, part) = (luminance(r) - BRIGHTEST, share * self.weights.gauge);
+            loss += (part * e * e) as f64;
+            gradients.values[r * CHANNELS..].iter_mut().zip(LUMINANCE).for_each(|(d, w)| *d += 2.0 * part * e * w);
+        }
+        loss
     }
 
     /// Penalty of negative irradiance, the same directions for every light.
@@ -196,9 +374,7 @@ impl SceneLoss<'_> {
         let mut loss = 0.0;
         let lights = self.lights.len() / LIGHT;
         for i in 0..DIRECTIONS {
-            let z = 1.0 - 2.0 * (i as f64 + 0.5) / DIRECTIONS as f64;
-            let (r, turn) = ((1.0 - z * z).sqrt(), i as f64 * 2.399_963_229_728_653);
-            let basis = sh_light::basis(DVec3::new(r * turn.cos(), r * turn.sin(), z));
+            let basis = sh_light::basis(spread(i, DIRECTIONS));
             for l in 0..lights {
                 let light = &self.lights[l * LIGHT..][..LIGHT];
                 let part = self.weights.negative / (DIRECTIONS * lights * 3) as f32;
@@ -219,17 +395,20 @@ impl BatchLoss for SceneLoss<'_> {
             lights: vec![0.0; self.lights.len()],
             skies: vec![0.0; self.skies.len()],
             gains: vec![0.0; self.gains.len()],
+            suns: vec![0.0; self.suns.map_or(0, |s| s.values.len())],
             ..SceneGradients::default()
         };
         let share = 1.0 / self.counts.iter().sum::<f32>().max(1.0);
         let (mut loss, mut mse, mut worst) = (0.0, 0.0, Vec::with_capacity(rays));
+        let sunlit: Vec<Option<Sunlit>> = (0..rays).into_par_iter().map(|r| self.sunlit(r, out)).collect();
         for r in (0..rays).filter(|r| self.counts[*r] > 0.0) {
-            let (value, squared, error) = self.ray(r, out, gradients, &mut tables, share);
+            let ray = RayIn { values: &out.values[r * CHANNELS..][..CHANNELS], opacity: out.opacity[r], sunlit: sunlit[r] };
+            let (value, squared, error) = self.ray(r, &ray, gradients, &mut tables, share);
             loss += value;
             mse += squared * (share * self.counts[r]) as f64;
             worst.push(error);
         }
-        loss += self.negative(&mut tables);
+        loss += self.negative(&mut tables) + self.gauge(out, gradients, share);
         if !worst.is_empty() {
             let at = worst.len() / 2;
             tables.median = *worst.select_nth_unstable_by(at, f32::total_cmp).1;
@@ -241,131 +420,5 @@ impl BatchLoss for SceneLoss<'_> {
 
     fn distortion(&self) -> f32 {
         self.weights.distortion
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use diorama_geom::rng::Rng;
-
-    struct Case {
-        values: Vec<f32>,
-        opacity: Vec<f32>,
-        dirs: Vec<f32>,
-        target: Vec<f32>,
-        lights: Vec<f32>,
-        skies: Vec<f32>,
-        gains: Vec<f32>,
-    }
-
-    const RAYS: usize = 5;
-
-    fn case() -> Case {
-        let rng = Rng::new(3, 1);
-        let draw = |n: usize, stream: u64| (0..n).map(|i| rng.uniform(stream * 1000 + i as u64)).collect::<Vec<f32>>();
-        let mut values = draw(RAYS * CHANNELS, 1);
-        values.chunks_exact_mut(CHANNELS).for_each(|v| v[4..].iter_mut().for_each(|n| *n = 20.0 * (*n - 0.5)));
-        let mut dirs: Vec<f32> = draw(RAYS * 3, 2).iter().map(|d| d - 0.5).collect();
-        dirs.chunks_exact_mut(3).for_each(|d| {
-            let l = d.iter().map(|v| v * v).sum::<f32>().sqrt();
-            d.iter_mut().for_each(|v| *v /= l);
-        });
-        let signed = |n: usize, stream: u64, by: f32| draw(n, stream).iter().map(|v| by * (v - 0.3)).collect::<Vec<f32>>();
-        Case {
-            values,
-            opacity: draw(RAYS, 3),
-            dirs,
-            target: draw(RAYS * 3, 4),
-            lights: signed(2 * LIGHT, 5, 2.0),
-            skies: signed(2 * SKY, 6, 1.0),
-            gains: signed(3 * RAYS, 7, 0.4),
-        }
-    }
-
-    fn run(c: &Case) -> (f64, RayGradients, SceneGradients) {
-        let loss = SceneLoss {
-            weights: Weights { huber: 0.4, robust: 0.0, orientation: 0.3, shadow: 0.2, negative: 0.5, distortion: 0.0 },
-            target: &c.target,
-            counts: &[1.0, 0.5, 1.0, 0.0, 1.0],
-            dirs: &c.dirs,
-            light: &[0, 1, 1, 0, 1],
-            image: &[0, 1, 2, 3, 4],
-            lights: &c.lights,
-            skies: &c.skies,
-            gains: &c.gains,
-            out: Mutex::default(),
-        };
-        let mut d = RayGradients::default();
-        d.clear(RAYS, CHANNELS);
-        let out = RayOutputs { values: &c.values, opacity: &c.opacity, depth: &[0.0; RAYS] };
-        let value = loss.batch(&out, &mut d);
-        (value, d, loss.out.into_inner().unwrap())
-    }
-
-    /// Compares a gradient with central differences of the loss.
-    fn check(name: &str, of: fn(&mut Case) -> &mut Vec<f32>, got: &[f32], step: f32) {
-        let mut compared = 0;
-        for i in 0..got.len() {
-            let at = |by: f32| {
-                let mut c = case();
-                of(&mut c)[i] += by;
-                run(&c).0
-            };
-            let (a, b) = (at(step), at(-step));
-            let want = (a - b) / (2.0 * step as f64);
-            // Not across a kink of max(0, ·).
-            let curvature = ((a + b - 2.0 * run(&case()).0) / (step * step) as f64).abs();
-            if curvature * (step as f64) < 0.05 * want.abs() + 0.02 {
-                compared += (want.abs() > 1e-4) as usize;
-                assert!((got[i] as f64 - want).abs() < 0.02 * want.abs() + 2e-3, "{name} {i}: {} {want}", got[i]);
-            }
-        }
-        assert!(compared * 4 > got.len(), "{name}: {compared} of {}", got.len());
-    }
-
-    #[test]
-    fn gradients_are_those_of_the_loss() {
-        let (_, d, tables) = run(&case());
-        check("values", |c| &mut c.values, &d.values, 3e-3);
-        check("opacity", |c| &mut c.opacity, &d.opacity, 3e-3);
-        check("lights", |c| &mut c.lights, &tables.lights, 3e-3);
-        check("gains", |c| &mut c.gains, &tables.gains, 3e-3);
-    }
-
-    #[test]
-    fn the_light_of_a_perfect_explanation_has_no_loss() {
-        let mut c = case();
-        for r in 0..RAYS {
-            let l = [0, 1, 1, 0, 1][r];
-            let (light, sky) = (&c.lights[l * LIGHT..][..LIGHT], &c.skies[l * SKY..][..SKY]);
-            let rgb = color(&c.values[r * CHANNELS..][..CHANNELS], c.opacity[r], &c.dirs[3 * r..3 * r + 3], light, sky);
-            (0..3).for_each(|k| c.target[3 * r + k] = encode(rgb[k] * c.gains[3 * r + k].exp()).0);
-        }
-        let tables = run(&c).2;
-        assert!(tables.mse < 1e-10 && tables.median < 1e-5, "{tables:?}");
-    }
-
-    #[test]
-    fn pixels_that_fit_badly_count_less() {
-        let c = case();
-        let with = |robust: f32| {
-            let loss = SceneLoss {
-                weights: Weights { huber: 1.0, robust, orientation: 0.0, shadow: 0.0, negative: 0.0, distortion: 0.0 },
-                target: &c.target,
-                counts: &[1.0; RAYS],
-                dirs: &c.dirs,
-                light: &[0; RAYS],
-                image: &[0; RAYS],
-                lights: &c.lights,
-                skies: &c.skies,
-                gains: &[],
-                out: Mutex::default(),
-            };
-            let mut d = RayGradients::default();
-            d.clear(RAYS, CHANNELS);
-            loss.batch(&RayOutputs { values: &c.values, opacity: &c.opacity, depth: &[0.0; RAYS] }, &mut d)
-        };
-        assert!(with(0.05) < 0.2 * with(0.0), "{} {}", with(0.05), with(0.0));
     }
 }

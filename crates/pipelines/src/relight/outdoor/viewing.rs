@@ -16,6 +16,7 @@ use diorama_geom::view_controls::{ControlInput, ControlValues, ViewControl, View
 use diorama_geom::view_source::{MeshRequest, ViewRequest};
 use diorama_geom::{Capture, ImageU8};
 use diorama_kernels::ops::ray_generation::PosedCamera;
+use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -34,19 +35,30 @@ const UNLIT: [&str; 3] = ["albedo", "normal", "depth"];
 /// A model with the lights that the viewer offers besides those that were learned.
 pub struct ViewedScene {
     model: SceneModel,
-    /// Name and light of each environment map.
-    maps: Arc<Vec<(String, Daylight)>>,
+    maps: Arc<Vec<GivenLight>>,
+}
+
+/// A light of a file: harmonics, and the sun (direction and irradiance) that they lack.
+pub struct GivenLight {
+    name: String,
+    light: ShLight,
+    sun: Option<(DVec3, [f64; 3])>,
 }
 
 /// Lights of files for the viewer, each with its file name, and notes about what was mended in them.
 ///
 /// # Errors
 /// When a file is no light.
-pub fn read_maps(files: &[PathBuf]) -> Result<(Vec<(String, Daylight)>, Vec<String>)> {
+pub fn read_maps(files: &[PathBuf]) -> Result<(Vec<GivenLight>, Vec<String>)> {
     let (mut maps, mut notes) = (Vec::new(), Vec::new());
     for file in files {
         let (light, of_file) = LightOptions::of(Source::File(file.clone())).read()?;
-        maps.push((file.file_stem().unwrap_or_default().to_string_lossy().into_owned(), light));
+        let light = light.sun_apart();
+        maps.push(GivenLight {
+            name: file.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+            light: ShLight::of(&light.environment),
+            sun: light.sun.map(|s| (s.direction, s.irradiance)),
+        });
         notes.extend(of_file);
     }
     Ok((maps, notes))
@@ -56,7 +68,7 @@ pub fn read_maps(files: &[PathBuf]) -> Result<(Vec<(String, Daylight)>, Vec<Stri
 ///
 /// # Errors
 /// When what was saved in the viewer before cannot be read.
-pub fn open(run: &Path, model: SceneModel, maps: Vec<(String, Daylight)>, running: bool) -> Result<Arc<RunView>> {
+pub fn open(run: &Path, model: SceneModel, maps: Vec<GivenLight>, running: bool) -> Result<Arc<RunView>> {
     RunView::new(run, ViewedScene { model, maps: Arc::new(maps) }, running)
 }
 
@@ -73,38 +85,48 @@ impl ViewedScene {
     fn lights(&self) -> Vec<(String, String)> {
         let m = &self.model;
         let learned = (0..m.light_count()).map(|i| (format!("learned:{i}"), m.light_name(i)));
-        let maps = self.maps.iter().enumerate().map(|(i, (name, _))| (format!("map:{i}"), name.clone()));
+        let maps = self.maps.iter().enumerate().map(|(i, map)| (format!("map:{i}"), map.name.clone()));
         learned.chain(maps).chain([(CLEAR.to_string(), "Clear sky".to_string())]).collect()
     }
 
     /// The light that the controls describe.
     fn light(&self, values: &ControlValues) -> ViewLight {
-        let (turn, strength) = (values.number("rotate").to_radians(), values.number("strength"));
+        let m = &self.model;
+        let (turn, strength) = (DMat3::from_rotation_z(values.number("rotate").to_radians()), values.number("strength"));
         let (elevation, azimuth) = (values.number("sun_elevation").to_radians(), values.number("sun_azimuth").to_radians());
-        let (up, level) = elevation.sin_cos();
-        let (right, ahead) = azimuth.sin_cos();
-        let sun = DVec3::new(level * right, level * ahead, up);
+        let added = [values.number("sun_power"); 3];
+        let added = (added[0] > 0.0).then(|| (Sky::clear(elevation, azimuth).sun(), added));
         let choice = values.choice("light");
         let number = |prefix: &str| choice.strip_prefix(prefix).and_then(|i| i.parse::<usize>().ok());
-        let harmonics = |light: &Daylight| {
-            let mut harmonics = ShLight::of(&light.environment);
-            light.sun.iter().for_each(|s| harmonics.add_sun(s.direction, s.irradiance));
-            harmonics
-        };
-        let mut light = match (number("learned:"), number("map:")) {
+        match (number("learned:"), number("map:")) {
             (Some(i), _) => {
-                let sky = self.model.sky(i).iter().map(|v| v * strength as f32).collect();
-                let light = self.model.light(i).rotated(DMat3::from_rotation_z(turn)).scaled(strength);
-                ViewLight { light, sky }
+                let mut light = ViewLight::learned(m, i);
+                light.light = light.light.rotated(turn).scaled(strength);
+                light.sky.iter_mut().for_each(|v| *v *= strength as f32);
+                match (&mut light.sun, added) {
+                    (Some(sun), _) => {
+                        let (direction, irradiance) = added.unwrap_or((turn * DVec3::new(sun[0] as f64, sun[1] as f64, sun[2] as f64), [0.0; 3]));
+                        sun[..3].copy_from_slice(&direction.as_vec3().to_array());
+                        sun[3..].iter_mut().for_each(|v| *v *= strength as f32);
+                        if added.is_some() {
+                            (0..3).for_each(|k| sun[3 + k] = (irradiance[k] / PI) as f32);
+                        }
+                    }
+                    (None, Some((direction, irradiance))) => light.light.add_sun(direction, irradiance),
+                    (None, None) => {}
+                }
+                light
             }
-            (None, Some(i)) => ViewLight::of(harmonics(&self.maps[i].1.clone().turned(turn, strength))),
+            (None, Some(i)) => {
+                let map = &self.maps[i];
+                let own = map.sun.map(|(direction, irradiance)| (turn * direction, irradiance.map(|v| v * strength)));
+                ViewLight::new(m, map.light.rotated(turn).scaled(strength), added.or(own))
+            }
             (None, None) => {
-                let sky = Daylight::clear(&Sky::clear(elevation, azimuth), SKY_ROWS);
-                return ViewLight::of(harmonics(&sky.turned(turn, SKY_STRENGTH * strength)));
+                let sky = Daylight::clear(&Sky::clear(elevation, azimuth), SKY_ROWS).turned(0.0, SKY_STRENGTH * strength);
+                ViewLight::new(m, ShLight::of(&sky.environment).rotated(turn), sky.sun.map(|s| (turn * s.direction, s.irradiance)))
             }
-        };
-        light.light.add_sun(sun, [values.number("sun_power"); 3]);
-        light
+        }
     }
 
     fn posed(&self, r: &ViewRequest) -> PosedCamera {
@@ -168,7 +190,7 @@ impl ViewedModel for ViewedScene {
             control("strength", "Strength", "Factor of the light", slider(0.0, 4.0, 0.05, "", 1.0)),
             control("sun_azimuth", "Sun azimuth", "Of the clear sky's sun or the added one", slider(-180.0, 180.0, 1.0, "°", 140.0)),
             control("sun_elevation", "Sun elevation", "Height of the sun above the horizon", slider(0.0, 90.0, 1.0, "°", 35.0)),
-            control("sun_power", "Added sun", "Irradiance of a sun besides a learned light or a map", slider(0.0, 6.0, 0.1, "", 0.0)),
+            control("sun_power", "Added sun", "Irradiance of a sun besides a learned light or in place of its sun", slider(0.0, 6.0, 0.1, "", 0.0)),
         ]
     }
 

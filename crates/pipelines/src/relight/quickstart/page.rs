@@ -35,9 +35,8 @@ pub fn html(m: &Made) -> String {
 <h1>diorama relight quickstart</h1>\n\
 <h2>Both together</h2>\n<p>The trained chair in the trained street ({chair}, {site}) under a light that neither was photographed in, path-traced from \
 <code>scene.toml</code>.</p>\n<img src=\"composed.png\" alt=\"the chair in the street\">\n{notes}\
-<h2>The street</h2>\n<table>{scene}</table>\n<p>Views under the light of no photograph: the model's above, photographs below.</p>\n\
-<img src=\"pictures/unseen_light.png\" alt=\"renders above photographs\">\n\
-<p>Color, albedo, normals and shadow of held-out views.</p>\n<img src=\"pictures/layers.png\" alt=\"layers\">\n\
+<h2>The street</h2>\n<table>{scene}</table>\n<p>Held-out views in the light of no photograph: picture, albedo, normals, shadow and depth; the model's above, the true ones below.</p>\n\
+<img src=\"pictures/layers.png\" alt=\"layers\">\n\
 <h2>The chair</h2>\n<table>{object}</table>\n\
 <h2>Your own photographs</h2>\n<pre>diorama relight prepare photos/ -o data/site\ndiorama relight train data/site -o runs/site\n\
 diorama relight render runs/site --light dusk.hdr -o relit\ndiorama relight mesh runs/site -o site.glb\n\

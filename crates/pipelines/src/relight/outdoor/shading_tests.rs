@@ -1,0 +1,199 @@
+//! The loss against central differences.
+
+use super::shading::*;
+use super::visibility::Visibility;
+use diorama_engine::fields::DensityQuery;
+use diorama_engine::samplers::occupancy::Occupancy;
+use diorama_geom::rng::Rng;
+use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
+use std::sync::{LazyLock, Mutex};
+
+struct Case {
+    values: Vec<f32>,
+    opacity: Vec<f32>,
+    dirs: Vec<f32>,
+    target: Vec<f32>,
+    lights: Vec<f32>,
+    skies: Vec<f32>,
+    gains: Vec<f32>,
+    /// Empty: no suns apart.
+    suns: Vec<f32>,
+}
+
+/// Space without matter.
+struct Empty;
+
+impl DensityQuery for Empty {
+    fn density(&self, _: &[f32], sigma: &mut [f32]) {
+        sigma.fill(0.0);
+    }
+}
+
+static EMPTY: LazyLock<Visibility> = LazyLock::new(|| Visibility::of(&Empty, &Occupancy::new(16, 1, false), (0.0, 1.0), 16));
+
+const RAYS: usize = 5;
+
+fn case() -> Case {
+    let rng = Rng::new(3, 1);
+    let draw = |n: usize, stream: u64| (0..n).map(|i| rng.uniform(stream * 1000 + i as u64)).collect::<Vec<f32>>();
+    let mut values = draw(RAYS * CHANNELS, 1);
+    values.chunks_exact_mut(CHANNELS).for_each(|v| v[NORMAL..].iter_mut().for_each(|n| *n = 20.0 * (*n - 0.5)));
+    let mut dirs: Vec<f32> = draw(RAYS * 3, 2).iter().map(|d| d - 0.5).collect();
+    dirs.chunks_exact_mut(3).for_each(|d| {
+        let l = d.iter().map(|v| v * v).sum::<f32>().sqrt();
+        d.iter_mut().for_each(|v| *v /= l);
+    });
+    let signed = |n: usize, stream: u64, by: f32| draw(n, stream).iter().map(|v| by * (v - 0.3)).collect::<Vec<f32>>();
+    Case {
+        values,
+        opacity: draw(RAYS, 3),
+        dirs,
+        target: draw(RAYS * 3, 4),
+        lights: signed(2 * LIGHT, 5, 2.0),
+        skies: signed(2 * SKY, 6, 1.0),
+        gains: signed(3 * RAYS, 7, 0.4),
+        suns: Vec::new(),
+    }
+}
+
+fn sunlit_case() -> Case {
+    let sun = |toward: [f32; 3], power: f32| [toward[0], toward[1], toward[2], power, 0.8 * power, 0.6, 0.1, 0.2, 0.3];
+    Case { suns: [sun([0.6, 0.0, 0.8], 0.9), sun([0.0, -0.8, 0.6], 0.5)].concat(), ..case() }
+}
+
+fn run(c: &Case) -> (f64, RayGradients, SceneGradients) {
+    let loss = SceneLoss {
+        weights: Weights {
+            huber: 0.4,
+            robust: 0.0,
+            orientation: 0.3,
+            shadow: 0.2,
+            negative: 0.5,
+            distortion: 0.0,
+            masked_sky: 0.4,
+            likely_sky: 0.0,
+            gauge: 0.0,
+            tie: 0.3,
+            push: 1.0,
+        },
+        target: &c.target,
+        alpha: &[1.0, 0.0, 0.5, 0.0, 1.0],
+        noise: &[],
+        counts: &[1.0, 0.5, 1.0, 0.0, 1.0],
+        dirs: &c.dirs,
+        light: &[0, 1, 1, 0, 1],
+        image: &[0, 1, 2, 3, 4],
+        lights: &c.lights,
+        skies: &c.skies,
+        gains: &c.gains,
+        suns: (!c.suns.is_empty()).then(|| Suns { values: &c.suns, visibility: &EMPTY, origins: &[0.5; 3 * RAYS] }),
+        out: Mutex::default(),
+    };
+    let mut d = RayGradients::default();
+    d.clear(RAYS, CHANNELS);
+    let out = RayOutputs { values: &c.values, opacity: &c.opacity, depth: &[0.0; RAYS] };
+    let value = loss.batch(&out, &mut d);
+    (value, d, loss.out.into_inner().unwrap())
+}
+
+/// Compares a gradient with central differences of the loss.
+fn check(name: &str, base: fn() -> Case, of: fn(&mut Case) -> &mut Vec<f32>, got: &[f32], step: f32) {
+    let mut compared = 0;
+    for i in 0..got.len() {
+        let at = |by: f32| {
+            let mut c = base();
+            of(&mut c)[i] += by;
+            run(&c).0
+        };
+        let (a, b) = (at(step), at(-step));
+        let want = (a - b) / (2.0 * step as f64);
+        // Not across a kink of max(0, ·).
+        let curvature = ((a + b - 2.0 * run(&base()).0) / (step * step) as f64).abs();
+        if curvature * (step as f64) < 0.05 * want.abs() + 0.02 {
+            compared += (want.abs() > 1e-4) as usize;
+            assert!((got[i] as f64 - want).abs() < 0.02 * want.abs() + 2e-3, "{name} {i}: {} {want}", got[i]);
+        }
+    }
+    assert!(compared * 4 > got.len(), "{name}: {compared} of {}", got.len());
+}
+
+#[test]
+fn gradients_are_those_of_the_loss() {
+    let (_, d, tables) = run(&case());
+    check("values", case, |c| &mut c.values, &d.values, 3e-3);
+    check("opacity", case, |c| &mut c.opacity, &d.opacity, 3e-3);
+    check("lights", case, |c| &mut c.lights, &tables.lights, 3e-3);
+    check("gains", case, |c| &mut c.gains, &tables.gains, 3e-3);
+}
+
+#[test]
+fn gradients_with_suns_apart_are_those_of_the_loss() {
+    let (_, d, tables) = run(&sunlit_case());
+    check("values", sunlit_case, |c| &mut c.values, &d.values, 3e-3);
+    check("lights", sunlit_case, |c| &mut c.lights, &tables.lights, 3e-3);
+    // Directions are searched, and nothing hides the sky from these surfaces.
+    for l in 0..2 {
+        let powers = 9 * l + 3..9 * l + 6;
+        assert!(tables.suns[9 * l..9 * l + 3] == [0.0; 3] && tables.suns[powers.clone()].iter().all(|d| *d != 0.0), "{:?}", tables.suns);
+        for i in powers {
+            let at = |by: f32| {
+                let mut c = sunlit_case();
+                c.suns[i] += by;
+                run(&c).0
+            };
+            let want = (at(3e-3) - at(-3e-3)) / 6e-3;
+            assert!((tables.suns[i] as f64 - want).abs() < 0.02 * want.abs() + 1e-3, "{i}: {} {want}", tables.suns[i]);
+        }
+    }
+}
+
+#[test]
+fn the_light_of_a_perfect_explanation_has_no_loss() {
+    let mut c = case();
+    for r in 0..RAYS {
+        let l = [0, 1, 1, 0, 1][r];
+        let (light, sky) = (&c.lights[l * LIGHT..][..LIGHT], &c.skies[l * SKY..][..SKY]);
+        let rgb = color(&c.values[r * CHANNELS..][..CHANNELS], c.opacity[r], &c.dirs[3 * r..3 * r + 3], light, sky, None).rgb;
+        (0..3).for_each(|k| c.target[3 * r + k] = encode(rgb[k] * c.gains[3 * r + k].exp()).0);
+    }
+    let tables = run(&c).2;
+    assert!(tables.mse < 1e-10 && tables.median < 1e-5, "{tables:?}");
+}
+
+#[test]
+fn pixels_that_fit_badly_count_less() {
+    let c = case();
+    let with = |robust: f32| {
+        let loss = SceneLoss {
+            weights: Weights {
+                huber: 1.0,
+                robust,
+                orientation: 0.0,
+                shadow: 0.0,
+                negative: 0.0,
+                distortion: 0.0,
+                masked_sky: 0.0,
+                likely_sky: 0.0,
+                gauge: 0.0,
+                tie: 0.0,
+                push: 0.0,
+            },
+            target: &c.target,
+            alpha: &[1.0; RAYS],
+            noise: &[],
+            counts: &[1.0; RAYS],
+            dirs: &c.dirs,
+            light: &[0; RAYS],
+            image: &[0; RAYS],
+            lights: &c.lights,
+            skies: &c.skies,
+            gains: &[],
+            suns: None,
+            out: Mutex::default(),
+        };
+        let mut d = RayGradients::default();
+        d.clear(RAYS, CHANNELS);
+        loss.batch(&RayOutputs { values: &c.values, opacity: &c.opacity, depth: &[0.0; RAYS] }, &mut d)
+    };
+    assert!(with(0.05) < 0.2 * with(0.0), "{} {}", with(0.05), with(0.0));
+}
