@@ -12,6 +12,7 @@ use crate::error::{PipelineError, Result};
 use diorama_data::{DataError, masks, photo, transforms_json};
 use diorama_geom::capture::Frame;
 use diorama_geom::color::{linear_from_srgb, srgb_from_linear};
+use diorama_geom::glam::DVec3;
 use diorama_geom::sh_light::ShLight;
 use diorama_geom::{Camera, Image, ImageU8, Similarity};
 use diorama_kernels::ops::ray_generation::PosedCamera;
