@@ -116,27 +116,6 @@ fn an_interrupted_run_goes_on_to_the_same_bits() {
     }
 }
 
-#[test]
-fn a_surface_that_explodes_or_vanishes_begins_again() {
-    let dir = tempfile::tempdir().unwrap();
-    let mut config = Config::new(Preset::Ci, photographs().into());
-    (config.run.topology_steps, config.run.texture_steps) = (8, 1);
-    // Distances that move by many cells per step.
-    config.optim.shape_rate = 50.0;
-    let mut folder = RunFolder::create(&dir.path().join("run"), false).unwrap();
-    let imported = capture::import(&config).unwrap();
-    let mut told = Vec::new();
-    let end = recipe::train(&config, &imported, &mut folder, false, &AtomicBool::new(false), &mut |e| {
-        if let diorama_engine::train::Event::Recovered { why, .. } = e {
-            told.push(why.clone());
-        }
-    });
-    assert!(told.iter().all(|w| w.contains("begins again") && w.contains("half the rate")) && !told.is_empty(), "{told:?}");
-    if let Err(e) = end {
-        assert!(e.to_string().contains("optim.shape_rate"), "{e}");
-    }
-}
-
 fn refusal(change: impl FnOnce(&Path, &mut Config)) -> PipelineError {
     let dir = tempfile::tempdir().unwrap();
     let data = dir.path().join("data");
