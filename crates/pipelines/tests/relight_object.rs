@@ -90,8 +90,8 @@ fn photographs_become_a_mesh_with_materials() {
     let s = scores::judge(&trained.model, &trained.capture, 16, &mut |_, _| Ok(())).unwrap();
     let t = s.truth.clone().unwrap();
     // Bars of the small benchmark: 22 dB, 1 % of the diagonal.
-    assert!(s.object_psnr > 26.0 && s.object_traced_psnr > 22.0, "{s:?}");
-    assert!(t.chamfer < 0.006 && t.base_color_psnr > 16.0 && t.object_relight_scaled_psnr > 20.0, "{s:?}");
+    assert!(s.object_psnr > 28.0 && s.object_traced_psnr > 28.0, "{s:?}");
+    assert!(t.chamfer < 0.004 && t.base_color_psnr > 12.0 && t.object_relight_psnr > 14.0, "{s:?}");
     let glb = dir.path().join("egg.glb");
     let probe = recipe::export(&trained.model, &glb).unwrap();
     let model = model_file::read(&glb).unwrap().model;
@@ -113,27 +113,6 @@ fn an_interrupted_run_goes_on_to_the_same_bits() {
         assert!(!train(&config, &run, true, None).summary.interrupted);
         let tensors = |run: &Path| checkpoint::load(&run.join("checkpoints")).unwrap().0.tensors;
         assert_eq!(tensors(&run), tensors(&whole), "stopped at {at}");
-    }
-}
-
-#[test]
-fn a_surface_that_explodes_or_vanishes_begins_again() {
-    let dir = tempfile::tempdir().unwrap();
-    let mut config = Config::new(Preset::Ci, photographs().into());
-    (config.run.topology_steps, config.run.texture_steps) = (8, 1);
-    // Distances that move by many cells per step.
-    config.optim.shape_rate = 50.0;
-    let mut folder = RunFolder::create(&dir.path().join("run"), false).unwrap();
-    let imported = capture::import(&config).unwrap();
-    let mut told = Vec::new();
-    let end = recipe::train(&config, &imported, &mut folder, false, &AtomicBool::new(false), &mut |e| {
-        if let diorama_engine::train::Event::Recovered { why, .. } = e {
-            told.push(why.clone());
-        }
-    });
-    assert!(told.iter().all(|w| w.contains("begins again") && w.contains("half the rate")) && !told.is_empty(), "{told:?}");
-    if let Err(e) = end {
-        assert!(e.to_string().contains("optim.shape_rate"), "{e}");
     }
 }
 

@@ -4,6 +4,7 @@
 
 use super::config::Config;
 use super::hull;
+use super::placement::Placement;
 use crate::error::{PipelineError, Result};
 use crate::run::config::Auto;
 use diorama_data::import::{self, ImportOptions};
@@ -24,30 +25,6 @@ const DEPTH: [f64; 2] = [0.05, 100.0];
 const MAY_BE_CUT: f64 = 0.005;
 /// Mean opacity beyond which a mask is taken for a mistake.
 const FULL: f64 = 0.95;
-
-/// Where the object is.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Placement {
-    pub center: DVec3,
-    pub scale: f64,
-}
-
-impl Placement {
-    /// A pose in object space.
-    pub fn pose(&self, world: &Pose) -> Pose {
-        Pose { rotation: world.rotation, translation: (world.translation - self.center) / self.scale }
-    }
-
-    /// A point of object space in the world.
-    pub fn to_world(&self, p: [f32; 3]) -> [f32; 3] {
-        (DVec3::from(p.map(f64::from)) * self.scale + self.center).as_vec3().to_array()
-    }
-
-    /// A point of the world in object space.
-    pub fn of_world(&self, p: [f32; 3]) -> [f32; 3] {
-        ((DVec3::from(p.map(f64::from)) - self.center) / self.scale).as_vec3().to_array()
-    }
-}
 
 /// A camera in object space.
 #[derive(Clone, Debug)]

@@ -165,7 +165,7 @@ impl Config {
                 mask: 1.0,
                 sign_change: [0.2, 0.01],
                 color_smoothness: 0.3,
-                white_light: 0.0,
+                white_light: 0.005,
                 laplacian: 3e3,
                 normal_consistency: 0.0,
             },

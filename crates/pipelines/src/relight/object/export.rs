@@ -1,6 +1,6 @@
 //! The trained object as a model of glTF's materials.
 
-use super::capture::Placement;
+use super::placement::Placement;
 use super::textured::{CHANNELS, Textured};
 use diorama_geom::color::{srgb_from_linear, u8_from_unit};
 use diorama_geom::glam::DAffine3;

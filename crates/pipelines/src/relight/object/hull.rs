@@ -1,6 +1,6 @@
 //! Visual hull (Laurentini 1994): the points of space that all masks allow, as a signed distance.
 
-use super::capture::Placement;
+use super::placement::Placement;
 use diorama_geom::capture::focus_point;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, Image, Pose};

@@ -14,6 +14,7 @@ pub mod hull;
 pub mod loss;
 pub mod material;
 pub mod model;
+pub mod placement;
 pub mod probe;
 pub mod raster;
 pub mod recipe;

@@ -1,7 +1,8 @@
 //! A run's model: the stage that it is in, and its checkpoints.
 
-use super::capture::{ObjectCapture, ObjectView, Placement};
+use super::capture::{ObjectCapture, ObjectView};
 use super::config::Config;
+use super::placement::Placement;
 use super::probe::Probe;
 use super::textured::{Layout, Textured};
 use super::topology::Topology;

@@ -6,6 +6,7 @@
 use super::capture::{ObjectCapture, ObjectPhoto};
 use super::export;
 use super::model::{ObjectModel, Stage, joined};
+use super::placement::Placement;
 use super::probe::Probe;
 use super::truth::ObjectTruth;
 use crate::error::{PipelineError, Result};
@@ -15,7 +16,7 @@ use diorama_geom::color::{linear_from_srgb, srgb_from_linear};
 use diorama_geom::daylight::Daylight;
 use diorama_geom::environment::Environment;
 use diorama_geom::glam::DVec3;
-use diorama_geom::{ImageU8, Model, Pose};
+use diorama_geom::{ImageU8, Model};
 use diorama_kernels::ops::path_trace::{Film, Scene, Settings, View, cpu};
 use diorama_mesh::closest_point::TriangleTree;
 use rayon::prelude::*;
@@ -226,7 +227,7 @@ fn beside(a: &[f32], b: &[f32], p: &ObjectPhoto) -> ImageU8 {
 struct Traced {
     model: Model,
     scene: Scene,
-    placement: super::capture::Placement,
+    placement: Placement,
     samples: u32,
 }
 
@@ -241,16 +242,12 @@ impl Traced {
     }
 
     fn view(&self, p: &ObjectPhoto) -> Vec<f32> {
-        let view = View { camera: p.view.camera, world_from_camera: in_world(&p.view.pose, &self.placement), lens: None };
+        let view = View { camera: p.view.camera, world_from_camera: self.placement.pose_in_world(&p.view.pose), lens: None };
         let mut film = Film::new(&p.view.camera);
         let settings = Settings { bounces: BOUNCES, shows_light: false, ..Settings::default() };
         cpu::render(&self.scene, &view, &settings, self.samples, &mut film);
         film.image(|p| [p.color[0], p.color[1], p.color[2], p.opacity]).data
     }
-}
-
-fn in_world(pose: &Pose, placement: &super::capture::Placement) -> Pose {
-    Pose { rotation: pose.rotation, translation: pose.translation * placement.scale + placement.center }
 }
 
 /// Mean of the mean distances, in both directions, from the points that cameras see of one surface to the other one, over the diagonal.
@@ -263,7 +260,7 @@ fn chamfer(ours: &Model, exact: &Model, photos: &[ObjectPhoto], model: &ObjectMo
     for (i, scene) in scenes.iter().enumerate() {
         let (mut sum, mut n) = (0.0, 0usize);
         for p in photos.iter().step_by(step) {
-            let view = View { camera: p.view.camera, world_from_camera: in_world(&p.view.pose, &model.placement), lens: None };
+            let view = View { camera: p.view.camera, world_from_camera: model.placement.pose_in_world(&p.view.pose), lens: None };
             let points: Vec<DVec3> = cpu::first_hits(scene, &view, false).into_iter().flatten().map(|h| h.position).collect();
             let away = |p: &DVec3| (trees[1 - i].nearest(p.as_vec3().to_array()).squared_distance as f64).sqrt();
             sum += points.par_iter().map(away).collect::<Vec<_>>().iter().sum::<f64>();

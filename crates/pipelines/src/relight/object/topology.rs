@@ -1,11 +1,12 @@
 //! First stage: the surface of a signed distance on a tetrahedral grid, whose topology is found, with a material by position (Shen et al.
 //! 2021, DMTet; Munkberg et al. 2022, nvdiffrec).
 
-use super::capture::{BOX_HALF, ObjectPhoto, ObjectView, Placement};
+use super::capture::{BOX_HALF, ObjectPhoto, ObjectView};
 use super::config::Config;
 use super::hull;
 use super::loss::{self, PictureLoss};
 use super::material::{self, Material};
+use super::placement::Placement;
 use super::probe::Probe;
 use super::raster::{Shape, Surface, SurfaceGradient};
 use diorama_engine::params::ParamGroup;

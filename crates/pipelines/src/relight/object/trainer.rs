@@ -144,3 +144,65 @@ impl Trainee for Trainer<'_> {
         Ok(Some(Scores::from([Scalar::psnr("psnr", all.iter().sum::<f64>() / all.len() as f64)])))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::relight::object::capture::{ObjectPhoto, ObjectView};
+    use crate::relight::object::config::Preset;
+    use crate::relight::object::hull::Silhouette;
+    use crate::relight::object::placement::Placement;
+    use diorama_geom::glam::DVec3;
+    use diorama_geom::{Camera, Image, Pose};
+
+    /// Eight pictures of a gray ball.
+    fn ball() -> ObjectCapture {
+        let camera = Camera::pinhole(32, 32, 0.7);
+        let photo = |i: usize| {
+            let (angle, z) = (i as f64 * 2.4, -0.8 + 0.2 * i as f64);
+            let r = (1.0 - z * z).sqrt();
+            let pose = Pose::look_at(4.0 * DVec3::new(r * angle.cos(), r * angle.sin(), z), DVec3::ZERO, DVec3::Z);
+            let pixel = |p: usize| {
+                let d = pose.rotation * camera.direction((p % 32) as f64 + 0.5, (p / 32) as f64 + 0.5);
+                if pose.translation.cross(d).length() < 0.8 { [0.3, 0.3, 0.3, 1.0] } else { [0.0; 4] }
+            };
+            let rgba = Image { width: 32, height: 32, channels: 4, data: (0..32 * 32).flat_map(pixel).collect() };
+            ObjectPhoto { name: i.to_string(), rgba, view: ObjectView::new(camera, pose), split: Split::Train }
+        };
+        let photos: Vec<ObjectPhoto> = (0..8).map(photo).collect();
+        let silhouettes = photos.iter().map(|p| Silhouette::new(&p.rgba, p.view.camera, p.view.pose)).collect();
+        ObjectCapture { photos, placement: Placement { center: DVec3::ZERO, scale: 1.0 }, silhouettes }
+    }
+
+    #[test]
+    fn a_lost_surface_begins_again_until_that_is_in_vain() {
+        let capture = ball();
+        let mut model = ObjectModel::new(Config::new(Preset::Ci, "d".into()), &capture).unwrap();
+        // Far below what the hull says: nothing is inside.
+        model.begin_again(&capture, -9.0, 1.0).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let mut trainer = Trainer::new(model, capture, folder.path());
+        for (bias, rate) in [(-8.7, 0.5), (-8.4, 0.25)] {
+            assert!(trainer.step(0, 0.0).unwrap().loss.is_nan());
+            let (to, why) = trainer.recover().unwrap().unwrap();
+            assert!(to == 0 && why.contains("vanished") && why.contains("+0.3"), "{why}");
+            assert!((trainer.model.bias - bias).abs() < 1e-5 && trainer.model.rate_scale == rate);
+        }
+        assert!(trainer.step(0, 0.0).unwrap().loss.is_nan());
+        let e = trainer.recover().unwrap_err();
+        assert!(e.is_input() && e.to_string().contains("optim.shape_rate"), "{e}");
+    }
+
+    #[test]
+    fn every_photograph_comes_once_before_any_comes_again() {
+        let capture = ball();
+        let model = ObjectModel::new(Config::new(Preset::Ci, "d".into()), &capture).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let trainer = Trainer::new(model, capture, folder.path());
+        for round in 0..3 {
+            let mut chosen: Vec<usize> = (8 * round..8 * round + 8).flat_map(|s| trainer.chosen(s)).collect();
+            chosen.sort_unstable();
+            assert_eq!(chosen, (0..8).collect::<Vec<_>>());
+        }
+    }
+}
