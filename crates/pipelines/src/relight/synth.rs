@@ -26,6 +26,10 @@ const EXPOSED: f64 = 1.1;
 const CANDIDATES: usize = 40;
 /// Least distance in meters of what the center of a view shows.
 const NEAREST: f64 = 5.0;
+/// Pixels of each view, share of the visible points on either side of an axis, and edge of the outer cube at most, by which the cubes are chosen.
+const PROBED: (u32, u32) = (24, 18);
+const OUTLIERS: f64 = 0.1;
+const MOST_SCALE: u32 = 8;
 /// Bounces of light.
 const BOUNCES: u32 = 6;
 /// Every so many views, one is held out.
@@ -212,9 +216,8 @@ pub fn generate(
         truth::save_light(out, &truth.lights[l].name, daylight)?;
     }
     truth.save(out)?;
-    let bounds = model.bounds().unwrap_or_default();
     for (name, frames) in ["transforms_train.json", "transforms_test.json"].into_iter().zip(frames) {
-        atomic::write(&out.join(name), &serde_json::to_vec_pretty(&capture(frames, cameras, bounds)).expect("plain values"))?;
+        atomic::write(&out.join(name), &serde_json::to_vec_pretty(&capture(frames, &scene, cameras)).expect("plain values"))?;
     }
     Ok(made)
 }
@@ -246,14 +249,27 @@ fn frame(name: &str, camera: &Camera, pose: &Pose, session: usize) -> serde_json
     })
 }
 
-/// `transforms.json` whose box holds cameras and scene: the inner cube is the whole of it.
-fn capture(frames: Vec<serde_json::Value>, cameras: &[(Camera, Pose)], (low, high): ([f64; 3], [f64; 3])) -> serde_json::Value {
-    let (mut low, mut high) = (DVec3::from(low), DVec3::from(high));
-    for (_, pose) in cameras {
-        (low, high) = (low.min(pose.translation), high.max(pose.translation));
+/// `transforms.json` whose inner cube holds the cameras and most of what they see, and whose outer cube all of it.
+fn capture(frames: Vec<serde_json::Value>, scene: &Scene, cameras: &[(Camera, Pose)]) -> serde_json::Value {
+    let mut seen: Vec<DVec3> = Vec::new();
+    for (camera, pose) in cameras {
+        let view = View { camera: camera.resized(PROBED.0, PROBED.1), world_from_camera: *pose, lens: None };
+        seen.extend(cpu::first_hits(scene, &view, true).into_iter().flatten().map(|h| h.position));
     }
+    let standing = || cameras.iter().map(|(_, pose)| pose.translation);
+    let range = |axis: usize| -> (f64, f64) {
+        let mut along: Vec<f64> = seen.iter().map(|p| p[axis]).collect();
+        along.sort_by(f64::total_cmp);
+        let at = |share: f64| along.get((share * (along.len().max(1) - 1) as f64) as usize).copied();
+        let fold = |first: Option<f64>, of: fn(f64, f64) -> f64| standing().map(|p| p[axis]).chain(first).reduce(of).unwrap_or(0.0);
+        (fold(at(OUTLIERS), f64::min), fold(at(1.0 - OUTLIERS), f64::max))
+    };
+    let [(x0, x1), (y0, y1), (z0, z1)] = [range(0), range(1), range(2)];
+    let (low, high) = (DVec3::new(x0, y0, z0), DVec3::new(x1, y1, z1));
     let (center, half) = (0.5 * (low + high), 0.505 * (high - low).max_element());
+    let farthest = seen.iter().map(|p| (*p - center).abs().max_element()).fold(half, f64::max);
+    let aabb_scale = (farthest / half).min(MOST_SCALE as f64).ceil().max(1.0) as u32;
     let scale = 0.5 / half;
     let offset = DVec3::splat(0.5) - scale * center;
-    json!({ "aabb_scale": 1, "scale": scale, "offset": [offset.x, offset.y, offset.z], "frames": frames })
+    json!({ "aabb_scale": aabb_scale.next_power_of_two(), "scale": scale, "offset": [offset.x, offset.y, offset.z], "frames": frames })
 }

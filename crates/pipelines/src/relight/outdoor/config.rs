@@ -115,6 +115,8 @@ pub struct NormalsConfig {
     pub tie: f32,
     /// Share of the tie's gradient that the density gets.
     pub push: f32,
+    /// Share of the gradient of colors that normals get: light that they explain badly bends them away from surfaces.
+    pub lit: f32,
 }
 
 /// Rays and samples.
@@ -227,15 +229,15 @@ impl Config {
                 net_rate: 1e-3,
                 light_rate: 2e-2,
                 final_scale: 0.05,
-                even_until: 0.6,
-                directed_from: 0.8,
+                even_until: 0.3,
+                directed_from: 0.5,
                 sky_from: 0.4,
             },
-            normals: NormalsConfig { first: 1.0 / 64.0, last: 1.0 / 256.0, until: 0.6, tie: 3e-4, push: 0.0 },
+            normals: NormalsConfig { first: 1.0 / 64.0, last: 1.0 / 256.0, until: 0.6, tie: 1e-3, push: 0.0, lit: 0.0 },
             sampling: SamplingConfig {
                 rays: pick(512, 4096),
                 max_samples: 256,
-                near: 0.05,
+                near: 0.02,
                 occupancy_resolution: pick(64, 128),
                 occupancy_points: pick(1 << 14, 1 << 17),
                 occupancy_every: 16,
@@ -279,8 +281,8 @@ impl Configuration for Config {
             return fault("light: sun_from must lie between 0 and 1, sun_updates be at least 1, sun_cells from 16 to 512");
         }
         let n = &self.normals;
-        if !(n.last > 0.0 && n.first >= n.last && n.tie >= 0.0 && n.push >= 0.0) {
-            return fault("normals: last must be above 0, first at least last, tie and push 0 or more");
+        if !(n.last > 0.0 && n.first >= n.last && n.tie >= 0.0 && n.push >= 0.0 && n.lit >= 0.0) {
+            return fault("normals: last must be above 0, first at least last, tie, push and lit 0 or more");
         }
         if self.field.width == 0 || !self.field.width.is_multiple_of(16) || self.field.width > 512 {
             return fault("field.width: must be a multiple of 16 up to 512");

@@ -74,7 +74,7 @@ pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &Sheet)
         return Err(PipelineError::Usage(format!("{}: has no truth; only generated benchmarks do", data.display())));
     }
     let truth = Truth::read(data)?;
-    let gauge = gauge(model, &truth);
+    let gauge = gauge(model, data, &truth)?;
     let (mut unseen, mut oracle, mut mean, mut seen, mut sunlit) = <(Errors, Errors, Errors, Errors, Errors)>::default();
     let (mut albedos, mut angles, mut shadows, mut depths) = <(Vec<_>, Vec<_>, Vec<_>, Vec<_>)>::default();
     let per_meter = model.model_from_world.scale as f32;
@@ -178,24 +178,25 @@ pub fn encoded(linear: &Image) -> ImageU8 {
     Image { data, ..linear.clone() }.to_u8()
 }
 
-/// Factor by channel from exact light to the model's: brightness is shared between albedo and light by chance.
-fn gauge(model: &SceneModel, truth: &Truth) -> [f64; 3] {
-    std::array::from_fn(|k| {
-        let (mut both, mut own) = (0.0, 0.0);
-        for (l, session) in model.sessions.iter().enumerate() {
-            let Some(exact) = truth.lights.get(*session as usize) else { continue };
-            let mut learned = model.light(l);
-            if let Some(s) = model.sun(l) {
-                let irradiance = [3, 4, 5].map(|k| s[k] as f64 * std::f64::consts::PI);
-                learned.add_sun(DVec3::new(s[0] as f64, s[1] as f64, s[2] as f64), irradiance);
-            }
-            for i in 0..9 {
-                both += learned.0[i][k] * exact.harmonics[i][k];
-                own += exact.harmonics[i][k] * exact.harmonics[i][k];
-            }
-        }
-        if own > 0.0 && both > 0.0 { both / own } else { 1.0 }
-    })
+/// Factor by channel from exact light to the model's: that by which the model's albedo is too dark, as brightness is shared between albedo and
+/// light by chance.
+fn gauge(model: &SceneModel, data: &Path, truth: &Truth) -> Result<[f64; 3]> {
+    let mut pairs = Vec::new();
+    for frame in model.capture.indices(Split::Test) {
+        let name = &model.capture.frames[frame].name;
+        let Some(of) = truth.views.iter().find(|v| v.light == truth.unseen && name.ends_with(&v.photograph)) else { continue };
+        let layers = truth::read_view(data, &of.view)?;
+        let view = model.view(&model.posed(frame), &ViewLight::learned(model, 0), &mut |_| {});
+        let rgb = |image: &Image, i: usize| -> [f32; 3] { std::array::from_fn(|k| image.data[3 * i + k]) };
+        pairs.extend(valid(&layers).map(|i| (rgb(&view.albedo, i), rgb(&layers.albedo, i))));
+    }
+    Ok(std::array::from_fn(|k| factor(&pairs, k)))
+}
+
+/// The factor by which a channel of the first colors comes nearest to that of the second.
+fn factor(pairs: &[([f32; 3], [f32; 3])], k: usize) -> f64 {
+    let of = |f: &dyn Fn(f64, f64) -> f64| pairs.iter().map(|(got, want)| f(got[k] as f64, want[k] as f64)).sum::<f64>();
+    of(&|g, w| g * w) / of(&|g, _| g * g).max(1e-12)
 }
 
 /// An exact light, scaled.
@@ -229,7 +230,7 @@ fn scaled_psnr(pairs: &[([f32; 3], [f32; 3])]) -> f64 {
     let mut sum = 0.0;
     for k in 0..3 {
         let of = |f: &dyn Fn(f64, f64) -> f64| pairs.iter().map(|(got, want)| f(got[k] as f64, want[k] as f64)).sum::<f64>();
-        let factor = of(&|g, w| g * w) / of(&|g, _| g * g).max(1e-12);
+        let factor = factor(pairs, k);
         sum += of(&|g, w| (factor * g - w) * (factor * g - w));
     }
     -10.0 * (sum / (3 * pairs.len()).max(1) as f64).log10()

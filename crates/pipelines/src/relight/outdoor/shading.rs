@@ -54,6 +54,7 @@ pub struct Weights {
     /// Angle between normal and slope, and the share of its gradient that the slope gets.
     pub tie: f32,
     pub push: f32,
+    pub lit: f32,
 }
 
 /// What the rays of a step are compared with.
@@ -321,6 +322,7 @@ impl SceneLoss<'_> {
                 (0..16).for_each(|i| tables.skies[light_of * SKY + 3 * i + k] += share * 0.1 * s.sky[k] * s.sky_basis[i]);
             }
         }
+        d_normal.iter_mut().for_each(|d| *d *= w.lit);
         if sunlit.is_none() {
             loss += (share * w.shadow * (1.0 - shadow) * (1.0 - shadow)) as f64;
             d_values[3] -= share * 2.0 * w.shadow * (1.0 - shadow);

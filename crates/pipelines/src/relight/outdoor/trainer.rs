@@ -175,6 +175,7 @@ impl Trainer<'_> {
             gauge: c.loss.gauge,
             tie: c.normals.tie,
             push: c.normals.push,
+            lit: c.normals.lit,
         }
     }
 
