@@ -17,8 +17,8 @@ use crate::run::RunFolder;
 use crate::run::config::Configuration;
 use diorama_data::{DataError, atomic, photo};
 use diorama_engine::train::Event;
-use diorama_geom::capture::Split;
 use diorama_geom::ImageU8;
+use diorama_geom::capture::Split;
 use diorama_mesh::extract::Method;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -81,12 +81,7 @@ pub struct Made {
 ///
 /// # Errors
 /// When a stage fails, or the folder cannot be written.
-pub fn quickstart(
-    folder: &Path,
-    o: &QuickstartOptions,
-    stop: &AtomicBool,
-    listeners: Listeners,
-) -> Result<Option<Made>> {
+pub fn quickstart(folder: &Path, o: &QuickstartOptions, stop: &AtomicBool, listeners: Listeners) -> Result<Option<Made>> {
     std::fs::create_dir_all(folder).map_err(DataError::io(folder, "create"))?;
     let Listeners { stage: note, share, events } = listeners;
     let mut q = Quickstart { folder, o, stop, notes: Vec::new(), share, events };

@@ -12,7 +12,9 @@ use std::path::PathBuf;
 
 /// Run every step on a street and a chair that the program generates itself
 #[derive(Args, Clone, Debug)]
-#[command(after_help = "Example:\n  diorama relight quickstart -o runs/relight-quickstart\n\nAfter an interruption, the same command goes on.")]
+#[command(
+    after_help = "Example:\n  diorama relight quickstart -o runs/relight-quickstart\n\nAfter an interruption, the same command goes on."
+)]
 pub struct Quickstart {
     /// Folder for all results
     #[arg(short, long, default_value = "runs/relight-quickstart")]

@@ -1,12 +1,12 @@
 //! `diorama relight train`
 
-use crate::commands::view::ListenFlags;
 use crate::commands::process::{INTERRUPT, use_threads, watch_interrupts};
+use crate::commands::view::ListenFlags;
 use crate::commands::{Outcome, Verb};
 use crate::terminal::Progress;
 use clap::Args;
-use diorama_pipelines::relight::outdoor::config::{Config, Preset};
 use diorama_geom::Capture;
+use diorama_pipelines::relight::outdoor::config::{Config, Preset};
 use diorama_pipelines::relight::outdoor::model::SceneModel;
 use diorama_pipelines::relight::outdoor::recipe;
 use diorama_pipelines::relight::outdoor::viewing::{self, RunView};

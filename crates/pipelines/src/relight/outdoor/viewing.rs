@@ -105,7 +105,8 @@ impl ViewedScene {
                 light.sky.iter_mut().for_each(|v| *v *= strength as f32);
                 match (&mut light.sun, added) {
                     (Some(sun), _) => {
-                        let (direction, irradiance) = added.unwrap_or((turn * DVec3::new(sun[0] as f64, sun[1] as f64, sun[2] as f64), [0.0; 3]));
+                        let (direction, irradiance) =
+                            added.unwrap_or((turn * DVec3::new(sun[0] as f64, sun[1] as f64, sun[2] as f64), [0.0; 3]));
                         sun[..3].copy_from_slice(&direction.as_vec3().to_array());
                         sun[3..].iter_mut().for_each(|v| *v *= strength as f32);
                         if added.is_some() {
@@ -190,7 +191,12 @@ impl ViewedModel for ViewedScene {
             control("strength", "Strength", "Factor of the light", slider(0.0, 4.0, 0.05, "", 1.0)),
             control("sun_azimuth", "Sun azimuth", "Of the clear sky's sun or the added one", slider(-180.0, 180.0, 1.0, "°", 140.0)),
             control("sun_elevation", "Sun elevation", "Height of the sun above the horizon", slider(0.0, 90.0, 1.0, "°", 35.0)),
-            control("sun_power", "Added sun", "Irradiance of a sun besides a learned light or in place of its sun", slider(0.0, 6.0, 0.1, "", 0.0)),
+            control(
+                "sun_power",
+                "Added sun",
+                "Irradiance of a sun besides a learned light or in place of its sun",
+                slider(0.0, 6.0, 0.1, "", 0.0),
+            ),
         ]
     }
 
