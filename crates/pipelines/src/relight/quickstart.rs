@@ -48,7 +48,7 @@ impl Default for QuickstartOptions {
     fn default() -> Self {
         QuickstartOptions {
             street: SynthOptions { views: 20, lights: 4, size: (96, 54), samples: 48, seed: 0 },
-            scene_steps: 2500,
+            scene_steps: 1500,
             chair_views: 32,
             chair_size: (128, 128),
             object: object::config::Preset::Fast,

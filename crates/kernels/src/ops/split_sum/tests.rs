@@ -127,8 +127,8 @@ fn levels_and_roughness_are_inverse() {
 #[test]
 fn a_white_metal_in_a_white_furnace_is_invisible() {
     let ones = [1.0f64; 3];
-    for (r, cosine) in [(0.1, 0.9), (0.5, 0.3), (1.0, 0.6)] {
-        let view = [(1.0 - cosine * cosine as f64).sqrt(), 0.0, cosine];
+    for (r, cosine) in [(0.1, 0.9f64), (0.5, 0.3), (1.0, 0.6)] {
+        let view = [(1.0 - cosine * cosine).sqrt(), 0.0, cosine];
         for m in [0.0, 1.0] {
             let p = Point { normal: [0.0, 0.0, 1.0], view, kd: ones, ks: [0.0, r, m], diffuse: ones, specular: ones };
             let out = reference::shade(&p)[0];

@@ -83,7 +83,7 @@ impl Problem<'_> {
 
     /// Error beyond which pixels count less.
     fn scale(&self, errors: &[[f64; 3]]) -> f64 {
-        let mut sizes: Vec<f64> = errors.iter().map(|e| size(e)).collect();
+        let mut sizes: Vec<f64> = errors.iter().map(size).collect();
         let at = sizes.len() / 2;
         (ROBUST * *sizes.select_nth_unstable_by(at, f64::total_cmp).1).max(LEAST)
     }

@@ -174,7 +174,7 @@ mod tests {
         let silhouettes: Vec<Silhouette> = (0..12)
             .map(|i| {
                 let (angle, z) = (i as f64 * 2.4, -0.8 + 1.6 * (i as f64 + 0.5) / 12.0);
-                let r = (1.0 - z * z as f64).sqrt();
+                let r = (1.0 - z * z).sqrt();
                 let eye = center + 2.0 * DVec3::new(r * angle.cos(), r * angle.sin(), z);
                 let pose = Pose::look_at(eye, center + DVec3::splat(0.05), DVec3::Z);
                 let mut image = Image::zeros(64, 64, 4);

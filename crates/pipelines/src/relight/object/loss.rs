@@ -87,7 +87,7 @@ mod tests {
             let mut q = p.clone();
             let at = |v: f64, q: &mut Vec<f32>| {
                 q[i] = v as f32;
-                let l = picture(q, &t, 1.5, Rng::new(3, 3), &mut vec![0.0; 40]);
+                let l = picture(q, &t, 1.5, Rng::new(3, 3), &mut [0.0; 40]);
                 l.color + l.mask
             };
             (i, (at(wide[i] + 1e-3, &mut q) - at(wide[i] - 1e-3, &mut q)) / 2e-3)

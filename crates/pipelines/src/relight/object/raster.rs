@@ -178,8 +178,8 @@ impl Surface {
             let c = &d_clip[4 * i..4 * i + 4];
             for k in 0..3 {
                 d_positions[i][k] += d[k] + (0..4).map(|j| view.clip[j][k] * c[j]).sum::<f32>();
-                d_normals[i][k] = d[3 + k];
             }
+            d_normals[i].copy_from_slice(&d[3..6]);
         }
         vertex_normals::cpu::backward(shape.faces, shape.positions, &d_normals, d_positions);
     }
