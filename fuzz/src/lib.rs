@@ -10,6 +10,8 @@ use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, ImageU8, Pose, Similarity, SparsePoint};
 use diorama_pipelines::Application;
 use diorama_pipelines::object::config::{Config, Method};
+use diorama_pipelines::relight::{self, outdoor};
+use diorama_pipelines::run::config::{self, Configuration};
 use diorama_pipelines::run::viewer_files;
 use std::path::PathBuf;
 use std::sync::OnceLock;
@@ -328,20 +330,29 @@ fn run_config(data: &[u8]) {
     let path = file("run/config.toml", data);
     let _ = Application::of_run(path.parent().expect("a folder"));
     let Ok(text) = std::str::from_utf8(data) else { return };
-    if let Ok(mut config) = Config::from_toml(text) {
-        let _ = config.check();
-        // A configuration that was read can be written and set.
-        let _ = Config::from_toml(&config.to_toml());
-        let _ = config.set("data.downscale", text);
-    }
+    read_config::<Config>(text);
+    read_config::<outdoor::config::Config>(text);
+    read_config::<relight::object::config::Config>(text);
     // An option's value may be anything.
     let _ = Config::new(Method::Ngp, "x".into()).set(text, text);
+}
+
+/// A configuration that was read can be written and set.
+fn read_config<C: Configuration>(text: &str) {
+    if let Ok(mut config) = config::from_toml::<C>(text) {
+        let _ = config.check();
+        let _ = config::from_toml::<C>(&config::to_toml(&config));
+        let _ = config::set(&mut config, "data.downscale", text);
+    }
 }
 
 fn config_seeds() -> Vec<Vec<u8>> {
     let of = |m| Config::new(m, "data".into()).to_toml();
     let unknown = of(Method::Ngp).replace("\"object\"", "\"sculpture\"");
-    [Method::Ngp, Method::Nerf, Method::Mlp, Method::Baseline].map(of).into_iter().chain([unknown]).map(String::into_bytes).collect()
+    let scene = config::to_toml(&outdoor::config::Config::template());
+    let object = config::to_toml(&relight::object::config::Config::template());
+    let methods = [Method::Ngp, Method::Nerf, Method::Mlp, Method::Baseline].map(of);
+    methods.into_iter().chain([unknown, scene, object]).map(String::into_bytes).collect()
 }
 
 fn crop_json(data: &[u8]) {

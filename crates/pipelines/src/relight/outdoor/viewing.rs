@@ -137,7 +137,7 @@ impl ViewedScene {
     /// All layers of a view.
     fn draw(&self, r: &ViewRequest) -> SceneView {
         let m = &self.model;
-        let mut tracer = m.tracer(Quality::Fast);
+        let mut tracer = m.tracer(Quality::Full);
         let corner = |c: [f32; 3]| m.model_from_world.point(DVec3::from(c.map(f64::from))).as_vec3().to_array();
         tracer.clip = r.clip.map(|(low, high)| (corner(low), corner(high)));
         m.view_with(tracer, &self.posed(r), &self.light(&r.values), &mut |_| {})
