@@ -49,8 +49,8 @@ impl Daylight {
         Daylight { environment, sun: (sun.irradiance[1] > 0.0).then_some(sun) }
     }
 
-    /// The same light with the sun of its map apart, where there is one: a peak that is at least [`PEAK`] times as bright as the mean. What
-    /// lies within [`GLARE`] of it and is brighter than the ring around is the sun.
+    /// The same light with the sun of its map apart, where there is one: a peak that is at least `PEAK` times as bright as the mean. What
+    /// lies within `GLARE` of it and is brighter than the ring around is the sun.
     pub fn sun_apart(self) -> Daylight {
         if self.sun.is_some() {
             return self;
