@@ -33,7 +33,7 @@ pub fn html(m: &Made) -> String {
     format!(
         "<!doctype html>\n<html lang=\"en\"><meta charset=\"utf-8\"><title>diorama relight quickstart</title>\n<style>{STYLE}</style>\n\
 <h1>diorama relight quickstart</h1>\n\
-<h2>Both together</h2>\n<p>The trained chair in the trained street ({chair}, {site}) under a light that neither was photographed in, path-traced from \
+<h2>Both together</h2>\n<p>The trained chair ({chair}) in the street (the trained one is {site}) under a light that neither was photographed in, path-traced from \
 <code>scene.toml</code>.</p>\n<img src=\"composed.png\" alt=\"the chair in the street\">\n{notes}\
 <h2>The street</h2>\n<table>{scene}</table>\n<p>Held-out views in the light of no photograph: picture, albedo, normals, shadow and depth; the model's above, the true ones below.</p>\n\
 <img src=\"pictures/layers.png\" alt=\"layers\">\n\
