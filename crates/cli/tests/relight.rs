@@ -138,3 +138,18 @@ fn wrong_requests_are_refused_in_one_line() {
     refused(at, &["eval", "."], &["run folder"]);
     refused(at, &["render", ".", "--layers", "gloss"], &["--layers", "albedo"]);
 }
+
+#[test]
+fn a_quickstart_needs_a_folder_of_its_own_and_can_be_interrupted() {
+    let dir = folder();
+    refused(dir.path(), &["quickstart", "-o", "."], &["holds no quickstart", "--out"]);
+    let mut begun = command(dir.path(), &["quickstart", "-o", "q"]).spawn().unwrap();
+    let street = dir.path().join("q/street/images");
+    while !std::fs::read_dir(&street).is_ok_and(|mut d| d.next().is_some()) {
+        assert!(begun.try_wait().unwrap().is_none(), "it ended before it photographed anything");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    assert!(Command::new("kill").args(["-INT", &begun.id().to_string()]).status().unwrap().success());
+    assert_eq!(begun.wait().unwrap().code(), Some(130));
+    assert!(!dir.path().join("q/street/transforms_train.json").exists(), "what is unfinished does not look finished");
+}
