@@ -44,7 +44,7 @@ pub struct QuickstartOptions {
 }
 
 impl Default for QuickstartOptions {
-    /// About a quarter of an hour on two cores.
+    /// About seven minutes on two cores.
     fn default() -> Self {
         QuickstartOptions {
             street: SynthOptions { views: 20, lights: 4, size: (96, 54), samples: 48, seed: 0 },
