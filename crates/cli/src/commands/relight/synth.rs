@@ -2,6 +2,7 @@
 
 use super::light_flags::LightFlags;
 use crate::commands::process::{INTERRUPT, usage, use_threads, watch_interrupts};
+use crate::commands::render::parse_size;
 use crate::commands::{Outcome, Verb};
 use crate::terminal::ShareShown;
 use clap::Args;
@@ -99,11 +100,7 @@ impl Verb for Synth {
 impl Synth {
     /// Photographs of an object.
     fn object(&self, object: &str) -> Result<Outcome> {
-        let of = |text: &str| text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
-        let size: (u32, u32) = if self.size == "ci" { (64, 64) } else { of(&self.size).unwrap_or((0, 0)) };
-        if !(16..=8192).contains(&size.0) || !(16..=8192).contains(&size.1) {
-            return Err(usage(format!("size {}: of an object give WIDTHxHEIGHT from 16 to 8192, for example 256x256", self.size)));
-        }
+        let size = if self.size == "ci" { (64, 64) } else { parse_size(&self.size)? };
         let unseen = self.unseen_light.parse().map_err(|e: String| usage(format!("unseen-light {e}")))?;
         let options = ObjectSynth {
             object: object.into(),
