@@ -178,6 +178,12 @@ pub struct Capture {
 }
 
 impl Capture {
+    /// How far cameras stand from what they look at, in inner cubes.
+    pub fn viewing_distance(&self) -> f64 {
+        let poses: Vec<Pose> = self.frames.iter().map(|f| f.world_from_camera).collect();
+        focus_point(&poses).1 * self.scene.model_from_world().scale
+    }
+
     /// A capture of frames without other metadata, in their own world.
     pub fn new(frames: Vec<Frame>, scene: SceneBox) -> Capture {
         Capture {

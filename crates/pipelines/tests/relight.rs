@@ -82,8 +82,8 @@ fn an_interrupted_run_ends_as_if_it_had_not_been() {
         let mut folder = if resume { RunFolder::open(&at).unwrap().0 } else { RunFolder::create(&at, false).unwrap() };
         let mut config = config(&data, 24);
         config.run.log_every = 1;
-        // Suns are found before the interruption and after it.
-        (config.light.model, config.light.sun_from, config.light.sun_cells) = ("sun".into(), 0.2, 32);
+        // Interrupted while surfaces are learned, and between two times that suns are found.
+        (config.light.model, config.light.from, config.light.sun_cells) = ("sun".into(), 0.3, 32);
         let stop = AtomicBool::new(false);
         let mut logged = 0;
         let trained = recipe::train(&config, &mut folder, resume, None, &stop, &mut |e| {
@@ -96,7 +96,8 @@ fn an_interrupted_run_ends_as_if_it_had_not_been() {
         (trained.summary.interrupted, trained.model)
     };
     let (_, whole) = train("whole", None, false);
-    assert!(train("parts", Some(9), false).0);
+    assert!(train("parts", Some(4), false).0);
+    assert!(train("parts", Some(9), true).0);
     let (_, resumed) = train("parts", None, true);
     assert_eq!(whole.field.weights.values, resumed.field.weights.values);
     assert_eq!(whole.field.encoder.table().unwrap().values, resumed.field.encoder.table().unwrap().values);

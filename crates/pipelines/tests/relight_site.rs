@@ -35,6 +35,7 @@ fn model() -> SceneModel {
     let at = |i: usize| DVec3::new((i % 6) as f64 / 2.5 - 1.0, (i / 6 % 6) as f64 * 0.32 - 0.8, (i / 36) as f64 * 0.28);
     capture.points = (0..216).map(|i| SparsePoint { position: at(i), color: [0; 3], error: 0.0, frames: vec![0, 1, 2] }).collect();
     let mut model = SceneModel::new(Config::new(Preset::Ci, "data".into()), capture).unwrap();
+    model.begin_light().unwrap();
     model.field.net.density.shift = DENSE;
     model
 }

@@ -1,9 +1,9 @@
 //! The space and the grids of a field, as a configuration and a capture decide them.
 
 use super::config::Config;
-use diorama_geom::capture::{Split, focus_point};
+use diorama_geom::Capture;
+use diorama_geom::capture::Split;
 use diorama_geom::contraction::Space;
-use diorama_geom::{Capture, Pose};
 use diorama_kernels::ops::hash_grid::HashGridConfig;
 
 /// Cascades of the occupancy grid of unbounded space: they reach 64 inner cubes far, beyond which a ray has a few samples left.
@@ -16,12 +16,6 @@ const FINEST: (f64, f64) = (512.0, 2048.0);
 const PIXELS_PER_ROW: f64 = 5.0;
 const ROWS: (f64, f64) = (14.0, 19.0);
 
-/// How far cameras stand from what they look at, in inner cubes.
-pub fn viewing_distance(capture: &Capture) -> f64 {
-    let poses: Vec<Pose> = capture.frames.iter().map(|f| f.world_from_camera).collect();
-    focus_point(&poses).1 * capture.scene.model_from_world().scale
-}
-
 /// The space that a configuration gives a capture: opaque photographs show the world to its end.
 pub fn space(config: &Config, capture: &Capture, has_alpha: bool) -> Space {
     let unbounded = match &config.field.space[..] {
@@ -30,7 +24,7 @@ pub fn space(config: &Config, capture: &Capture, has_alpha: bool) -> Space {
     };
     match unbounded {
         // What lies around the cameras keeps its shape.
-        true => Space::Contracted((2.0 * viewing_distance(capture)).clamp(1.0, 8.0) as f32),
+        true => Space::Contracted((2.0 * capture.viewing_distance()).clamp(1.0, 8.0) as f32),
         false => Space::Cube(capture.scene.aabb_scale.max(1) as f32),
     }
 }
@@ -44,7 +38,7 @@ pub fn hash_grid(config: &Config, capture: &Capture, space: Space) -> HashGridCo
         0 => {
             let mut focal: Vec<f64> = train.iter().map(|c| c.fx.max(c.fy)).collect();
             focal.sort_by(f64::total_cmp);
-            let per_cube = (2.0 * focal[focal.len() / 2] / viewing_distance(capture)).clamp(FINEST.0, FINEST.1);
+            let per_cube = (2.0 * focal[focal.len() / 2] / capture.viewing_distance()).clamp(FINEST.0, FINEST.1);
             let cubes = match space {
                 Space::Contracted(edge) => 2.0 * edge,
                 Space::Cube(edge) => edge,

@@ -16,7 +16,6 @@ mod loading;
 pub mod memory;
 pub mod model;
 mod model_state;
-mod nearest;
 mod observations;
 pub mod points;
 pub mod quickstart;

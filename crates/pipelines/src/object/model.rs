@@ -1,7 +1,7 @@
 //! The model of the object application: a capture with the fields that are fitted to it.
 
 use super::config::{Background, Config, Method};
-use super::field_shape::{cascades, hash_grid, space, viewing_distance};
+use super::field_shape::{cascades, hash_grid, space};
 use crate::error::{PipelineError, Result};
 use diorama_engine::background::LearnedBackground;
 use diorama_engine::fields::{self, DensityQuery, Field, FieldBuffers, Pruning};
@@ -160,7 +160,7 @@ impl ObjectModel {
 
     /// How far cameras stand from what they look at, in inner cubes.
     pub fn viewing_distance(&self) -> f64 {
-        viewing_distance(&self.capture)
+        self.capture.viewing_distance()
     }
 
     /// The training cameras as given.

@@ -1,7 +1,7 @@
 //! Pixels of training photographs whose distance is known, from sparse points or from stereo.
 
 use super::model::ObjectModel;
-use super::nearest;
+use crate::run::nearest;
 use diorama_engine::samplers::pixels::{Observation, PixelSource};
 use diorama_engine::samplers::stereo;
 use diorama_geom::capture::SparsePoint;

@@ -7,6 +7,7 @@ pub mod device;
 pub mod folder;
 pub mod kept_capture;
 pub mod metrics;
+pub mod nearest;
 pub mod param_state;
 pub mod photographs;
 pub mod prepare;

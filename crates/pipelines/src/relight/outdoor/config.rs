@@ -2,7 +2,6 @@
 
 use crate::error::{PipelineError, Result};
 use crate::run::config::{self, Configuration};
-use diorama_engine::fields::{DensitySlope, Normals};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -13,6 +12,15 @@ pub enum Preset {
     /// Small: for tests and small photographs.
     Ci,
     Fast,
+}
+
+/// What a run learns at a time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// Surfaces, and how they look in each light.
+    Surfaces,
+    /// Albedo, shadow and light on surfaces that stay.
+    Light,
 }
 
 /// Where the photographs are and how they are read.
@@ -38,6 +46,8 @@ pub struct FieldConfig {
     pub finest: u32,
     /// Width of hidden layers.
     pub width: usize,
+    /// Numbers of the code of a light.
+    pub appearance: usize,
     /// `box` or `unbounded`.
     pub space: String,
     /// Density before anything is learned, per inner cube.
@@ -54,9 +64,9 @@ pub struct LightConfig {
     pub gain: bool,
     /// `sh`: spherical harmonics and a learned shadow; `sun`: a sun apart, whose shadows are those of the learned surfaces.
     pub model: String,
-    /// Share of the steps before the sun is told apart.
-    pub sun_from: f32,
-    /// Times that suns and shadows are brought up to date with the surfaces.
+    /// Share of the steps in which surfaces are learned, before light is told apart.
+    pub from: f32,
+    /// Times that suns are found anew after that.
     pub sun_updates: u64,
     /// Cells per axis in which surfaces are solid or not.
     pub sun_cells: usize,
@@ -70,18 +80,17 @@ pub struct LossConfig {
     pub huber: f32,
     /// Error beyond which a pixel counts less and less, in multiples of the running median; 0: all count alike.
     pub robust: f32,
-    /// Normals that face away from the camera.
-    pub orientation: f32,
-    /// Deviation of the shadow from 1.
+    /// Deviation of the shadow from 1 where it is not traced, and from the traced one.
     pub shadow: f32,
+    pub traced: f32,
+    /// Angle between the normals that the field says and those of its surfaces.
+    pub normal: f32,
     /// Negative irradiance.
     pub negative: f32,
-    /// Spread of a ray's weights (Barron et al. 2022).
+    /// Spread of a ray's weights (Barron et al. 2022), from nothing at first to this while coarse surfaces are found.
     pub distortion: f32,
-    /// Opacity where a mask says that there is nothing but sky.
-    pub masked_sky: f32,
-    /// Opacity of rays above the horizon whose color is that of the sky.
-    pub likely_sky: f32,
+    /// Light that ends away from the distance that comparing photographs tells.
+    pub depth: f32,
     /// Brightest twentieth of the albedo beyond a luminance of 0.9.
     pub gauge: f32,
 }
@@ -90,42 +99,25 @@ pub struct LossConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OptimConfig {
+    /// Of the surfaces: grid and network alike.
     pub grid_rate: f32,
+    pub table_decay: f32,
+    /// Of the heads of albedo, shadow and normal.
     pub net_rate: f32,
     pub light_rate: f32,
     /// Rate at the end over the rate at the start.
     pub final_scale: f32,
-    /// Shares of the steps between which light gains its direction: before, it is even, and normals do not matter.
-    pub even_until: f32,
-    pub directed_from: f32,
-    /// Share of the steps in which noise stands for the sky: a sky that learns at once explains surfaces, and the field stays empty.
-    pub sky_from: f32,
-}
-
-/// Normals: a head of the network says them, and they are tied to the slope of the density.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct NormalsConfig {
-    /// Distances at which opacities are compared for the slope, at first and from `until` on, in inner cubes.
-    pub first: f32,
-    pub last: f32,
-    /// Share of the steps in which the distance shrinks.
-    pub until: f32,
-    /// Weight of the angle between normal and slope.
-    pub tie: f32,
-    /// Share of the tie's gradient that the density gets.
-    pub push: f32,
-    /// Share of the gradient of colors that normals get: light that they explain badly bends them away from surfaces.
-    pub lit: f32,
 }
 
 /// Rays and samples.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SamplingConfig {
+    /// Rays per step; 0: as many as give `batch_samples` samples.
     pub rays: usize,
+    pub batch_samples: usize,
     pub max_samples: usize,
-    /// Nearest distance at which matter may be, in inner cubes.
+    /// Nearest distance at which matter may be, in inner cubes; 0: told by comparing photographs.
     pub near: f32,
     pub occupancy_resolution: usize,
     pub occupancy_points: usize,
@@ -153,16 +145,8 @@ pub struct Config {
     pub light: LightConfig,
     pub loss: LossConfig,
     pub optim: OptimConfig,
-    pub normals: NormalsConfig,
     pub sampling: SamplingConfig,
     pub run: RunConfig,
-}
-
-impl OptimConfig {
-    /// How much of the direction of light counts when a share of the steps is done.
-    pub fn directed(&self, progress: f32) -> f32 {
-        ((progress - self.even_until) / (self.directed_from - self.even_until).max(1e-6)).clamp(0.0, 1.0)
-    }
 }
 
 impl LightConfig {
@@ -171,20 +155,17 @@ impl LightConfig {
         self.model == "sun"
     }
 
-    /// Updates of suns and shadows that are due when a share of the steps is done.
-    pub fn sun_updates_by(&self, progress: f32) -> u64 {
-        if !self.has_sun() || progress < self.sun_from {
-            return 0;
+    /// Stage of a run of which a share is done, and the share of the stage: first surfaces, then light.
+    pub fn stage(&self, progress: f32) -> (Stage, f32) {
+        match progress < self.from {
+            true => (Stage::Surfaces, progress / self.from),
+            false => (Stage::Light, ((progress - self.from) / (1.0 - self.from)).min(1.0)),
         }
-        (((progress - self.sun_from) / (1.0 - self.sun_from) * self.sun_updates as f32) as u64 + 1).min(self.sun_updates)
     }
-}
 
-impl NormalsConfig {
-    /// How slopes are computed when a share of the steps is done.
-    pub fn of(&self, progress: f32) -> Normals {
-        let slope = DensitySlope::annealed(progress / self.until.max(1e-6), self.first, self.last);
-        Normals { slope, ..Normals::default() }
+    /// Times that suns are to be found anew when a share of the light's stage is done.
+    pub fn sun_updates_by(&self, share: f32) -> u64 {
+        if self.has_sun() { (share * (self.sun_updates + 1) as f32) as u64 } else { 0 }.min(self.sun_updates)
     }
 }
 
@@ -197,52 +178,45 @@ impl Config {
             seed: 0,
             data: DataConfig { path, downscale: 1, split: "file".into(), memory_budget: 4 << 30 },
             field: FieldConfig {
-                levels: pick(8, 16),
-                log2_size: pick(14, 19) as u32,
+                levels: 16,
+                log2_size: pick(16, 19) as u32,
                 base: 16,
-                finest: pick(256, 2048) as u32,
+                finest: pick(512, 2048) as u32,
                 width: pick(32, 64),
-                space: "box".into(),
-                first_density: 1.0,
+                appearance: 8,
+                space: "unbounded".into(),
+                first_density: 0.1,
             },
             light: LightConfig {
                 of: "session".into(),
                 gain: false,
                 model: "sh".into(),
-                sun_from: 0.75,
-                sun_updates: 4,
+                from: 0.6,
+                sun_updates: 3,
                 sun_cells: pick(128, 256),
             },
             loss: LossConfig {
                 huber: 0.1,
                 robust: 0.0,
-                orientation: 1e-4,
                 shadow: 1e-2,
+                traced: 0.1,
+                normal: 0.1,
                 negative: 0.1,
-                distortion: 1e-4,
-                masked_sky: 0.01,
-                likely_sky: 0.02,
+                distortion: 0.1,
+                depth: 0.3,
                 gauge: 0.1,
             },
-            optim: OptimConfig {
-                grid_rate: 1e-2,
-                net_rate: 1e-3,
-                light_rate: 2e-2,
-                final_scale: 0.05,
-                even_until: 0.3,
-                directed_from: 0.5,
-                sky_from: 0.4,
-            },
-            normals: NormalsConfig { first: 1.0 / 64.0, last: 1.0 / 256.0, until: 0.6, tie: 1e-3, push: 0.0, lit: 0.0 },
+            optim: OptimConfig { grid_rate: 1.5e-2, table_decay: 1e-5, net_rate: 3e-3, light_rate: 5e-3, final_scale: 0.05 },
             sampling: SamplingConfig {
-                rays: pick(512, 4096),
-                max_samples: 256,
-                near: 0.02,
-                occupancy_resolution: pick(64, 128),
-                occupancy_points: pick(1 << 14, 1 << 17),
+                rays: 0,
+                batch_samples: pick(1 << 15, 1 << 16),
+                max_samples: 1024,
+                near: 0.0,
+                occupancy_resolution: 128,
+                occupancy_points: 1 << 16,
                 occupancy_every: 16,
             },
-            run: RunConfig { steps: pick(1500, 20_000) as u64, seconds: 0.0, log_every: 50, save_every_seconds: 60.0 },
+            run: RunConfig { steps: pick(3000, 20_000) as u64, seconds: 0.0, log_every: 50, save_every_seconds: 60.0 },
         }
     }
 
@@ -277,12 +251,11 @@ impl Configuration for Config {
         if !["sh", "sun"].contains(&&self.light.model[..]) {
             return fault("light.model: expected sh or sun");
         }
-        if !(0.0..1.0).contains(&self.light.sun_from) || self.light.sun_updates == 0 || !(16..=512).contains(&self.light.sun_cells) {
-            return fault("light: sun_from must lie between 0 and 1, sun_updates be at least 1, sun_cells from 16 to 512");
+        if !(self.light.from > 0.0 && self.light.from < 1.0 && (16..=512).contains(&self.light.sun_cells)) {
+            return fault("light: from must lie between 0 and 1, sun_cells from 16 to 512");
         }
-        let n = &self.normals;
-        if !(n.last > 0.0 && n.first >= n.last && n.tie >= 0.0 && n.push >= 0.0 && n.lit >= 0.0) {
-            return fault("normals: last must be above 0, first at least last, tie, push and lit 0 or more");
+        if !(1..=256).contains(&self.field.appearance) {
+            return fault("field.appearance: must be from 1 to 256");
         }
         if self.field.width == 0 || !self.field.width.is_multiple_of(16) || self.field.width > 512 {
             return fault("field.width: must be a multiple of 16 up to 512");
@@ -297,17 +270,21 @@ impl Configuration for Config {
         if !(self.field.first_density > 0.0 && self.field.first_density.is_finite()) {
             return fault("field.first_density: must be above 0");
         }
-        if self.data.downscale == 0 || self.sampling.rays == 0 || self.sampling.max_samples == 0 || self.sampling.occupancy_every == 0 {
-            return fault("data.downscale, sampling.rays, max_samples and occupancy_every must be at least 1");
+        if self.data.downscale == 0
+            || self.sampling.batch_samples < 64
+            || self.sampling.max_samples == 0
+            || self.sampling.occupancy_every == 0
+        {
+            return fault("data.downscale, sampling.max_samples and occupancy_every must be at least 1, batch_samples at least 64");
         }
         let weights = [
             self.loss.robust,
-            self.loss.orientation,
             self.loss.shadow,
+            self.loss.traced,
+            self.loss.normal,
             self.loss.negative,
             self.loss.distortion,
-            self.loss.masked_sky,
-            self.loss.likely_sky,
+            self.loss.depth,
             self.loss.gauge,
         ];
         if self.loss.huber <= 0.0 || weights.iter().any(|w| !(*w >= 0.0 && w.is_finite())) {
@@ -331,7 +308,7 @@ mod tests {
         }
         let mut c = Config::template();
         for (key, value) in
-            [("light.of", "sun"), ("field.width", "20"), ("loss.huber", "0"), ("sampling.rays", "0"), ("field.space", "cube")]
+            [("light.of", "sun"), ("field.width", "20"), ("loss.huber", "0"), ("sampling.batch_samples", "10"), ("field.space", "cube")]
         {
             let e = c.clone().set(key, value).unwrap_err();
             assert!(e.is_input() && e.to_string().contains(key.split('.').next().unwrap()), "{e}");

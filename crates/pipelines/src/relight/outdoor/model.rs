@@ -1,14 +1,15 @@
 //! The scene model: a field of density, albedo and shadow, and light and sky per session.
 
-use super::config::Config;
+use super::config::{Config, Stage};
+use super::fields;
 use super::shading::{LIGHT, SKY};
 use super::sun::SUN;
 use super::visibility::{self, Visibility};
 use crate::error::{PipelineError, Result};
 use crate::run::param_state::{self, entry};
 use diorama_data::checkpoint::{Checkpoint, Entry};
-use diorama_engine::fields::{DirectionCode, Encoder, Field, Pruning, RayCodes};
-use diorama_engine::params::{ParamGroup, ParamSet, Schedule};
+use diorama_engine::fields::{Field, Pruning};
+use diorama_engine::params::{ParamGroup, ParamSet};
 use diorama_engine::renderers::volume::{Backdrop, Quality, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::placement::Placement;
@@ -16,32 +17,23 @@ use diorama_engine::step::Scene;
 use diorama_engine::train::Origin;
 use diorama_geom::capture::Split;
 use diorama_geom::contraction::Space;
-use diorama_geom::glam::DVec3;
-use diorama_geom::rng::Rng;
 use diorama_geom::sh_light::ShLight;
 use diorama_geom::{Capture, Similarity};
 use diorama_kernels::ops::adam::Adam;
-use diorama_kernels::ops::field_step::{FieldNet, Output};
-use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
-use diorama_kernels::ops::hash_grid::{HashGrid, HashGridConfig};
-use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Streams of initial values.
-const WEIGHTS: u64 = 1;
-const TABLE: u64 = 2;
-/// Output layers are padded to a whole vector.
-const PADDED: usize = 16;
-/// Shift of the shadow before its sigmoid: at first, little is in shadow.
-const LIT: f32 = 2.0;
-/// Where rays end in space without a bound, in inner cubes.
+/// Where rays end in space without a bound, in inner cubes, and where the sky begins: what was learned beyond is the sky of the photographs.
 const FAR: f32 = 1024.0;
+const SKY_FROM: f32 = 8.0;
 
 /// Field, lights and capture of one run.
 pub struct SceneModel {
     pub config: Config,
+    pub stage: Stage,
+    /// First step of the light's stage.
+    pub began: u64,
     pub capture: Capture,
     pub model_from_world: Similarity,
     pub field: Field,
@@ -52,7 +44,7 @@ pub struct SceneModel {
     pub skies: ParamGroup,
     /// Logarithms of gains, `[train, 3]`; empty without gains.
     pub gains: ParamGroup,
-    /// Suns apart, `[lights, 9]`, empty without; and once they are told apart, what hides them.
+    /// Sun of each light, `[lights, 9]`, and what hides it; both from the light's stage on. Lights hold suns, too, unless they are apart.
     pub suns: ParamGroup,
     pub visibility: Option<Visibility>,
     pub sun_updates: u64,
@@ -63,6 +55,8 @@ pub struct SceneModel {
     pub sessions: Vec<u32>,
     pub origin: Origin,
     pub rays: u64,
+    /// Running mean of the samples that a ray of training has.
+    pub samples_per_ray: f64,
     /// Running median of the errors, in sRGB.
     pub median: f32,
     pub rate_scale: f32,
@@ -82,7 +76,8 @@ impl SceneModel {
         }
         let (light_of, sessions) = lights_of(&config, &capture, &train);
         let space = match config.field.space == "unbounded" {
-            true => Space::Contracted(2.0),
+            // What lies around the cameras keeps its shape.
+            true => Space::Contracted((2.0 * capture.viewing_distance()).clamp(1.0, 8.0) as f32),
             false => Space::Cube(capture.scene.aabb_scale.max(1) as f32),
         };
         let (edge, unbounded) = match space {
@@ -90,24 +85,23 @@ impl SceneModel {
             Space::Cube(e) => (e as u32, false),
         };
         let cascades = if unbounded { 8 } else { edge.ilog2() as usize + 1 };
-        let schedule = Schedule { warmup: 0.01, final_scale: config.optim.final_scale, decay_from: 0.3 };
+        let schedule = fields::schedule(&config);
         let adam = |rate: f32| Adam { rate, ..Adam::default() };
         let group = |name, values, rate| ParamGroup { schedule, ..ParamGroup::dense(name, values, adam(rate)) };
         let n = sessions.len().max(light_of.iter().map(|l| *l as usize + 1).max().unwrap_or(0));
         let rate = config.optim.light_rate;
         let gains = if config.light.gain { vec![0.0; 3 * train.len()] } else { Vec::new() };
-        let suns = vec![0.0; if config.light.has_sun() { SUN * n } else { 0 }];
-        let mut field = field(&config, space, edge)?;
-        field.weights.schedule = schedule;
-        field.encoder.table_mut().into_iter().for_each(|t| t.schedule = schedule);
+        let field = fields::of_surfaces(&config, space, train.len());
         let mut model = SceneModel {
+            stage: Stage::Surfaces,
+            began: 0,
             model_from_world: capture.scene.model_from_world(),
             field,
             occupancy: Occupancy::new(config.sampling.occupancy_resolution, cascades, unbounded),
             lights: group("lights", first_lights(n), rate),
             skies: group("skies", first_skies(n), rate),
             gains: group("gains", gains, rate),
-            suns: group("suns", suns, rate),
+            suns: group("suns", vec![0.0; SUN * n], rate),
             visibility: None,
             sun_updates: 0,
             train,
@@ -115,6 +109,7 @@ impl SceneModel {
             sessions,
             origin: Origin::default(),
             rays: 0,
+            samples_per_ray: 256.0,
             median: 0.1,
             rate_scale: 1.0,
             config,
@@ -138,8 +133,9 @@ impl SceneModel {
 
     /// Lowest corner and edge of the outer cube in model space.
     pub fn cube(&self) -> (f32, f32) {
+        let far = if self.stage == Stage::Light { SKY_FROM } else { FAR };
         match self.field.space {
-            Space::Contracted(_) => (0.5 - FAR, 2.0 * FAR),
+            Space::Contracted(_) => (0.5 - far, 2.0 * far),
             Space::Cube(edge) => (0.5 - 0.5 * edge, edge),
         }
     }
@@ -211,6 +207,8 @@ impl SceneModel {
     pub fn for_rendering(&self) -> SceneModel {
         SceneModel {
             config: self.config.clone(),
+            stage: self.stage,
+            began: self.began,
             capture: self.capture.clone(),
             model_from_world: self.model_from_world,
             field: self.field.for_rendering(),
@@ -226,6 +224,7 @@ impl SceneModel {
             sessions: self.sessions.clone(),
             origin: self.origin,
             rays: self.rays,
+            samples_per_ray: self.samples_per_ray,
             median: self.median,
             rate_scale: self.rate_scale,
         }
@@ -244,32 +243,56 @@ impl SceneModel {
         if self.field.is_unbounded() { (-0.5, 2.0) } else { self.cube() }
     }
 
-    /// The sun of a session or photograph; none while it is not told apart.
-    pub fn sun(&self, index: usize) -> Option<[f32; SUN]> {
-        self.visibility.as_ref().map(|_| std::array::from_fn(|i| self.suns.values[index * SUN + i]))
+    /// Counts a step's rays and their samples.
+    pub fn count(&mut self, rays: usize, samples: f64) {
+        let own = samples / rays.max(1) as f64;
+        self.samples_per_ray = if self.rays == 0 { own } else { 0.9 * self.samples_per_ray + 0.1 * own };
+        self.rays += rays as u64;
     }
 
-    /// Light that surfaces send to each other over the light that a horizontal white surface receives, by channel, in all lights together.
-    pub fn bounced(&self) -> [f32; 3] {
-        let n = self.lights.values.len() / LIGHT;
-        std::array::from_fn(|k| {
-            let (mut bounced, mut received) = (0.0, 0.0);
-            for sun in (0..n).filter_map(|l| self.sun(l)).zip(0..n) {
-                bounced += sun.0[6 + k];
-                received += sun.0[3 + k] * sun.0[2].max(0.0) + self.light(sun.1).shade(DVec3::Z)[k].max(0.0) as f32;
-            }
-            if received > 0.0 { bounced / received } else { 0.0 }
-        })
+    /// Whether suns are apart from the lights' harmonics.
+    pub fn has_suns(&self) -> bool {
+        self.stage == Stage::Light && self.config.light.has_sun()
+    }
+
+    /// The sun of a session or photograph where it is apart.
+    pub fn sun(&self, index: usize) -> Option<[f32; SUN]> {
+        self.has_suns().then(|| std::array::from_fn(|i| self.suns.values[index * SUN + i]))
+    }
+
+    /// Gives each light the mean code of its photographs, in place of the photographs' codes.
+    pub fn share_codes(&mut self) {
+        let lights = self.light_count();
+        let Some(a) = &mut self.field.codes.appearance else { return };
+        let mean = |l: usize, k: usize| {
+            let own = || (0..self.train.len()).filter(|i| self.light_of[*i] as usize == l);
+            own().map(|i| a.group.values[i * a.dims + k]).sum::<f32>() / own().count().max(1) as f32
+        };
+        let means: Vec<f32> = (0..lights).flat_map(|l| (0..a.dims).map(move |k| (l, k))).map(|(l, k)| mean(l, k)).collect();
+        a.group.values = means;
+    }
+
+    /// Goes on to the stage of light: surfaces stay, and albedo, shadow and normal are to be learned on them.
+    ///
+    /// # Errors
+    /// When the model is not in the stage of surfaces.
+    pub fn begin_light(&mut self) -> Result<()> {
+        self.field = fields::of_materials(&self.config, self.field.clone())?;
+        self.stage = Stage::Light;
+        Ok(())
     }
 
     /// Everything that a checkpoint holds; `solid` are the solid cells where suns are apart.
     pub fn entries<'a>(&'a mut self, solid: &'a [f32]) -> (Vec<Entry<'a>>, HashMap<String, String>) {
         let metadata = HashMap::from([
             ("method".to_string(), "relight".to_string()),
+            ("stage".into(), if self.stage == Stage::Light { "light" } else { "surfaces" }.into()),
+            ("began".into(), self.began.to_string()),
             ("step".into(), self.origin.step.to_string()),
             ("rays".into(), self.rays.to_string()),
             ("sun_updates".into(), self.sun_updates.to_string()),
             ("seconds_bits".into(), self.origin.seconds.to_bits().to_string()),
+            ("samples_per_ray_bits".into(), self.samples_per_ray.to_bits().to_string()),
             ("median_bits".into(), self.median.to_bits().to_string()),
             ("rate_scale_bits".into(), self.rate_scale.to_bits().to_string()),
         ]);
@@ -291,8 +314,13 @@ impl SceneModel {
             let value = c.metadata.get(key).and_then(|v| v.parse().ok());
             value.ok_or_else(|| PipelineError::Usage(format!("{}: metadata {key} is missing or malformed", file.display())))
         }
+        if c.metadata.get("stage").is_some_and(|s| s == "light") && self.stage == Stage::Surfaces {
+            self.begin_light()?;
+        }
         self.origin = Origin { step: number(&c, "step", file)?, seconds: f64::from_bits(number(&c, "seconds_bits", file)?) };
         self.rays = number(&c, "rays", file)?;
+        self.samples_per_ray = f64::from_bits(number(&c, "samples_per_ray_bits", file)?);
+        self.began = number(&c, "began", file)?;
         self.sun_updates = number(&c, "sun_updates", file)?;
         self.median = f32::from_bits(number(&c, "median_bits", file)?);
         self.rate_scale = f32::from_bits(number(&c, "rate_scale_bits", file)?);
@@ -334,48 +362,4 @@ fn first_lights(n: usize) -> Vec<f32> {
 fn first_skies(n: usize) -> Vec<f32> {
     // The first basis function is 0.2821.
     (0..n).flat_map(|_| (0..SKY).map(|i| if i < 3 { 0.5 / 0.282_094_8 } else { 0.0 })).collect()
-}
-
-/// Hash grid → density and features; features → albedo and normal; features and gray light → shadow.
-fn field(config: &Config, space: Space, edge: u32) -> Result<Field> {
-    use Source::{Input, Layer as L};
-    let f = &config.field;
-    let scale = if matches!(space, Space::Contracted(_)) { 4 } else { edge };
-    let grid =
-        HashGrid::new(HashGridConfig { levels: f.levels, features: 2, log2_size: f.log2_size, base: f.base, finest: f.finest * scale });
-    let layer = |inputs: Vec<Source>, width: usize, activation| Layer::new(inputs, width, activation, true);
-    let layers = vec![
-        layer(vec![Input(0)], f.width, Activation::Relu),
-        layer(vec![L(0)], PADDED, Activation::None),
-        layer(vec![L(1)], f.width, Activation::Relu),
-        layer(vec![L(2)], PADDED, Activation::None),
-        layer(vec![L(1), Input(1)], f.width, Activation::Relu),
-        layer(vec![L(4)], PADDED, Activation::None),
-        layer(vec![L(1)], f.width, Activation::Relu),
-        layer(vec![L(6)], PADDED, Activation::None),
-    ];
-    let head = |layer, activation, shift| Head { layer, channel: 0, activation, shift };
-    let net = FieldNet {
-        density: head(1, Activation::TruncatedExp, f.first_density.ln()),
-        outputs: vec![
-            Output { head: head(3, Activation::Sigmoid, 0.0), channels: 3 },
-            Output { head: head(5, Activation::Sigmoid, LIT), channels: 1 },
-            Output { head: head(7, Activation::Tanh, 0.0), channels: 3 },
-        ],
-        mlp: Mlp::new(vec![grid.output_dims(), 9], layers),
-    };
-    let rng = Rng::new(config.seed, TABLE);
-    let table = (0..grid.params_len()).map(|i| (rng.uniform(i as u64) * 2.0 - 1.0) * 1e-4).collect();
-    let o = &config.optim;
-    let weights = net.mlp.init(&Rng::new(config.seed, WEIGHTS));
-    let mut field = Field {
-        weights: ParamGroup::dense("weights", weights, Adam { rate: o.net_rate, ..Adam::default() }),
-        encoder: Encoder::Hash { grid, table: ParamGroup::sparse("table", table, Adam { rate: o.grid_rate, ..Adam::default() }) },
-        codes: RayCodes { direction: DirectionCode::None, appearance: None, given: vec![9] },
-        net,
-        space,
-        normals: None,
-    };
-    field.set_normals(Some(config.normals.of(1.0))).map_err(|e| PipelineError::Usage(e.to_string()))?;
-    Ok(field)
 }

@@ -1,15 +1,18 @@
 //! Training recipe of the scene model, to be read from top to bottom.
 
-use super::config::Config;
+use super::config::{Config, Stage};
 use super::model::SceneModel;
 use super::trainer::Trainer;
 use super::viewing::RunView;
 use crate::error::{PipelineError, Result};
+use crate::run::nearest;
 use crate::run::photographs::StoredPhotographs;
 use crate::run::{RunDescription, RunFolder, folder, kept_capture};
 use diorama_data::checkpoint;
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
+use diorama_engine::samplers::pixels::{Observation, PixelSource};
+use diorama_engine::samplers::stereo;
 use diorama_engine::train::{self, Event, RunError, RunOptions, Summary};
 use diorama_geom::capture::Split;
 use diorama_geom::{Capture, Reduction};
@@ -39,6 +42,7 @@ pub fn train(
     single_light(&capture).into_iter().for_each(|n| events(&Event::Note(n)));
     let photographs = load_pixels(config, &capture)?;
     let mut model = SceneModel::new(config.clone(), capture)?;
+    let observations = observations(&mut model, &photographs, interrupt, events);
     if resume {
         if checkpoint::exists(&folder.checkpoints()) {
             let (c, note) = checkpoint::load(&folder.checkpoints())?;
@@ -50,7 +54,7 @@ pub fn train(
         folder.write_description(&model.config, &model.capture)?;
     }
     let (origin, checkpoints) = (model.origin, folder.checkpoints());
-    let mut trainer = Trainer::new(model, photographs, &checkpoints)?;
+    let mut trainer = Trainer::new(model, photographs, observations, &checkpoints)?;
     trainer.view = view;
     let r = &config.run;
     let options = RunOptions {
@@ -83,6 +87,28 @@ pub fn train(
     Ok(Trained { model: trainer.model, summary })
 }
 
+/// Pixels whose distance comparing photographs tells, and where that is left open, how near matter may be.
+fn observations(
+    model: &mut SceneModel,
+    photographs: &StoredPhotographs,
+    interrupt: &AtomicBool,
+    events: &mut dyn FnMut(&Event),
+) -> Vec<Observation> {
+    let distance = model.capture.viewing_distance();
+    events(&Event::Note(format!("comparing {} photographs with their neighbors to find distances", model.train.len())));
+    let mut found = stereo::observe(photographs, &model.cameras(), distance, interrupt);
+    found.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y));
+    let near = &mut model.config.sampling.near;
+    if *near == 0.0 {
+        // Stereo looks no nearer than that, so that what it does not find may be there all the same.
+        let most = (stereo::NEAREST * distance) as f32;
+        *near = nearest::of_observations(&found).map_or(nearest::UNKNOWN, |n| n.min(most).max(nearest::UNKNOWN));
+    }
+    found.retain(|o| o.distance > *near);
+    events(&Event::Note(format!("the distance of {} pixels was found (--set loss.depth=0: do not use it)", found.len())));
+    found
+}
+
 /// The capture that a configuration names.
 ///
 /// # Errors
@@ -112,12 +138,19 @@ fn load_pixels(config: &Config, capture: &Capture) -> Result<StoredPhotographs> 
 /// A trained model, and notes.
 ///
 /// # Errors
-/// When the folder holds no run of this application, or its checkpoint is damaged.
+/// When the folder holds no run of this application, its checkpoint is damaged, or it ended before light was told apart.
 pub fn load(run: &Path) -> Result<(SceneModel, Vec<String>)> {
-    load_of(run, None)
+    let (model, notes) = load_of(run, None)?;
+    match model.stage {
+        Stage::Light => Ok((model, notes)),
+        Stage::Surfaces => Err(PipelineError::Usage(format!(
+            "{}: the run ended before light was told apart; go on with `diorama relight train --resume -o {0}`",
+            run.display()
+        ))),
+    }
 }
 
-/// The same, where `data` says to what folder the photographs moved.
+/// A model in whatever stage it is, and notes; `data` says to what folder the photographs moved.
 ///
 /// # Errors
 /// As [`load`].
@@ -135,7 +168,7 @@ pub fn load_of(run: &Path, data: Option<&Path>) -> Result<(SceneModel, Vec<Strin
 /// # Errors
 /// As [`load`].
 pub fn describe(run: &Path) -> Result<serde_json::Value> {
-    let (model, notes) = load(run)?;
+    let (model, notes) = load_of(run, None)?;
     Ok(serde_json::json!({
         "kind": "relight run",
         "data": model.config.data.path,

@@ -1,11 +1,13 @@
 //! Views of the scene model under any light, and its layers.
 
+use super::config::Stage;
 use super::model::SceneModel;
 use super::shading::{self, CHANNELS, NORMAL, Sunlit, gray};
-use super::sun::SUN;
+use super::sun::{self, SUN};
 use diorama_engine::renderers::layers::Layers;
 use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_geom::Image;
+use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::DVec3;
 use diorama_geom::sh_light::ShLight;
 use diorama_kernels::ops::ray_generation::{self, PosedCamera};
@@ -29,20 +31,16 @@ impl ViewLight {
 
     /// Harmonics, and a sun (direction and irradiance) besides, as a model takes them: apart, if it tells suns apart.
     pub fn new(model: &SceneModel, mut light: ShLight, sun: Option<(DVec3, [f64; 3])>) -> ViewLight {
-        if model.visibility.is_none() {
+        if !model.has_suns() {
             sun.iter().for_each(|(direction, irradiance)| light.add_sun(*direction, *irradiance));
             return ViewLight::of(light);
         }
         let mut out = ViewLight::of(light);
         let (direction, irradiance) = sun.unwrap_or((DVec3::Z, [0.0; 3]));
-        let (up, bounced) = (light.shade(DVec3::Z), model.bounced());
         let mut numbers = [0.0; SUN];
         numbers[..3].copy_from_slice(&direction.as_vec3().to_array());
-        for k in 0..3 {
-            let power = irradiance[k] / std::f64::consts::PI;
-            numbers[3 + k] = power as f32;
-            numbers[6 + k] = bounced[k] * (up[k].max(0.0) + power * direction.z.max(0.0)) as f32;
-        }
+        (0..3).for_each(|k| numbers[3 + k] = (irradiance[k] / std::f64::consts::PI) as f32);
+        sun::set_bounced(&mut numbers, &out.numbers());
         out.sun = Some(numbers);
         out
     }
@@ -80,6 +78,9 @@ impl SceneModel {
 
     /// The same by a tracer of this model, such as one that shows only what lies in a box.
     pub fn view_with(&self, tracer: Tracer, camera: &PosedCamera, light: &ViewLight, progress: &mut dyn FnMut(usize)) -> SceneView {
+        if self.stage == Stage::Surfaces {
+            return unlit_view(&tracer.layers(camera, &[], progress), camera);
+        }
         let numbers = light.numbers();
         let code: Vec<f32> = numbers.chunks_exact(3).map(gray).collect();
         let Layers { values, opacity, depth } = tracer.layers(camera, &[&code], progress);
@@ -99,7 +100,7 @@ impl SceneModel {
             let ray = (o, out.depth.data[i] * o);
             let reach = |sun: &[f32]| {
                 let visibility = self.visibility.as_ref().expect("suns are told apart");
-                shading::reach(visibility, sun, &v, ray, &origins[at.clone()], &dirs[at.clone()])
+                shading::reach(visibility, sun, &v[NORMAL..], ray, &origins[at.clone()], &dirs[at.clone()])
             };
             let sunlit = light.sun.as_ref().map(|sun| Sunlit { sun, reach: reach(sun) });
             let color = shading::color(&v, o, &dirs[at.clone()], &numbers, &light.sky, sunlit);
@@ -113,5 +114,22 @@ impl SceneModel {
             out.shadow.data[i] = color.shadow;
         }
         out
+    }
+}
+
+/// Surfaces as they look in the mean of all lights, from which nothing is told apart yet: in place of color and albedo alike. Normals face the
+/// camera.
+fn unlit_view(layers: &Layers, camera: &PosedCamera) -> SceneView {
+    let (w, h) = (layers.values.width, layers.values.height);
+    let linear = Image { data: layers.values.data.iter().map(|v| linear_from_srgb(v.clamp(0.0, 1.0))).collect(), ..layers.values.clone() };
+    let back = -camera.pose.rotation.z_axis.as_vec3();
+    SceneView {
+        albedo: linear.clone(),
+        normal: Image { data: back.to_array().repeat(w * h), ..Image::zeros(w, h, 3) },
+        shadow: Image { data: vec![1.0; w * h], ..Image::zeros(w, h, 1) },
+        irradiance: Image { data: vec![1.0; 3 * w * h], ..Image::zeros(w, h, 3) },
+        color: linear,
+        depth: layers.depth.clone(),
+        opacity: layers.opacity.clone(),
     }
 }

@@ -125,7 +125,7 @@ pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &Sheet)
         mean_light_psnr: mean.psnr(),
         seen_light_psnr: seen.psnr(),
         sunlit_psnr: sunlit.psnr(),
-        light: if model.visibility.is_some() { "sun" } else { "sh" }.into(),
+        light: if model.has_suns() { "sun" } else { "sh" }.into(),
         albedo_psnr: scaled_psnr(&albedos),
         normal_median_deg: median(angles),
         depth_median: median(depths),

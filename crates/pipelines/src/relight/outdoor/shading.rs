@@ -1,8 +1,9 @@
 //! Loss of the scene model: `C = S · A ⊙ max(0, Lᵀ b(N)) + (1 − o) · sky(d)` in linear light, compared in sRGB, and its gradient. With a
 //! sun apart, its light, the sky's and that of surfaces (see [`super::sun`]) take the place of `S · max(0, Lᵀ b(N))`.
 //!
-//! Per ray, the field composites albedo `A` (premultiplied by the opacity `o`), shadow `S` (1 where nothing is hit), the normal that a head
-//! of the network says, whose direction `N` counts, and the slope `−Σ w ∇σ`, to which the normal is tied (Verbin et al. 2022). Light `L` `[9, 3]` and sky `[16, 3]` are of the ray's session.
+//! Per ray, the field composites albedo `A` (premultiplied by the opacity `o`), shadow `S` (1 where nothing is hit) and the normal that a
+//! head of the network says, whose direction `N` counts. Light `L` `[9, 3]` and sky `[16, 3]` are of the ray's session. In training, the
+//! normal is that of the surfaces as they were learned, which the head is taught.
 
 use super::sun::SUN;
 use super::visibility::{Visibility, spread};
@@ -18,19 +19,17 @@ pub const LIGHT: usize = 27;
 /// Degree of the sky's spherical harmonics, and its numbers `[16, 3]`.
 const SKY_DEGREE: usize = 4;
 pub const SKY: usize = 48;
-/// Channels: albedo, shadow, normal, slope.
-pub const CHANNELS: usize = 10;
-/// First channel of the normal and of the slope.
+/// Channels: albedo, shadow, normal.
+pub const CHANNELS: usize = 7;
+/// First channel of the normal.
 pub const NORMAL: usize = 4;
-const SLOPE: usize = 7;
 /// Luminance of linear RGB.
 const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
 /// Luminance of albedo that few surfaces exceed.
 const BRIGHTEST: f32 = 0.9;
-/// Difference in sRGB at which a color is hardly that of the sky any more.
-const ALIKE: f32 = 0.05;
-/// Opacity below which a ray shows no surface.
+/// Opacity below which a ray shows no surface, and above which it shows little else.
 const FAINT: f32 = 0.05;
+const SOLID: f32 = 0.5;
 /// Length below which a vector has no direction.
 const SHORTEST: f32 = 1e-12;
 /// Directions in which irradiance must not be negative.
@@ -42,19 +41,15 @@ pub struct Weights {
     pub huber: f32,
     /// Error beyond which a pixel counts less (Geman–McClure), in sRGB; 0: all count alike.
     pub robust: f32,
-    pub orientation: f32,
+    /// Deviation of the shadow from 1.
     pub shadow: f32,
+    /// Deviation of the shadow from the traced one.
+    pub traced: f32,
     pub negative: f32,
-    pub distortion: f32,
-    /// Opacity where the target has none, and where the target has the sky's color.
-    pub masked_sky: f32,
-    pub likely_sky: f32,
     /// Albedos beyond what surfaces have.
     pub gauge: f32,
-    /// Angle between normal and slope, and the share of its gradient that the slope gets.
+    /// Angle between the head's normal and the surface's.
     pub tie: f32,
-    pub push: f32,
-    pub lit: f32,
 }
 
 /// What the rays of a step are compared with.
@@ -62,12 +57,10 @@ pub struct SceneLoss<'a> {
     pub weights: Weights,
     /// sRGB, `[R, 3]`.
     pub target: &'a [f32],
-    /// Opacity of the target: 0 where a mask says that there is sky, `[R]`.
-    pub alpha: &'a [f32],
-    /// Gray in place of the sky, `[R]`; empty: the sky.
-    pub noise: &'a [f32],
-    /// Share with which each ray counts, `[R]`.
+    /// Share with which each ray's color counts, `[R]`.
     pub counts: &'a [f32],
+    /// Normals of the surfaces in model space, `[R, 3]`; 0 where they are not known.
+    pub normals: &'a [f32],
     /// Of unit length, `[R, 3]`.
     pub dirs: &'a [f32],
     /// Light of each ray, `[R]`, and its photograph.
@@ -79,6 +72,8 @@ pub struct SceneLoss<'a> {
     pub gains: &'a [f32],
     /// Suns apart; none: the shadow that the field says.
     pub suns: Option<Suns<'a>>,
+    /// Light that shadows are traced in, for the field to learn them.
+    pub traced: Option<TracedLight<'a>>,
     pub out: Mutex<SceneGradients>,
 }
 
@@ -92,6 +87,18 @@ pub struct Suns<'a> {
     pub origins: &'a [f32],
 }
 
+/// A sun and a sky of each ray, with what hides them.
+#[derive(Clone, Copy)]
+pub struct TracedLight<'a> {
+    /// `[R, 9]`: direction, power, light from surfaces.
+    pub suns: &'a [f32],
+    /// `[R, 9, 3]`
+    pub skies: &'a [f32],
+    pub visibility: &'a Visibility,
+    /// Of the rays, `[R, 3]`.
+    pub origins: &'a [f32],
+}
+
 /// Sun of a surface point, and the shares of its light and the sky's that reach the point.
 #[derive(Clone, Copy)]
 pub struct Sunlit<'a> {
@@ -100,11 +107,11 @@ pub struct Sunlit<'a> {
 }
 
 /// Shares of a sun's and the sky's light that reach what a ray shows, `[sun, sky]`; `depth` is `Σ w t`.
-pub fn reach(visibility: &Visibility, sun: &[f32], values: &[f32], (opacity, depth): (f32, f32), origin: &[f32], dir: &[f32]) -> [f32; 2] {
+pub fn reach(visibility: &Visibility, sun: &[f32], normal: &[f32], (opacity, depth): (f32, f32), origin: &[f32], dir: &[f32]) -> [f32; 2] {
     if opacity < FAINT {
         return [1.0; 2];
     }
-    let normal = Vec3::from(unit(&values[NORMAL..]).0);
+    let normal = Vec3::from(unit(normal).0);
     let point = Vec3::from_slice(origin) + Vec3::from_slice(dir) * (depth / opacity);
     let toward = Vec3::from_slice(sun);
     let direct = if normal.dot(toward) > 0.0 { visibility.from_sun(point, normal, toward) } else { 1.0 };
@@ -133,20 +140,37 @@ pub(super) fn encode(linear: f32) -> (f32, f32) {
 }
 
 /// Value and derivative of the Huber loss, quadratic below `width`: both scaled such that it is `e²` near zero.
-fn huber(e: f32, width: f32) -> (f32, f32) {
+pub(super) fn huber(e: f32, width: f32) -> (f32, f32) {
     let a = e.abs();
     if a <= width { (e * e, 2.0 * e) } else { (width * (2.0 * a - width), 2.0 * width * e.signum()) }
 }
 
+/// Weight of a ray with a squared error, held constant: iteratively reweighted least squares (Geman–McClure).
+pub(super) fn trust(squared: f32, robust: f32) -> f32 {
+    if robust > 0.0 { (robust * robust / (robust * robust + squared)).powi(2) } else { 1.0 }
+}
+
+/// Adds the gradient of a channel of a sky for the gradient `d` of its color; light that is negative is pulled back to 0.
+pub(super) fn sky_gradient(to: &mut [f32], k: usize, sky: &[f32; 3], basis: &[f32; 16], d: f32, share: f32) {
+    let d = if sky[k] > 0.0 { d } else { share * 0.1 * sky[k] };
+    (0..16).for_each(|i| to[3 * i + k] += d * basis[i]);
+}
+
+/// Radiance of a sky in a direction, and the basis functions there.
+pub(super) fn sky_at(sky: &[f32], dir: &[f32]) -> ([f32; 3], [f32; 16]) {
+    let mut basis = [0.0; 16];
+    spherical_harmonics::cpu::forward(SKY_DEGREE, dir, &mut basis);
+    (std::array::from_fn(|k| (0..16).map(|i| sky[3 * i + k] * basis[i]).sum()), basis)
+}
+
 /// Irradiance over π of a white surface with a normal, by channel.
-fn irradiance(light: &[f32], basis: &[f64; 9]) -> [f32; 3] {
+pub(super) fn irradiance(light: &[f32], basis: &[f64; 9]) -> [f32; 3] {
     std::array::from_fn(|k| (0..9).map(|i| light[3 * i + k] * basis[i] as f32).sum())
 }
 
 /// A color as the model explains it, and what its gradient needs.
 struct Shaded {
     normal: [f32; 3],
-    length: f32,
     basis: [f64; 9],
     /// Irradiance before it is cut off at 0.
     lit: [f32; 3],
@@ -155,7 +179,7 @@ struct Shaded {
 }
 
 /// Direction and length of a vector; straight up if there is none.
-fn unit(v: &[f32]) -> ([f32; 3], f32) {
+pub(super) fn unit(v: &[f32]) -> ([f32; 3], f32) {
     let length = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
     (if length > SHORTEST { [v[0] / length, v[1] / length, v[2] / length] } else { [0.0, 0.0, 1.0] }, length)
 }
@@ -169,13 +193,11 @@ fn add_direction(d: &mut [f32], gradient: [f32; 3], (direction, length): ([f32; 
 }
 
 /// Normal, light and sky of a ray.
-fn shade(values: &[f32], dir: &[f32], light: &[f32], sky: &[f32]) -> Shaded {
-    let (normal, length) = unit(&values[NORMAL..]);
+fn shade(normal: &[f32], dir: &[f32], light: &[f32], sky: &[f32]) -> Shaded {
+    let normal = unit(normal).0;
     let basis = sh_light::basis(DVec3::from(normal.map(f64::from)));
-    let mut sky_basis = [0.0; 16];
-    spherical_harmonics::cpu::forward(SKY_DEGREE, dir, &mut sky_basis);
-    let of_sky = std::array::from_fn(|k| (0..16).map(|i| sky[3 * i + k] * sky_basis[i]).sum());
-    Shaded { normal, length, basis, lit: irradiance(light, &basis), sky: of_sky, sky_basis }
+    let (of_sky, sky_basis) = sky_at(sky, dir);
+    Shaded { normal, basis, lit: irradiance(light, &basis), sky: of_sky, sky_basis }
 }
 
 /// Light that a white surface sends, with its shadow.
@@ -201,7 +223,7 @@ pub struct RayColor {
 
 /// Linear color of composited values under a light and before a sky.
 pub fn color(values: &[f32], opacity: f32, dir: &[f32], light: &[f32], sky: &[f32], sunlit: Option<Sunlit>) -> RayColor {
-    let s = shade(values, dir, light, sky);
+    let s = shade(&values[NORMAL..], dir, light, sky);
     let irradiance: [f32; 3] = std::array::from_fn(|k| received(values, &s, sunlit, k));
     let rgb = std::array::from_fn(|k| values[k] * irradiance[k] + (1.0 - opacity) * s.sky[k].max(0.0));
     let shadow = sunlit.map_or(values[3], |l| {
@@ -219,31 +241,10 @@ pub fn gray(c: &[f32]) -> f32 {
     (0..3).map(|k| LUMINANCE[k] * c[k]).sum()
 }
 
-/// Gradient of the basis functions with respect to the normal, `[9]` rows of `[x, y, z]`.
-fn basis_gradient(n: [f32; 3]) -> [[f32; 3]; 9] {
-    let [x, y, z] = n;
-    let (a, b, c, d) = (0.488_602_5, 1.092_548_4, 0.315_391_57, 0.546_274_2);
-    [
-        [0.0; 3],
-        [0.0, a, 0.0],
-        [0.0, 0.0, a],
-        [a, 0.0, 0.0],
-        [b * y, b * x, 0.0],
-        [0.0, b * z, b * y],
-        [0.0, 0.0, 6.0 * c * z],
-        [b * z, 0.0, b * x],
-        [2.0 * d * x, -2.0 * d * y, 0.0],
-    ]
-}
-
-/// Adds the gradients of a sun's numbers and of the normal, for one channel and the gradient `d` of the light that a surface receives.
-fn sun_gradient(l: &Sunlit, normal: [f32; 3], d: f32, k: usize, d_sun: &mut [f32], d_normal: &mut [f32; 3]) {
+/// Adds the gradient of a sun's power, for one channel and the gradient `d` of the light that a surface receives.
+fn sun_gradient(l: &Sunlit, normal: [f32; 3], d: f32, k: usize, d_sun: &mut [f32]) {
     let facing = (0..3).map(|a| normal[a] * l.sun[a]).sum::<f32>();
-    if facing > 0.0 {
-        d_sun[3 + k] += d * l.reach[0] * facing;
-        (0..3).for_each(|a| d_normal[a] += d * l.reach[0] * l.sun[3 + k] * l.sun[a]);
-    }
-    d_sun[6 + k] += d * (1.0 - l.reach[1]);
+    d_sun[3 + k] += d * l.reach[0] * facing.max(0.0);
 }
 
 /// What the loss of a ray reads.
@@ -251,29 +252,50 @@ fn sun_gradient(l: &Sunlit, normal: [f32; 3], d: f32, k: usize, d_sun: &mut [f32
 struct RayIn<'a> {
     values: &'a [f32],
     opacity: f32,
+    normal: [f32; 3],
     sunlit: Option<Sunlit<'a>>,
+    /// Share of the light that arrives as traced.
+    traced: Option<f32>,
 }
 
 impl SceneLoss<'_> {
+    /// Normal of a ray's surface: as it was learned, else what the head says.
+    fn normal(&self, r: usize, out: &RayOutputs) -> [f32; 3] {
+        let own = &self.normals[3 * r..3 * r + 3];
+        let is_known = own.iter().any(|v| *v != 0.0);
+        unit(if is_known { own } else { &out.values[r * CHANNELS + NORMAL..][..3] }).0
+    }
+
     /// Sun of a ray and what of its light arrives.
     fn sunlit(&self, r: usize, out: &RayOutputs) -> Option<Sunlit<'_>> {
         let s = self.suns.as_ref()?;
         let sun = &s.values[SUN * self.light[r] as usize..][..SUN];
-        let (values, at) = (&out.values[r * CHANNELS..][..CHANNELS], 3 * r..3 * r + 3);
-        let reach = reach(s.visibility, sun, values, (out.opacity[r], out.depth[r]), &s.origins[at.clone()], &self.dirs[at]);
+        let at = 3 * r..3 * r + 3;
+        let reach = reach(s.visibility, sun, &self.normal(r, out), (out.opacity[r], out.depth[r]), &s.origins[at.clone()], &self.dirs[at]);
         Some(Sunlit { sun, reach })
+    }
+
+    /// Share of the light of a ray's sun and sky that arrives; none where the ray meets no surface.
+    fn traced(&self, r: usize, out: &RayOutputs) -> Option<f32> {
+        let t = self.traced.as_ref().filter(|_| out.opacity[r] > SOLID)?;
+        let (sun, sky, at) = (&t.suns[SUN * r..][..SUN], &t.skies[LIGHT * r..][..LIGHT], 3 * r..3 * r + 3);
+        let normal = self.normal(r, out);
+        let reach = reach(t.visibility, sun, &normal, (out.opacity[r], out.depth[r]), &t.origins[at.clone()], &self.dirs[at]);
+        let lit = irradiance(sky, &sh_light::basis(DVec3::from(normal.map(f64::from))));
+        let facing = (0..3).map(|a| normal[a] * sun[a]).sum::<f32>().max(0.0);
+        let of = |reach: [f32; 2]| {
+            gray(&[0, 1, 2].map(|k| sun[3 + k] * reach[0] * facing + reach[1] * lit[k].max(0.0) + (1.0 - reach[1]) * sun[6 + k]))
+        };
+        Some((of(reach) / of([1.0; 2]).max(1e-6)).clamp(0.0, 1.0))
     }
 
     /// One ray: its loss; adds gradients. `share` is its part of the sum. Returns the loss, the squared error and the largest error.
     fn ray(&self, r: usize, ray: &RayIn, d: &mut RayGradients, tables: &mut SceneGradients, share: f32) -> (f64, f64, f32) {
-        let RayIn { values, opacity, sunlit } = *ray;
+        let RayIn { values, opacity, normal, sunlit, .. } = *ray;
         let dir = &self.dirs[3 * r..3 * r + 3];
         let (light_of, image) = (self.light[r] as usize, self.image[r] as usize);
         let (light, sky) = (&self.lights[light_of * LIGHT..][..LIGHT], &self.skies[light_of * SKY..][..SKY]);
-        let mut s = shade(values, dir, light, sky);
-        if let Some(noise) = self.noise.get(r) {
-            (s.sky, s.sky_basis) = ([*noise; 3], [0.0; 16]);
-        }
+        let s = shade(&normal, dir, light, sky);
         let (shadow, gain) = (values[3], self.gains.get(3 * image..3 * image + 3));
         let w = self.weights;
         let (mut errors, mut d_colors) = ([0.0; 3], [0.0; 3]);
@@ -289,12 +311,9 @@ impl SceneLoss<'_> {
             d_colors[k] = slope * factor;
         }
         let squared: f32 = errors.iter().map(|e| e * e).sum();
-        // Weight of the ray, held constant: iteratively reweighted least squares.
-        let trust = if w.robust > 0.0 { (w.robust * w.robust / (w.robust * w.robust + squared)).powi(2) } else { 1.0 };
-        let part = share * self.counts[r] * trust;
+        let part = share * self.counts[r] * trust(squared, w.robust);
         let mut loss = 0.0;
-        let (d_values, mut d_normal) = (&mut d.values[r * CHANNELS..][..CHANNELS], [0.0f32; 3]);
-        let slopes = basis_gradient(s.normal);
+        let d_values = &mut d.values[r * CHANNELS..][..CHANNELS];
         for k in 0..3 {
             let (value, slope) = huber(errors[k], w.huber);
             loss += (part * value / 3.0) as f64;
@@ -305,54 +324,34 @@ impl SceneLoss<'_> {
             d_values[k] += dc * white[k];
             match sunlit {
                 None => d_values[3] += dc * values[k] * s.lit[k].max(0.0),
-                Some(l) => sun_gradient(&l, s.normal, dc * values[k], k, &mut tables.suns[SUN * light_of..][..SUN], &mut d_normal),
+                Some(l) => sun_gradient(&l, s.normal, dc * values[k], k, &mut tables.suns[SUN * light_of..][..SUN]),
             }
             if s.lit[k] > 0.0 {
                 let d_lit = dc * arrives * values[k];
-                for i in 0..9 {
-                    tables.lights[light_of * LIGHT + 3 * i + k] += d_lit * s.basis[i] as f32;
-                    (0..3).for_each(|a| d_normal[a] += d_lit * light[3 * i + k] * slopes[i][a]);
-                }
+                (0..9).for_each(|i| tables.lights[light_of * LIGHT + 3 * i + k] += d_lit * s.basis[i] as f32);
             }
-            if s.sky[k] > 0.0 {
-                d.opacity[r] -= dc * s.sky[k];
-                (0..16).for_each(|i| tables.skies[light_of * SKY + 3 * i + k] += dc * (1.0 - opacity) * s.sky_basis[i]);
-            } else {
-                // Light is never negative; the pull brings it back.
-                (0..16).for_each(|i| tables.skies[light_of * SKY + 3 * i + k] += share * 0.1 * s.sky[k] * s.sky_basis[i]);
-            }
+            let of_sky = &mut tables.skies[light_of * SKY..][..SKY];
+            sky_gradient(of_sky, k, &s.sky, &s.sky_basis, dc * (1.0 - opacity), share);
         }
-        d_normal.iter_mut().for_each(|d| *d *= w.lit);
-        if sunlit.is_none() {
-            loss += (share * w.shadow * (1.0 - shadow) * (1.0 - shadow)) as f64;
-            d_values[3] -= share * 2.0 * w.shadow * (1.0 - shadow);
-        }
-        let sky = share * (w.masked_sky * (1.0 - self.alpha[r]) + w.likely_sky * self.likely_sky(r, &s, dir));
-        loss += (sky * opacity * opacity) as f64;
-        d.opacity[r] += 2.0 * sky * opacity;
-        let facing = (0..3).map(|a| s.normal[a] * dir[a]).sum::<f32>();
-        if facing > 0.0 && s.length > SHORTEST {
-            loss += (share * w.orientation * facing * facing) as f64;
-            (0..3).for_each(|a| d_normal[a] += share * 2.0 * w.orientation * facing * dir[a]);
-        }
-        let slope = unit(&values[SLOPE..]);
-        if slope.1 > SHORTEST {
-            let tie = share * w.tie;
-            loss += (tie * (1.0 - (0..3).map(|a| s.normal[a] * slope.0[a]).sum::<f32>())) as f64;
-            (0..3).for_each(|a| d_normal[a] -= tie * slope.0[a]);
-            add_direction(&mut d_values[SLOPE..], s.normal.map(|n| -w.push * tie * n), slope);
-        }
-        add_direction(&mut d_values[NORMAL..], d_normal, (s.normal, s.length));
         (loss, squared as f64 / 3.0, errors.iter().fold(0.0, |m, e| m.max(e.abs())))
     }
 
-    /// How well the sky alone explains a ray above the horizon, 0 to 1, held constant.
-    fn likely_sky(&self, r: usize, s: &Shaded, dir: &[f32]) -> f32 {
-        if dir[2] <= 0.0 || !self.noise.is_empty() {
-            return 0.0;
+    /// What the heads of normal and shadow are taught besides the color; adds gradients.
+    fn teach(&self, r: usize, ray: &RayIn, d: &mut RayGradients, share: f32) -> f64 {
+        let (w, values, mut loss) = (self.weights, ray.values, 0.0);
+        let d_values = &mut d.values[r * CHANNELS..][..CHANNELS];
+        if self.suns.is_none() {
+            let (want, weight) = ray.traced.map_or((1.0, w.shadow), |t| (t, w.traced));
+            let off = values[3] - want;
+            loss += (share * weight * off * off) as f64;
+            d_values[3] += 2.0 * share * weight * off;
         }
-        let squared: f32 = (0..3).map(|k| (encode(s.sky[k].max(0.0)).0.min(1.0) - self.target[3 * r + k]).powi(2)).sum();
-        (-0.5 * squared / (ALIKE * ALIKE)).exp()
+        let said = unit(&values[NORMAL..]);
+        if said.1 > SHORTEST && self.normals[3 * r..3 * r + 3].iter().any(|v| *v != 0.0) {
+            loss += (share * w.tie * (1.0 - (0..3).map(|a| said.0[a] * ray.normal[a]).sum::<f32>())) as f64;
+            add_direction(&mut d_values[NORMAL..], ray.normal.map(|n| -share * w.tie * n), said);
+        }
+        loss
     }
 
     /// Penalty of albedos so bright that light would have to be dark: of the brightest twentieth, where that begins above [`BRIGHTEST`].
@@ -402,13 +401,17 @@ impl BatchLoss for SceneLoss<'_> {
         };
         let share = 1.0 / self.counts.iter().sum::<f32>().max(1.0);
         let (mut loss, mut mse, mut worst) = (0.0, 0.0, Vec::with_capacity(rays));
-        let sunlit: Vec<Option<Sunlit>> = (0..rays).into_par_iter().map(|r| self.sunlit(r, out)).collect();
-        for r in (0..rays).filter(|r| self.counts[*r] > 0.0) {
-            let ray = RayIn { values: &out.values[r * CHANNELS..][..CHANNELS], opacity: out.opacity[r], sunlit: sunlit[r] };
-            let (value, squared, error) = self.ray(r, &ray, gradients, &mut tables, share);
-            loss += value;
-            mse += squared * (share * self.counts[r]) as f64;
-            worst.push(error);
+        let reached = (0..rays).into_par_iter().map(|r| (self.sunlit(r, out), self.traced(r, out)));
+        for (r, (sunlit, traced)) in reached.collect::<Vec<_>>().into_iter().enumerate() {
+            let values = &out.values[r * CHANNELS..][..CHANNELS];
+            let ray = RayIn { values, opacity: out.opacity[r], normal: self.normal(r, out), sunlit, traced };
+            loss += self.teach(r, &ray, gradients, 1.0 / rays as f32);
+            if self.counts[r] > 0.0 {
+                let (value, squared, error) = self.ray(r, &ray, gradients, &mut tables, share);
+                loss += value;
+                mse += squared * (share * self.counts[r]) as f64;
+                worst.push(error);
+            }
         }
         loss += self.negative(&mut tables) + self.gauge(out, gradients, share);
         if !worst.is_empty() {
@@ -418,9 +421,5 @@ impl BatchLoss for SceneLoss<'_> {
         tables.mse = mse;
         *self.out.lock().expect("no other thread holds it") = tables;
         loss
-    }
-
-    fn distortion(&self) -> f32 {
-        self.weights.distortion
     }
 }

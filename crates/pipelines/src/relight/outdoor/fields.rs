@@ -1,0 +1,98 @@
+//! The two fields of a scene: of surfaces and how they look in each light, then, on the same surfaces, of albedo, shadow and normal.
+
+use super::config::Config;
+use crate::error::{PipelineError, Result};
+use diorama_engine::fields::{self, DirectionCode, Field, RayCodes};
+use diorama_engine::params::{ParamGroup, Schedule};
+use diorama_geom::contraction::Space;
+use diorama_geom::rng::Rng;
+use diorama_kernels::gemm::Precision;
+use diorama_kernels::ops::adam::Adam;
+use diorama_kernels::ops::field_step::{FieldNet, Output};
+use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
+use diorama_kernels::ops::hash_grid::HashGridConfig;
+use diorama_kernels::ops::linear::Activation;
+
+/// Stream of initial values.
+const MATERIALS: u64 = 4;
+/// Output layers are padded to a whole vector.
+const PADDED: usize = 16;
+/// Shift of the shadow before its sigmoid: at first, little is in shadow.
+const LIT: f32 = 2.0;
+/// Layers of the density, which come first.
+const DENSITY: usize = 2;
+
+fn layer(inputs: Vec<Source>, width: usize, activation: Activation) -> Layer {
+    Layer::new(inputs, width, activation, true)
+}
+
+fn head(layer: usize, activation: Activation, shift: f32) -> Head {
+    Head { layer, channel: 0, activation, shift }
+}
+
+/// Course of the rates over each stage.
+pub fn schedule(config: &Config) -> Schedule {
+    Schedule { warmup: 0.01, final_scale: config.optim.final_scale, decay_from: 0.3 }
+}
+
+/// Surfaces, and their colors in sRGB as seen from a direction in each of `lights` lights, which have codes: instant-ngp's field with an
+/// appearance code (Müller et al. 2022; Martin-Brualla et al. 2021).
+pub fn of_surfaces(config: &Config, space: Space, lights: usize) -> Field {
+    let (f, o) = (&config.field, &config.optim);
+    let cubes = match space {
+        Space::Contracted(edge) => 2.0 * edge,
+        Space::Cube(edge) => edge,
+    };
+    let finest = (f.finest as f32 * cubes) as u32;
+    let grid = HashGridConfig { levels: f.levels, features: 2, log2_size: f.log2_size, base: f.base, finest };
+    let mut field = fields::ngp(grid, space, o.grid_rate, lights, f.appearance, config.seed);
+    field.net.density.shift = f.first_density.ln();
+    field.net.mlp.precision = Precision::Bf16;
+    field.encoder.table_mut().into_iter().for_each(|t| t.adam.weight_decay = o.table_decay);
+    field.groups_mut().into_iter().for_each(|g| g.schedule = schedule(config));
+    field
+}
+
+/// Albedo, shadow and normal on the surfaces of a field, which stay as they are: the grid's and the density's features → albedo and normal;
+/// these and gray light → shadow.
+///
+/// # Errors
+/// When the field is not one of surfaces.
+pub fn of_materials(config: &Config, surfaces: Field) -> Result<Field> {
+    use Source::{Input, Layer as L};
+    let (net, width) = (&surfaces.net.mlp, config.field.width);
+    if net.layers.len() <= DENSITY || surfaces.codes.appearance.is_none() {
+        return Err(PipelineError::Usage("the field has no surfaces to begin with".into()));
+    }
+    let mut layers = net.layers[..DENSITY].to_vec();
+    for given in [&[][..], &[Input(1)], &[]] {
+        let first = layers.len();
+        layers.extend([
+            layer([Input(0), L(1)].iter().chain(given).copied().collect(), width, Activation::Relu),
+            layer(vec![L(first)], width, Activation::Relu),
+            layer(vec![L(first + 1)], PADDED, Activation::None),
+        ]);
+    }
+    let net = FieldNet {
+        density: surfaces.net.density,
+        outputs: vec![
+            Output { head: head(4, Activation::Sigmoid, 0.0), channels: 3 },
+            Output { head: head(7, Activation::Sigmoid, LIT), channels: 1 },
+            Output { head: head(10, Activation::Tanh, 0.0), channels: 3 },
+        ],
+        mlp: Mlp { precision: Precision::Bf16, ..Mlp::new(vec![surfaces.encoder.dims(), 9], layers) },
+    };
+    let mut weights = net.mlp.init(&Rng::new(config.seed, MATERIALS));
+    let kept = net.mlp.offsets[DENSITY];
+    weights[..kept].copy_from_slice(&surfaces.weights.values[..kept]);
+    let adam = Adam { rate: config.optim.net_rate, ..Adam::default() };
+    let mut field = Field {
+        weights: ParamGroup { schedule: schedule(config), ..ParamGroup::dense("weights", weights, adam) },
+        codes: RayCodes { direction: DirectionCode::None, appearance: None, given: vec![9] },
+        net,
+        ..surfaces
+    };
+    field.freeze_layers(|j| j < DENSITY);
+    field.encoder.table_mut().into_iter().for_each(|t| t.frozen = true);
+    Ok(field)
+}
