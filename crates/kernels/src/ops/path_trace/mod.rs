@@ -13,7 +13,9 @@ mod sampler;
 mod surface;
 #[cfg(test)]
 mod tests;
+mod tracer;
 mod vector;
+mod wave;
 
 use diorama_geom::daylight::Daylight;
 use diorama_geom::glam::DVec3;

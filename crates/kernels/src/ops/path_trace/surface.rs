@@ -124,6 +124,9 @@ fn bilinear(texture: &Texture, uv: [f32; 2], decode: impl Fn(u8) -> f32) -> [f32
 /// Index of a texel that lies within the image.
 #[inline(always)]
 fn wrapped(i: i64, n: usize, wrap: Wrap) -> usize {
+    if (0..n as i64).contains(&i) {
+        return i as usize;
+    }
     let n = n as i64;
     let i = match wrap {
         Wrap::Clamp => i.clamp(0, n - 1),
