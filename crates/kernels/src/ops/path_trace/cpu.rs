@@ -42,7 +42,7 @@ pub fn first_hits(scene: &Scene, view: &View, porous: bool) -> Vec<Option<FirstH
             let ray = Ray { origin: narrow(view.world_from_camera.translation), direction: narrow(d), range: [0.0, f32::INFINITY] };
             let mut sampler = Sampler::new(0, (y * w + x) as u32, 0);
             let found = if porous {
-                scene.geometry.nearest(&ray).map(|f| (scene.geometry.point(&f), f.hit.t))
+                scene.geometry.nearest(&ray).map(|f| (scene.at(&f).0, f.hit.t))
             } else {
                 let nearest = scene.geometry.nearest(&ray);
                 Tracer::new(scene, &Settings::default()).meet(ray, nearest, &mut sampler).found.map(|m| (m.point, m.t))
@@ -61,7 +61,7 @@ pub fn first_hits(scene: &Scene, view: &View, porous: bool) -> Vec<Option<FirstH
 pub fn first_hit(scene: &Scene, origin: DVec3, direction: DVec3) -> Option<FirstHit> {
     let ray = Ray { origin: narrow(origin), direction: narrow(direction), range: [0.0, f32::INFINITY] };
     scene.geometry.nearest(&ray).map(|found| {
-        let point = scene.geometry.point(&found);
+        let point = scene.at(&found).0;
         FirstHit { instance: point.instance, position: DVec3::from(point.position.map(f64::from)), depth: found.hit.t as f64 }
     })
 }

@@ -235,17 +235,20 @@ impl Geometry {
         (placed, &self.meshes[placed.mesh])
     }
 
-    /// Properties of a surface that was found.
+    /// Properties of a surface that was found; the tangent only where `needs_tangent` says so of a material, else it is zero.
     #[inline(always)]
-    pub fn point(&self, found: &Found) -> Point {
+    pub fn point(&self, found: &Found, needs_tangent: impl Fn(u32) -> bool) -> Point {
         let (placed, mesh) = self.mesh(found);
         let (face, w) = (&mesh.faces[found.hit.triangle as usize], found.hit.weights);
         let corners = face.corners.map(|v| &mesh.vertices[v as usize]);
         let p = corners.map(|v| v.position);
         let flat = cross(sub(p[1], p[0]), sub(p[2], p[0]));
-        let mut tangent: [f32; 4] = mix(corners.map(|v| v.tangent), w);
-        if tangent[3] == 0.0 {
-            tangent = tangent_of(p, corners.map(|v| v.uv));
+        let mut tangent = [0.0; 4];
+        if needs_tangent(face.material) {
+            tangent = mix(corners.map(|v| v.tangent), w);
+            if tangent[3] == 0.0 {
+                tangent = tangent_of(p, corners.map(|v| v.uv));
+            }
         }
         let mut point = Point {
             position: mix(p, w),

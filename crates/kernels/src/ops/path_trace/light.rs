@@ -333,7 +333,9 @@ impl DistantLight {
             let (left, top) = (x.floor(), y.floor());
             (places.fraction[0][i], places.fraction[1][i]) = (x - left, y - top);
             // SAFETY: coordinates within the map, whose size fits; clamped, and NaN becomes the lowest.
-            let [left, top] = unsafe { [left.max(-1.0).min(width as f32).to_int_unchecked::<i32>(), top.max(-1.0).min(height as f32).to_int_unchecked::<i32>()] };
+            let [left, top] = unsafe {
+                [left.max(-1.0).min(width as f32).to_int_unchecked::<i32>(), top.max(-1.0).min(height as f32).to_int_unchecked::<i32>()]
+            };
             let right = if left + 1 >= width { 0 } else { left + 1 };
             let left = if left < 0 { width - 1 } else { left.min(width - 1) };
             let (upper, lower) = (top.max(0).min(height - 1) * width, (top + 1).min(height - 1) * width);

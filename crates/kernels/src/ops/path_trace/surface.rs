@@ -48,6 +48,12 @@ impl Surfaces {
         }
     }
 
+    /// Whether [`Surfaces::at`] reads the tangents of points of a material.
+    #[inline(always)]
+    pub fn needs_tangent(&self, material: u32) -> bool {
+        self.materials[material as usize].normal_texture.is_some()
+    }
+
     /// Whether the material has holes, or lets light pass; only then are `opacity` and `transmission` other than 1 and 0.
     #[inline(always)]
     pub fn at(&self, point: &Point) -> Surface {

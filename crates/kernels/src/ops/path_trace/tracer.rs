@@ -126,8 +126,7 @@ impl<'a> Tracer<'a> {
         for _ in 0..PASSED {
             self.count_rays(1);
             let Some(found) = nearest else { return Meeting { passed, found: None } };
-            let point = self.scene.geometry.point(&found);
-            let surface = self.scene.surfaces.at(&point);
+            let (point, surface) = self.scene.at(&found);
             let t = found.hit.t;
             if surface.opacity >= 1.0 && surface.transmission == 0.0 {
                 return Meeting { passed, found: Some(Met { point, surface, t }) };
@@ -162,7 +161,7 @@ impl<'a> Tracer<'a> {
         let mut share = [1.0; 3];
         for _ in 0..PASSED {
             let Some(found) = self.scene.geometry.nearest_porous(&ray) else { return share };
-            let surface = self.scene.surfaces.at(&self.scene.geometry.point(&found));
+            let (_, surface) = self.scene.at(&found);
             let pane = through(&surface, dot(ray.direction, surface.normal));
             share = std::array::from_fn(|k| share[k] * (1.0 - surface.opacity + surface.opacity * pane[k]));
             if share == [0.0; 3] {

@@ -10,6 +10,7 @@ use super::vector::{V3, along, dot, luminance, scale, times, unit};
 use super::{Pixel, Strategy, View};
 use crate::math::multiversion;
 use crate::ops::ray_triangles::{Hit, Ray};
+use diorama_geom::Lens;
 use diorama_geom::glam::DVec3;
 use std::ops::Range;
 
@@ -62,13 +63,13 @@ multiversion! {
         let w = view.camera.width as usize;
         let (rows, spp) = (pixels.len() / w, samples.len());
         let mut sums = vec![[0.0f32; Pixel::LEN]; pixels.len()];
-        let mut wave = Wave::new(tracer);
+        let (mut wave, eye) = (Wave::new(tracer), Eye::new(view));
         // Columns of few rows, so that neighboring paths meet the same triangles.
         let place = |i: usize| [i / spp / rows, i / spp % rows];
         let total = pixels.len() * spp;
         for first in (0..total).step_by(WAVE) {
             let range = first..(first + WAVE).min(total);
-            wave.start(view, range.clone().map(|i| {
+            wave.start(&eye, range.clone().map(|i| {
                 let [x, row] = place(i);
                 ([x, top + row], samples.start + (i % spp) as u32)
             }));
@@ -92,22 +93,42 @@ multiversion! {
     }
 }
 
-/// A ray through a random point of a pixel and of the lens.
-#[inline(always)]
-fn camera_ray(view: &View, [x, y]: [usize; 2], sampler: &mut Sampler) -> Ray {
-    let [dx, dy] = sampler.pair();
-    let pose = &view.world_from_camera;
-    let (mut origin, mut d) = (DVec3::ZERO, view.camera.direction(x as f64 + dx as f64, y as f64 + dy as f64));
-    match view.lens.filter(|_| d.z > 0.0) {
-        Some(lens) => {
-            let lens_point = sampler.pair();
+/// Rays of a view.
+struct Eye<'a> {
+    view: &'a View,
+    /// For a pinhole camera, directions in the world as `[x, y, one]` of pixel coordinates.
+    pinhole: Option<[DVec3; 3]>,
+}
+
+impl Eye<'_> {
+    fn new(view: &View) -> Eye<'_> {
+        let (c, turn) = (&view.camera, view.world_from_camera.rotation);
+        let is_plain = matches!(c.lens, Lens::Pinhole) && view.lens.is_none();
+        let axes = [DVec3::new(1.0 / c.fx, 0.0, 0.0), DVec3::new(0.0, 1.0 / c.fy, 0.0), DVec3::new(-c.cx / c.fx, -c.cy / c.fy, 1.0)];
+        Eye { view, pinhole: is_plain.then(|| axes.map(|axis| turn * axis)) }
+    }
+
+    /// A ray through a random point of a pixel and of the lens.
+    #[inline(always)]
+    fn ray(&self, [x, y]: [usize; 2], sampler: &mut Sampler) -> Ray {
+        let [dx, dy] = sampler.pair();
+        let (x, y) = (x as f64 + dx as f64, y as f64 + dy as f64);
+        let pose = &self.view.world_from_camera;
+        let ray = |origin, direction| Ray { origin, direction, range: [0.0, f32::INFINITY] };
+        if let Some([right, down, ahead]) = self.pinhole {
+            sampler.skip_pair();
+            let d: V3 = std::array::from_fn(|k| (x * right[k] + y * down[k] + ahead[k]) as f32);
+            return ray(narrow(pose.translation), unit(d));
+        }
+        let (mut origin, mut d) = (DVec3::ZERO, self.view.camera.direction(x, y));
+        let lens_point = sampler.pair();
+        if let Some(lens) = self.view.lens.filter(|_| d.z > 0.0) {
             let (radius, angle) = (lens.radius * (lens_point[0] as f64).sqrt(), std::f64::consts::TAU * lens_point[1] as f64);
             origin = DVec3::new(radius * angle.cos(), radius * angle.sin(), 0.0);
             d = (d * (lens.focus / d.z) - origin).normalize();
         }
-        None => sampler.skip_pair(),
+        ray(narrow(pose.point(origin)), narrow(pose.rotation * d))
     }
-    Ray { origin: narrow(pose.point(origin)), direction: narrow(pose.rotation * d), range: [0.0, f32::INFINITY] }
 }
 
 /// `(a / (a + b))` of squares: the power heuristic.
@@ -153,12 +174,12 @@ impl<'a> Wave<'a> {
 
     /// New paths through pixels (x, y), of samples.
     #[inline(always)]
-    fn start(&mut self, view: &View, samples: impl Iterator<Item = ([usize; 2], u32)>) {
+    fn start(&mut self, eye: &Eye, samples: impl Iterator<Item = ([usize; 2], u32)>) {
         self.paths.clear();
         self.rays.clear();
         for ([x, y], sample) in samples {
-            let mut sampler = Sampler::new(self.tracer.settings.seed, (y * view.camera.width as usize + x) as u32, sample);
-            self.rays.push(camera_ray(view, [x, y], &mut sampler));
+            let mut sampler = Sampler::new(self.tracer.settings.seed, (y * eye.view.camera.width as usize + x) as u32, sample);
+            self.rays.push(eye.ray([x, y], &mut sampler));
             self.paths.push(Path { sampler, throughput: [1.0; 3], density: f32::INFINITY, is_backdrop: false, sample: Pixel::default() });
         }
         self.alive.clear();

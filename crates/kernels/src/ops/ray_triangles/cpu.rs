@@ -13,6 +13,8 @@ pub(super) const WIDER: f32 = 1.000_000_4;
 /// Smallest component of a direction that divides.
 const TINY: f32 = 1e-30;
 
+/// Rays that take their steps in turns.
+const AT_ONCE: usize = 4;
 /// Entries at most: seven for each level of the deepest tree, which has 40 levels by area and 28 by halves.
 const DEEPEST: usize = 512;
 
@@ -174,58 +176,117 @@ impl Stack {
     }
 }
 
+/// A ray on its way.
+struct Way {
+    /// Index among those that are traced.
+    ray: usize,
+    prepared: Prepared,
+    range: [f32; 2],
+    best: Hit,
+    stack: Stack,
+    /// The node or packet that it is at.
+    at: u32,
+}
+
+impl Way {
+    #[inline(always)]
+    fn new(ray: &Ray, index: usize) -> Way {
+        Way { ray: index, prepared: Prepared::new(ray), range: ray.range, best: Hit::NONE, stack: Stack::new(), at: 0 }
+    }
+
+    /// Begins with another ray.
+    #[inline(always)]
+    fn start(&mut self, ray: &Ray, index: usize) {
+        (self.ray, self.prepared, self.range, self.best, self.at) = (index, Prepared::new(ray), ray.range, Hit::NONE, 0);
+        self.stack.size = 0;
+    }
+
+    /// Goes to what is next on the stack; false if nothing is.
+    #[inline(always)]
+    fn pop(&mut self) -> bool {
+        let next = self.stack.pop(self.best.t);
+        self.at = next.unwrap_or(0);
+        next.is_some()
+    }
+
+    /// Visits a node or packet; false if the ray is at its end.
+    #[inline(always)]
+    unsafe fn step<O: Octet, const ANY: bool>(&mut self, bvh: &Bvh) -> bool {
+        if self.at & LEAF != 0 {
+            // SAFETY: as the caller guarantees.
+            unsafe { self.prepared.triangles::<O>(&bvh.packets[(self.at & !LEAF) as usize], self.range, &mut self.best) };
+            return !(ANY && self.best.is_some()) && self.pop();
+        }
+        let node = &bvh.nodes[self.at as usize];
+        // SAFETY: as the caller guarantees.
+        let (near, met) = unsafe { self.prepared.boxes::<O>(node, [self.range[0], self.range[1].min(self.best.t)]) };
+        if met == 0 {
+            return self.pop();
+        }
+        if O::COMPRESSES {
+            // SAFETY: as the caller guarantees.
+            let nearest = unsafe { near.compress(met, &node.content, self.stack.room()) };
+            self.stack.size += met.count_ones() as usize - 1;
+            self.at = nearest as u32;
+            return true;
+        }
+        if met & (met - 1) == 0 {
+            self.at = node.content[met.trailing_zeros() as usize % WIDTH];
+            return true;
+        }
+        let mut distances = [0.0; WIDTH];
+        // SAFETY: as the caller guarantees.
+        unsafe { near.store(&mut distances) };
+        let first = self.stack.size;
+        for i in each(met) {
+            // Sorted, the farthest at the bottom.
+            self.stack.insert(entry(distances[i], node.content[i]), first);
+        }
+        self.pop()
+    }
+}
+
 impl Bvh {
     #[inline(always)]
     pub(super) unsafe fn trace<O: Octet, const ANY: bool>(&self, ray: &Ray) -> Hit {
-        let (prepared, mut best, mut stack) = (Prepared::new(ray), Hit::NONE, Stack::new());
-        let mut next = if self.nodes.is_empty() { None } else { Some(0) };
-        while let Some(content) = next {
-            if content & LEAF != 0 {
-                // SAFETY: as the caller guarantees.
-                unsafe { prepared.triangles::<O>(&self.packets[(content & !LEAF) as usize], ray.range, &mut best) };
-                if ANY && best.is_some() {
-                    return best;
-                }
-                next = stack.pop(best.t);
-                continue;
-            }
-            let node = &self.nodes[content as usize];
-            // SAFETY: as the caller guarantees.
-            let (near, met) = unsafe { prepared.boxes::<O>(node, [ray.range[0], ray.range[1].min(best.t)]) };
-            if met == 0 {
-                next = stack.pop(best.t);
-                continue;
-            }
-            if O::COMPRESSES {
-                // SAFETY: as the caller guarantees.
-                let nearest = unsafe { near.compress(met, &node.content, stack.room()) };
-                stack.size += met.count_ones() as usize - 1;
-                next = Some(nearest as u32);
-                continue;
-            }
-            if met & (met - 1) == 0 {
-                next = Some(node.content[met.trailing_zeros() as usize % WIDTH]);
-                continue;
-            }
-            let mut distances = [0.0; WIDTH];
-            // SAFETY: as the caller guarantees.
-            unsafe { near.store(&mut distances) };
-            let first = stack.size;
-            for i in each(met) {
-                // Sorted, the farthest at the bottom.
-                stack.insert(entry(distances[i], node.content[i]), first);
-            }
-            next = stack.pop(best.t);
+        let mut way = Way::new(ray, 0);
+        // SAFETY: as the caller guarantees.
+        while !self.nodes.is_empty() && unsafe { way.step::<O, ANY>(self) } {}
+        way.best
+    }
+
+    /// Rays take their steps in turns, so that the CPU works on one while another waits for what it has to know next.
+    #[inline(always)]
+    unsafe fn trace_block<O: Octet, const ANY: bool>(&self, rays: &[Ray], hits: &mut [Hit]) {
+        if self.nodes.is_empty() {
+            return hits.fill(Hit::NONE);
         }
-        best
+        let mut rest = (0..).zip(rays);
+        let mut ways: [Option<Way>; AT_ONCE] = std::array::from_fn(|_| rest.next().map(|(i, ray)| Way::new(ray, i)));
+        let mut going = ways.iter().flatten().count();
+        while going > 0 {
+            for slot in &mut ways {
+                let Some(way) = slot else { continue };
+                // SAFETY: as the caller guarantees.
+                if unsafe { way.step::<O, ANY>(self) } {
+                    continue;
+                }
+                hits[way.ray] = way.best;
+                match rest.next() {
+                    Some((i, ray)) => way.start(ray, i),
+                    None => {
+                        *slot = None;
+                        going -= 1;
+                    }
+                }
+            }
+        }
     }
 
     #[inline(always)]
-    unsafe fn trace_block<O: Octet>(&self, rays: &[Ray], any: bool, hits: &mut [Hit]) {
-        for (ray, hit) in rays.iter().zip(hits) {
-            // SAFETY: as the caller guarantees.
-            *hit = unsafe { if any { self.trace::<O, true>(ray) } else { self.trace::<O, false>(ray) } };
-        }
+    unsafe fn trace_either<O: Octet>(&self, rays: &[Ray], any: bool, hits: &mut [Hit]) {
+        // SAFETY: as the caller guarantees.
+        unsafe { if any { self.trace_block::<O, true>(rays, hits) } else { self.trace_block::<O, false>(rays, hits) } }
     }
 
     /// The nearest hit of each ray, or with `any` some hit; [`Hit::NONE`] if nothing is in its way.
@@ -240,7 +301,7 @@ impl Bvh {
             Level::Avx512 => unsafe { self.trace_block_avx512(rays, any, hits) },
             #[cfg(target_arch = "x86_64")]
             Level::Avx2 => unsafe { self.trace_block_avx2(rays, any, hits) },
-            _ => unsafe { self.trace_block::<octet::Plain>(rays, any, hits) },
+            _ => unsafe { self.trace_either::<octet::Plain>(rays, any, hits) },
         }
     }
 
@@ -269,7 +330,7 @@ impl Bvh {
             unsafe { self.trace_bundle::<O>(rays, &mut stack, hits) };
         }
         // SAFETY: as the caller guarantees.
-        unsafe { self.trace_block::<O>(rest, false, rest_hits) };
+        unsafe { self.trace_block::<O, false>(rest, rest_hits) };
     }
 
     #[cfg(target_arch = "x86_64")]
@@ -298,14 +359,14 @@ impl Bvh {
     #[target_feature(enable = "avx512f,avx512dq,avx512bw,avx512vl,avx2")]
     unsafe fn trace_block_avx512(&self, rays: &[Ray], any: bool, hits: &mut [Hit]) {
         // SAFETY: compiled for the set.
-        unsafe { self.trace_block::<octet::Avx512>(rays, any, hits) }
+        unsafe { self.trace_either::<octet::Avx512>(rays, any, hits) }
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
     unsafe fn trace_block_avx2(&self, rays: &[Ray], any: bool, hits: &mut [Hit]) {
         // SAFETY: compiled for the set.
-        unsafe { self.trace_block::<octet::Avx2>(rays, any, hits) }
+        unsafe { self.trace_either::<octet::Avx2>(rays, any, hits) }
     }
 }
 
