@@ -64,18 +64,13 @@ multiversion! {
         let (rows, spp) = (pixels.len() / w, samples.len());
         let mut sums = vec![[0.0f32; Pixel::LEN]; pixels.len()];
         let (mut wave, eye) = (Wave::new(tracer), Eye::new(view));
-        // Columns of few rows, so that neighboring paths meet the same triangles.
-        let place = |i: usize| [i / spp / rows, i / spp % rows];
+        let mut places = Places { x: 0, row: 0, sample: 0, rows, samples: spp };
         let total = pixels.len() * spp;
         for first in (0..total).step_by(WAVE) {
-            let range = first..(first + WAVE).min(total);
-            wave.start(&eye, range.clone().map(|i| {
-                let [x, row] = place(i);
-                ([x, top + row], samples.start + (i % spp) as u32)
-            }));
+            let here = places.clone();
+            wave.start(&eye, top, samples.start, places.by_ref().take(WAVE.min(total - first)));
             wave.run();
-            for (i, path) in range.zip(&wave.paths) {
-                let [x, row] = place(i);
+            for ([x, row, _], path) in here.zip(&wave.paths) {
                 for (sum, value) in sums[row * w + x].iter_mut().zip(path.values()) {
                     *sum += value;
                 }
@@ -90,6 +85,33 @@ multiversion! {
             }
             *pixel = Pixel::of(mean);
         }
+    }
+}
+
+/// Columns, rows and samples of a strip without end: columns of few rows, so that neighboring paths meet the same triangles.
+#[derive(Clone)]
+struct Places {
+    x: usize,
+    row: usize,
+    sample: usize,
+    rows: usize,
+    samples: usize,
+}
+
+impl Iterator for Places {
+    type Item = [usize; 3];
+
+    #[inline(always)]
+    fn next(&mut self) -> Option<[usize; 3]> {
+        let here = [self.x, self.row, self.sample];
+        self.sample += 1;
+        if self.sample == self.samples {
+            (self.sample, self.row) = (0, self.row + 1);
+        }
+        if self.row == self.rows {
+            (self.row, self.x) = (0, self.x + 1);
+        }
+        Some(here)
     }
 }
 
@@ -108,10 +130,9 @@ impl Eye<'_> {
         Eye { view, pinhole: is_plain.then(|| axes.map(|axis| turn * axis)) }
     }
 
-    /// A ray through a random point of a pixel and of the lens.
+    /// A ray through a point of a pixel, and a random one of the lens.
     #[inline(always)]
-    fn ray(&self, [x, y]: [usize; 2], sampler: &mut Sampler) -> Ray {
-        let [dx, dy] = sampler.pair();
+    fn ray(&self, [x, y]: [usize; 2], [dx, dy]: [f32; 2], sampler: &mut Sampler) -> Ray {
         let (x, y) = (x as f64 + dx as f64, y as f64 + dy as f64);
         let pose = &self.view.world_from_camera;
         let ray = |origin, direction| Ray { origin, direction, range: [0.0, f32::INFINITY] };
@@ -172,15 +193,35 @@ impl<'a> Wave<'a> {
         }
     }
 
-    /// New paths through pixels (x, y), of samples.
+    /// New paths through pixels of the rows from `top` on, of samples from `first` on.
     #[inline(always)]
-    fn start(&mut self, eye: &Eye, samples: impl Iterator<Item = ([usize; 2], u32)>) {
+    fn start(&mut self, eye: &Eye, top: usize, first: u32, mut places: impl Iterator<Item = [usize; 3]>) {
         self.paths.clear();
         self.rays.clear();
-        for ([x, y], sample) in samples {
-            let mut sampler = Sampler::new(self.tracer.settings.seed, (y * eye.view.camera.width as usize + x) as u32, sample);
-            self.rays.push(eye.ray([x, y], &mut sampler));
-            self.paths.push(Path { sampler, throughput: [1.0; 3], density: f32::INFINITY, is_backdrop: false, sample: Pixel::default() });
+        let width = eye.view.camera.width as usize;
+        loop {
+            let (mut samplers, mut pixels, mut n) = ([Sampler::new(0, 0, 0); LANES], [[0; 2]; LANES], 0);
+            for [x, row, sample] in places.by_ref().take(LANES) {
+                pixels[n] = [x, top + row];
+                samplers[n] = Sampler::new(self.tracer.settings.seed, ((top + row) * width + x) as u32, first + sample as u32);
+                samplers[n].skip_pair();
+                n += 1;
+            }
+            if n == 0 {
+                break;
+            }
+            let [dx, dy] = sampler::pairs(&samplers);
+            for i in 0..n {
+                let mut sampler = samplers[i];
+                self.rays.push(eye.ray(pixels[i], [dx[i], dy[i]], &mut sampler));
+                self.paths.push(Path {
+                    sampler,
+                    throughput: [1.0; 3],
+                    density: f32::INFINITY,
+                    is_backdrop: false,
+                    sample: Pixel::default(),
+                });
+            }
         }
         self.alive.clear();
         self.alive.extend(0..self.paths.len() as u32);

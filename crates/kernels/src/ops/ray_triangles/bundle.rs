@@ -90,7 +90,9 @@ impl Bvh {
             }
             let node = &self.nodes[content as usize];
             let first = stack.len();
-            for child in 0..WIDTH {
+            // Absent children are the last.
+            let children = (0..WIDTH).take_while(|child| node.bounds[0][0][*child] <= node.bounds[0][1][*child]);
+            for child in children {
                 // SAFETY: as the caller guarantees.
                 let (distances, met) = unsafe { bundle.child::<O>(node, child) };
                 if met == 0 {

@@ -51,7 +51,7 @@ impl Prepared {
             inverse,
             first: inverse.map(|i| (i < 0.0) as usize),
             axes: [x, y, z],
-            shear: [d[x] / d[z], d[y] / d[z], 1.0 / d[z]],
+            shear: [d[x] * inverse[z], d[y] * inverse[z], inverse[z]],
         }
     }
 
