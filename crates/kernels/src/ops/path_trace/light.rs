@@ -131,10 +131,10 @@ impl Steps {
         let (sums, guide) = (self.sums.as_ptr(), self.guide.as_ptr());
         for i in 0..LANES {
             let row = rows[i].min(height - 1);
-            // SAFETY: the numbers are not negative and below 1, so the product fits; bucket and row are inside, and so is what the guide says.
+            // SAFETY: the product is brought within the guide, also if it is no number; the row is inside, and so is what the guide says.
             // The last sum of a row is above every number, where the steps end.
             let (at, below, above) = unsafe {
-                let bucket = (random[i] * n as f32).to_int_unchecked::<u32>().min(last);
+                let bucket = (random[i] * n as f32).max(0.0).min(last as f32).to_int_unchecked::<u32>();
                 let start = row * (n + 1);
                 let at = *guide.add((row * n + bucket) as usize);
                 let at = at + (*sums.add((start + at + 1) as usize) <= random[i]) as u32;
@@ -300,8 +300,8 @@ impl DistantLight {
             (x[i], y[i]) = ((u - u.floor()) * self.width as f32, arc_cosine(directions[2][i]) / PI * self.height as f32);
         }
         let last = [self.width as u32 - 1, self.height as u32 - 1];
-        // SAFETY: coordinates lie within the map, whose size fits.
-        let inside = |v: f32, last: u32| unsafe { v.clamp(0.0, last as f32).to_int_unchecked::<u32>() };
+        // SAFETY: coordinates are brought within the map, whose size fits, also if they are no numbers.
+        let inside = |v: f32, last: u32| unsafe { v.max(0.0).min(last as f32).to_int_unchecked::<u32>() };
         let places = self.places(&x, &y, |i| inside(y[i], last[1]) * self.width as u32 + inside(x[i], last[0]));
         for i in 0..n {
             prefetch(&self.texels[places.texels[0][i] as usize]);
