@@ -9,8 +9,8 @@ use serde::Serialize;
 
 /// Cells of the grid along each side; each is two triangles.
 const CELLS: usize = 128;
-/// Edge of the sheet in clip space, such that no corner lies on the center of a pixel: there, rounding may leave a pixel open.
-const EXTENT: f32 = 2.217;
+/// Edge of the sheet in clip space; corners of the sheet lie on centers of pixels.
+const EXTENT: f32 = 2.25;
 /// Edge of the texture in texels.
 const TEXELS: usize = 1024;
 

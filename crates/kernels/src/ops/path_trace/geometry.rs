@@ -3,6 +3,7 @@
 
 use super::vector::{V3, cross, mix, sub, transform_direction, transform_normal, transform_point, unit};
 use crate::ops::ray_triangles::{Bvh, Hit, Ray};
+use crate::tasks::prefetch;
 use diorama_geom::glam::DAffine3;
 use diorama_geom::model::{Model, Opacity};
 
@@ -15,18 +16,30 @@ const IDENTITY: Affine = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0,
 #[derive(Clone, Debug)]
 struct Mesh {
     bvh: Bvh,
-    positions: Vec<V3>,
-    normals: Vec<V3>,
-    /// Along u, with the sign of the direction against v; zero where there are none.
-    tangents: Vec<[f32; 4]>,
-    uvs: Vec<[f32; 2]>,
-    /// Linear factors of the base color.
-    colors: Vec<V3>,
-    triangles: Vec<[u32; 3]>,
-    /// Index of the material of each triangle.
-    materials: Vec<u32>,
-    /// Index of the instance that each triangle belongs to, for meshes that stand once.
-    instances: Vec<u32>,
+    vertices: Vec<Vertex>,
+    faces: Vec<Face>,
+}
+
+/// What is interpolated between the corners of a triangle; together, because a hit reads all of it.
+#[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
+struct Vertex {
+    position: V3,
+    normal: V3,
+    /// Along u, with the sign of the direction against v; zero where there is none.
+    tangent: [f32; 4],
+    uv: [f32; 2],
+    /// Linear factor of the base color.
+    color: V3,
+}
+
+/// A triangle.
+#[derive(Clone, Copy, Debug)]
+struct Face {
+    corners: [u32; 3],
+    material: u32,
+    /// The instance that it belongs to, in meshes that stand once.
+    instance: u32,
 }
 
 /// A mesh where it stands.
@@ -136,12 +149,12 @@ impl Geometry {
                     geometry.meshes.push(mesh.finished());
                     geometry.meshes.len() - 1
                 });
-                let (low, high) = bounds(geometry.meshes[mesh].positions.iter().map(|p| transform_point(&world_from_mesh, *p)));
+                let (low, high) = bounds(geometry.meshes[mesh].vertices.iter().map(|v| transform_point(&world_from_mesh, v.position)));
                 let mesh_from_world = rows(&instance.world_from_part.inverse());
                 placed.push(Placed { mesh, instance: i as u32, is_moved: true, world_from_mesh, mesh_from_world, low, high });
             }
-            if !once.triangles.is_empty() {
-                let (low, high) = bounds(once.positions.iter().copied());
+            if !once.faces.is_empty() {
+                let (low, high) = bounds(once.vertices.iter().map(|v| v.position));
                 geometry.meshes.push(once.finished());
                 let mesh = geometry.meshes.len() - 1;
                 placed.push(Placed { mesh, instance: 0, is_moved: false, world_from_mesh: IDENTITY, mesh_from_world: IDENTITY, low, high });
@@ -161,6 +174,33 @@ impl Geometry {
         self.nearest_porous(&Ray { range, ..*ray }).or(solid)
     }
 
+    /// The nearest surface that each ray meets, if any; faster with `alike` where neighbors among the rays start and point alike.
+    #[inline(always)]
+    pub fn nearest_each(&self, rays: &[Ray], alike: bool, hits: &mut [Hit], found: &mut [Option<Found>]) {
+        let Some(mesh) = self.solid.only(&self.meshes).filter(|_| self.porous.nodes.is_empty()) else {
+            return found.iter_mut().zip(rays).for_each(|(found, ray)| *found = self.nearest(ray));
+        };
+        if alike {
+            mesh.bvh.trace_neighbors(rays, hits);
+        } else {
+            mesh.bvh.trace_each(rays, false, hits);
+        }
+        for (found, hit) in found.iter_mut().zip(hits) {
+            *found = hit.is_some().then_some(Found { hit: *hit, is_porous: false, placed: 0 });
+        }
+    }
+
+    /// Some hit of each ray with what light cannot pass, or none.
+    #[inline(always)]
+    pub fn blocking_each(&self, rays: &[Ray], hits: &mut [Hit]) {
+        match self.solid.only(&self.meshes) {
+            Some(mesh) => mesh.bvh.trace_each(rays, true, hits),
+            None => hits.iter_mut().zip(rays).for_each(|(hit, ray)| {
+                *hit = self.solid.nearest(&self.meshes, ray, true).map_or(Hit::NONE, |f| f.hit);
+            }),
+        }
+    }
+
     /// The nearest surface among those that light may pass.
     pub fn nearest_porous(&self, ray: &Ray) -> Option<Found> {
         if self.porous.nodes.is_empty() {
@@ -175,30 +215,50 @@ impl Geometry {
         self.solid.nearest(&self.meshes, ray, true).is_some()
     }
 
-    /// Properties of a surface that was found.
+    /// Starts to fetch what [`Geometry::prefetch_vertices`] reads.
     #[inline(always)]
-    pub fn point(&self, found: &Found) -> Point {
+    pub fn prefetch_face(&self, found: &Found) {
+        prefetch(&self.mesh(found).1.faces[found.hit.triangle as usize]);
+    }
+
+    /// Starts to fetch what [`Geometry::point`] reads.
+    #[inline(always)]
+    pub fn prefetch_vertices(&self, found: &Found) {
+        let mesh = self.mesh(found).1;
+        mesh.faces[found.hit.triangle as usize].corners.iter().for_each(|v| prefetch(&mesh.vertices[*v as usize]));
+    }
+
+    #[inline(always)]
+    fn mesh(&self, found: &Found) -> (&Placed, &Mesh) {
         let tree = if found.is_porous { &self.porous } else { &self.solid };
         let placed = &tree.placed[found.placed as usize];
-        let mesh = &self.meshes[placed.mesh];
-        let (i, w) = (found.hit.triangle as usize, found.hit.weights);
-        let corners = mesh.triangles[i].map(|v| v as usize);
-        let p = corners.map(|v| mesh.positions[v]);
-        let uvs = corners.map(|v| mesh.uvs[v]);
+        (placed, &self.meshes[placed.mesh])
+    }
+
+    /// Properties of a surface that was found; the tangent only where `needs_tangent` says so of a material, else it is zero.
+    #[inline(always)]
+    pub fn point(&self, found: &Found, needs_tangent: impl Fn(u32) -> bool) -> Point {
+        let (placed, mesh) = self.mesh(found);
+        let (face, w) = (&mesh.faces[found.hit.triangle as usize], found.hit.weights);
+        let corners = face.corners.map(|v| &mesh.vertices[v as usize]);
+        let p = corners.map(|v| v.position);
         let flat = cross(sub(p[1], p[0]), sub(p[2], p[0]));
-        let mut tangent: [f32; 4] = mix(corners.map(|v| mesh.tangents[v]), w);
-        if tangent[3] == 0.0 {
-            tangent = tangent_of(p, uvs);
+        let mut tangent = [0.0; 4];
+        if needs_tangent(face.material) {
+            tangent = mix(corners.map(|v| v.tangent), w);
+            if tangent[3] == 0.0 {
+                tangent = tangent_of(p, corners.map(|v| v.uv));
+            }
         }
         let mut point = Point {
             position: mix(p, w),
             flat_normal: unit(flat),
-            normal: mix(corners.map(|v| mesh.normals[v]), w),
+            normal: mix(corners.map(|v| v.normal), w),
             tangent,
-            uv: mix(uvs, w),
-            color: mix(corners.map(|v| mesh.colors[v]), w),
-            material: mesh.materials[i],
-            instance: if placed.is_moved { placed.instance } else { mesh.instances[i] },
+            uv: mix(corners.map(|v| v.uv), w),
+            color: mix(corners.map(|v| v.color), w),
+            material: face.material,
+            instance: if placed.is_moved { placed.instance } else { face.instance },
         };
         if placed.is_moved {
             let t = [tangent[0], tangent[1], tangent[2]];
@@ -242,21 +302,11 @@ fn union(a: (V3, V3), b: (V3, V3)) -> (V3, V3) {
 
 impl Mesh {
     fn empty() -> Mesh {
-        Mesh {
-            bvh: Bvh::build(&[], &[]),
-            positions: Vec::new(),
-            normals: Vec::new(),
-            tangents: Vec::new(),
-            uvs: Vec::new(),
-            colors: Vec::new(),
-            triangles: Vec::new(),
-            materials: Vec::new(),
-            instances: Vec::new(),
-        }
+        Mesh { bvh: Bvh::build(&[], &[]), vertices: Vec::new(), faces: Vec::new() }
     }
 
     fn append(&mut self, model: &Model, part: usize, instance: u32, world_from_part: &DAffine3) {
-        let (part, first) = (&model.parts[part], self.positions.len() as u32);
+        let (part, first) = (&model.parts[part], self.vertices.len() as u32);
         let (mesh, n) = (&part.mesh, part.mesh.positions.len());
         assert!(part.material < model.materials.len(), "part {} has a material that does not exist", part.name);
         let (there, back) = (rows(world_from_part), rows(&world_from_part.inverse()));
@@ -266,28 +316,28 @@ impl Mesh {
             shaded.compute_normals();
             normals = shaded.normals;
         }
-        self.positions.extend(mesh.positions.iter().map(|p| transform_point(&there, *p)));
-        self.normals.extend(normals.iter().map(|v| transform_normal(&back, *v)));
-        self.tangents.extend((0..n).map(|i| match mesh.tangents.get(i) {
-            Some(t) => {
+        let linear = |c: &V3| c.map(diorama_geom::color::linear_from_srgb);
+        self.vertices.extend((0..n).map(|i| Vertex {
+            position: transform_point(&there, mesh.positions[i]),
+            normal: transform_normal(&back, normals[i]),
+            tangent: mesh.tangents.get(i).map_or([0.0; 4], |t| {
                 let [x, y, z] = transform_direction(&there, [t[0], t[1], t[2]]);
                 [x, y, z, t[3]]
-            }
-            None => [0.0; 4],
+            }),
+            uv: mesh.uvs.get(i).copied().unwrap_or([0.0; 2]),
+            color: mesh.colors_srgb.get(i).map_or([1.0; 3], linear),
         }));
-        self.uvs.extend((0..n).map(|i| mesh.uvs.get(i).copied().unwrap_or([0.0; 2])));
-        let linear = |c: &V3| c.map(diorama_geom::color::linear_from_srgb);
-        self.colors.extend((0..n).map(|i| mesh.colors_srgb.get(i).map_or([1.0; 3], linear)));
         // A reflection turns triangles inside out.
         let is_mirrored = world_from_part.matrix3.determinant() < 0.0;
         let turned = |f: &[u32; 3]| if is_mirrored { [f[0], f[2], f[1]] } else { *f }.map(|v| first + v);
-        self.triangles.extend(mesh.faces.iter().map(turned));
-        self.materials.resize(self.triangles.len(), part.material as u32);
-        self.instances.resize(self.triangles.len(), instance);
+        let material = part.material as u32;
+        self.faces.extend(mesh.faces.iter().map(|f| Face { corners: turned(f), material, instance }));
     }
 
     fn finished(mut self) -> Mesh {
-        self.bvh = Bvh::build(&self.positions, &self.triangles);
+        let positions: Vec<V3> = self.vertices.iter().map(|v| v.position).collect();
+        let triangles: Vec<[u32; 3]> = self.faces.iter().map(|f| f.corners).collect();
+        self.bvh = Bvh::build(&positions, &triangles);
         self
     }
 }
@@ -304,11 +354,16 @@ impl Tree {
         Tree { placed, nodes }
     }
 
+    /// The mesh, if it is alone and where it stands in the world.
+    #[inline(always)]
+    fn only<'a>(&self, meshes: &'a [Mesh]) -> Option<&'a Mesh> {
+        let [only] = &self.placed[..] else { return None };
+        (!only.is_moved).then(|| &meshes[only.mesh])
+    }
+
     fn nearest(&self, meshes: &[Mesh], ray: &Ray, any: bool) -> Option<Found> {
-        if let [only] = &self.placed[..]
-            && !only.is_moved
-        {
-            let hit = meshes[only.mesh].bvh.trace_one(ray, any);
+        if let Some(mesh) = self.only(meshes) {
+            let hit = mesh.bvh.trace_one(ray, any);
             return hit.is_some().then_some(Found { hit, is_porous: false, placed: 0 });
         }
         let inverse = ray.direction.map(|d| 1.0 / if d.abs() < 1e-30 { 1e-30f32.copysign(d) } else { d });

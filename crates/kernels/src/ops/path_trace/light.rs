@@ -2,6 +2,7 @@
 //! section 12.5), and the sun's disc.
 
 use super::vector::{V3, along, arc_cosine, dot, frame, luminance, scale, sin_cos_turns, sub, turns_of};
+use crate::tasks::prefetch;
 use diorama_geom::daylight::Daylight;
 use std::f32::consts::PI;
 
@@ -17,8 +18,9 @@ pub struct DistantLight {
     texels: Vec<[f32; 4]>,
     /// Angle by which sources are turned, in turns.
     turn: f32,
+    /// One distribution, and one for each row.
     rows: Steps,
-    columns: Vec<Steps>,
+    columns: Steps,
     /// Cosine of the polar angle at the upper edge of each row, and at the lower one of the last, `[H + 1]`.
     edges: Vec<f32>,
     sun: Option<Disc>,
@@ -55,18 +57,40 @@ pub struct Drawn {
     pub density: f32,
 }
 
-/// A distribution that is constant within equal intervals, and for equal shares of it the interval to search from.
+impl Drawn {
+    /// No light.
+    pub const NONE: Drawn = Drawn { direction: [0.0; 3], radiance: [0.0; 3], density: 0.0 };
+}
+
+/// Draws that are computed together, in lanes.
+pub const LANES: usize = 32;
+
+type Floats = [f32; LANES];
+type Indices = [u32; LANES];
+
+/// Distributions that are constant within equal intervals, and for equal shares of each the interval to search from.
 #[derive(Clone, Debug)]
 struct Steps {
-    /// Sums before each interval, from 0 to 1.
+    /// Intervals of each.
+    n: usize,
+    /// Sums before each interval, from 0 to 1, `[rows, n + 1]`.
     sums: Vec<f32>,
+    /// `[rows, n]`
     guide: Vec<u32>,
 }
 
 impl Steps {
-    /// Even if all weights are 0.
-    fn new(weights: &[f64]) -> Steps {
-        let n = weights.len();
+    /// Even where all weights of a row are 0.
+    fn new(weights: &[f64], n: usize) -> Steps {
+        let mut steps = Steps { n, sums: Vec::new(), guide: Vec::new() };
+        weights.chunks_exact(n).for_each(|row| steps.push(row));
+        // Room for one more step beyond the last interval.
+        steps.sums.push(2.0);
+        steps
+    }
+
+    fn push(&mut self, weights: &[f64]) {
+        let n = self.n;
         let total: f64 = weights.iter().sum();
         let mut sums = vec![0.0f32; n + 1];
         let mut sum = 0.0;
@@ -75,35 +99,74 @@ impl Steps {
             sums[i + 1] = sum.min(1.0) as f32;
         }
         sums[n] = 1.0;
-        let mut guide = vec![0; n];
         let mut at = 0;
-        for (i, g) in guide.iter_mut().enumerate() {
+        for i in 0..n {
             while at + 1 < n && sums[at + 1] <= i as f32 / n as f32 {
                 at += 1;
             }
-            *g = at as u32;
+            self.guide.push(at as u32);
         }
-        Steps { sums, guide }
+        self.sums.extend(sums);
     }
 
-    #[inline(always)]
-    fn share(&self, i: usize) -> f32 {
-        self.sums[i + 1] - self.sums[i]
+    fn share(&self, row: usize, i: usize) -> f32 {
+        let at = row * (self.n + 1) + i;
+        self.sums[at + 1] - self.sums[at]
     }
 
-    /// The interval that a number in `[0, 1)` falls into, and where in it.
+    /// Starts to fetch what [`Steps::find`] reads.
     #[inline(always)]
-    fn find(&self, random: f32) -> (usize, f32) {
-        let n = self.guide.len();
-        let k = ((random * n as f32) as usize).min(n - 1);
-        let (mut i, mut last) = (self.guide[k] as usize, self.guide.get(k + 1).map_or(n - 1, |g| *g as usize));
-        while i < last {
-            let middle = (i + last) / 2;
-            (i, last) = if self.sums[middle + 1] <= random { (middle + 1, last) } else { (i, middle) };
-        }
-        let size = self.share(i);
-        (i, if size > 0.0 { ((random - self.sums[i]) / size).clamp(0.0, 1.0) } else { 0.5 })
+    fn prefetch(&self, row: usize, random: f32) {
+        let bucket = ((random * self.n as f32) as usize).min(self.n - 1);
+        prefetch(&self.guide[row * self.n + bucket]);
+        prefetch(&self.sums[row * (self.n + 1) + bucket]);
     }
+
+    /// The intervals that numbers in `[0, 1)` fall into in rows, and where in them.
+    #[inline(always)]
+    fn find(&self, rows: &Indices, random: &Floats) -> (Indices, Floats) {
+        let (n, last) = (self.n as u32, self.n as u32 - 1);
+        let height = self.guide.len() as u32 / n;
+        let (mut found, mut places) = ([0; LANES], [0.0; LANES]);
+        let (sums, guide) = (self.sums.as_ptr(), self.guide.as_ptr());
+        for i in 0..LANES {
+            let row = rows[i].min(height - 1);
+            // SAFETY: the product is brought within the guide, also if it is no number; the row is inside, and so is what the guide says.
+            // The last sum of a row is above every number, where the steps end.
+            let (at, below, above) = unsafe {
+                let bucket = (random[i] * n as f32).max(0.0).min(last as f32).to_int_unchecked::<u32>();
+                let start = row * (n + 1);
+                let at = *guide.add((row * n + bucket) as usize);
+                let at = at + (*sums.add((start + at + 1) as usize) <= random[i]) as u32;
+                let at = (at + (*sums.add((start + at.min(last) + 1) as usize) <= random[i]) as u32).min(last);
+                (at, *sums.add((start + at) as usize), *sums.add((start + at + 1) as usize))
+            };
+            let size = above - below;
+            found[i] = at;
+            places[i] = if size > 0.0 { (random[i] - below) / size } else { 0.5 };
+        }
+        for i in 0..LANES {
+            // Rarely, a third interval or more.
+            let start = rows[i].min(height - 1) as usize * (self.n + 1);
+            while self.sums[start + found[i] as usize + 1] <= random[i] && found[i] < last {
+                found[i] += 1;
+                let at = start + found[i] as usize;
+                let size = self.sums[at + 1] - self.sums[at];
+                places[i] = if size > 0.0 { (random[i] - self.sums[at]) / size } else { 0.5 };
+            }
+            places[i] = places[i].clamp(0.0, 1.0);
+        }
+        (found, places)
+    }
+}
+
+/// Where directions meet the map: texels around a point with its place between them, and the texel that it lies in.
+#[derive(Clone, Copy)]
+struct Places {
+    /// Indices of the upper left, upper right, lower left and lower right texel.
+    texels: [Indices; 4],
+    fraction: [Floats; 2],
+    inside: Indices,
 }
 
 impl DistantLight {
@@ -121,16 +184,15 @@ impl DistantLight {
             rows.iter().flat_map(|y| beside.iter().map(|x| lum(*x, *y))).sum()
         };
         let mut weights = vec![0.0; width * height];
-        let (mut row_weights, mut columns) = (Vec::with_capacity(height), Vec::with_capacity(height));
+        let mut row_weights = Vec::with_capacity(height);
         for (y, row) in weights.chunks_exact_mut(width).enumerate() {
             row.iter_mut().enumerate().for_each(|(x, w)| *w = weight(x, y));
             row_weights.push(row.iter().sum::<f64>() * environment.solid_angle(y));
-            columns.push(Steps::new(row));
         }
         if row_weights.iter().sum::<f64>() == 0.0 {
             row_weights = (0..height).map(|y| environment.solid_angle(y)).collect();
         }
-        let rows = Steps::new(&row_weights);
+        let (rows, columns) = (Steps::new(&row_weights, height), Steps::new(&weights, width));
         let sun = light.sun.map(|s| {
             let solid_angle = s.solid_angle();
             Disc {
@@ -148,7 +210,7 @@ impl DistantLight {
         });
         let texels = (0..width * height)
             .map(|i| {
-                let share = rows.share(i / width) * columns[i / width].share(i % width);
+                let share = rows.share(0, i / width) * columns.share(i / width, i % width);
                 let [r, g, b] = radiance[i];
                 [r, g, b, share * (1.0 - sun_share) / environment.solid_angle(i / width) as f32]
             })
@@ -173,40 +235,129 @@ impl DistantLight {
     /// Draws a direction from two numbers in `[0, 1)`.
     #[inline(always)]
     pub fn draw(&self, random: [f32; 2]) -> Drawn {
-        let [mut a, b] = random;
-        let is_sun = a < self.sun_share;
-        a = if is_sun { a / self.sun_share } else { (a - self.sun_share) / (1.0 - self.sun_share) };
-        match self.draw_sun([a, b]) {
-            Some(direction) if is_sun => {
-                let (radiance, density) = self.evaluate(direction);
-                Drawn { direction, radiance, density }
-            }
-            _ => self.draw_map([a, b]),
-        }
+        self.draw_lanes(&random.map(|v| [v; LANES]), 1)[0]
     }
 
+    /// Draws a direction from each of the first `n` pairs of numbers in `[0, 1)`; what follows are any.
     #[inline(always)]
-    fn draw_map(&self, random: [f32; 2]) -> Drawn {
-        let (y, fy) = self.rows.find(random[0]);
-        let (x, fx) = self.columns[y].find(random[1]);
-        // Even in solid angle, not in the polar angle.
-        let z = self.edges[y] + fy * (self.edges[y + 1] - self.edges[y]);
-        let sine = (1.0 - z * z).max(0.0).sqrt();
-        let (column, row) = (x as f32 + fx, arc_cosine(z) / PI * self.height as f32);
-        let [right, ahead] = sin_cos_turns(column / self.width as f32 - 0.5 - self.turn);
-        let direction = [sine * right, sine * ahead, z];
-        let (radiance, density) = self.with_sun(direction, self.bilinear(column, row, (x, y)));
-        Drawn { direction, radiance, density }
+    pub fn draw_lanes(&self, [first, second]: &[Floats; 2], n: usize) -> [Drawn; LANES] {
+        let mut from_map = [0.0; LANES];
+        for i in 0..LANES {
+            // Those that draw from the sun draw from the map as well, for nothing.
+            from_map[i] = ((first[i] - self.sun_share) / (1.0 - self.sun_share)).clamp(0.0, 1.0 - f32::EPSILON);
+        }
+        let (rows, fy) = self.rows.find(&[0; LANES], &from_map);
+        (0..n).for_each(|i| self.columns.prefetch(rows[i] as usize, second[i]));
+        let (columns, fx) = self.columns.find(&rows, second);
+        for i in 0..n {
+            self.prefetch_texels(rows[i], columns[i], fy[i]);
+        }
+        let (mut directions, mut x, mut y) = ([[0.0; LANES]; 3], [0.0; LANES], [0.0; LANES]);
+        let edges = self.edges.as_ptr();
+        for i in 0..LANES {
+            // SAFETY: there is an edge more than rows.
+            let (above, below) = unsafe { (*edges.add(rows[i] as usize), *edges.add(rows[i] as usize + 1)) };
+            // Even in solid angle, not in the polar angle.
+            let z = above + fy[i] * (below - above);
+            let sine = (1.0 - z * z).max(0.0).sqrt();
+            x[i] = columns[i] as f32 + fx[i];
+            y[i] = arc_cosine(z) / PI * self.height as f32;
+            let [right, ahead] = sin_cos_turns(x[i] / self.width as f32 - 0.5 - self.turn);
+            (directions[0][i], directions[1][i], directions[2][i]) = (sine * right, sine * ahead, z);
+        }
+        let places = self.places(&x, &y, |i| rows[i] * self.width as u32 + columns[i]);
+        let mut drawn = [Drawn::NONE; LANES];
+        for (i, drawn) in drawn.iter_mut().enumerate().take(n) {
+            let is_sun = first[i] < self.sun_share;
+            *drawn = match self.draw_sun([first[i] / self.sun_share, second[i]]) {
+                Some(direction) if is_sun => {
+                    let (radiance, density) = self.evaluate(direction);
+                    Drawn { direction, radiance, density }
+                }
+                _ => {
+                    let direction = directions.map(|axis| axis[i]);
+                    let (radiance, density) = self.with_sun(direction, self.bilinear(&places, i));
+                    Drawn { direction, radiance, density }
+                }
+            };
+        }
+        drawn
     }
 
     /// Linear radiance from a direction of length 1, and the density per steradian with which it is drawn.
     #[inline(always)]
     pub fn evaluate(&self, direction: V3) -> (V3, f32) {
-        let u = 0.5 + turns_of(direction[0], direction[1]) + self.turn;
-        let v = arc_cosine(direction[2]) / PI;
-        let (x, y) = ((u - u.floor()) * self.width as f32, v * self.height as f32);
-        let (column, row) = ((x as usize).min(self.width - 1), (y as usize).min(self.height - 1));
-        self.with_sun(direction, self.bilinear(x, y, (column, row)))
+        self.evaluate_lanes(&direction.map(|v| [v; LANES]), 1)[0]
+    }
+
+    /// Linear radiance from the first `n` directions of length 1, `[axis][lane]`, and the densities per steradian with which they are drawn;
+    /// what follows are any.
+    #[inline(always)]
+    pub fn evaluate_lanes(&self, directions: &[Floats; 3], n: usize) -> [(V3, f32); LANES] {
+        let (mut x, mut y) = ([0.0; LANES], [0.0; LANES]);
+        for i in 0..LANES {
+            let u = 0.5 + turns_of(directions[0][i], directions[1][i]) + self.turn;
+            (x[i], y[i]) = ((u - u.floor()) * self.width as f32, arc_cosine(directions[2][i]) / PI * self.height as f32);
+        }
+        let last = [self.width as u32 - 1, self.height as u32 - 1];
+        // SAFETY: coordinates are brought within the map, whose size fits, also if they are no numbers.
+        let inside = |v: f32, last: u32| unsafe { v.max(0.0).min(last as f32).to_int_unchecked::<u32>() };
+        let places = self.places(&x, &y, |i| inside(y[i], last[1]) * self.width as u32 + inside(x[i], last[0]));
+        for i in 0..n {
+            prefetch(&self.texels[places.texels[0][i] as usize]);
+            prefetch(&self.texels[places.texels[2][i] as usize]);
+        }
+        let mut values = [([0.0; 3], 0.0); LANES];
+        for (i, value) in values.iter_mut().enumerate().take(n) {
+            *value = self.with_sun(directions.map(|axis| axis[i]), self.bilinear(&places, i));
+        }
+        values
+    }
+
+    /// Starts to fetch a texel and the one above or below it that is nearer to a place in it.
+    #[inline(always)]
+    fn prefetch_texels(&self, row: u32, column: u32, place: f32) {
+        let at = row as usize * self.width + column as usize;
+        let beside = if place < 0.5 { at.saturating_sub(self.width) } else { (at + self.width).min(self.texels.len() - 1) };
+        prefetch(&self.texels[at]);
+        prefetch(&self.texels[beside]);
+    }
+
+    /// Texels around pixel coordinates, which lie within the map.
+    #[inline(always)]
+    fn places(&self, x: &Floats, y: &Floats, inside: impl Fn(usize) -> u32) -> Places {
+        let (width, height) = (self.width as i32, self.height as i32);
+        let mut places = Places { texels: [[0; LANES]; 4], fraction: [[0.0; LANES]; 2], inside: [0; LANES] };
+        for i in 0..LANES {
+            let (x, y) = (x[i] - 0.5, y[i] - 0.5);
+            let (left, top) = (x.floor(), y.floor());
+            (places.fraction[0][i], places.fraction[1][i]) = (x - left, y - top);
+            // SAFETY: coordinates within the map, whose size fits; clamped, and NaN becomes the lowest.
+            let [left, top] = unsafe {
+                [left.max(-1.0).min(width as f32).to_int_unchecked::<i32>(), top.max(-1.0).min(height as f32).to_int_unchecked::<i32>()]
+            };
+            let right = if left + 1 >= width { 0 } else { left + 1 };
+            let left = if left < 0 { width - 1 } else { left.min(width - 1) };
+            let (upper, lower) = (top.max(0).min(height - 1) * width, (top + 1).min(height - 1) * width);
+            places.texels[0][i] = (upper + left) as u32;
+            places.texels[1][i] = (upper + right) as u32;
+            places.texels[2][i] = (lower + left) as u32;
+            places.texels[3][i] = (lower + right) as u32;
+            places.inside[i] = inside(i);
+        }
+        places
+    }
+
+    /// Radiance at a place, and the density of the texel that it lies in.
+    #[inline(always)]
+    fn bilinear(&self, places: &Places, i: usize) -> (V3, f32) {
+        let [a, b, c, d] = places.texels.map(|t| self.texels[t[i] as usize]);
+        let [fx, fy] = places.fraction.map(|f| f[i]);
+        let mut sum = [0.0; 4];
+        for k in 0..4 {
+            sum[k] = (1.0 - fy) * (a[k] * (1.0 - fx) + b[k] * fx) + fy * (c[k] * (1.0 - fx) + d[k] * fx);
+        }
+        ([sum[0], sum[1], sum[2]], self.texels[places.inside[i] as usize][3])
     }
 
     /// Adds the sun's radiance and density where a direction points into it.
@@ -216,30 +367,6 @@ impl DistantLight {
             Some(sun) if sun.contains(direction) => (along(radiance, 1.0, sun.radiance), density + sun.density * self.sun_share),
             _ => (radiance, density),
         }
-    }
-
-    /// Radiance at pixel coordinates, and the density of the pixel that they lie in.
-    #[inline(always)]
-    fn bilinear(&self, x: f32, y: f32, (column, row): (usize, usize)) -> (V3, f32) {
-        let (x, y) = (x - 0.5, y - 0.5);
-        let (left, top) = (x.floor(), y.floor());
-        let (fx, fy) = (x - left, y - top);
-        let (left, top) = (left as isize, top as isize);
-        let wrapped = |c: isize| {
-            if c < 0 {
-                self.width - 1
-            } else if c as usize >= self.width {
-                0
-            } else {
-                c as usize
-            }
-        };
-        let columns = [wrapped(left), wrapped(left + 1)];
-        let rows = [top, top + 1].map(|r| r.clamp(0, self.height as isize - 1) as usize * self.width);
-        let p = |r: usize, c: usize| &self.texels[rows[r] + columns[c]];
-        let [a, b, c, d] = [p(0, 0), p(0, 1), p(1, 0), p(1, 1)];
-        let radiance = std::array::from_fn(|k| (1.0 - fy) * (a[k] * (1.0 - fx) + b[k] * fx) + fy * (c[k] * (1.0 - fx) + d[k] * fx));
-        (radiance, self.texels[row * self.width + column][3])
     }
 }
 

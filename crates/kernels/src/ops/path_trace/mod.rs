@@ -13,14 +13,16 @@ mod sampler;
 mod surface;
 #[cfg(test)]
 mod tests;
+mod tracer;
 mod vector;
+mod wave;
 
 use diorama_geom::daylight::Daylight;
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, Image, Model, Pose};
-use geometry::Geometry;
+use geometry::{Found, Geometry, Point};
 use light::DistantLight;
-use surface::Surfaces;
+use surface::{Surface, Surfaces};
 
 /// What is rendered: surfaces and the light on them.
 #[derive(Clone, Debug)]
@@ -52,6 +54,13 @@ impl Scene {
     /// Makes the first `instances` of the model the backdrop, whose light is also kept apart.
     pub fn set_backdrop(&mut self, instances: usize) {
         self.is_backdrop.iter_mut().enumerate().for_each(|(i, b)| *b = i < instances);
+    }
+
+    /// What a ray found.
+    #[inline(always)]
+    fn at(&self, found: &Found) -> (Point, Surface) {
+        let point = self.geometry.point(found, |material| self.surfaces.needs_tangent(material));
+        (point, self.surfaces.at(&point))
     }
 
     /// Triangles of all instances.

@@ -53,13 +53,14 @@ impl Sampler {
     /// The next two numbers in `[0, 1)`; over the samples of a pixel they fill the square evenly.
     #[inline(always)]
     pub fn pair(&mut self) -> [f32; 2] {
+        self.skip_pair();
+        pair_of(self.seed, self.index, self.dimension)
+    }
+
+    /// Leaves out the next two numbers.
+    #[inline(always)]
+    pub fn skip_pair(&mut self) {
         self.dimension = self.dimension.wrapping_add(1);
-        let seed = hash(self.seed ^ self.dimension.wrapping_mul(0x9e37_79b9));
-        let index = scramble_reversed(self.index.reverse_bits(), seed).reverse_bits();
-        // Both dimensions with reversed bits.
-        let (first, second) = (index, pascal(index));
-        let scrambled = |bits: u32, salt: u32| unit(scramble_reversed(bits, hash(seed ^ salt)).reverse_bits());
-        [scrambled(first, 0x68bc_21eb), scrambled(second, 0x02e5_be93)]
     }
 
     /// The next number in `[0, 1)`, without regard to the other samples: for decisions between two ways.
@@ -68,6 +69,27 @@ impl Sampler {
         self.dimension = self.dimension.wrapping_add(1);
         unit(hash(self.seed ^ self.index.wrapping_mul(0x85eb_ca6b) ^ self.dimension.wrapping_mul(0x9e37_79b9)))
     }
+}
+
+#[inline(always)]
+fn pair_of(seed: u32, index: u32, dimension: u32) -> [f32; 2] {
+    let seed = hash(seed ^ dimension.wrapping_mul(0x9e37_79b9));
+    let index = scramble_reversed(index.reverse_bits(), seed).reverse_bits();
+    // Both dimensions with reversed bits.
+    let (first, second) = (index, pascal(index));
+    let scrambled = |bits: u32, salt: u32| unit(scramble_reversed(bits, hash(seed ^ salt)).reverse_bits());
+    [scrambled(first, 0x68bc_21eb), scrambled(second, 0x02e5_be93)]
+}
+
+/// The two numbers that samplers came to: the first ones, and the second ones.
+#[inline(always)]
+pub fn pairs<const N: usize>(samplers: &[Sampler; N]) -> [[f32; N]; 2] {
+    let mut numbers = [[0.0; N]; 2];
+    for i in 0..N {
+        let Sampler { seed, index, dimension } = samplers[i];
+        [numbers[0][i], numbers[1][i]] = pair_of(seed, index, dimension);
+    }
+    numbers
 }
 
 #[cfg(test)]

@@ -48,6 +48,12 @@ impl Surfaces {
         }
     }
 
+    /// Whether [`Surfaces::at`] reads the tangents of points of a material.
+    #[inline(always)]
+    pub fn needs_tangent(&self, material: u32) -> bool {
+        self.materials[material as usize].normal_texture.is_some()
+    }
+
     /// Whether the material has holes, or lets light pass; only then are `opacity` and `transmission` other than 1 and 0.
     #[inline(always)]
     pub fn at(&self, point: &Point) -> Surface {
@@ -124,6 +130,9 @@ fn bilinear(texture: &Texture, uv: [f32; 2], decode: impl Fn(u8) -> f32) -> [f32
 /// Index of a texel that lies within the image.
 #[inline(always)]
 fn wrapped(i: i64, n: usize, wrap: Wrap) -> usize {
+    if (0..n as i64).contains(&i) {
+        return i as usize;
+    }
     let n = n as i64;
     let i = match wrap {
         Wrap::Clamp => i.clamp(0, n - 1),

@@ -3,6 +3,7 @@
 //! With `β = M⁻¹ q`, `dβ = −M⁻¹ dM β`: a pixel's gradient `g` of β adds `−(M⁻ᵀ g) βᵢ` to corner `i`. M belongs to the triangle, so that a
 //! run needs only the sums of `gⱼ βᵢ`.
 
+use super::setup::Vertex;
 use super::{Raster, Rasterize};
 use crate::partials;
 
@@ -33,14 +34,13 @@ struct Run {
 }
 
 impl Run {
-    /// From corners in clip space and the first pixel's column and row.
+    /// From corners, size and the first pixel's column and row.
     #[inline(always)]
-    fn new(corners: [[f32; 4]; 3], [h, w]: [usize; 2], pixel: [usize; 2]) -> Run {
+    fn new(corners: [[f32; 4]; 3], size: [usize; 2], pixel: [usize; 2]) -> Run {
         let [center_x, center_y] = pixel.map(|v| v as f64 + 0.5);
-        let (half_w, half_h) = (0.5 * w as f64, 0.5 * h as f64);
         let p = corners.map(|c| {
-            let [x, y, _, w] = c.map(f64::from);
-            [x * half_w + (half_w - center_x) * w, y * half_h + (half_h - center_y) * w, w]
+            let v = Vertex::new(c, size);
+            [v.x - center_x * v.w, v.y - center_y * v.w, v.w]
         });
         let mut inverse: [[f64; 3]; 3] = std::array::from_fn(|i| {
             let (j, k) = (&p[(i + 1) % 3], &p[(i + 2) % 3]);

@@ -1,8 +1,10 @@
 //! Triangles sorted into tiles: counts per tile and chunk of triangles, prefix sum, fill. Within a tile, triangles keep their order.
 
-use super::setup::Setup;
+use super::setup::{Setup, Span, Vertex};
 use super::{Rasterize, TILE};
+use crate::math::multiversion;
 use crate::tasks::{self, Parts};
+use std::mem::MaybeUninit;
 
 /// Triangles per chunk at least.
 const CHUNK: usize = 256;
@@ -12,7 +14,7 @@ const CHUNKS: usize = 16;
 /// Triangles of each tile of each image.
 pub(super) struct Bins {
     /// `[N, F]`
-    pub setups: Vec<Setup>,
+    pub setups: Vec<(Setup, Span)>,
     /// Where the triangles of tile `[n, y, x]` begin, `[N · tiles + 1]`.
     pub offsets: Vec<u32>,
     /// Triangles, tile by tile.
@@ -21,27 +23,44 @@ pub(super) struct Bins {
     pub grid: [usize; 2],
 }
 
-fn setups(r: &Rasterize, positions: &[f32], triangles: &[[u32; 3]]) -> Vec<Setup> {
-    let (n, f) = (r.images * triangles.len(), triangles.len());
-    let mut setups: Vec<Setup> = Vec::with_capacity(n);
-    let parts = Parts::new(&mut setups.spare_capacity_mut()[..n]);
+/// Writes all elements of a new vector, in chunks of tasks: `write(first index, chunk)`.
+fn collect<T: Send>(n: usize, write: impl Fn(usize, &mut [MaybeUninit<T>]) + Sync) -> Vec<T> {
+    let mut all: Vec<T> = Vec::with_capacity(n);
+    let parts = Parts::new(&mut all.spare_capacity_mut()[..n]);
     tasks::run(n.div_ceil(CHUNK), 32 * n, |task| {
         // SAFETY: each task has a chunk of its own.
-        let setups = unsafe { parts.chunk(task, CHUNK) };
-        for (i, setup) in (task * CHUNK..).zip(setups) {
-            let vertices = &positions[i / f * r.vertices * 4..][..r.vertices * 4];
-            setup.write(Setup::new(triangles[i % f].map(|v| std::array::from_fn(|k| vertices[4 * v as usize + k])), r.size));
-        }
+        write(task * CHUNK, unsafe { parts.chunk(task, CHUNK) });
     });
     // SAFETY: the tasks wrote every element.
-    unsafe { setups.set_len(n) };
-    setups
+    unsafe { all.set_len(n) };
+    all
+}
+
+multiversion! {
+    /// Vertices from `first` on.
+    fn place(size: [usize; 2], positions: &[f32], first: usize, to: &mut [MaybeUninit<Vertex>]) {
+        for (to, p) in to.iter_mut().zip(&positions.as_chunks::<4>().0[first..]) {
+            to.write(Vertex::new(*p, size));
+        }
+    }
+}
+
+multiversion! {
+    /// Triangles from number `first` of all images on.
+    fn set_up(r: &Rasterize, vertices: &[Vertex], triangles: &[[u32; 3]], first: usize, to: &mut [MaybeUninit<(Setup, Span)>]) {
+        let f = triangles.len();
+        for (i, to) in (first..).zip(to) {
+            let image = &vertices[i / f * r.vertices..][..r.vertices];
+            to.write(Setup::new(triangles[i % f].map(|v| &image[v as usize]), r.size));
+        }
+    }
 }
 
 impl Bins {
     pub fn new(r: &Rasterize, positions: &[f32], triangles: &[[u32; 3]]) -> Bins {
         let (f, grid) = (triangles.len(), r.size.map(|n| n.div_ceil(TILE)));
-        let setups = setups(r, positions, triangles);
+        let vertices = collect(r.images * r.vertices, |first, to| place(r.size, positions, first, to));
+        let setups = collect(r.images * f, |first, to| set_up(r, &vertices, triangles, first, to));
         let tiles = grid[0] * grid[1];
         let per_chunk = f.div_ceil(CHUNKS).max(CHUNK);
         let chunks = f.div_ceil(per_chunk);
@@ -55,8 +74,8 @@ impl Bins {
         tasks::run(r.images * chunks, 32 * setups.len(), |task| {
             // SAFETY: each task has a chunk of its own.
             let counts = unsafe { parts.chunk(task, tiles) };
-            for setup in &setups[chunk_of(task).0] {
-                setup.each_tile(|x, y| counts[y * grid[1] + x] += 1);
+            for (setup, span) in &setups[chunk_of(task).0] {
+                span.each_tile(setup, |x, y| counts[y * grid[1] + x] += 1);
             }
         });
         let mut offsets = Vec::with_capacity(r.images * tiles + 1);
@@ -79,8 +98,8 @@ impl Bins {
             // SAFETY: each task has a chunk of its own.
             let next = unsafe { nexts.chunk(task, tiles) };
             let (range, first) = chunk_of(task);
-            for (triangle, setup) in (first..).zip(&setups[range]) {
-                setup.each_tile(|x, y| {
+            for (triangle, (setup, span)) in (first..).zip(&setups[range]) {
+                span.each_tile(setup, |x, y| {
                     let at = &mut next[y * grid[1] + x];
                     let place = *at as usize..*at as usize + 1;
                     // SAFETY: the counts give every chunk and tile places of their own.

@@ -1,7 +1,7 @@
 //! Tiles of 16² pixels as tasks: each tests its triangles in their order, a row of pixels at a time, and then divides once per pixel.
 
 use super::bins::Bins;
-use super::setup::Setup;
+use super::setup::{self, Setup, Span};
 use super::{Raster, Rasterize, TILE};
 use crate::tasks::{self, Parts};
 use crate::vector::{fma, vectorized};
@@ -33,23 +33,38 @@ struct Local {
     one: [f32; 4],
     /// Smallest value of an edge function that counts as inside: 0 or the next number.
     least: [f32; 3],
+    /// Exact edge functions of column and row.
+    edge_x: [i32; 3],
+    edge_y: [i32; 3],
+    edge_one: [i32; 3],
 }
+
+/// Beyond what exact edge functions change by within a tile.
+const FAR: i64 = 1 << 30;
+/// Columns of a row of pixels.
+const COLUMNS: Row<i32> = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15];
 
 impl Local {
     #[inline(always)]
     fn new(s: &Setup, corner: [usize; 2]) -> Local {
         let [left, top] = corner.map(|v| v as f64);
         let one = std::array::from_fn(|i| (s.one[i] + s.x[i] * left + s.y[i] * top) as f32);
-        let is_top_left = |i: usize| s.x[i] > 0.0 || s.x[i] == 0.0 && s.y[i] > 0.0;
-        let least = std::array::from_fn(|i| if is_top_left(i) { 0.0 } else { f32::from_bits(1) });
-        Local { x: s.x.map(|v| v as f32), y: s.y.map(|v| v as f32), one, least }
+        let least = std::array::from_fn(|i| if setup::is_top_left(s.x[i], s.y[i]) { 0.0 } else { f32::from_bits(1) });
+        let edge_one = std::array::from_fn(|i| {
+            let at = s.edge_one[i] + s.edge_x[i] as i64 * corner[0] as i64 + s.edge_y[i] as i64 * corner[1] as i64;
+            // Edges that are so far away do not cross the tile.
+            at.clamp(-FAR, FAR) as i32
+        });
+        let Setup { edge_x, edge_y, .. } = *s;
+        Local { x: s.x.map(|v| v as f32), y: s.y.map(|v| v as f32), one, least, edge_x, edge_y, edge_one }
     }
 }
 
 /// Tests one triangle at the pixels of one row.
 #[inline(always)]
-fn cover_row<const F: bool, const PEEL: bool>(t: &Local, id: u32, y: usize, tile: &mut Tile) {
+fn cover_row<const F: bool, const PEEL: bool, const EXACT: bool>(t: &Local, id: u32, y: usize, tile: &mut Tile) {
     let start: [f32; 4] = std::array::from_fn(|i| fma::<F>(t.y[i], CENTERS[y], t.one[i]));
+    let edge: [i32; 3] = std::array::from_fn(|i| t.edge_one[i] + t.edge_y[i] * COLUMNS[y]);
     let (depth, ids) = (&mut tile.depth[y], &mut tile.ids[y]);
     let (first, second, sum) = (&mut tile.first[y], &mut tile.second[y], &mut tile.sum[y]);
     let (front, front_ids) = (&tile.front[y], &tile.front_ids[y]);
@@ -57,8 +72,14 @@ fn cover_row<const F: bool, const PEEL: bool>(t: &Local, id: u32, y: usize, tile
     let mut any = 0u32;
     let mut hits = [0u32; TILE];
     for x in 0..TILE {
-        let (a, b, c, z) = (at(0, x), at(1, x), at(2, x), at(3, x));
-        let mut hit = (a >= t.least[0]) & (b >= t.least[1]) & (c >= t.least[2]) & (z < depth[x]) & (z >= -1.0);
+        let mut hit = if EXACT {
+            let [a, b, c] = [0, 1, 2].map(|i| edge[i] + t.edge_x[i] * COLUMNS[x]);
+            (a | b | c) >= 0
+        } else {
+            (at(0, x) >= t.least[0]) & (at(1, x) >= t.least[1]) & (at(2, x) >= t.least[2])
+        };
+        let z = at(3, x);
+        hit &= (z < depth[x]) & (z >= -1.0);
         if PEEL {
             hit &= (z > front[x]) | ((z == front[x]) & (id > front_ids[x]));
         }
@@ -80,21 +101,25 @@ fn cover_row<const F: bool, const PEEL: bool>(t: &Local, id: u32, y: usize, tile
 }
 
 #[inline(always)]
-fn cover_all<const F: bool, const PEEL: bool>(setups: &[Setup], triangles: &[u32], corner: [usize; 2], tile: &mut Tile) {
+fn cover_all<const F: bool, const PEEL: bool>(setups: &[(Setup, Span)], triangles: &[u32], corner: [usize; 2], tile: &mut Tile) {
     for triangle in triangles {
-        let s = &setups[*triangle as usize];
+        let (s, span) = &setups[*triangle as usize];
         let local = Local::new(s, corner);
         let top = corner[1] as i32;
-        let (first, last) = ((s.first[1] - top).max(0) as usize, (s.last[1] - top).min(TILE as i32 - 1) as usize);
+        let (first, last) = ((span.first[1] - top).max(0) as usize, (span.last[1] - top).min(TILE as i32 - 1) as usize);
         for y in first..=last {
-            cover_row::<F, PEEL>(&local, triangle + 1, y, tile);
+            if s.is_exact {
+                cover_row::<F, PEEL, true>(&local, triangle + 1, y, tile);
+            } else {
+                cover_row::<F, PEEL, false>(&local, triangle + 1, y, tile);
+            }
         }
     }
 }
 
 vectorized! {
     /// Tests triangles at the pixels of the tile whose first pixel is `corner` (x, y).
-    fn cover<const F>(setups: &[Setup], triangles: &[u32], corner: [usize; 2], peel: bool, tile: &mut Tile) {
+    fn cover<const F>(setups: &[(Setup, Span)], triangles: &[u32], corner: [usize; 2], peel: bool, tile: &mut Tile) {
         if peel {
             cover_all::<F, true>(setups, triangles, corner, tile);
         } else {
@@ -120,13 +145,13 @@ vectorized! {
 }
 
 /// `(∂E/∂X − u ∂ΣE/∂X) / ΣE` and the like at the pixels of a row.
-fn derive(setups: &[Setup], tile: &Tile, y: usize, out: &mut [f32]) {
+fn derive(setups: &[(Setup, Span)], tile: &Tile, y: usize, out: &mut [f32]) {
     for (x, out) in out.as_chunks_mut::<4>().0.iter_mut().enumerate() {
         let Some(triangle) = tile.ids[y][x].checked_sub(1) else {
             *out = [0.0; 4];
             continue;
         };
-        let s = &setups[triangle as usize];
+        let s = &setups[triangle as usize].0;
         let (u, v, inverse) = (tile.first[y][x], tile.second[y][x], tile.sum[y][x]);
         for (k, slopes) in [&s.x, &s.y].into_iter().enumerate() {
             let [a, b, c, _] = slopes.map(|v| v as f32);
@@ -150,7 +175,7 @@ impl Target<'_> {
     ///
     /// # Safety
     /// No other task may write these pixels.
-    unsafe fn write(&self, setups: &[Setup], tile: &Tile, y: usize, start: usize, columns: usize) {
+    unsafe fn write(&self, setups: &[(Setup, Span)], tile: &Tile, y: usize, start: usize, columns: usize) {
         let pixels = start..start + columns;
         // SAFETY: as the caller vouches.
         unsafe {

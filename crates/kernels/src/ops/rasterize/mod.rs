@@ -10,6 +10,8 @@
 //!   `pixel = (clip.xy / clip.w + 1) / 2 · [W, H]`.
 //! - A point is visible where `−w ≤ z ≤ w`; smaller z/w is nearer. Both sides of triangles are drawn.
 //! - A point of the triangle `a b c` is `u a + v b + (1 − u − v) c`.
+//! - Vertices before the camera, and not far outside of the picture, are first moved to a grid of 1/256 pixel, and keep their depth; gradients
+//!   pass as if they had not been moved. What triangles of such vertices cover is computed in integers, without rounding.
 //! - A center on an edge that two triangles share belongs to exactly one of them (top-left rule). Of triangles at one depth, the first wins.
 
 mod backward;
@@ -24,6 +26,11 @@ pub use backward::{Upstream, backward};
 
 /// Edge of the tiles that triangles are sorted into, in pixels.
 const TILE: usize = 16;
+
+/// Steps per pixel of the grid that vertices are moved to.
+const GRID: f64 = 256.0;
+/// Steps from the picture's corner to the farthest vertices on the grid: 2¹⁵ pixels.
+const WIDEST: f64 = 8_388_608.0;
 
 /// Rasterization of positions `[N, V, 4]` in clip space, which gives `[N, H, W]` pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,6 +1,6 @@
 //! Every pixel against every triangle in f64, by solving `M β = q`.
 
-use super::Rasterize;
+use super::{GRID, Rasterize, WIDEST};
 
 /// As [`Raster`](super::Raster), with screen derivatives.
 #[derive(Clone, Debug, Default)]
@@ -28,21 +28,48 @@ fn dot(a: Vec3, b: Vec3) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// A triangle of an image: `M⁻¹` by rows, z of the corners.
+/// Positions with x and y moved to the grid, where they can be.
+///
+/// # Shapes
+/// positions `[N, V, 4]`.
+pub fn snapped(r: &Rasterize, positions: &[f64]) -> Vec<f64> {
+    let mut moved = positions.to_vec();
+    for p in moved.as_chunks_mut::<4>().0 {
+        if let Some(grid) = on_grid(r, p) {
+            (0..2).for_each(|k| p[k] = grid[k] as f64 / GRID / half(r, k) * p[3] - p[3]);
+        }
+    }
+    moved
+}
+
+/// Half of the picture's width or height.
+fn half(r: &Rasterize, axis: usize) -> f64 {
+    0.5 * r.size[1 - axis] as f64
+}
+
+/// Steps of the grid to a vertex before the camera that is not too far outside.
+fn on_grid(r: &Rasterize, p: &[f64]) -> Option<[i128; 2]> {
+    let steps = [0, 1].map(|k| ((p[k] + p[3]) * half(r, k) / p[3] * GRID).round_ties_even());
+    (p[3] > 0.0 && steps.iter().all(|s| s.abs() <= WIDEST)).then(|| steps.map(|s| s as i128))
+}
+
+/// A triangle of an image: `M⁻¹` by rows, z of the corners, and the corners on the grid.
 struct Triangle {
     inverse: [Vec3; 3],
     z: Vec3,
+    grid: Option<[[i128; 2]; 3]>,
 }
 
 impl Triangle {
     /// `None` where it is seen from its edge.
     fn new(r: &Rasterize, positions: &[f64], image: usize, triangle: [u32; 3]) -> Option<Triangle> {
         let corner = triangle.map(|v| &positions[(image * r.vertices + v as usize) * 4..][..4]);
-        let (half_w, half_h) = (0.5 * r.size[1] as f64, 0.5 * r.size[0] as f64);
-        let p = corner.map(|c| [(c[0] + c[3]) * half_w, (c[1] + c[3]) * half_h, c[3]]);
+        let p = corner.map(|c| [(c[0] + c[3]) * half(r, 0), (c[1] + c[3]) * half(r, 1), c[3]]);
         let rows = [cross(p[1], p[2]), cross(p[2], p[0]), cross(p[0], p[1])];
         let volume = dot(p[0], rows[0]);
-        (volume != 0.0).then(|| Triangle { inverse: rows.map(|r| r.map(|v| v / volume)), z: corner.map(|c| c[2]) })
+        let [a, b, c] = corner.map(|c| on_grid(r, c));
+        let grid = a.zip(b).zip(c).map(|((a, b), c)| [a, b, c]);
+        (volume != 0.0).then(|| Triangle { inverse: rows.map(|r| r.map(|v| v / volume)), z: corner.map(|c| c[2]), grid })
     }
 
     /// Weights at a pixel's center.
@@ -50,11 +77,26 @@ impl Triangle {
         self.inverse.map(|row| dot(row, [x as f64 + 0.5, y as f64 + 0.5, 1.0]))
     }
 
-    fn covers(&self, beta: Vec3) -> bool {
-        (0..3).all(|i| {
-            let [x, y, _] = self.inverse[i];
-            beta[i] > 0.0 || beta[i] == 0.0 && (x > 0.0 || x == 0.0 && y > 0.0)
-        })
+    fn covers(&self, x: usize, y: usize) -> bool {
+        let Some(p) = self.grid else {
+            let beta = self.beta(x, y);
+            return (0..3).all(|i| {
+                let [x, y, _] = self.inverse[i];
+                beta[i] > 0.0 || beta[i] == 0.0 && (x > 0.0 || x == 0.0 && y > 0.0)
+            });
+        };
+        let at = |v: usize| (2 * v as i128 + 1) * GRID as i128 / 2;
+        let side =
+            |from: [i128; 2], to: [i128; 2], q: [i128; 2]| (to[0] - from[0]) * (q[1] - from[1]) - (to[1] - from[1]) * (q[0] - from[0]);
+        let area = side(p[0], p[1], p[2]);
+        area != 0
+            && (0..3).all(|i| {
+                let (from, to) = (p[i], p[(i + 1) % 3]);
+                let inside = side(from, to, [at(x), at(y)]) * area.signum();
+                // How the function grows along x and y.
+                let (right, down) = ((from[1] - to[1]) * area.signum(), (to[0] - from[0]) * area.signum());
+                inside > 0 || inside == 0 && (right > 0 || right == 0 && down > 0)
+            })
     }
 }
 
@@ -64,11 +106,12 @@ fn pixels(r: &Rasterize) -> impl Iterator<Item = (usize, usize, usize)> {
     (0..r.pixels()).map(move |p| (p / (h * w), p % w, p / w % h))
 }
 
-/// Nearest triangles; with the depths and ids of a layer in front, the next ones behind it.
+/// Nearest triangles of [`snapped`] positions; with the depths and ids of a layer in front, the next ones behind it.
 ///
 /// # Shapes
 /// positions `[N, V, 4]`, triangles `[F, 3]`.
 pub fn forward(r: &Rasterize, positions: &[f64], triangles: &[[u32; 3]], front: Option<&Raster>) -> Raster {
+    let positions = &snapped(r, positions);
     let solve = |image| triangles.iter().map(move |t| Triangle::new(r, positions, image, *t)).collect();
     let solved: Vec<Vec<Option<Triangle>>> = (0..r.images).map(solve).collect();
     let mut ids = Vec::new();
@@ -78,7 +121,7 @@ pub fn forward(r: &Rasterize, positions: &[f64], triangles: &[[u32; 3]], front: 
             let beta = t.beta(x, y);
             let (z, id) = (dot(beta, t.z), i as u32 + 1);
             let behind = front.is_none_or(|f| f.ids[p] != 0 && (z > f.depth[p] || z == f.depth[p] && id > f.ids[p]));
-            if t.covers(beta) && z.abs() <= 1.0 && z < best.0 && behind {
+            if t.covers(x, y) && z.abs() <= 1.0 && z < best.0 && behind {
                 best = (z, id);
             }
         }
@@ -87,7 +130,7 @@ pub fn forward(r: &Rasterize, positions: &[f64], triangles: &[[u32; 3]], front: 
     shade(r, positions, triangles, ids)
 }
 
-/// What pixels show of given triangles.
+/// What pixels show of given triangles of vertices where they are.
 pub fn shade(r: &Rasterize, positions: &[f64], triangles: &[[u32; 3]], ids: Vec<u32>) -> Raster {
     let mut out = Raster { ids, ..Default::default() };
     for (p, (image, x, y)) in pixels(r).enumerate() {
@@ -109,7 +152,7 @@ pub fn shade(r: &Rasterize, positions: &[f64], triangles: &[[u32; 3]], ids: Vec<
     out
 }
 
-/// Gradient of positions.
+/// Gradient of positions, of vertices where they are.
 ///
 /// # Shapes
 /// positions `[N, V, 4]`, triangles `[F, 3]`, ids `[N, H, W]`.

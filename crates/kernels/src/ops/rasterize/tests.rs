@@ -120,13 +120,14 @@ fn what_a_case_shows_is_what_its_name_says() {
 #[test]
 fn pixels_show_what_their_rays_hit() {
     // Another way to the same picture: rays through the pixels, of depths within the planes.
-    for (points, triangles) in [soup(150, 0.6, 1.2, 21), soup(200, 0.7, 0.0, 23)] {
-        let c = Case {
-            name: "rays",
-            raster: Rasterize { images: 1, vertices: points.len(), size: [80, 80] },
-            positions: project(&points),
-            triangles: triangles.clone(),
-        };
+    for (mut points, triangles) in [soup(150, 0.6, 1.2, 21), soup(200, 0.7, 0.0, 23)] {
+        let raster = Rasterize { images: 1, vertices: points.len(), size: [80, 80] };
+        // Rays meet vertices where they are, so these are put on the grid.
+        let on_grid = reference::snapped(&raster, &wide(&project(&points)));
+        for (point, moved) in points.iter_mut().zip(on_grid.as_chunks::<4>().0) {
+            (point[0], point[1]) = (moved[0] as f32, moved[1] as f32);
+        }
+        let c = Case { name: "rays", raster, positions: project(&points), triangles: triangles.clone() };
         let got = forward(&c, false);
         let mut differ = 0;
         for p in 0..80 * 80 {
@@ -192,6 +193,27 @@ fn a_bent_sheet_has_neither_holes_nor_overlaps() {
 }
 
 #[test]
+fn corners_on_centers_leave_no_pixel_open() {
+    // A sheet whose corners project onto centers of pixels only after rounding, as perspective does.
+    let n = 16usize;
+    let vertex = |i: usize| {
+        let [x, y] = [i % (n + 1), i / (n + 1)].map(|v| (8.0 * v as f32 + 0.5) / 64.0 - 1.0);
+        let w = 1.0 + random(1, i as u64)[0].abs();
+        [x * w, y * w, 0.3 * w, w]
+    };
+    let positions: Vec<f32> = (0..(n + 1) * (n + 1)).flat_map(vertex).collect();
+    let (_, triangles) = sheet(n, 1);
+    let raster = Rasterize { images: 1, vertices: positions.len() / 4, size: [128, 128] };
+    let want = reference::forward(&raster, &wide(&positions), &triangles, None).ids;
+    for level in Level::available() {
+        let mut out = Raster::default();
+        with_level(level, || cpu::forward(&raster, &positions, &triangles, false, &mut out));
+        assert!(out.ids.iter().all(|id| *id != 0), "{level:?}");
+        assert_eq!(out.ids, want, "{level:?}");
+    }
+}
+
+#[test]
 fn layers_come_off_in_order_of_depth() {
     let c = cases().into_iter().find(|c| c.name == "odd size").unwrap();
     let (mut front, mut exact) = (forward(&c, true), reference::forward(&c.raster, &wide(&c.positions), &c.triangles, None));
@@ -246,7 +268,7 @@ fn screen_derivatives_are_differences_between_pixels() {
     let c = cases().into_iter().find(|c| c.name == "one triangle").unwrap();
     // A shift of the picture by a small part of a pixel is a shift of the positions.
     let shifted = |x: f64, y: f64| {
-        let mut positions = wide(&c.positions);
+        let mut positions = reference::snapped(&c.raster, &wide(&c.positions));
         for p in positions.as_chunks_mut::<4>().0 {
             p[0] -= x / 32.0 * p[3];
             p[1] -= y / 32.0 * p[3];
@@ -274,7 +296,8 @@ fn gradients_match_the_reference_at_every_level() {
             let wide_only = reference::Upstream { depth: &zeros[..n], derivatives: &zeros, ..wide_all };
             for (up, wide_up) in [(all, wide_all), (only, wide_only)] {
                 with_level(level, || backward(&c.raster, &c.positions, &c.triangles, &raster, &up, &mut got));
-                let want = reference::backward(&c.raster, &wide(&c.positions), &c.triangles, &raster.ids, &wide_up);
+                let positions = reference::snapped(&c.raster, &wide(&c.positions));
+                let want = reference::backward(&c.raster, &positions, &c.triangles, &raster.ids, &wide_up);
                 assert_close(c.name, &got, &want, 1e-3);
             }
         }

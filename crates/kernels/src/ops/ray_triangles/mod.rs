@@ -3,6 +3,7 @@
 //! Triangles have two sides. Between the triangles of a closed surface no ray passes (Woop, Benthin and Wald 2013).
 
 mod build;
+mod bundle;
 pub mod cpu;
 mod octet;
 pub mod reference;

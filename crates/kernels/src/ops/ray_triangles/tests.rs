@@ -54,6 +54,28 @@ fn sphere(n: usize) -> (Vec<[f32; 3]>, Vec<[u32; 3]>) {
 }
 
 #[test]
+fn bundles_have_the_hits_of_each_ray_on_every_level() {
+    // Some bundles are alike, others point to all sides, and the last rays fill none.
+    let (vertices, triangles) = soup(2000, 0.2, 5);
+    let bvh = Bvh::build(&vertices, &triangles);
+    let mut rays = rays(803, 21);
+    for i in 0..400 {
+        let (first, [a, b, c]) = (rays[i / 8 * 8], rays[i].direction.map(|d| 0.02 * d));
+        rays[i] = Ray { direction: [first.direction[0] + a, first.direction[1] + b, first.direction[2] + c], range: [0.1, 2.0], ..first };
+    }
+    for empty in [false, true] {
+        let bvh = if empty { Bvh::build(&[], &[]) } else { bvh.clone() };
+        let want = nearest(&bvh, &rays);
+        assert_eq!(want.iter().any(Hit::is_some), !empty);
+        for level in Level::available() {
+            let mut hits = vec![Hit::NONE; rays.len()];
+            with_level(level, || bvh.trace_neighbors(&rays, &mut hits));
+            assert_eq!(hits, want, "{}", level.name());
+        }
+    }
+}
+
+#[test]
 fn nearest_hits_match_the_reference_on_every_level() {
     for (n, size) in [(0, 0.1), (1, 1.0), (9, 0.5), (700, 0.3), (3000, 0.1)] {
         let (vertices, triangles) = soup(n, size, 3);
