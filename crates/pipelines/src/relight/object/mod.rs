@@ -7,6 +7,7 @@
 //!
 //! Adam does not depend on the scale of gradients, so the factors of gradients that others give (64 for light, ⅛ for hash tables) are left out.
 
+pub mod albedo_entropy;
 pub mod capture;
 pub mod config;
 mod export;
@@ -19,8 +20,11 @@ pub mod probe;
 pub mod raster;
 pub mod recipe;
 pub mod scores;
+mod surroundings;
 pub mod synth;
 pub mod textured;
 pub mod topology;
+mod traced;
 mod trainer;
+mod transport;
 pub mod truth;
