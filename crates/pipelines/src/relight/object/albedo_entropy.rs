@@ -37,27 +37,39 @@ const LOCAL: f32 = 0.5;
 const SEEN: f32 = 0.3;
 const CLIPPED: f32 = 0.97;
 
-/// Radiance of each vertex without its gloss: the mean of the darker half of what photographs show; none where too few do.
-pub fn observed(photos: &[&ObjectPhoto], positions: &[[f32; 3]], normals: &[[f32; 3]], transport: &Transport) -> Vec<Option<[f32; 3]>> {
-    let seen: Vec<Vec<Option<[f32; 3]>>> = photos
-        .iter()
-        .map(|photo| {
-            let hidden = transport.are_hidden(positions, normals, photo.view.eye);
-            let at = |v: usize| {
-                let view = unit(sub(photo.view.eye, positions[v]));
-                (!hidden[v] && dot(unit(normals[v]), view) > SEEN).then(|| sample(photo, positions[v])).flatten()
-            };
-            (0..positions.len()).into_par_iter().with_min_len(256).map(at).collect()
-        })
-        .collect();
-    let of = |v: usize| {
-        let mut colors: Vec<[f32; 3]> = seen.iter().filter_map(|s| s[v]).collect();
+/// A vertex in a photograph.
+#[derive(Clone, Copy, Debug)]
+pub struct Sighting {
+    pub color: [f32; 3],
+    pub eye: [f32; 3],
+}
+
+/// Where photographs show each vertex `[V]`.
+pub fn sightings(photos: &[&ObjectPhoto], (positions, normals): (&[[f32; 3]], &[[f32; 3]]), transport: &Transport) -> Vec<Vec<Sighting>> {
+    let mut all = vec![Vec::new(); positions.len()];
+    for photo in photos {
+        let eye = photo.view.eye;
+        let hidden = transport.are_hidden(positions, normals, eye);
+        let at = |v: usize| {
+            let view = unit(sub(eye, positions[v]));
+            (!hidden[v] && dot(unit(normals[v]), view) > SEEN).then(|| sample(photo, positions[v])).flatten()
+        };
+        let seen: Vec<Option<[f32; 3]>> = (0..positions.len()).into_par_iter().with_min_len(256).map(at).collect();
+        all.iter_mut().zip(seen).for_each(|(all, s)| all.extend(s.map(|color| Sighting { color, eye })));
+    }
+    all
+}
+
+/// Radiance of each vertex without highlights: the mean of the darker half of what photographs show; none where too few do.
+pub fn observed(sightings: &[Vec<Sighting>]) -> Vec<Option<[f32; 3]>> {
+    let of = |seen: &Vec<Sighting>| {
+        let mut colors: Vec<[f32; 3]> = seen.iter().map(|s| s.color).collect();
         colors.sort_by(|a, b| luminance(*a).total_cmp(&luminance(*b)));
         let kept = &colors[colors.len() / 4..(colors.len() / 2 + 1).min(colors.len())];
         let n = kept.len() as f32;
         (colors.len() >= 3).then(|| std::array::from_fn(|k| kept.iter().map(|c| c[k]).sum::<f32>() / n))
     };
-    (0..positions.len()).into_par_iter().with_min_len(256).map(of).collect()
+    sightings.par_iter().with_min_len(256).map(of).collect()
 }
 
 /// The color of a photograph where a point is, if the object fills that place.

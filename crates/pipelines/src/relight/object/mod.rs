@@ -11,6 +11,7 @@ pub mod albedo_entropy;
 pub mod capture;
 pub mod config;
 mod export;
+mod gloss;
 pub mod hull;
 pub mod loss;
 pub mod material;

@@ -102,6 +102,12 @@ impl Probe {
         self.update();
     }
 
+    /// Multiplies the light by a factor per channel.
+    pub fn scale(&mut self, by: [f32; 3]) {
+        self.group.values.as_chunks_mut::<3>().0.iter_mut().for_each(|l| (0..3).for_each(|k| l[k] *= by[k]));
+        self.update();
+    }
+
     /// Means of the light over `edge`² squares of each face.
     pub fn coarse(&self, edge: usize) -> Vec<[f32; 3]> {
         let (size, mut out) = (self.shape().size, vec![[0.0f32; 3]; 6 * edge * edge]);

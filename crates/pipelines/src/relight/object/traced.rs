@@ -4,6 +4,7 @@
 use super::albedo_entropy;
 use super::capture::ObjectCapture;
 use super::config::Config;
+use super::gloss;
 use super::probe::Probe;
 use super::surroundings::Surroundings;
 use super::textured::{CHANNELS, Textured};
@@ -15,6 +16,9 @@ use diorama_mesh::bake;
 
 /// Roughness to begin with.
 const ROUGHNESS: f32 = 0.5;
+/// How often light and gloss are found in turns, and the least share of a color that is not gloss.
+const ROUNDS: usize = 2;
+const LEFT: f32 = 0.1;
 /// Largest base color to begin with, and least light.
 const BRIGHTEST: f32 = 0.95;
 const DARK: f32 = 1e-3;
@@ -35,12 +39,28 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
     let texels = bake::texels(&flat, size);
     let before = probe.diffuse(texels.normals.as_flattened());
     let normals: Vec<[f32; 3]> = vertex_normals::cpu::forward(&m.layout.faces, m.places()).into_iter().map(unit).collect();
-    if !probe.group.frozen {
-        let photos: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.photos[i]).collect();
-        let observed = albedo_entropy::observed(&photos, m.places(), &normals, &around.transport);
-        let coarse = albedo_entropy::estimate(&around.transport, &observed, m.places(), config.seed);
-        probe.set_coarse(&coarse, config.optim.traced_light_rate);
+    let photos: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.photos[i]).collect();
+    let at = (m.places(), &normals[..]);
+    let sightings = albedo_entropy::sightings(&photos, at, &around.transport);
+    let mut gloss = None;
+    if probe.group.frozen {
+        gloss = gloss::fit(probe, &around.transport, &sightings, at);
+    } else {
+        let mut observed = albedo_entropy::observed(&sightings);
+        for _ in 0..ROUNDS {
+            let coarse = albedo_entropy::estimate(&around.transport, &observed, m.places(), config.seed);
+            probe.set_coarse(&coarse, config.optim.traced_light_rate);
+            gloss = gloss::fit(probe, &around.transport, &sightings, at);
+            let Some(g) = &gloss else { break };
+            probe.scale(g.scale);
+            observed = albedo_entropy::observed(&sightings);
+            for (o, mirrored) in observed.iter_mut().zip(&g.mirrored) {
+                *o = o.map(|c| std::array::from_fn(|k| (c[k] - mirrored[k]).max(LEFT * c[k])));
+            }
+        }
     }
+    let roughness = gloss.as_ref().map_or(ROUGHNESS, |g| g.roughness);
+    let mirrored = gloss.map_or_else(|| vec![[0.0; 3]; m.places().len()], |g| g.mirrored);
     // Two rounds: light between surfaces depends on their colors.
     let sent: Vec<[f32; 3]> = texels
         .index
@@ -58,14 +78,17 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
             .map(|i| {
                 let corners = m.layout.faces[texels.face[i] as usize];
                 let weights = place(texels.positions[i], corners.map(|v| m.places()[v as usize]));
-                let light: [f32; 3] = std::array::from_fn(|k| (0..3).map(|c| weights[c] * lit.diffuse(corners[c] as usize)[k]).sum());
-                std::array::from_fn(|k| (sent[i][k] / light[k].max(DARK)).min(BRIGHTEST))
+                let mix = |of: &dyn Fn(usize, usize) -> f32, k: usize| (0..3).map(|c| weights[c] * of(corners[c] as usize, k)).sum::<f32>();
+                std::array::from_fn(|k| {
+                    let (light, gloss) = (mix(&|v, k| lit.diffuse(v)[k], k), mix(&|v, k| mirrored[v][k], k));
+                    ((sent[i][k] - gloss).max(LEFT * sent[i][k]) / light.max(DARK)).min(BRIGHTEST)
+                })
             })
             .collect();
         let spread = bake::spread(&texels, &colors, size);
         for (t, c) in m.texels.values.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&spread) {
             t[..3].copy_from_slice(c);
-            t[3..6].copy_from_slice(&[0.0, ROUGHNESS, 0.0]);
+            t[3..6].copy_from_slice(&[0.0, roughness, 0.0]);
         }
     }
     m.forget_steps();
