@@ -45,6 +45,10 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
     let mut gloss = None;
     if probe.group.frozen {
         gloss = gloss::fit(probe, &around.transport, &sightings, at);
+        // The light is as bright as it is.
+        if let Some(g) = &mut gloss {
+            g.mirrored.iter_mut().for_each(|m| (0..3).for_each(|k| m[k] /= g.scale[k]));
+        }
     } else {
         let mut observed = albedo_entropy::observed(&sightings);
         for _ in 0..ROUNDS {
@@ -76,11 +80,11 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
         let lit = around.light(probe, &m.vertex_colors(&drawn));
         let colors: Vec<[f32; 3]> = (0..sent.len())
             .map(|i| {
-                let corners = m.layout.faces[texels.face[i] as usize];
-                let weights = place(texels.positions[i], corners.map(|v| m.places()[v as usize]));
-                let mix = |of: &dyn Fn(usize, usize) -> f32, k: usize| (0..3).map(|c| weights[c] * of(corners[c] as usize, k)).sum::<f32>();
+                let corners = m.layout.faces[texels.face[i] as usize].map(|v| v as usize);
+                let weights = place(texels.positions[i], corners.map(|v| m.places()[v]));
+                let mix = |of: &dyn Fn(usize) -> f32| (0..3).map(|c| weights[c] * of(corners[c])).sum::<f32>();
                 std::array::from_fn(|k| {
-                    let (light, gloss) = (mix(&|v, k| lit.diffuse(v)[k], k), mix(&|v, k| mirrored[v][k], k));
+                    let (light, gloss) = (mix(&|v| lit.diffuse(v)[k]), mix(&|v| mirrored[v][k]));
                     ((sent[i][k] - gloss).max(LEFT * sent[i][k]) / light.max(DARK)).min(BRIGHTEST)
                 })
             })
