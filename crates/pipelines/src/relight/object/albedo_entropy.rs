@@ -175,7 +175,7 @@ impl Lobes {
 /// Coarse light `[texels]` for what the vertices send.
 pub fn estimate(transport: &Transport, observed: &[Option<[f32; 3]>], positions: &[[f32; 3]], seed: u64) -> Vec<[f32; 3]> {
     let sent: Vec<[f32; 3]> = observed.iter().map(|o| o.unwrap_or_default()).collect();
-    let indirect = transport.from_surfaces(&sent);
+    let indirect = transport.bounced(&sent);
     let known: Vec<usize> =
         (0..observed.len()).filter(|v| observed[*v].is_some_and(|c| c.iter().all(|c| *c < CLIPPED) && luminance(c) > 1e-3)).collect();
     let chosen: Vec<usize> = known.iter().step_by(known.len().div_ceil(VERTICES).max(1)).copied().collect();

@@ -185,7 +185,7 @@ impl Transport {
     }
 
     /// Light from other surfaces at the vertices, where each sends the radiance `sent` `[V]`.
-    pub fn from_surfaces(&self, sent: &[[f32; 3]]) -> Vec<[f32; 3]> {
+    pub fn bounced(&self, sent: &[[f32; 3]]) -> Vec<[f32; 3]> {
         self.blocked.multiply(sent)
     }
 
