@@ -5,6 +5,9 @@ use crate::run::config::{self, Auto, Configuration};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
+/// Numbers of a texel: base color; occlusion, roughness, metalness; normal in tangent space.
+pub const CHANNELS: usize = 9;
+
 /// Size of the model and length of its training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

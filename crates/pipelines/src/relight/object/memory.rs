@@ -1,7 +1,6 @@
 //! Memory that training needs, estimated before it begins, so that a size too large is refused at once.
 
-use super::config::Config;
-use super::textured::CHANNELS;
+use super::config::{CHANNELS, Config};
 use crate::error::{PipelineError, Result};
 
 /// Bytes of a number.

@@ -2,7 +2,7 @@
 
 use super::albedo_entropy;
 use super::capture::ObjectView;
-use super::config::Config;
+use super::config::{CHANNELS, Config};
 use super::loss;
 use super::material::{self, Material};
 use super::probe::{Probe, Seen};
@@ -21,8 +21,6 @@ use diorama_mesh::{atlas, bake, normal_map};
 use rayon::prelude::*;
 use std::collections::HashMap;
 
-/// Numbers of a texel: base color; occlusion, roughness, metalness; normal in tangent space.
-pub const CHANNELS: usize = 9;
 /// Numbers of a vertex of the texture: coordinates and tangent.
 const ATTRIBUTES: usize = 6;
 /// Of so many surface points, one is compared with a texel nearby.

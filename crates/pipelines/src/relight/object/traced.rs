@@ -3,11 +3,11 @@
 
 use super::albedo_entropy;
 use super::capture::ObjectCapture;
-use super::config::Config;
+use super::config::{CHANNELS, Config};
 use super::gloss;
 use super::probe::Probe;
 use super::surroundings::Surroundings;
-use super::textured::{CHANNELS, Textured};
+use super::textured::Textured;
 use super::transport::{dot, unit};
 use diorama_geom::capture::Split;
 use diorama_geom::mesh::{cross, sub};
