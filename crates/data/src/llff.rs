@@ -90,6 +90,14 @@ mod tests {
     }
 
     #[test]
+    fn another_shape_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("poses_bounds.npy"), npy("2, 15", &[1.0; 30])).unwrap();
+        let e = read(dir.path()).unwrap_err();
+        assert!(e.is_input() && e.to_string().contains("[2, 15]") && e.to_string().contains("[images, 17]"), "{e}");
+    }
+
+    #[test]
     fn a_header_that_claims_too_much_is_refused() {
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("a.npy");

@@ -101,13 +101,83 @@ fn photographs_become_a_mesh_with_materials() {
 }
 
 #[test]
+fn the_third_stage_keeps_the_mesh_and_explains_the_photographs() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut config = Config::new(Preset::Ci, photographs().into());
+    (config.run.topology_steps, config.run.traced_steps) = (100, 60);
+    let traced = train(&config, &dir.path().join("traced"), false, None);
+    let s = scores::judge(&traced.model, &traced.capture, 8, &mut |_, _| Ok(())).unwrap();
+    assert!(s.object_psnr > 25.0 && s.truth.as_ref().unwrap().chamfer < 0.004, "{s:?}");
+    assert_eq!(traced.model.stage.name(), "traced");
+}
+
+/// The photographs as `poses_bounds.npy` with masks beside `images`.
+fn nerd_layout(data: &Path) {
+    for folder in ["images", "masks"] {
+        std::fs::create_dir_all(data.join(folder)).unwrap();
+    }
+    let imported = capture::import(&Config::new(Preset::Ci, photographs().into())).unwrap();
+    let mut values = Vec::new();
+    let mut frames = imported.frames;
+    frames.sort_by(|a, b| a.name.cmp(&b.name));
+    for (i, f) in frames.iter().enumerate() {
+        let (r, t, c) = (f.world_from_camera.rotation, f.world_from_camera.translation, &f.camera);
+        for k in 0..3 {
+            values.extend([r.y_axis[k], r.x_axis[k], -r.z_axis[k], t[k], [c.height as f64, c.width as f64, c.fx][k]]);
+        }
+        values.extend([0.1, 10.0]);
+        let image = photo::load(&f.image).unwrap();
+        let part = |channels: usize, of: &dyn Fn(&[u8; 4]) -> Vec<u8>| {
+            let data = image.data.as_chunks::<4>().0.iter().flat_map(of).collect();
+            ImageU8 { channels, data, width: image.width, height: image.height }
+        };
+        photo::save_png(&data.join(format!("images/{i:03}.png")), &part(3, &|p| p[..3].to_vec())).unwrap();
+        photo::save_png(&data.join(format!("masks/{i:03}.png")), &part(1, &|p| vec![p[3]])).unwrap();
+    }
+    let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, 17), }}\n", frames.len());
+    let mut npy = b"\x93NUMPY\x01\0".to_vec();
+    npy.extend((header.len() as u16).to_le_bytes());
+    npy.extend(header.as_bytes());
+    values.iter().for_each(|v: &f64| npy.extend(v.to_le_bytes()));
+    std::fs::write(data.join("poses_bounds.npy"), npy).unwrap();
+}
+
+#[test]
+fn a_given_mesh_is_textured_from_photographs_with_masks() {
+    let dir = tempfile::tempdir().unwrap();
+    let (data, base) = (dir.path().join("data"), dir.path().join("egg.glb"));
+    nerd_layout(&data);
+    gltf::save(&base, &egg(), WriteOptions::default()).unwrap();
+    let mut config = Config::new(Preset::Ci, data);
+    config.base_mesh = base;
+    let trained = train(&config, &dir.path().join("run"), false, None);
+    assert_eq!(trained.summary.step, config.run.texture_steps);
+    // Photographs of this layout have no split: those of training are compared.
+    let photos = trained.capture.photos.iter().step_by(6);
+    let off: Vec<f64> = photos.map(|p| scores::squared_error(&trained.model.picture(&p.view), &p.rgba.data)).collect();
+    let psnr = -10.0 * (off.iter().sum::<f64>() / off.len() as f64).log10();
+    assert!(psnr > 22.0, "{psnr} dB");
+}
+
+#[test]
+fn a_random_surface_finds_the_object() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut config = Config::new(Preset::Ci, photographs().into());
+    config.grid.start = "random".into();
+    let trained = train(&config, &dir.path().join("run"), false, None);
+    let s = scores::judge(&trained.model, &trained.capture, 4, &mut |_, _| Ok(())).unwrap();
+    // Parts of the first noise are left inside, and the shape is coarse.
+    assert!(s.object_psnr > 18.0 && s.truth.as_ref().unwrap().chamfer < 0.04, "{s:?}");
+}
+
+#[test]
 fn an_interrupted_run_goes_on_to_the_same_bits() {
     let dir = tempfile::tempdir().unwrap();
     let mut config = Config::new(Preset::Ci, photographs().into());
-    (config.run.topology_steps, config.run.texture_steps, config.run.log_every) = (6, 6, 1);
+    (config.run.topology_steps, config.run.texture_steps, config.run.traced_steps, config.run.log_every) = (6, 6, 6, 1);
     let whole = dir.path().join("whole");
     train(&config, &whole, false, None);
-    for at in [3, 6, 9] {
+    for at in [3, 6, 9, 12, 15] {
         let run = dir.path().join(format!("stopped{at}"));
         assert!(train(&config, &run, false, Some(at)).summary.interrupted);
         assert!(!train(&config, &run, true, None).summary.interrupted);

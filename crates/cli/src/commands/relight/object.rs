@@ -36,9 +36,12 @@ pub struct Object {
     /// Edge of the textures in texels [default: by preset]
     #[arg(long)]
     texture: Option<usize>,
-    /// Steps of each of the two stages [default: by preset]
+    /// Steps of each stage [default: by preset]
     #[arg(long)]
     steps: Option<u64>,
+    /// Add a third stage of as many steps, with traced shadows and light between surfaces; it tells base color from light better
+    #[arg(long)]
+    mc: bool,
     /// Environment map of the photographs, which is not learned then
     #[arg(long, value_name = "FILE")]
     fixed_light: Option<PathBuf>,
@@ -85,7 +88,7 @@ impl Object {
             (Some(config), None) => {
                 let fixed =
                     [self.grid.is_some(), self.texture.is_some(), self.steps.is_some(), self.base.is_some(), self.fixed_light.is_some()];
-                if fixed.contains(&true) || self.seed.is_some() || !self.set.is_empty() {
+                if fixed.contains(&true) || self.seed.is_some() || self.mc || !self.set.is_empty() {
                     return Err(PipelineError::Usage("--resume: the run has its configuration; leave out what would change it".into()));
                 }
                 return Ok(config);
@@ -97,6 +100,9 @@ impl Object {
         }
         self.texture.iter().for_each(|t| config.material.texture = *t);
         self.steps.iter().for_each(|s| (config.run.topology_steps, config.run.texture_steps) = (*s, *s));
+        if self.mc {
+            config.run.traced_steps = config.run.texture_steps;
+        }
         self.seed.iter().for_each(|s| config.seed = *s);
         for (name, file, into) in [("base", &self.base, &mut config.base_mesh), ("fixed-light", &self.fixed_light, &mut config.light.fixed)]
         {

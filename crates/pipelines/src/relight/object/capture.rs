@@ -4,6 +4,7 @@
 
 use super::config::Config;
 use super::hull;
+use super::memory;
 use super::placement::Placement;
 use crate::error::{PipelineError, Result};
 use crate::run::config::Auto;
@@ -130,6 +131,8 @@ pub fn load(config: &Config, capture: &Capture) -> Result<ObjectCapture> {
         .map(|(name, rgba, camera, pose, split)| ObjectPhoto { name, rgba, view: ObjectView::new(camera, placement.pose(&pose)), split })
         .collect();
     check_box(&photos, found.scale)?;
+    let pixels = photos.iter().map(|p| p.rgba.width * p.rgba.height).max().unwrap_or(0);
+    memory::check(config, photos.len(), pixels, diorama_data::memory::of_machine().available)?;
     Ok(ObjectCapture { photos, placement, silhouettes })
 }
 

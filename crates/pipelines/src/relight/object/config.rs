@@ -5,6 +5,9 @@ use crate::run::config::{self, Auto, Configuration};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
+/// Numbers of a texel: base color; occlusion, roughness, metalness; normal in tangent space.
+pub const CHANNELS: usize = 9;
+
 /// Size of the model and length of its training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -88,6 +91,8 @@ pub struct LossConfig {
     pub color_smoothness: f32,
     /// Color of the light.
     pub white_light: f32,
+    /// Entropy of base colors in the third stage.
+    pub color_entropy: f32,
     /// Bending of the mesh in the second stage against its first shape; falls to 0.
     pub laplacian: f32,
     /// Angles between faces in the first stage.
@@ -105,6 +110,8 @@ pub struct OptimConfig {
     pub light_rate: f32,
     /// Textures in the second stage.
     pub texture_rate: f32,
+    /// Light in the third stage.
+    pub traced_light_rate: f32,
     /// Vertices in the second stage.
     pub vertex_rate: f32,
     /// Rate at the end of a stage over that at its start.
@@ -119,6 +126,8 @@ pub struct RunConfig {
     pub topology_steps: u64,
     /// Steps on a fixed mesh with textures, after them.
     pub texture_steps: u64,
+    /// Steps with traced shadows, after them; 0: none.
+    pub traced_steps: u64,
     /// Photographs per step.
     pub batch: usize,
     pub log_every: u64,
@@ -166,6 +175,7 @@ impl Config {
                 sign_change: [0.2, 0.01],
                 color_smoothness: 0.3,
                 white_light: 0.005,
+                color_entropy: 0.02,
                 laplacian: 3e3,
                 normal_consistency: 0.0,
             },
@@ -175,12 +185,14 @@ impl Config {
                 material_from: 0.0,
                 light_rate: 0.1,
                 texture_rate: 0.01,
+                traced_light_rate: 0.01,
                 vertex_rate: 0.001,
                 final_scale: 0.1,
             },
             run: RunConfig {
                 topology_steps: pick(200, 3000) as u64,
                 texture_steps: pick(100, 3000) as u64,
+                traced_steps: 0,
                 batch: 1,
                 log_every: pick(20, 50) as u64,
                 save_every_seconds: 60.0,
@@ -201,9 +213,9 @@ impl Config {
         if self.base_mesh.as_os_str().is_empty() { self.run.topology_steps } else { 0 }
     }
 
-    /// Steps of both stages.
+    /// Steps of all stages.
     pub fn steps(&self) -> u64 {
-        self.topology_steps() + self.run.texture_steps
+        self.topology_steps() + self.run.texture_steps + self.run.traced_steps
     }
 }
 
@@ -246,12 +258,30 @@ impl Configuration for Config {
             return fault("light.cube: must be 32, 64, 128 or 256");
         }
         let l = &self.loss;
-        let weights = [l.mask, l.sign_change[0], l.sign_change[1], l.color_smoothness, l.white_light, l.laplacian, l.normal_consistency];
+        let weights = [
+            l.mask,
+            l.sign_change[0],
+            l.sign_change[1],
+            l.color_smoothness,
+            l.white_light,
+            l.color_entropy,
+            l.laplacian,
+            l.normal_consistency,
+        ];
         if weights.iter().any(|w| !(*w >= 0.0 && w.is_finite())) {
             return fault("loss: weights must be 0 or more");
         }
         let o = &self.optim;
-        let rates = [o.shape_rate, o.material_from, o.material_rate, o.light_rate, o.texture_rate, o.vertex_rate, o.final_scale];
+        let rates = [
+            o.shape_rate,
+            o.material_from,
+            o.material_rate,
+            o.light_rate,
+            o.texture_rate,
+            o.traced_light_rate,
+            o.vertex_rate,
+            o.final_scale,
+        ];
         if rates.iter().any(|r| !(*r >= 0.0 && r.is_finite())) || o.final_scale == 0.0 {
             return fault("optim: rates must be 0 or more, final_scale above 0");
         }

@@ -1,7 +1,8 @@
 //! The trained object as a model of glTF's materials.
 
+use super::config::CHANNELS;
 use super::placement::Placement;
-use super::textured::{CHANNELS, Textured};
+use super::textured::Textured;
 use diorama_geom::color::{srgb_from_linear, u8_from_unit};
 use diorama_geom::glam::DAffine3;
 use diorama_geom::model::{Instance, Material, Model, Part, Texture, Wrap};

@@ -6,6 +6,7 @@ use super::placement::Placement;
 use super::probe::Probe;
 use super::textured::{Layout, Textured};
 use super::topology::Topology;
+use super::traced;
 use crate::error::{PipelineError, Result};
 use crate::relight::light::{LightOptions, Source};
 use crate::run::param_state::{self, entry};
@@ -27,6 +28,17 @@ const FLOATER: f32 = 0.002;
 pub enum Stage {
     Topology(Box<Topology>),
     Textured(Box<Textured>),
+}
+
+impl Stage {
+    /// Name in checkpoints.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Stage::Topology(_) => "topology",
+            Stage::Textured(m) if m.surroundings.is_some() => "traced",
+            Stage::Textured(_) => "textured",
+        }
+    }
 }
 
 /// The model of a run.
@@ -91,6 +103,15 @@ impl ObjectModel {
         Ok(())
     }
 
+    /// Goes on to the third stage: shadows and light between surfaces are traced.
+    pub fn give_surroundings(&mut self, capture: &ObjectCapture) {
+        if let Stage::Textured(m) = &mut self.stage
+            && m.surroundings.is_none()
+        {
+            traced::begin(m, &self.config, capture, &mut self.probe);
+        }
+    }
+
     /// The picture `[H, W, 4]` of a view, linear light times opacity.
     pub fn picture(&self, view: &ObjectView) -> Vec<f32> {
         match &self.stage {
@@ -120,7 +141,7 @@ impl ObjectModel {
     pub fn save(&mut self, folder: &Path) -> Result<()> {
         let mut metadata = HashMap::from([
             ("method".to_string(), "relight-object".to_string()),
-            ("stage".into(), if matches!(self.stage, Stage::Topology(_)) { "topology" } else { "textured" }.to_string()),
+            ("stage".into(), self.stage.name().to_string()),
             ("step".into(), self.origin.step.to_string()),
             ("seconds_bits".into(), self.origin.seconds.to_bits().to_string()),
             ("rate_scale_bits".into(), self.rate_scale.to_bits().to_string()),
@@ -158,11 +179,18 @@ impl ObjectModel {
             *v = f64::from_bits(number(&c, &format!("center{k}_bits"), file)?);
         }
         self.placement = Placement { center: DVec3::from(center), scale: f64::from_bits(number(&c, "scale_bits", file)?) };
-        if c.metadata.get("stage").is_some_and(|s| s == "textured") {
+        let stage = c.metadata.get("stage").cloned().unwrap_or_default();
+        if stage != "topology" {
             self.stage = Stage::Textured(Box::new(Textured::of(&self.config, take_layout(&mut c, file)?)));
         }
         param_state::restore(&mut self.params(), &mut c, file)?;
         self.probe.update();
+        if let Stage::Textured(m) = &mut self.stage
+            && stage == "traced"
+        {
+            m.surroundings = Some(Box::new(traced::surroundings(m, &self.config)));
+            self.probe.group.adam.rate = self.config.optim.traced_light_rate;
+        }
         Ok(())
     }
 }

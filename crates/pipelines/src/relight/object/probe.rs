@@ -23,6 +23,19 @@ pub struct Probe {
     prefilter: Prefilter,
     blurred: Blurred,
     d_blurred: Blurred,
+    /// Gradient of the texels besides that of blurred light.
+    d_texels: Vec<f32>,
+}
+
+/// What surroundings do to the light on surface points.
+#[derive(Clone, Debug, Default)]
+pub struct Seen {
+    /// Share of the diffuse light that is not in shadow, and diffuse light from other surfaces `[P, 3]`.
+    pub share: Vec<f32>,
+    pub added: Vec<f32>,
+    /// Share of the mirrored lobe in which the light is seen `[P]`, and light from other surfaces in the rest of it `[P, 3]`.
+    pub open: Vec<f32>,
+    pub reflected: Vec<f32>,
 }
 
 impl Probe {
@@ -56,7 +69,8 @@ impl Probe {
     fn of(shape: CubePrefilter, values: Vec<f32>, adam: Adam) -> Probe {
         let zeros = || Blurred { diffuse: vec![0.0; shape.diffuse_texture().numbers()], specular: vec![0.0; shape.texture().numbers()] };
         let (blurred, d_blurred) = (zeros(), zeros());
-        Probe { group: ParamGroup::dense("light", values, adam), prefilter: Prefilter::new(shape), blurred, d_blurred }
+        let d_texels = vec![0.0; values.len()];
+        Probe { group: ParamGroup::dense("light", values, adam), prefilter: Prefilter::new(shape), blurred, d_blurred, d_texels }
     }
 
     fn shape(&self) -> CubePrefilter {
@@ -68,32 +82,106 @@ impl Probe {
         self.prefilter.forward(&self.group.values, &mut self.blurred);
         self.d_blurred.diffuse.fill(0.0);
         self.d_blurred.specular.fill(0.0);
+        self.d_texels.fill(0.0);
     }
 
-    /// Colors of surface points.
-    pub fn shade(&self, points: &Points) -> Shaded {
+    /// Replaces light that is learned by a coarse one, `edge`² texels per face, and forgets how it was trained.
+    pub fn set_coarse(&mut self, coarse: &[[f32; 3]], rate: f32) {
+        let (size, edge) = (self.shape().size, (coarse.len() / 6).isqrt());
+        let t = Texture { kind: Kind::Cube, filter: Filter::Bilinear, images: 1, size: [edge; 2], channels: 3 };
+        let directions: Vec<f32> = (0..6 * size * size)
+            .flat_map(|i| {
+                let place = |c: usize| (c as f32 + 0.5) / size as f32;
+                cube_direction(i / (size * size), place(i % size), place(i / size % size))
+            })
+            .collect();
+        let mut values = vec![0.0; self.group.values.len()];
+        texture::cpu::forward(&t, coarse.as_flattened(), &directions, &[], &mut values);
+        let adam = Adam { rate, ..self.group.adam };
+        self.group = ParamGroup::dense("light", values, adam);
+        self.update();
+    }
+
+    /// Multiplies the light by a factor per channel.
+    pub fn scale(&mut self, by: [f32; 3]) {
+        self.group.values.as_chunks_mut::<3>().0.iter_mut().for_each(|l| (0..3).for_each(|k| l[k] *= by[k]));
+        self.update();
+    }
+
+    /// Means of the light over `edge`² squares of each face.
+    pub fn coarse(&self, edge: usize) -> Vec<[f32; 3]> {
+        let (size, mut out) = (self.shape().size, vec![[0.0f32; 3]; 6 * edge * edge]);
+        let wide = size / edge;
+        let share = 1.0 / (wide * wide) as f32;
+        for (i, v) in self.group.values.as_chunks::<3>().0.iter().enumerate() {
+            let to = &mut out[coarse_of(i, size, edge)];
+            (0..3).for_each(|k| to[k] += share * v[k]);
+        }
+        out
+    }
+
+    /// Keeps the gradient of [`Probe::coarse`].
+    pub fn coarse_backward(&mut self, d: &[[f32; 3]]) {
+        let (size, edge) = (self.shape().size, (d.len() / 6).isqrt());
+        let wide = size / edge;
+        let share = 1.0 / (wide * wide) as f32;
+        for (i, to) in self.d_texels.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+            let d = d[coarse_of(i, size, edge)];
+            (0..3).for_each(|k| to[k] += share * d[k]);
+        }
+    }
+
+    /// Diffuse light along normals `[P, 3]` where nothing casts shadows.
+    pub fn diffuse(&self, normals: &[f32]) -> Vec<f32> {
+        let mut out = vec![0.0; normals.len()];
+        texture::cpu::forward(&self.shape().diffuse_texture(), &self.blurred.diffuse, normals, &[], &mut out);
+        out
+    }
+
+    /// Keeps the gradient of the light for that of [`Probe::diffuse`].
+    pub fn diffuse_backward(&mut self, normals: &[f32], d: &[f32]) {
+        let t = self.shape().diffuse_texture();
+        add(&mut self.d_blurred.diffuse, |to| texture::cpu::backward_texels(&t, normals, &[], d, to));
+    }
+
+    /// Colors of surface points; without surroundings if `seen` is none.
+    pub fn shade(&self, points: &Points, seen: Option<&Seen>) -> Shaded {
         let n = points.normal.len();
         let mut s = Shaded {
             directions: vec![0.0; n],
             levels: vec![0.0; n / 3],
             diffuse: vec![0.0; n],
             specular: vec![0.0; n],
+            unshadowed: Vec::new(),
             color: vec![0.0; n],
         };
         split_sum::cpu::lookups(points, self.shape().levels(), &mut s.directions, &mut s.levels);
         texture::cpu::forward(&self.shape().diffuse_texture(), &self.blurred.diffuse, points.normal, &[], &mut s.diffuse);
         texture::cpu::forward(&self.shape().texture(), &self.blurred.specular, &s.directions, &s.levels, &mut s.specular);
+        if let Some(seen) = seen {
+            s.unshadowed = s.diffuse.clone();
+            s.diffuse.iter_mut().zip(&seen.share).zip(&seen.added).for_each(|((d, share), added)| *d = *d * share + added);
+            let rows = s.specular.as_chunks_mut::<3>().0.iter_mut().zip(&seen.open).zip(seen.reflected.as_chunks::<3>().0);
+            rows.for_each(|((s, open), more)| (0..3).for_each(|k| s[k] = s[k] * open + more[k]));
+        }
         split_sum::cpu::forward(points, &Light { diffuse: &s.diffuse, specular: &s.specular }, &mut s.color);
         s
     }
 
-    /// Gradients of normals, base color and of occlusion, roughness, metalness for the gradient of [`Probe::shade`]'s color; that of the light is kept.
-    pub fn shade_backward(&mut self, points: &Points, shaded: &Shaded, d: &[f32]) -> [Vec<f32>; 3] {
+    /// Gradients of normals, base color, occlusion, roughness and metalness, and of the share in `seen`, for that of [`Probe::shade`]'s color; that
+    /// of the light is kept.
+    pub fn shade_backward(&mut self, points: &Points, (shaded, seen): (&Shaded, Option<&Seen>), d: &[f32]) -> [Vec<f32>; 4] {
         let n = points.normal.len();
         let [mut d_normal, mut d_kd, mut d_ks, mut d_diffuse, mut d_specular] = std::array::from_fn(|_| vec![0.0; n]);
         let light = Light { diffuse: &shaded.diffuse, specular: &shaded.specular };
         let into = Gradients { normal: &mut d_normal, kd: &mut d_kd, ks: &mut d_ks, diffuse: &mut d_diffuse, specular: &mut d_specular };
         split_sum::cpu::backward(points, &light, d, into);
+        let mut d_share = Vec::new();
+        if let Some(seen) = seen {
+            d_share = d_diffuse.iter().zip(&shaded.unshadowed).map(|(d, u)| d * u).collect();
+            d_diffuse.iter_mut().zip(&seen.share).for_each(|(d, share)| *d *= share);
+            d_specular.as_chunks_mut::<3>().0.iter_mut().zip(&seen.open).for_each(|(d, open)| d.iter_mut().for_each(|d| *d *= open));
+        }
         let (flat, lobes) = (self.shape().diffuse_texture(), self.shape().texture());
         let (mut d_directions, mut d_levels, mut d_along) = (vec![0.0; n], vec![0.0; n / 3], vec![0.0; n]);
         let at = (&shaded.directions[..], &shaded.levels[..]);
@@ -105,7 +193,7 @@ impl Probe {
             add(&mut self.d_blurred.diffuse, |to| texture::cpu::backward_texels(&flat, points.normal, &[], &d_diffuse, to));
             add(&mut self.d_blurred.specular, |to| texture::cpu::backward_texels(&lobes, at.0, at.1, &d_specular, to));
         }
-        [d_normal, d_kd, d_ks]
+        [d_normal, d_kd, d_ks, d_share]
     }
 
     /// Turns the gradients of blurred light into that of its texels, and adds that of `weight · mean |L − gray|`, whose value is returned.
@@ -114,6 +202,7 @@ impl Probe {
             return 0.0;
         }
         self.prefilter.backward(&self.d_blurred, &mut self.group.grads);
+        self.group.grads.iter_mut().zip(&self.d_texels).for_each(|(g, d)| *g += d);
         let scale = weight / self.group.values.len() as f32;
         let mut sum = 0.0;
         for (texel, d) in self.group.values.as_chunks::<3>().0.iter().zip(self.group.grads.as_chunks_mut::<3>().0) {
@@ -147,6 +236,12 @@ impl Probe {
     }
 }
 
+/// The square of a coarse light that holds a texel.
+fn coarse_of(i: usize, size: usize, edge: usize) -> usize {
+    let (face, y, x, wide) = (i / (size * size), i / size % size, i % size, size / edge);
+    (face * edge + y / wide) * edge + x / wide
+}
+
 fn add(into: &mut [f32], gradient: impl FnOnce(&mut [f32])) {
     let mut own = vec![0.0; into.len()];
     gradient(&mut own);
@@ -159,6 +254,8 @@ pub struct Shaded {
     levels: Vec<f32>,
     diffuse: Vec<f32>,
     specular: Vec<f32>,
+    /// Diffuse light before shadows; empty where there are none.
+    unshadowed: Vec<f32>,
     /// Linear `[P, 3]`.
     pub color: Vec<f32>,
 }

@@ -111,6 +111,20 @@ impl Surface {
         self.covered.iter().flat_map(|p| all[*p as usize * width..(*p as usize + 1) * width].iter().copied()).collect()
     }
 
+    /// Gradient of attributes `[V′, A]` for that of [`Surface::interpolate`].
+    pub fn interpolate_backward(&self, attributes: &[f32], width: usize, faces: &[[u32; 3]], d: &[f32]) -> Vec<f32> {
+        let pixels = self.raster.ids.len();
+        let s = Interpolate { images: 1, pixels, vertices: attributes.len() / width, attributes: width, per_image: false };
+        let mut d_values = vec![0.0; pixels * width];
+        for (pixel, d) in self.covered.iter().zip(d.chunks_exact(width)) {
+            d_values[*pixel as usize * width..][..width].copy_from_slice(d);
+        }
+        let (mut out, mut d_uv) = (vec![0.0; attributes.len()], vec![0.0; self.raster.uv.len()]);
+        let at = Pixels { ids: &self.raster.ids, uv: &self.raster.uv };
+        interpolate::cpu::backward(&s, attributes, faces, at, &d_values, &mut out, &mut d_uv);
+        out
+    }
+
     /// Screen derivatives of the first `chosen` of such attributes at the covered pixels, `[P, chosen, 2]`.
     pub fn derivatives(&self, attributes: &[f32], width: usize, chosen: &[usize], faces: &[[u32; 3]]) -> Vec<f32> {
         let s = Interpolate {

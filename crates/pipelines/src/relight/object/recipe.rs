@@ -114,16 +114,16 @@ pub fn load(run: &Path) -> Result<(ObjectModel, ObjectCapture, Vec<String>)> {
 /// As [`load`].
 pub fn describe(run: &Path) -> Result<serde_json::Value> {
     let (model, photographs, notes) = load(run)?;
-    let (stage, faces) = match &model.stage {
-        Stage::Topology(m) => ("topology", m.mesh().faces.len()),
-        Stage::Textured(m) => ("textured", m.layout.faces.len()),
+    let faces = match &model.stage {
+        Stage::Topology(m) => m.mesh().faces.len(),
+        Stage::Textured(m) => m.layout.faces.len(),
     };
     Ok(serde_json::json!({
         "kind": "relight object run",
         "data": model.config.data.path,
         "steps": model.origin.step,
         "seconds": model.origin.seconds,
-        "stage": stage,
+        "stage": model.stage.name(),
         "faces": faces,
         "training_views": photographs.indices(Split::Train).len(),
         "held_out_views": photographs.indices(Split::Test).len(),

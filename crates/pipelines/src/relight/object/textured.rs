@@ -1,11 +1,13 @@
 //! Second stage: a mesh that keeps its triangles, with textures of base color, occlusion, roughness, metalness and normals.
 
+use super::albedo_entropy;
 use super::capture::ObjectView;
-use super::config::Config;
+use super::config::{CHANNELS, Config};
 use super::loss;
 use super::material::{self, Material};
-use super::probe::Probe;
+use super::probe::{Probe, Seen};
 use super::raster::{Shape, Surface, SurfaceGradient};
+use super::surroundings::{LitVertices, Surroundings};
 use super::topology::{StepInput, StepLoss, ViewPass};
 use diorama_engine::params::ParamGroup;
 use diorama_geom::Mesh;
@@ -19,8 +21,6 @@ use diorama_mesh::{atlas, bake, normal_map};
 use rayon::prelude::*;
 use std::collections::HashMap;
 
-/// Numbers of a texel: base color; occlusion, roughness, metalness; normal in tangent space.
-pub const CHANNELS: usize = 9;
 /// Numbers of a vertex of the texture: coordinates and tangent.
 const ATTRIBUTES: usize = 6;
 /// Of so many surface points, one is compared with a texel nearby.
@@ -30,6 +30,13 @@ const JITTER: f32 = 0.01;
 /// Steps over which rates rise.
 const WARMUP: f32 = 100.0;
 const OCCLUSION: f32 = 0.001;
+/// Level at which vertices read their color.
+const VERTEX_LEVEL: f32 = 1.0;
+/// Points of a view whose colors are compared, and the width within which colors attract each other.
+const COMPARED: usize = 2048;
+const ENTROPY_WIDTH: f32 = 0.15;
+/// Stream of random numbers of pictures that are not trained on.
+const PICTURE: u64 = 36;
 
 /// Triangles, fixed: of positions, and of the texture, where vertices of seams are doubled.
 #[derive(Clone, Debug, PartialEq)]
@@ -75,6 +82,8 @@ pub struct Textured {
     pub positions: ParamGroup,
     pub texels: ParamGroup,
     color: [f32; 2],
+    /// Third stage: what the surface casts onto itself. The mesh no longer moves then.
+    pub surroundings: Option<Box<Surroundings>>,
 }
 
 impl Textured {
@@ -116,6 +125,7 @@ impl Textured {
             texels: ParamGroup::dense("texels", texels, adam(config.optim.texture_rate)),
             layout,
             color: config.material.color,
+            surroundings: None,
         }
     }
 
@@ -125,7 +135,7 @@ impl Textured {
     }
 
     /// Normals of the texture's vertices.
-    fn smooth_normals(&self) -> Vec<[f32; 3]> {
+    pub fn smooth_normals(&self) -> Vec<[f32; 3]> {
         let normals = vertex_normals::cpu::forward(&self.layout.faces, self.places());
         self.layout.source.iter().map(|i| normals[*i as usize]).collect()
     }
@@ -175,38 +185,67 @@ impl Textured {
         let drawn = self.drawn();
         let looked = self.look(view, &drawn);
         let values = self.lookup(&drawn, &looked.uv, &looked.level);
-        let lit = looked.shade(&values, probe);
+        let around = self.light(&drawn, probe);
+        let lit = looked.shade(&values, probe, self.around(around.as_ref(), Rng::new(0, PICTURE)));
         [&lit.shaded.color, &lit.kd].map(|c| looked.surface.picture(&drawn.shape(self), c).rgba)
+    }
+
+    /// Lets the textures' optimizer begin anew.
+    pub fn forget_steps(&mut self) {
+        self.texels.moment1.fill(0.0);
+        self.texels.moment2.fill(0.0);
+    }
+
+    /// Diffuse base color of the vertices.
+    pub fn vertex_colors(&self, drawn: &Drawn) -> Vec<[f32; 3]> {
+        let mut uv = vec![[0.5f32; 2]; self.layout.initial.len()];
+        self.layout.source.iter().zip(&self.layout.uvs).for_each(|(v, at)| uv[*v as usize] = *at);
+        let values = self.lookup(drawn, uv.as_flattened(), &vec![VERTEX_LEVEL; uv.len()]);
+        values.as_chunks::<CHANNELS>().0.iter().map(|t| [t[0], t[1], t[2]].map(|c| c * (1.0 - t[5]))).collect()
+    }
+
+    /// Light at the vertices, in the third stage.
+    pub fn light(&self, drawn: &Drawn, probe: &Probe) -> Option<LitVertices> {
+        self.surroundings.as_ref().map(|s| s.light(probe, &self.vertex_colors(drawn)))
+    }
+
+    fn around<'a>(&'a self, lit: Option<&'a LitVertices>, rng: Rng) -> Option<Around<'a>> {
+        self.surroundings.as_deref().zip(lit).map(|(surroundings, lit)| Around { surroundings, lit, rng })
     }
 
     /// One optimizer step.
     pub fn step(&mut self, config: &Config, input: &StepInput, probe: &mut Probe) -> StepLoss {
         let drawn = self.drawn();
         let mut loss = StepLoss { faces: self.layout.faces.len(), ..StepLoss::default() };
-        let mut gradient = Gradient { positions: vec![[0.0; 3]; self.places().len()], texels: vec![0.0; self.texture.numbers()] };
         let share = 1.0 / input.photos.len() as f32;
         probe.update();
+        let lit = self.light(&drawn, probe);
+        let mut gradient = Gradient {
+            positions: vec![[0.0; 3]; self.places().len()],
+            texels: vec![0.0; self.texture.numbers()],
+            shares: vec![0.0; self.surroundings.as_ref().map_or(0, |s| s.attributes())],
+        };
         for (i, photo) in input.photos.iter().enumerate() {
             let looked = self.look(&photo.view, &drawn);
             let pass = ViewPass { config, photo, share, rng: Rng::new(input.rng.bits(i as u64), 0), progress: input.progress };
-            self.view(&pass, (&drawn, &looked), probe, &mut loss, &mut gradient);
+            self.view(&pass, (&drawn, &looked, lit.as_ref()), probe, &mut loss, &mut gradient);
+        }
+        if let Some(around) = self.around(lit.as_ref(), input.rng) {
+            around.surroundings.light_backward(around.lit, &gradient.shares, probe);
         }
         loss.regularizers += probe.finish_backward(config.loss.white_light);
-        let weight = config.loss.laplacian * (1.0 - input.progress);
-        let bent = mesh_smoothness::cpu::relative_laplacian(
-            &self.neighbors,
-            &self.first_laplacian,
-            self.places(),
-            weight,
-            &mut gradient.positions,
-        );
-        loss.regularizers += weight as f64 * bent;
+        let rate = input.rate_scale * config.optim.final_scale.powf(input.progress) * (input.t as f32 / WARMUP).min(1.0);
+        if self.surroundings.is_none() {
+            let weight = config.loss.laplacian * (1.0 - input.progress);
+            let (first, to) = (&self.first_laplacian, &mut gradient.positions);
+            let bent = mesh_smoothness::cpu::relative_laplacian(&self.neighbors, first, self.places(), weight, to);
+            loss.regularizers += weight as f64 * bent;
+            self.positions.grads.copy_from_slice(gradient.positions.as_flattened());
+            self.positions.step(input.t, rate);
+        }
         mips::backward(&self.texture, &mut gradient.texels);
         let n = self.texels.values.len();
         self.texels.grads.copy_from_slice(&gradient.texels[..n]);
-        self.positions.grads.copy_from_slice(gradient.positions.as_flattened());
-        let rate = input.rate_scale * config.optim.final_scale.powf(input.progress) * (input.t as f32 / WARMUP).min(1.0);
-        self.positions.step(input.t, rate);
         self.texels.step(input.t, rate);
         probe.step(input.t, rate);
         self.clamp();
@@ -215,10 +254,10 @@ impl Textured {
 
     /// Keeps texels where materials are.
     fn clamp(&mut self) {
-        let [low, high] = self.color;
+        let ([low, high], most_occluded) = (self.color, if self.surroundings.is_some() { 0.0 } else { 1.0 });
         self.texels.values.as_chunks_mut::<CHANNELS>().0.par_iter_mut().with_min_len(4096).for_each(|t| {
             t[..3].iter_mut().for_each(|v| *v = v.clamp(low, high));
-            t[3] = t[3].clamp(0.0, 1.0);
+            t[3] = t[3].clamp(0.0, most_occluded);
             t[4] = t[4].clamp(SMOOTHEST, 1.0);
             t[5] = t[5].clamp(0.0, 1.0);
             t[6..8].iter_mut().for_each(|v| *v = v.clamp(-1.0, 1.0));
@@ -227,8 +266,15 @@ impl Textured {
     }
 
     /// One photograph: its losses, and gradients of everything.
-    fn view(&self, pass: &ViewPass, of: (&Drawn, &Looked), probe: &mut Probe, loss: &mut StepLoss, gradient: &mut Gradient) {
-        let (ViewPass { config, photo, share, rng, .. }, (drawn, looked)) = (*pass, of);
+    fn view(
+        &self,
+        pass: &ViewPass,
+        of: (&Drawn, &Looked, Option<&LitVertices>),
+        probe: &mut Probe,
+        loss: &mut StepLoss,
+        gradient: &mut Gradient,
+    ) {
+        let (ViewPass { config, photo, share, rng, .. }, (drawn, looked, lit_vertices)) = (*pass, of);
         let (shape, surface) = (drawn.shape(self), &looked.surface);
         let n = surface.covered.len();
         // Texels nearby follow the points' own.
@@ -240,7 +286,8 @@ impl Textured {
             level.push(looked.level[*i]);
         }
         let values = self.lookup(drawn, &uv, &level);
-        let lit = looked.shade(&values[..n * CHANNELS], probe);
+        let around = self.around(lit_vertices, Rng::new(rng.bits(3), 3));
+        let lit = looked.shade(&values[..n * CHANNELS], probe, around);
         let picture = surface.picture(&shape, &lit.shaded.color);
         let mut d = vec![0.0; picture.rgba.len()];
         let of = loss::picture(&picture.rgba, &photo.rgba.data, config.loss.mask, Rng::new(rng.bits(2), 2), &mut d);
@@ -248,7 +295,12 @@ impl Textured {
         loss.add(of, share as f64);
         let (d_color, d_clip) = surface.picture_backward(&picture, &d);
         let at = Points { normal: &lit.bent, view: &surface.view, kd: &lit.kd, ks: &lit.ks };
-        let [mut d_normal, d_kd, d_ks] = probe.shade_backward(&at, &lit.shaded, &d_color);
+        let [mut d_normal, mut d_kd, d_ks, d_share] = probe.shade_backward(&at, (&lit.shaded, lit.seen.as_ref()), &d_color);
+        if let Some(around) = around {
+            around.surroundings.seen_backward(around.lit, surface, &d_share, &mut gradient.shares);
+            let weight = share * n as f32 / (photo.rgba.width * photo.rgba.height) as f32 * config.loss.color_entropy;
+            loss.regularizers += few_colors(&lit.kd, weight, Rng::new(rng.bits(4), 4), &mut d_kd);
+        }
         surface.bent_backward(&lit.normal, &mut d_normal);
         let mut d_values = vec![0.0; values.len()];
         let d_smooth = looked.tangent_backward(&lit, &values, &d_normal, &mut d_values);
@@ -279,9 +331,34 @@ impl Textured {
 struct Gradient {
     positions: Vec<[f32; 3]>,
     texels: Vec<f32>,
+    /// Of the vertices' shares of light, in the third stage.
+    shares: Vec<f32>,
 }
 
 /// What the views of one state of the model share.
+#[derive(Clone, Copy)]
+pub struct Around<'a> {
+    surroundings: &'a Surroundings,
+    lit: &'a LitVertices,
+    rng: Rng,
+}
+
+/// Adds the gradient of the entropy of some of the colors `[P, 3]`, and returns it.
+fn few_colors(kd: &[f32], weight: f32, rng: Rng, d_kd: &mut [f32]) -> f64 {
+    let n = kd.len() / 3;
+    if weight == 0.0 || n == 0 {
+        return 0.0;
+    }
+    let chosen: Vec<usize> = (0..COMPARED.min(n)).map(|i| rng.below(i as u64, n as u64) as usize).collect();
+    let colors: Vec<[f32; 3]> = chosen.iter().map(|i| std::array::from_fn(|k| kd[3 * i + k])).collect();
+    let (value, d) = albedo_entropy::entropy(&colors, &[], ENTROPY_WIDTH, &Rng::new(rng.bits(0), 1));
+    for (i, d) in chosen.iter().zip(&d) {
+        (0..3).for_each(|k| d_kd[3 * i + k] += weight * d[k]);
+    }
+    weight as f64 * value
+}
+
+/// What views of a step share.
 pub struct Drawn {
     normals: Vec<[f32; 3]>,
     attributes: Vec<f32>,
@@ -309,6 +386,7 @@ pub struct Lit {
     /// Normals of the texture in object space, before and after they are bent.
     normal: Vec<f32>,
     bent: Vec<f32>,
+    seen: Option<Seen>,
     pub shaded: super::probe::Shaded,
 }
 
@@ -324,7 +402,7 @@ impl Looked {
     }
 
     /// Lights the points with values of texels `[P, 9]`.
-    pub fn shade(&self, values: &[f32], probe: &Probe) -> Lit {
+    pub fn shade(&self, values: &[f32], probe: &Probe, around: Option<Around>) -> Lit {
         let n = self.surface.covered.len();
         let (mut kd, mut ks, mut normal) = (vec![0.0; 3 * n], vec![0.0; 3 * n], vec![0.0; 3 * n]);
         for (i, v) in values.as_chunks::<CHANNELS>().0.iter().enumerate() {
@@ -334,8 +412,9 @@ impl Looked {
             normal[at].copy_from_slice(&unit(turned(self.frame(i), [v[6], v[7], v[8]])));
         }
         let bent = self.surface.bent(&normal);
-        let shaded = probe.shade(&Points { normal: &bent, view: &self.surface.view, kd: &kd, ks: &ks });
-        Lit { kd, ks, normal, bent, shaded }
+        let seen = around.map(|a| a.surroundings.seen(a.lit, &self.surface, (&bent, &ks), a.rng));
+        let shaded = probe.shade(&Points { normal: &bent, view: &self.surface.view, kd: &kd, ks: &ks }, seen.as_ref());
+        Lit { kd, ks, normal, bent, seen, shaded }
     }
 
     /// Gradients of the texels' normals, into `d_values`, and of the smooth normals; the tangent counts as given.

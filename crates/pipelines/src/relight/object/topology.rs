@@ -141,7 +141,7 @@ impl Topology {
         let shape = Shape { positions: &mesh.positions, normals: &normals, faces: &mesh.faces, topology: &topology };
         let surface = Surface::draw(view, &shape, false);
         let (values, normal) = (self.material.evaluate(&surface.position), surface.bent(&surface.normal));
-        let shaded = probe.shade(&Points { normal: &normal, view: &surface.view, kd: &values.kd, ks: &values.ks });
+        let shaded = probe.shade(&Points { normal: &normal, view: &surface.view, kd: &values.kd, ks: &values.ks }, None);
         surface.picture(&shape, &shaded.color).rgba
     }
 
@@ -212,14 +212,14 @@ impl Topology {
         let values = self.material.evaluate(&points);
         let normal = surface.bent(&surface.normal);
         let at = Points { normal: &normal, view: &surface.view, kd: &values.kd[..3 * n], ks: &values.ks[..3 * n] };
-        let shaded = probe.shade(&at);
+        let shaded = probe.shade(&at, None);
         let picture = surface.picture(shape, &shaded.color);
         let mut d = vec![0.0; picture.rgba.len()];
         let of = loss::picture(&picture.rgba, &photo.rgba.data, config.loss.mask, Rng::new(rng.bits(2), 2), &mut d);
         d.par_iter_mut().with_min_len(4096).for_each(|d| *d *= share);
         loss.add(of, share as f64);
         let (d_color, d_clip) = surface.picture_backward(&picture, &d);
-        let [mut d_normal, mut d_kd, mut d_ks] = probe.shade_backward(&at, &shaded, &d_color);
+        let [mut d_normal, mut d_kd, mut d_ks, _] = probe.shade_backward(&at, (&shaded, None), &d_color);
         surface.bent_backward(&surface.normal, &mut d_normal);
         d_kd.resize(points.len(), 0.0);
         d_ks.resize(points.len(), 0.0);

@@ -66,8 +66,12 @@ impl<'a> Trainer<'a> {
 
 /// The share of a stage that is done, and the step within it, from 1.
 fn place(config: &Config, step: u64) -> (f32, u32) {
-    let first = config.topology_steps();
-    let (done, of) = if step < first { (step, first) } else { (step - first, config.run.texture_steps) };
+    let (first, second) = (config.topology_steps(), config.run.texture_steps);
+    let (done, of) = match step {
+        s if s < first => (s, first),
+        s if s < first + second => (s - first, second),
+        s => (s - first - second, config.run.traced_steps),
+    };
     (done as f32 / of.max(1) as f32, done as u32 + 1)
 }
 
@@ -77,6 +81,9 @@ impl Trainee for Trainer<'_> {
     fn step(&mut self, step: u64, _: f64) -> Result<StepReport> {
         if step >= self.model.config.topology_steps() {
             self.model.give_texture(&self.capture)?;
+        }
+        if step >= self.model.config.topology_steps() + self.model.config.run.texture_steps {
+            self.model.give_surroundings(&self.capture);
         }
         let photos: Vec<_> = self.chosen(step).into_iter().map(|i| &self.capture.photos[i]).collect();
         let (progress, t) = place(&self.model.config, step);

@@ -1,0 +1,110 @@
+//! Third stage: how it begins. The mesh is kept; shadows and light between its surfaces are traced; the light is found anew, and what it was
+//! mistaken for is taken out of the base color.
+
+use super::albedo_entropy;
+use super::capture::ObjectCapture;
+use super::config::{CHANNELS, Config};
+use super::gloss;
+use super::probe::Probe;
+use super::surroundings::Surroundings;
+use super::textured::Textured;
+use super::transport::{dot, unit};
+use diorama_geom::capture::Split;
+use diorama_geom::mesh::{cross, sub};
+use diorama_kernels::ops::vertex_normals;
+use diorama_mesh::bake;
+
+/// Roughness to begin with.
+const ROUGHNESS: f32 = 0.5;
+/// How often light and gloss are found in turns, and the least share of a color that is not gloss.
+const ROUNDS: usize = 2;
+const LEFT: f32 = 0.1;
+/// Largest base color to begin with, and least light.
+const BRIGHTEST: f32 = 0.95;
+const DARK: f32 = 1e-3;
+
+/// What the mesh casts onto itself.
+pub fn surroundings(m: &Textured, config: &Config) -> Surroundings {
+    let normals = vertex_normals::cpu::forward(&m.layout.faces, m.places());
+    Surroundings::new(m.places(), &normals, &m.layout.faces, config.seed)
+}
+
+/// Traces the surroundings, finds the light unless it is given, and divides it out.
+pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: &mut Probe) {
+    let around = surroundings(m, config);
+    probe.update();
+    let mut flat = m.mesh();
+    flat.normals = m.smooth_normals();
+    let size = config.material.texture;
+    let texels = bake::texels(&flat, size);
+    let before = probe.diffuse(texels.normals.as_flattened());
+    let normals: Vec<[f32; 3]> = vertex_normals::cpu::forward(&m.layout.faces, m.places()).into_iter().map(unit).collect();
+    let photos: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.photos[i]).collect();
+    let at = (m.places(), &normals[..]);
+    let sightings = albedo_entropy::sightings(&photos, at, &around.transport);
+    let mut gloss = None;
+    if probe.group.frozen {
+        gloss = gloss::fit(probe, &around.transport, &sightings, at);
+        // The light is as bright as it is.
+        if let Some(g) = &mut gloss {
+            g.mirrored.iter_mut().for_each(|m| (0..3).for_each(|k| m[k] /= g.scale[k]));
+        }
+    } else {
+        let mut observed = albedo_entropy::observed(&sightings);
+        for _ in 0..ROUNDS {
+            let coarse = albedo_entropy::estimate(&around.transport, &observed, m.places(), config.seed);
+            probe.set_coarse(&coarse, config.optim.traced_light_rate);
+            gloss = gloss::fit(probe, &around.transport, &sightings, at);
+            let Some(g) = &gloss else { break };
+            probe.scale(g.scale);
+            observed = albedo_entropy::observed(&sightings);
+            for (o, mirrored) in observed.iter_mut().zip(&g.mirrored) {
+                *o = o.map(|c| std::array::from_fn(|k| (c[k] - mirrored[k]).max(LEFT * c[k])));
+            }
+        }
+    }
+    let roughness = gloss.as_ref().map_or(ROUGHNESS, |g| g.roughness);
+    let mirrored = gloss.map_or_else(|| vec![[0.0; 3]; m.places().len()], |g| g.mirrored);
+    // Two rounds: light between surfaces depends on their colors.
+    let sent: Vec<[f32; 3]> = texels
+        .index
+        .iter()
+        .zip(before.as_chunks::<3>().0)
+        .map(|(i, d)| {
+            let t = &m.texels.values[*i as usize * CHANNELS..][..CHANNELS];
+            std::array::from_fn(|k| t[k] * (1.0 - t[5]) * (1.0 - t[3]) * d[k])
+        })
+        .collect();
+    for _ in 0..2 {
+        let drawn = m.drawn();
+        let lit = around.light(probe, &m.vertex_colors(&drawn));
+        let colors: Vec<[f32; 3]> = (0..sent.len())
+            .map(|i| {
+                let corners = m.layout.faces[texels.face[i] as usize].map(|v| v as usize);
+                let weights = place(texels.positions[i], corners.map(|v| m.places()[v]));
+                let mix = |of: &dyn Fn(usize) -> f32| (0..3).map(|c| weights[c] * of(corners[c])).sum::<f32>();
+                std::array::from_fn(|k| {
+                    let (light, gloss) = (mix(&|v| lit.diffuse(v)[k]), mix(&|v| mirrored[v][k]));
+                    ((sent[i][k] - gloss).max(LEFT * sent[i][k]) / light.max(DARK)).min(BRIGHTEST)
+                })
+            })
+            .collect();
+        let spread = bake::spread(&texels, &colors, size);
+        for (t, c) in m.texels.values.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&spread) {
+            t[..3].copy_from_slice(c);
+            t[3..6].copy_from_slice(&[0.0, roughness, 0.0]);
+        }
+    }
+    m.forget_steps();
+    m.surroundings = Some(Box::new(around));
+}
+
+/// Weights of a triangle's corners at a point of it.
+fn place(p: [f32; 3], [a, b, c]: [[f32; 3]; 3]) -> [f32; 3] {
+    let (ab, ac, ap) = (sub(b, a), sub(c, a), sub(p, a));
+    let n = cross(ab, ac);
+    let area = dot(n, n).max(1e-20);
+    let (v, w) = (dot(cross(ap, ac), n) / area, dot(cross(ab, ap), n) / area);
+    let [v, w] = [v.clamp(0.0, 1.0), w.clamp(0.0, 1.0)];
+    [(1.0 - v - w).max(0.0), v, w]
+}
