@@ -1,0 +1,260 @@
+//! The light's stage of training: what is told apart at its beginning, its steps, and the updates of suns.
+
+use super::super::normal_maps::NormalMaps;
+use super::super::shading::{CHANNELS, LIGHT, SceneGradients, SceneLoss, Suns, TracedLight, Weights, gray};
+use super::super::sun::{self, Lit, SUN, Seen};
+use super::super::visibility::Visibility;
+use super::{SETTLED, Trainer};
+use crate::error::Result;
+use diorama_engine::fields::FieldBuffers;
+use diorama_engine::renderers::traced::Traced;
+use diorama_engine::renderers::volume::{Quality, Tracer};
+use diorama_engine::samplers::RayBatch;
+use diorama_engine::samplers::pixels::{self, DrawOptions};
+use diorama_engine::step::{GivenRays, Loss, Trainees};
+use diorama_engine::train::StepReport;
+use diorama_geom::color::linear_from_srgb;
+use diorama_geom::glam::Vec3;
+use diorama_geom::rng::Rng;
+use std::sync::Mutex;
+
+/// Streams of random numbers.
+const NOISE: u64 = 12;
+const SUNS: u64 = 13;
+const TAUGHT: u64 = 14;
+/// Pixels from which the light of all lights together is told apart: most in all, least and most for each light.
+const TELLING: (usize, usize, usize) = (40_000, 1000, 6000);
+/// Pixels from which a sun is found anew.
+const PIXELS_PER_SUN: usize = 4000;
+/// Opacity from which a pixel shows a surface.
+const SURFACE: f32 = 0.9;
+/// Standard deviation of noise on the light that the shadow sees.
+const LIGHT_NOISE: f32 = 0.01;
+/// Every so many rays, one teaches the shadow of a sun that no photograph has.
+const TAUGHT_RAYS: usize = 3;
+
+/// Light that shadows are traced in, ray by ray, and what the shadow's head reads of it.
+struct Taught {
+    /// `[R, 9]`, `[R, 9, 3]` and `[R, 9]`
+    suns: Vec<f32>,
+    skies: Vec<f32>,
+    codes: Vec<f32>,
+}
+
+impl Trainer<'_> {
+    /// Goes on to the stage of light: suns, skies and what hides them are found on the surfaces as they are.
+    pub(super) fn begin_light(&mut self, step: u64) -> Result<()> {
+        let m = &self.model;
+        let normals = NormalMaps::of(m, &self.cameras);
+        let visibility = Visibility::of(&m.field, &m.occupancy, m.shaded_cube(), m.config.light.sun_cells);
+        self.model.share_codes();
+        let (fitted, _) = sun::tell_apart(&self.seen(&normals), &visibility);
+        let m = &mut self.model;
+        let is_apart = m.config.light.has_sun();
+        for (l, found) in fitted.iter().enumerate() {
+            m.suns.values[SUN * l..][..SUN].copy_from_slice(&found.sun);
+            m.lights.values[LIGHT * l..][..LIGHT].copy_from_slice(&found.sky);
+            if !is_apart {
+                let light = &mut m.lights.values[LIGHT * l..][..LIGHT];
+                light.iter_mut().zip(sun::harmonics(&found.sun)).for_each(|(v, s)| *v += s);
+            }
+        }
+        (m.visibility, self.normals) = (Some(visibility), Some(normals));
+        m.begin_light()?;
+        (m.began, m.median) = (step, 0.1);
+        let scene = m.scene();
+        let trainees = Trainees { occupancy: Some(&mut m.occupancy), ..Trainees::of(&mut m.field) };
+        self.device.begin(&trainees, scene, None)
+    }
+
+    /// Random surface points of the photographs as they look in every light.
+    fn seen(&self, normals: &NormalMaps) -> Vec<Seen> {
+        let m = &self.model;
+        let lights = m.light_count();
+        let (all, least, most) = TELLING;
+        let mut batch = self.pixels((all / lights.max(1)).clamp(least, most));
+        let mut out: Vec<Seen> = Vec::new();
+        for l in 0..lights {
+            let tracer = Tracer { appearance: Some(l as u32), ..m.tracer(Quality::Full) };
+            let traced = tracer.trace_layers(&mut batch, &[], &mut FieldBuffers::default());
+            let shown = (0..batch.len()).filter(|r| batch.counts[*r]).filter_map(|r| {
+                let normal = normals.at(batch.images[r] as usize, batch.pixels[2 * r], batch.pixels[2 * r + 1]);
+                (traced.opacity[r] > SURFACE && normal != Vec3::ZERO).then_some((r, normal))
+            });
+            for (i, (r, normal)) in shown.enumerate() {
+                if l == 0 {
+                    out.push(Seen { point: point(&batch, &traced, r), normal, colors: Vec::new() });
+                }
+                let color = [0, 1, 2].map(|k| linear_from_srgb((traced.rgb[3 * r + k] / traced.opacity[r]).clamp(0.0, 1.0)));
+                out[i].colors.push(Vec3::from(color));
+            }
+        }
+        out
+    }
+
+    /// Random training pixels, apart from those that steps draw.
+    fn pixels(&self, n: usize) -> RayBatch {
+        let m = &self.model;
+        let (near, cube, rng) = (m.config.sampling.near, m.cube(), Rng::new(m.config.seed, SUNS));
+        let o = DrawOptions { cameras: &self.cameras, first: m.rays, rng, near, cube, error_map: None, observations: &[] };
+        let mut batch = RayBatch::default();
+        batch.resize(n);
+        pixels::draw(&self.photographs, &o, &mut batch);
+        batch
+    }
+
+    /// Finds suns anew if that is due.
+    fn update_suns(&mut self, share: f32) {
+        let due = self.model.config.light.sun_updates_by(share);
+        if due <= self.model.sun_updates {
+            return;
+        }
+        let pixels = self.lit_pixels();
+        let m = &mut self.model;
+        m.sun_updates = due;
+        let visibility = m.visibility.as_ref().expect("the light's stage");
+        for (l, pixels) in pixels.iter().enumerate() {
+            let known = Vec3::from_slice(&m.suns.values[SUN * l..]);
+            let found = sun::fit(pixels, visibility, Some(known));
+            m.suns.values[SUN * l..][..SUN].copy_from_slice(&found.sun);
+            m.lights.values[LIGHT * l..][..LIGHT].copy_from_slice(&found.sky);
+        }
+    }
+
+    /// Training pixels that show surfaces, by light.
+    fn lit_pixels(&self) -> Vec<Vec<Lit>> {
+        let (m, normals) = (&self.model, self.normals.as_ref().expect("the light's stage"));
+        let lights = m.light_count();
+        let mut batch = self.pixels(PIXELS_PER_SUN * lights);
+        let seen = m.tracer(Quality::Full).trace_layers(&mut batch, &[&[0.0; 9]], &mut FieldBuffers::default());
+        let mut out = vec![Vec::new(); lights];
+        for r in (0..batch.len()).filter(|r| batch.counts[*r] && seen.opacity[*r] > SURFACE) {
+            let normal = normals.at(batch.images[r] as usize, batch.pixels[2 * r], batch.pixels[2 * r + 1]);
+            if normal == Vec3::ZERO {
+                continue;
+            }
+            let albedo = Vec3::from_slice(&seen.rgb[r * CHANNELS..]) / seen.opacity[r];
+            let target = [0, 1, 2].map(|k| linear_from_srgb(batch.target[4 * r + k]));
+            let lit = Lit { point: point(&batch, &seen, r), normal, albedo, seen: Vec3::from(target) };
+            out[m.light_of[batch.images[r] as usize] as usize].push(lit);
+        }
+        out
+    }
+
+    /// The lights of the rays; every [`TAUGHT_RAYS`]th ray has a sun of its own. Shadows read a little noise besides.
+    fn taught(&self, light: &[u32], step: u64) -> Taught {
+        let (m, rng, noise) = (&self.model, self.rng(TAUGHT, step), self.rng(NOISE, step));
+        let mut out = Taught { suns: Vec::new(), skies: Vec::new(), codes: Vec::new() };
+        for (r, l) in light.iter().enumerate() {
+            let l = *l as usize;
+            let mut sun: [f32; SUN] = std::array::from_fn(|i| m.suns.values[SUN * l + i]);
+            let mut all: [f32; LIGHT] = std::array::from_fn(|i| m.lights.values[LIGHT * l + i]);
+            let mut sky = all;
+            match m.config.light.has_sun() {
+                true => all.iter_mut().zip(sun::harmonics(&sun)).for_each(|(v, s)| *v += s),
+                false => sky.iter_mut().zip(sun::harmonics(&sun)).for_each(|(v, s)| *v -= s),
+            }
+            if r % TAUGHT_RAYS == 0 {
+                let at = |k: u64| rng.uniform(4 * r as u64 + k);
+                let (z, turn) = (0.05 + 0.95 * at(0), std::f32::consts::TAU * at(1));
+                let across = (1.0 - z * z).max(0.0).sqrt();
+                sun[..3].copy_from_slice(&[across * turn.cos(), across * turn.sin(), z]);
+                let (power, clear) = (2.0 * at(2), 0.3 + at(3));
+                sun[3..6].iter_mut().for_each(|v| *v *= power);
+                sun[6..].iter_mut().chain(&mut sky).for_each(|v| *v *= clear);
+                all = sky;
+                all.iter_mut().zip(sun::harmonics(&sun)).for_each(|(v, s)| *v += s);
+            }
+            out.suns.extend(sun);
+            out.skies.extend(sky);
+            out.codes.extend((0..9).map(|i| gray(&all[3 * i..]) + LIGHT_NOISE * noise.normal((9 * r + i) as u64)));
+        }
+        out
+    }
+
+    /// One step of the light's stage.
+    pub(super) fn relight(&mut self, step: u64, share: f32) -> Result<StepReport> {
+        self.update_suns(share);
+        self.draw(step);
+        let (n, mut drawn, c) = (self.batch.len(), self.drawn(), self.model.config.clone());
+        let taught = self.taught(&drawn.light, step);
+        let is_apart = c.light.has_sun();
+        if !is_apart {
+            drawn.counts.iter_mut().step_by(TAUGHT_RAYS).for_each(|c| *c = 0.0);
+        }
+        let maps = self.normals.as_ref().expect("the light's stage");
+        let normal = |r: usize| maps.at(self.batch.images[r] as usize, self.batch.pixels[2 * r], self.batch.pixels[2 * r + 1]);
+        let normals: Vec<f32> = (0..n).flat_map(|r| normal(r).to_array()).collect();
+        let (lights, suns) = (self.model.lights.values.clone(), self.model.suns.values.clone());
+        // Taken out of the model, whose field the step changes.
+        let visibility = self.model.visibility.take().expect("the light's stage");
+        let origins = &self.batch.origins[..];
+        let settled = step >= self.model.began + SETTLED;
+        let loss = SceneLoss {
+            weights: Weights {
+                huber: c.loss.huber,
+                robust: if settled { c.loss.robust * self.model.median } else { 0.0 },
+                shadow: c.loss.shadow,
+                traced: c.loss.traced,
+                negative: c.loss.negative,
+                gauge: c.loss.gauge,
+                tie: c.loss.normal,
+            },
+            target: &drawn.target,
+            counts: &drawn.counts,
+            normals: &normals,
+            dirs: &self.batch.dirs,
+            light: &drawn.light,
+            image: &self.batch.images,
+            lights: &lights,
+            skies: &self.model.skies.values,
+            gains: &self.model.gains.values,
+            suns: is_apart.then_some(Suns { values: &suns, visibility: &visibility, origins }),
+            traced: (!is_apart).then_some(TracedLight { suns: &taught.suns, skies: &taught.skies, visibility: &visibility, origins }),
+            out: Mutex::default(),
+        };
+        let codes = [&taught.codes[..]];
+        let background = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0].repeat(n);
+        let given = given(&self.batch, &drawn.light, &background, &codes);
+        let described = self.described(step - self.model.began, share, given, Loss::Batch(&loss));
+        let (field, occupancy) = (&mut self.model.field, Some(&mut self.model.occupancy));
+        let done = self.device.step(&mut Trainees { occupancy, ..Trainees::of(field) }, None, &described, 1);
+        let tables = loss.out.into_inner().expect("the step is over");
+        self.model.visibility = Some(visibility);
+        let done = done?;
+        if done.shown.loss.is_finite() {
+            self.model.count(n, done.shown.trained);
+            self.update_lights(step - self.model.began, share, &tables);
+        }
+        Ok(StepReport { loss: done.shown.loss, scalars: self.scalars(tables.mse, n, done.shown.trained) })
+    }
+
+    /// One optimizer step of lights, skies, gains and suns.
+    fn update_lights(&mut self, step: u64, share: f32, tables: &SceneGradients) {
+        let m = &mut self.model;
+        m.median = 0.95 * m.median + 0.05 * tables.median;
+        let groups = [(&mut m.lights, &tables.lights), (&mut m.skies, &tables.skies), (&mut m.gains, &tables.gains)];
+        for (group, d) in groups.into_iter().chain((!tables.suns.is_empty()).then_some((&mut m.suns, &tables.suns))) {
+            group.grads.copy_from_slice(d);
+            group.step(step as u32 + 1, group.schedule.scale(share) * m.rate_scale);
+        }
+        // The direction has no gradient; light is not negative.
+        for (sun, sky) in m.suns.values.chunks_exact_mut(SUN).zip(m.lights.values.chunks_exact(LIGHT)) {
+            sun[3..6].iter_mut().for_each(|v| *v = v.max(0.0));
+            if !tables.suns.is_empty() {
+                sun::set_bounced(sun, sky);
+            }
+        }
+    }
+}
+
+/// Where a ray of a batch meets its surface.
+fn point(batch: &RayBatch, traced: &Traced, r: usize) -> Vec3 {
+    let at = |v: &[f32]| Vec3::from_slice(&v[3 * r..]);
+    at(&batch.origins) + at(&batch.dirs) * (traced.depth[r] / traced.opacity[r])
+}
+
+/// The rays of a batch with their codes, before a background `[R, C]`.
+fn given<'b>(batch: &'b RayBatch, light: &'b [u32], background: &'b [f32], codes: &'b [&'b [f32]]) -> GivenRays<'b> {
+    GivenRays { images: light, origins: &batch.origins, dirs: &batch.dirs, jitter: &batch.jitter, target: &[], background, codes }
+}
