@@ -197,7 +197,7 @@ impl Config {
             },
             loss: LossConfig {
                 huber: 0.1,
-                robust: 0.0,
+                robust: 2.0,
                 shadow: 1e-2,
                 traced: 0.1,
                 normal: 0.1,

@@ -18,7 +18,7 @@ struct Case {
     gains: Vec<f32>,
     /// Empty: no suns apart.
     suns: Vec<f32>,
-    /// Of the surfaces; the last ray's is not known.
+    /// Of the surfaces.
     normals: Vec<f32>,
 }
 
@@ -65,7 +65,8 @@ fn case() -> Case {
         skies: signed(2 * SKY, 6, 1.0),
         gains: signed(3 * RAYS, 7, 0.4),
         suns: Vec::new(),
-        normals: [draw(3 * (RAYS - 1), 8).iter().map(|v| v - 0.5).collect(), vec![0.0; 3]].concat(),
+        // Of slopes that the suns shine on.
+        normals: (0..RAYS).flat_map(|r| [0.5, -0.6 + 0.1 * r as f32, 0.6]).collect(),
     }
 }
 

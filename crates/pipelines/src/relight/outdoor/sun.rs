@@ -3,6 +3,7 @@
 //! receives. Directions are searched, the rest then is linear.
 
 use super::visibility::{Visibility, spread};
+use diorama_geom::color::srgb_from_linear;
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
 use rayon::prelude::*;
@@ -30,6 +31,9 @@ const BRIGHT: f32 = 0.7;
 const ROUNDS: usize = 5;
 const SEARCHED: usize = 1;
 const SETTLING: usize = 15;
+/// Difference in sRGB beyond which pixels count less and less, and rounds in which that is weighed.
+const TRUSTED: f32 = 0.15;
+const REWEIGHTED: usize = 3;
 /// Linear light below which errors do not count more.
 const DARK: f32 = 0.02;
 
@@ -41,6 +45,8 @@ pub struct Lit {
     pub albedo: Vec3,
     /// Linear light of the photograph.
     pub seen: Vec3,
+    /// How much the pixel counts: shadows that are a little off must not blur what is told apart.
+    pub trust: f32,
 }
 
 /// Light that explains pixels.
@@ -77,35 +83,41 @@ pub fn tell_apart(seen: &[Seen], visibility: &Visibility) -> (Vec<Fitted>, Vec<V
             .map(|l| {
                 // Shadows are in the first albedos, so the sun is looked for twice.
                 let known = (round > SEARCHED).then(|| Vec3::from_slice(&fitted[l].sun));
-                fit(&lit(seen, &albedos, l), visibility, known)
+                fit(&lit(seen, &albedos, l, None), visibility, known)
             })
             .collect();
         // Light and albedo approach each other slowly; meanwhile suns stay where they are.
         for _ in 0..SETTLING {
-            albedos = seen.par_iter().zip(&open).map(|(s, o)| explained(s, *o, &fitted, visibility)).collect();
+            albedos = seen.par_iter().zip(&open).zip(&albedos).map(|((s, o), a)| explained(s, *o, *a, &fitted, visibility)).collect();
             set_scale(&mut fitted, &mut albedos);
             fitted = (0..lights)
                 .into_par_iter()
-                .map(|l| solve(&lit(seen, &albedos, l), &open, visibility, Vec3::from_slice(&fitted[l].sun)))
+                .map(|l| {
+                    let trusted = lit(seen, &albedos, l, Some((&fitted[l], &open, visibility)));
+                    solve(&trusted, &open, visibility, Vec3::from_slice(&fitted[l].sun))
+                })
                 .collect();
         }
     }
     (fitted, albedos)
 }
 
-/// Surface points of given albedo in one light.
-fn lit(seen: &[Seen], albedos: &[Vec3], light: usize) -> Vec<Lit> {
-    let of = |(s, a): (&Seen, &Vec3)| Lit { point: s.point, normal: s.normal, albedo: *a, seen: s.colors[light] };
-    seen.iter().zip(albedos).map(of).collect()
+/// Surface points of given albedo in one light, each trusted as an explanation of it says.
+fn lit(seen: &[Seen], albedos: &[Vec3], light: usize, by: Option<(&Fitted, &[f32], &Visibility)>) -> Vec<Lit> {
+    let of = |(i, (s, a)): (usize, (&Seen, &Vec3))| {
+        let trust = by.map_or(1.0, |(f, open, v)| trust(*a * f.irradiance(s.point, s.normal, open[i], v), s.colors[light]));
+        Lit { point: s.point, normal: s.normal, albedo: *a, seen: s.colors[light], trust }
+    };
+    seen.iter().zip(albedos).enumerate().map(of).collect()
 }
 
-/// Albedo of a point that lights explain best, open to a share of the sky.
-fn explained(s: &Seen, open: f32, fitted: &[Fitted], visibility: &Visibility) -> Vec3 {
+/// Albedo of a point that lights explain best, open to a share of the sky; `before` says which lights to trust.
+fn explained(s: &Seen, open: f32, before: Vec3, fitted: &[Fitted], visibility: &Visibility) -> Vec3 {
     let (mut a, mut b) = (Vec3::ZERO, Vec3::splat(1e-6));
     for (f, c) in fitted.iter().zip(&s.colors) {
         let white = f.irradiance(s.point, s.normal, open, visibility);
         // The derivative of sRGB at what is seen, squared.
-        let weight = Vec3::from(c.max(Vec3::splat(DARK)).to_array().map(|v| v.powf(-1.16)));
+        let weight = Vec3::from(c.max(Vec3::splat(DARK)).to_array().map(|v| v.powf(-1.16))) * trust(before * white, *c);
         (a, b) = (a + weight * white * *c, b + weight * white * white);
     }
     (a / b).max(Vec3::ZERO)
@@ -180,7 +192,21 @@ pub fn fit(pixels: &[Lit], visibility: &Visibility, near: Option<Vec3>) -> Fitte
             best = next;
         }
     }
-    solve(pixels, &open(pixels), visibility, Vec3::from_slice(&best.sun))
+    let (all, mut trusted) = (open(pixels), pixels.to_vec());
+    for _ in 0..REWEIGHTED {
+        let found = solve(&trusted, &all, visibility, Vec3::from_slice(&best.sun));
+        let trust = |(p, o): (&Lit, &f32)| trust(p.albedo * found.irradiance(p.point, p.normal, *o, visibility), p.seen);
+        let trusts: Vec<f32> = pixels.par_iter().zip(&all).map(trust).collect();
+        trusted.iter_mut().zip(trusts).for_each(|(p, t)| p.trust = t);
+    }
+    solve(&trusted, &all, visibility, Vec3::from_slice(&best.sun))
+}
+
+/// How much a pixel counts that should look like another color (Geman–McClure in about sRGB).
+fn trust(got: Vec3, seen: Vec3) -> f32 {
+    let shown = |v: f32| srgb_from_linear(v.clamp(0.0, 1.0));
+    let squared: f32 = (0..3).map(|k| (shown(got[k]) - shown(seen[k])).powi(2)).sum();
+    (TRUSTED * TRUSTED / (TRUSTED * TRUSTED + squared)).powi(2)
 }
 
 /// Least squares for one direction.
@@ -199,7 +225,7 @@ fn solve(pixels: &[Lit], open: &[f32], visibility: &Visibility, direction: Vec3)
         });
         for k in 0..3 {
             // The derivative of sRGB at what is seen.
-            let weight = 0.44 * p.seen[k].max(DARK).powf(-0.58);
+            let weight = p.trust.sqrt() * 0.44 * p.seen[k].max(DARK).powf(-0.58);
             let (a, y) = ((weight * p.albedo[k]) as f64, (weight * p.seen[k]) as f64);
             for (i, line) in sums[k].iter_mut().enumerate() {
                 (i..UNKNOWNS).for_each(|j| line[j] += a * a * row[i] * row[j]);
@@ -300,7 +326,7 @@ mod tests {
                 let albedo = Vec3::new(0.2 + 0.5 * at(2), 0.3 + 0.3 * at(3), 0.5);
                 let lit = Vec3::from(sky.shade(DVec3::from(normal)).map(|v| v as f32)) * visibility.from_sky(point, normal);
                 let direct = power * normal.dot(sun).max(0.0) * visibility.from_sun(point, normal, sun);
-                Lit { point, normal, albedo, seen: albedo * (lit + direct) }
+                Lit { point, normal, albedo, seen: albedo * (lit + direct), trust: 1.0 }
             })
             .collect();
         let found = fit(&pixels, &visibility, None);

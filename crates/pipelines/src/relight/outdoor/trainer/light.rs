@@ -135,7 +135,7 @@ impl Trainer<'_> {
             }
             let albedo = Vec3::from_slice(&seen.rgb[r * CHANNELS..]) / seen.opacity[r];
             let target = [0, 1, 2].map(|k| linear_from_srgb(batch.target[4 * r + k]));
-            let lit = Lit { point: point(&batch, &seen, r), normal, albedo, seen: Vec3::from(target) };
+            let lit = Lit { point: point(&batch, &seen, r), normal, albedo, seen: Vec3::from(target), trust: 1.0 };
             out[m.light_of[batch.images[r] as usize] as usize].push(lit);
         }
         out
