@@ -133,7 +133,12 @@ impl SceneModel {
 
     /// Lowest corner and edge of the outer cube in model space.
     pub fn cube(&self) -> (f32, f32) {
-        let far = if self.stage == Stage::Light { SKY_FROM } else { FAR };
+        self.cube_in(self.stage)
+    }
+
+    /// The same in a stage: light has no surfaces in the sky.
+    pub fn cube_in(&self, stage: Stage) -> (f32, f32) {
+        let far = if stage == Stage::Light { SKY_FROM } else { FAR };
         match self.field.space {
             Space::Contracted(_) => (0.5 - far, 2.0 * far),
             Space::Cube(edge) => (0.5 - 0.5 * edge, edge),

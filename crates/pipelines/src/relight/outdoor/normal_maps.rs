@@ -3,8 +3,9 @@
 //! Seen by a camera, the inverse depth of a plane is linear in the image, `1/z = a x + b y + c`, and its normal is along `(a, b, c)`. Fits are
 //! robust, so that what stands before or behind does not count.
 
+use super::config::Stage;
 use super::model::SceneModel;
-use diorama_engine::renderers::volume::Quality;
+use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_geom::glam::{DMat3, DVec3, Vec3};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use rayon::prelude::*;
@@ -66,7 +67,10 @@ fn map(model: &SceneModel, camera: &PosedCamera) -> Map {
     let shrink = (LONGEST as f64 / c.width.max(c.height) as f64).min(1.0);
     let size = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
     let small = PosedCamera { camera: c.resized(size(c.width), size(c.height)), pose: camera.pose };
-    let view = model.tracer(Quality::Full).layers(&small, &[], &mut |_| {});
+    // The same surfaces whether light is about to be told apart or has been.
+    let tracer = Tracer { cube: model.cube_in(Stage::Light), ..model.tracer(Quality::Full) };
+    let codes: &[&[f32]] = if model.stage == Stage::Light { &[&[0.0; 9]] } else { &[] };
+    let view = tracer.layers(&small, codes, &mut |_| {});
     let (w, h) = (view.depth.width, view.depth.height);
     let rays: Vec<DVec3> = (0..w * h).map(|i| small.camera.direction((i % w) as f64 + 0.5, (i / w) as f64 + 0.5)).collect();
     let inverse = |i: usize| {
