@@ -1,5 +1,5 @@
 //! The light of photographs from how few colors an object has: of all lights, that under which the base colors of its surface have the least
-//! entropy (Alldrin, Mallick and Kriegman 2008; Barron and Malik 2015), light between surfaces and shadows being known ([`Transport`]).
+//! entropy (Alldrin, Mallick and Kriegman 2008; Barron and Malik 2015), light between surfaces and shadows being known (`Transport`).
 //!
 //! A vertex that sends the radiance `c` in the irradiance `π E(L)` has the base color `a = c / E`. With `x = ln(a + ε)`, and a Parzen window
 //! of width σ, the entropy is `−mean_i ln mean_j exp(−|x_i − x_j|² / 2σ²)`. The light is the exponential of a sum of lobes of three widths.

@@ -69,7 +69,7 @@ pub struct Seen {
 }
 
 /// Lights that explain how surfaces look in each of them, and the albedo of each point. Both are found in turn; how bright albedo is, and
-/// its tint, is chosen such that its brightest twentieth has a luminance of [`BRIGHT`] and the lights together are white.
+/// its tint, is chosen such that its brightest twentieth has a luminance of 0.7 and the lights together are white.
 pub fn tell_apart(seen: &[Seen], visibility: &Visibility) -> (Vec<Fitted>, Vec<Vec3>) {
     let lights = seen.first().map_or(0, |s| s.colors.len());
     let open: Vec<f32> = seen.par_iter().map(|p| visibility.from_sky(p.point, p.normal)).collect();
