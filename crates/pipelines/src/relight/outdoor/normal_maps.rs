@@ -10,8 +10,8 @@ use diorama_geom::glam::{DMat3, DVec3, Vec3};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use rayon::prelude::*;
 
-/// Pixels along the longer side at most.
-const LONGEST: u32 = 400;
+/// Pixels along the longer side at most: a plane must be larger than the noise of its distances.
+const LONGEST: u32 = 200;
 /// Reach of a window to each side and distance of the pixels in it that are used.
 const REACH: i32 = 6;
 const STRIDE: usize = 2;
