@@ -48,14 +48,7 @@ pub(super) fn find(
     if is_wanted && from == "auto" && !interrupt.load(Ordering::Relaxed) {
         model.config.loss.depth_from = if source == Source::Points { "points" } else { "stereo" }.into();
     }
-    let near = &mut model.config.sampling.near;
-    if *near == 0.0 {
-        // Stereo looks no nearer than that, so that what it does not find there may be there all the same.
-        let most = (stereo::NEAREST * viewing_distance) as f32;
-        *near = nearest::of_observations(&found).map_or(nearest::UNKNOWN, |n| n.min(most).max(nearest::UNKNOWN));
-    }
-    // Rays begin beyond what is closer, so that no sample could be there.
-    found.retain(|o| o.distance > *near);
+    nearest::settle(&mut model.config.sampling.near, &mut found, viewing_distance);
     (found, source)
 }
 

@@ -1,6 +1,7 @@
 //! Least distance between cameras and matter.
 
 use diorama_engine::samplers::pixels::Observation;
+use diorama_engine::samplers::stereo;
 use diorama_geom::Capture;
 use diorama_geom::capture::SparsePoint;
 
@@ -29,6 +30,17 @@ pub fn of_points(capture: &Capture) -> Option<f32> {
 /// The same by observations.
 pub fn of_observations(observations: &[Observation]) -> Option<f32> {
     most_of_the_way(observations.iter().map(|o| o.distance as f64).collect(), 1.0)
+}
+
+/// Settles the least distance where it is left open (0), from what stereo or points observed, and drops observations of what is closer: rays
+/// begin beyond it, so that no sample could be there.
+pub fn settle(near: &mut f32, found: &mut Vec<Observation>, viewing_distance: f64) {
+    if *near == 0.0 {
+        // Stereo looks no nearer than that, so that what it does not find may be there all the same.
+        let most = (stereo::NEAREST * viewing_distance) as f32;
+        *near = of_observations(found).map_or(UNKNOWN, |n| n.min(most).max(UNKNOWN));
+    }
+    found.retain(|o| o.distance > *near);
 }
 
 fn most_of_the_way(mut all: Vec<f64>, scale: f64) -> Option<f32> {

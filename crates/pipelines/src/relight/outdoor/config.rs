@@ -44,7 +44,7 @@ pub struct FieldConfig {
     pub base: u32,
     /// Cells per axis at the finest level, over the inner cube.
     pub finest: u32,
-    /// Width of hidden layers.
+    /// Width of the hidden layers of albedo, shadow and normal.
     pub width: usize,
     /// Numbers of the code of a light.
     pub appearance: usize,

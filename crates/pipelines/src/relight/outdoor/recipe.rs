@@ -94,18 +94,14 @@ fn observations(
     interrupt: &AtomicBool,
     events: &mut dyn FnMut(&Event),
 ) -> Vec<Observation> {
-    let distance = model.capture.viewing_distance();
-    events(&Event::Note(format!("comparing {} photographs with their neighbors to find distances", model.train.len())));
-    let mut found = stereo::observe(photographs, &model.cameras(), distance, interrupt);
-    found.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y));
-    let near = &mut model.config.sampling.near;
-    if *near == 0.0 {
-        // Stereo looks no nearer than that, so that what it does not find may be there all the same.
-        let most = (stereo::NEAREST * distance) as f32;
-        *near = nearest::of_observations(&found).map_or(nearest::UNKNOWN, |n| n.min(most).max(nearest::UNKNOWN));
+    let (distance, mut found) = (model.capture.viewing_distance(), Vec::new());
+    if model.config.loss.depth > 0.0 {
+        events(&Event::Note(format!("comparing {} photographs with their neighbors to find distances", model.train.len())));
+        found = stereo::observe(photographs, &model.cameras(), distance, interrupt);
+        found.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y));
+        events(&Event::Note(format!("the distance of {} pixels was found (--set loss.depth=0: do not use it)", found.len())));
     }
-    found.retain(|o| o.distance > *near);
-    events(&Event::Note(format!("the distance of {} pixels was found (--set loss.depth=0: do not use it)", found.len())));
+    nearest::settle(&mut model.config.sampling.near, &mut found, distance);
     found
 }
 

@@ -140,31 +140,31 @@ pub(super) fn encode(linear: f32) -> (f32, f32) {
 }
 
 /// Value and derivative of the Huber loss, quadratic below `width`: both scaled such that it is `e²` near zero.
-pub(super) fn huber(e: f32, width: f32) -> (f32, f32) {
+fn huber(e: f32, width: f32) -> (f32, f32) {
     let a = e.abs();
     if a <= width { (e * e, 2.0 * e) } else { (width * (2.0 * a - width), 2.0 * width * e.signum()) }
 }
 
 /// Weight of a ray with a squared error, held constant: iteratively reweighted least squares (Geman–McClure).
-pub(super) fn trust(squared: f32, robust: f32) -> f32 {
+fn trust(squared: f32, robust: f32) -> f32 {
     if robust > 0.0 { (robust * robust / (robust * robust + squared)).powi(2) } else { 1.0 }
 }
 
 /// Adds the gradient of a channel of a sky for the gradient `d` of its color; light that is negative is pulled back to 0.
-pub(super) fn sky_gradient(to: &mut [f32], k: usize, sky: &[f32; 3], basis: &[f32; 16], d: f32, share: f32) {
+fn sky_gradient(to: &mut [f32], k: usize, sky: &[f32; 3], basis: &[f32; 16], d: f32, share: f32) {
     let d = if sky[k] > 0.0 { d } else { share * 0.1 * sky[k] };
     (0..16).for_each(|i| to[3 * i + k] += d * basis[i]);
 }
 
 /// Radiance of a sky in a direction, and the basis functions there.
-pub(super) fn sky_at(sky: &[f32], dir: &[f32]) -> ([f32; 3], [f32; 16]) {
+fn sky_at(sky: &[f32], dir: &[f32]) -> ([f32; 3], [f32; 16]) {
     let mut basis = [0.0; 16];
     spherical_harmonics::cpu::forward(SKY_DEGREE, dir, &mut basis);
     (std::array::from_fn(|k| (0..16).map(|i| sky[3 * i + k] * basis[i]).sum()), basis)
 }
 
 /// Irradiance over π of a white surface with a normal, by channel.
-pub(super) fn irradiance(light: &[f32], basis: &[f64; 9]) -> [f32; 3] {
+fn irradiance(light: &[f32], basis: &[f64; 9]) -> [f32; 3] {
     std::array::from_fn(|k| (0..9).map(|i| light[3 * i + k] * basis[i] as f32).sum())
 }
 
@@ -179,7 +179,7 @@ struct Shaded {
 }
 
 /// Direction and length of a vector; straight up if there is none.
-pub(super) fn unit(v: &[f32]) -> ([f32; 3], f32) {
+fn unit(v: &[f32]) -> ([f32; 3], f32) {
     let length = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
     (if length > SHORTEST { [v[0] / length, v[1] / length, v[2] / length] } else { [0.0, 0.0, 1.0] }, length)
 }
@@ -202,12 +202,15 @@ fn shade(normal: &[f32], dir: &[f32], light: &[f32], sky: &[f32]) -> Shaded {
 
 /// Light that a white surface sends, with its shadow.
 fn received(values: &[f32], s: &Shaded, sunlit: Option<Sunlit>, k: usize) -> f32 {
-    match sunlit {
-        None => values[3] * s.lit[k].max(0.0),
-        Some(Sunlit { sun, reach }) => {
-            let facing = (0..3).map(|a| s.normal[a] * sun[a]).sum::<f32>().max(0.0);
-            sun[3 + k] * reach[0] * facing + reach[1] * s.lit[k].max(0.0) + (1.0 - reach[1]) * sun[6 + k]
-        }
+    sunlit.map_or(values[3] * s.lit[k].max(0.0), |l| l.received(&s.normal, &s.lit, k))
+}
+
+impl Sunlit<'_> {
+    /// Light that a white surface sends, `lit` being that of the whole sky.
+    fn received(&self, normal: &[f32; 3], lit: &[f32; 3], k: usize) -> f32 {
+        let Sunlit { sun, reach } = self;
+        let facing = (0..3).map(|a| normal[a] * sun[a]).sum::<f32>().max(0.0);
+        sun[3 + k] * reach[0] * facing + reach[1] * lit[k].max(0.0) + (1.0 - reach[1]) * sun[6 + k]
     }
 }
 
@@ -282,10 +285,7 @@ impl SceneLoss<'_> {
         let normal = self.normal(r, out);
         let reach = reach(t.visibility, sun, &normal, (out.opacity[r], out.depth[r]), &t.origins[at.clone()], &self.dirs[at]);
         let lit = irradiance(sky, &sh_light::basis(DVec3::from(normal.map(f64::from))));
-        let facing = (0..3).map(|a| normal[a] * sun[a]).sum::<f32>().max(0.0);
-        let of = |reach: [f32; 2]| {
-            gray(&[0, 1, 2].map(|k| sun[3 + k] * reach[0] * facing + reach[1] * lit[k].max(0.0) + (1.0 - reach[1]) * sun[6 + k]))
-        };
+        let of = |reach| gray(&[0, 1, 2].map(|k| Sunlit { sun, reach }.received(&normal, &lit, k)));
         Some((of(reach) / of([1.0; 2]).max(1e-6)).clamp(0.0, 1.0))
     }
 

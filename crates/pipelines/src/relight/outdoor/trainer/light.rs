@@ -34,6 +34,7 @@ const LIGHT_NOISE: f32 = 0.01;
 const TAUGHT_RAYS: usize = 3;
 
 /// Light that shadows are traced in, ray by ray, and what the shadow's head reads of it.
+#[derive(Default)]
 struct Taught {
     /// `[R, 9]`, `[R, 9, 3]` and `[R, 9]`
     suns: Vec<f32>,
@@ -150,10 +151,7 @@ impl Trainer<'_> {
             let mut sun: [f32; SUN] = std::array::from_fn(|i| m.suns.values[SUN * l + i]);
             let mut all: [f32; LIGHT] = std::array::from_fn(|i| m.lights.values[LIGHT * l + i]);
             let mut sky = all;
-            match m.config.light.has_sun() {
-                true => all.iter_mut().zip(sun::harmonics(&sun)).for_each(|(v, s)| *v += s),
-                false => sky.iter_mut().zip(sun::harmonics(&sun)).for_each(|(v, s)| *v -= s),
-            }
+            sky.iter_mut().zip(sun::harmonics(&sun)).for_each(|(v, s)| *v -= s);
             if r % TAUGHT_RAYS == 0 {
                 let at = |k: u64| rng.uniform(4 * r as u64 + k);
                 let (z, turn) = (0.05 + 0.95 * at(0), std::f32::consts::TAU * at(1));
@@ -177,8 +175,9 @@ impl Trainer<'_> {
         self.update_suns(share);
         self.draw(step);
         let (n, mut drawn, c) = (self.batch.len(), self.drawn(), self.model.config.clone());
-        let taught = self.taught(&drawn.light, step);
         let is_apart = c.light.has_sun();
+        // Where suns are apart, shadows are traced and not learned.
+        let taught = if is_apart { Taught::default() } else { self.taught(&drawn.light, step) };
         if !is_apart {
             drawn.counts.iter_mut().step_by(TAUGHT_RAYS).for_each(|c| *c = 0.0);
         }
@@ -213,7 +212,8 @@ impl Trainer<'_> {
             traced: (!is_apart).then_some(TracedLight { suns: &taught.suns, skies: &taught.skies, visibility: &visibility, origins }),
             out: Mutex::default(),
         };
-        let codes = [&taught.codes[..]];
+        let unread = vec![0.0; if is_apart { 9 * n } else { 0 }];
+        let codes = [if is_apart { &unread[..] } else { &taught.codes }];
         let background = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0].repeat(n);
         let given = given(&self.batch, &drawn.light, &background, &codes);
         let described = self.described(step - self.model.began, share, given, Loss::Batch(&loss));
