@@ -42,10 +42,11 @@ pub struct Place {
 }
 
 impl Place {
-    /// The procedural street, seen by a photographer who walks past one row of houses.
+    /// The northern row of the procedural street, seen by a photographer who walks past it. What stands behind the photographer would cast
+    /// shadows that no photograph explains.
     pub fn street(options: &SynthOptions) -> Place {
         let [w, h] = [options.size.0, options.size.1];
-        let model = street::model(options.seed);
+        let model = street::northern_row(options.seed);
         let cameras = looking_at_one_place(&model, street::cameras(CANDIDATES * options.views, w, h, options.seed), options.views);
         Place { model, cameras }
     }
@@ -102,11 +103,11 @@ impl SynthOptions {
 
 /// Name, sun's elevation and azimuth in degrees; none: overcast. The last one is held out.
 const LIGHTS: [(&str, Option<(f64, f64)>); 5] = [
-    ("morning", Some((28.0, 95.0))),
+    ("morning", Some((30.0, 125.0))),
     ("noon", Some((58.0, 185.0))),
-    ("evening", Some((16.0, 265.0))),
+    ("evening", Some((20.0, 245.0))),
     ("overcast", None),
-    ("unseen", Some((38.0, 220.0))),
+    ("unseen", Some((38.0, 215.0))),
 ];
 
 /// The light of a name in [`LIGHTS`], exposed.

@@ -31,11 +31,22 @@ pub const OCCLUDERS: [&str; 3] = ["car.", "tree.", "furniture."];
 
 /// The street of a seed, z up, in meters; the road runs along x through the origin.
 pub fn model(seed: u64) -> Model {
+    build(seed, false)
+}
+
+/// The same without what stands behind cameras that look at its northern row, so that they see what casts shadows there.
+pub fn northern_row(seed: u64) -> Model {
+    build(seed, true)
+}
+
+fn build(seed: u64, is_row: bool) -> Model {
     let mut builder = ModelBuilder::default();
     let m = Materials::new(&mut builder, seed);
-    let layout = Layout::new(seed);
+    let mut layout = Layout::new(seed);
+    let in_row = |at: DVec3| at.y > layout::FACADE - 0.1 && at.x < layout::END;
+    layout.trees.retain(|t| !is_row || t.at.y > 0.0);
     builder.stand("ground", &ground::ground(&m, &layout, seed), &[DAffine3::IDENTITY]);
-    for (name, object, at) in houses::houses(&m) {
+    for (name, object, at) in houses::houses(&m).into_iter().filter(|h| !is_row || in_row(h.2.translation)) {
         builder.stand(&name, &object, &[at]);
     }
     let at = |p: &layout::Place| place(p.at, p.angle) * DAffine3::from_scale(DVec3::splat(p.size));
