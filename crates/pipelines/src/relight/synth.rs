@@ -101,6 +101,9 @@ impl SynthOptions {
     }
 }
 
+/// Dust of an ordinary summer's day over that of the clearest: a fifth of the light then comes from the sky.
+const HAZE: f64 = 3.0;
+
 /// Name, sun's elevation and azimuth in degrees; none: overcast. The last one is held out.
 const LIGHTS: [(&str, Option<(f64, f64)>); 5] = [
     ("morning", Some((30.0, 125.0))),
@@ -113,7 +116,10 @@ const LIGHTS: [(&str, Option<(f64, f64)>); 5] = [
 /// The light of a name in [`LIGHTS`], exposed.
 fn light(index: usize) -> Daylight {
     let light = match LIGHTS[index].1 {
-        Some((elevation, azimuth)) => Daylight::clear(&Sky::clear(elevation.to_radians(), azimuth.to_radians()), ROWS),
+        Some((elevation, azimuth)) => {
+            let clear = Sky::clear(elevation.to_radians(), azimuth.to_radians());
+            Daylight::clear(&Sky { dust: HAZE, ..clear }, ROWS)
+        }
         // CIE overcast sky (Moon and Spencer 1942).
         None => Daylight::of(Environment::from_fn(ROWS, |d| {
             [0.95, 1.0, 1.05].map(|c| if d.z > 0.0 { c * (1.0 + 2.0 * d.z) / 3.0 } else { 0.0 })

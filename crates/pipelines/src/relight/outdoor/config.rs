@@ -66,8 +66,6 @@ pub struct LightConfig {
     pub model: String,
     /// Share of the steps in which surfaces are learned, before light is told apart.
     pub from: f32,
-    /// Times that suns are found anew after that.
-    pub sun_updates: u64,
     /// Cells per axis in which surfaces are solid or not.
     pub sun_cells: usize,
 }
@@ -162,11 +160,6 @@ impl LightConfig {
             false => (Stage::Light, ((progress - self.from) / (1.0 - self.from)).min(1.0)),
         }
     }
-
-    /// Times that suns are to be found anew when a share of the light's stage is done.
-    pub fn sun_updates_by(&self, share: f32) -> u64 {
-        if self.has_sun() { (share * (self.sun_updates + 1) as f32) as u64 } else { 0 }.min(self.sun_updates)
-    }
 }
 
 impl Config {
@@ -187,14 +180,7 @@ impl Config {
                 space: "unbounded".into(),
                 first_density: 0.1,
             },
-            light: LightConfig {
-                of: "session".into(),
-                gain: false,
-                model: "sh".into(),
-                from: 0.6,
-                sun_updates: 3,
-                sun_cells: pick(128, 256),
-            },
+            light: LightConfig { of: "session".into(), gain: false, model: "sh".into(), from: 0.6, sun_cells: pick(256, 512) },
             loss: LossConfig {
                 huber: 0.1,
                 robust: 2.0,

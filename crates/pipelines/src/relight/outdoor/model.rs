@@ -3,8 +3,8 @@
 use super::config::{Config, Stage};
 use super::fields;
 use super::shading::{LIGHT, SKY};
-use super::sun::SUN;
-use super::visibility::{self, Visibility};
+use super::sun::{SUN, Surfaces};
+use super::visibility::{self, Ambient, Visibility};
 use crate::error::{PipelineError, Result};
 use crate::run::param_state::{self, entry};
 use diorama_data::checkpoint::{Checkpoint, Entry};
@@ -23,10 +23,24 @@ use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use std::collections::HashMap;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Where rays end in space without a bound, in inner cubes, and where the sky begins: what was learned beyond is the sky of the photographs.
 const FAR: f32 = 1024.0;
 const SKY_FROM: f32 = 8.0;
+
+/// What stands around: what hides light, and surfaces that send it on.
+pub struct Around {
+    pub visibility: Visibility,
+    pub surfaces: Surfaces,
+}
+
+impl Around {
+    /// Light of a sky `[9, 3]`, and of surfaces that it and a sun light.
+    pub fn ambient(&self, sun: &[f32], sky: &[f32]) -> Ambient {
+        self.surfaces.spread(&self.visibility, sun, sky)
+    }
+}
 
 /// Field, lights and capture of one run.
 pub struct SceneModel {
@@ -44,10 +58,13 @@ pub struct SceneModel {
     pub skies: ParamGroup,
     /// Logarithms of gains, `[train, 3]`; empty without gains.
     pub gains: ParamGroup,
-    /// Sun of each light, `[lights, 9]`, and what hides it; both from the light's stage on. Lights hold suns, too, unless they are apart.
+    /// Sun of each light, `[lights, 6]`. Lights hold suns, too, unless they are apart.
     pub suns: ParamGroup,
-    pub visibility: Option<Visibility>,
-    pub sun_updates: u64,
+    /// Times that surfaces were flattened, and the distances that are from this: `[N, 4]` of image, column, row, distance.
+    pub flattened: u64,
+    pub flat: Vec<f32>,
+    /// What hides light and sends it on, from the light's stage on.
+    pub surroundings: Option<Arc<Around>>,
     /// Training frames, as indices into the capture, and the light of each.
     pub train: Vec<usize>,
     pub light_of: Vec<u32>,
@@ -102,8 +119,9 @@ impl SceneModel {
             skies: group("skies", first_skies(n), rate),
             gains: group("gains", gains, rate),
             suns: group("suns", vec![0.0; SUN * n], rate),
-            visibility: None,
-            sun_updates: 0,
+            flattened: 0,
+            flat: Vec::new(),
+            surroundings: None,
             train,
             light_of,
             sessions,
@@ -222,8 +240,9 @@ impl SceneModel {
             skies: self.skies.values_only(),
             gains: self.gains.values_only(),
             suns: self.suns.values_only(),
-            visibility: self.visibility.clone(),
-            sun_updates: self.sun_updates,
+            flattened: self.flattened,
+            flat: Vec::new(),
+            surroundings: self.surroundings.clone(),
             train: self.train.clone(),
             light_of: self.light_of.clone(),
             sessions: self.sessions.clone(),
@@ -233,6 +252,13 @@ impl SceneModel {
             median: self.median,
             rate_scale: self.rate_scale,
         }
+    }
+
+    /// Numbers of what stands around, as a checkpoint keeps them: solid cells, surfaces, distances of flat ones.
+    pub fn around(&self) -> [Vec<f32>; 3] {
+        let [solid, surfaces] =
+            self.surroundings.as_ref().map_or_else(Default::default, |a| [a.visibility.numbers(), a.surfaces.numbers()]);
+        [solid, surfaces, self.flat.clone()]
     }
 
     /// Everything that is trained by gradients.
@@ -265,6 +291,13 @@ impl SceneModel {
         self.has_suns().then(|| std::array::from_fn(|i| self.suns.values[index * SUN + i]))
     }
 
+    /// Light of the sky and of surfaces in each learned light, where suns are apart.
+    pub fn ambients(&self) -> Vec<Ambient> {
+        let Some(around) = self.surroundings.as_ref().filter(|_| self.has_suns()) else { return Vec::new() };
+        let lights = self.suns.values.chunks_exact(SUN).zip(self.lights.values.chunks_exact(LIGHT));
+        lights.map(|(sun, sky)| around.ambient(sun, sky)).collect()
+    }
+
     /// Gives each light the mean code of its photographs, in place of the photographs' codes.
     pub fn share_codes(&mut self) {
         let lights = self.light_count();
@@ -287,15 +320,15 @@ impl SceneModel {
         Ok(())
     }
 
-    /// Everything that a checkpoint holds; `solid` are the solid cells where suns are apart.
-    pub fn entries<'a>(&'a mut self, solid: &'a [f32]) -> (Vec<Entry<'a>>, HashMap<String, String>) {
+    /// Everything that a checkpoint holds; `around` are the numbers of what stands around.
+    pub fn entries<'a>(&'a mut self, around: &'a [Vec<f32>; 3]) -> (Vec<Entry<'a>>, HashMap<String, String>) {
         let metadata = HashMap::from([
             ("method".to_string(), "relight".to_string()),
             ("stage".into(), if self.stage == Stage::Light { "light" } else { "surfaces" }.into()),
             ("began".into(), self.began.to_string()),
             ("step".into(), self.origin.step.to_string()),
             ("rays".into(), self.rays.to_string()),
-            ("sun_updates".into(), self.sun_updates.to_string()),
+            ("flattened".into(), self.flattened.to_string()),
             ("seconds_bits".into(), self.origin.seconds.to_bits().to_string()),
             ("samples_per_ray_bits".into(), self.samples_per_ray.to_bits().to_string()),
             ("median_bits".into(), self.median.to_bits().to_string()),
@@ -306,7 +339,8 @@ impl SceneModel {
         params.add("", [&mut self.lights, &mut self.skies, &mut self.gains, &mut self.suns]);
         let mut entries = param_state::entries(params);
         entries.extend([entry("occupancy", &self.occupancy.grid.density), entry("occupancy.fresh", &self.occupancy.grid.fresh)]);
-        entries.extend((!solid.is_empty()).then(|| entry("solid", solid)));
+        entries
+            .extend(["solid", "surfaces", "flat"].into_iter().zip(around).filter(|(_, v)| !v.is_empty()).map(|(name, v)| entry(name, v)));
         (entries, metadata)
     }
 
@@ -326,7 +360,8 @@ impl SceneModel {
         self.rays = number(&c, "rays", file)?;
         self.samples_per_ray = f64::from_bits(number(&c, "samples_per_ray_bits", file)?);
         self.began = number(&c, "began", file)?;
-        self.sun_updates = number(&c, "sun_updates", file)?;
+        self.flattened = number(&c, "flattened", file)?;
+        self.flat = c.take("flat").unwrap_or_default();
         self.median = f32::from_bits(number(&c, "median_bits", file)?);
         self.rate_scale = f32::from_bits(number(&c, "rate_scale_bits", file)?);
         param_state::restore(&mut self.params(), &mut c, file)?;
@@ -338,7 +373,9 @@ impl SceneModel {
             if solid.len() != visibility::numbers_len(cells) {
                 return Err(PipelineError::Usage(format!("{}: solid does not have {cells} cells per axis", file.display())));
             }
-            self.visibility = Some(Visibility::from_numbers(&solid, self.shaded_cube(), cells));
+            let visibility = Visibility::from_numbers(&solid, self.shaded_cube(), cells);
+            let surfaces = Surfaces::from_numbers(&c.take("surfaces").unwrap_or_default(), &visibility);
+            self.surroundings = Some(Arc::new(Around { visibility, surfaces }));
         }
         Ok(())
     }

@@ -1,19 +1,22 @@
 //! Normals of the learned surfaces as the training cameras see them: planes through the distances around each pixel.
 //!
 //! Seen by a camera, the inverse depth of a plane is linear in the image, `1/z = a x + b y + c`, and its normal is along `(a, b, c)`. Fits are
-//! robust, so that what stands before or behind does not count.
+//! robust, so that what stands before or behind does not count. Where a plane along one of the place's main directions, which are those that
+//! most fits agree on, explains the distances as well, it is taken instead: it has less freedom to follow noise.
 
 use super::config::Stage;
 use super::model::SceneModel;
+use super::visibility::spread;
 use diorama_engine::renderers::volume::{Quality, Tracer};
+use diorama_engine::samplers::pixels::Observation;
 use diorama_geom::glam::{DMat3, DVec3, Vec3};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use rayon::prelude::*;
 
-/// Pixels along the longer side at most: a plane must be larger than the noise of its distances.
-const LONGEST: u32 = 200;
-/// Reach of a window to each side and distance of the pixels in it that are used.
-const REACH: i32 = 6;
+/// Pixels along the longer side at most.
+const LONGEST: u32 = 320;
+/// Reach of a window to each side and distance of the pixels in it that are used: a plane must be larger than the noise of its distances.
+const REACH: i32 = 8;
 const STRIDE: usize = 2;
 /// Relative difference of inverse depths beyond which a pixel is of something else, and rounds of the robust fit.
 const APART: f64 = 0.01;
@@ -21,6 +24,19 @@ const ROUNDS: usize = 4;
 /// Opacity from which there is a surface, and the mean weight in a window from which it is plane enough.
 const SURFACE: f32 = 0.5;
 const PLANE: f64 = 0.15;
+/// Share of the free fit's support from which a plane along a main direction is taken.
+const SUPPORTED: f64 = 0.55;
+/// Mean weight in a window from which its plane tells distances, and by how much at most it moves them.
+const FLAT: f64 = 0.4;
+const FLATTENED: f64 = 0.02;
+/// Normals of which the main directions are found, directions that are tried, and most that are kept.
+const SAMPLED: usize = 50_000;
+const TRIED: usize = 3000;
+const MOST: usize = 12;
+/// Angles in radians within which normals support a direction, and within which they support no other; and the least share of all.
+const NEAR: f32 = 0.14;
+const OWN: f32 = 0.26;
+const SHARE: f32 = 0.02;
 
 /// Maps of the training cameras.
 pub struct NormalMaps {
@@ -34,6 +50,26 @@ struct Map {
     height: usize,
     /// In model space; 0 where it is not known.
     normals: Vec<Vec3>,
+    /// Distance along the ray to the plane; 0 where few distances lie on it.
+    distances: Vec<f32>,
+}
+
+/// Distances of a view.
+struct Seen {
+    width: usize,
+    height: usize,
+    to_model: DMat3,
+    /// Rays whose component along the view axis is 1.
+    rays: Vec<DVec3>,
+    /// 0 where there is no surface.
+    inverse: Vec<f64>,
+}
+
+/// A plane in a camera's space, `n · p = 1` scaled to `(a, b, c)` of `1/z`, and the sum of the weights of what lies on it.
+#[derive(Clone, Copy)]
+struct Plane {
+    of: DVec3,
+    support: f64,
 }
 
 impl NormalMaps {
@@ -49,7 +85,11 @@ impl NormalMaps {
             (at, [c.camera.width as f32, c.camera.height as f32])
         });
         let of = of.collect();
-        NormalMaps { maps: shown.iter().map(|c| map(model, c)).collect(), of }
+        let seen: Vec<Seen> = shown.iter().map(|c| Seen::of(model, c)).collect();
+        let free: Vec<Vec<Option<Plane>>> = seen.iter().map(Seen::free_planes).collect();
+        let main = main_directions(&seen, &free);
+        let maps = seen.iter().zip(&free).map(|(s, f)| s.map(f, &main));
+        NormalMaps { maps: maps.collect(), of }
     }
 
     /// Normal at a pixel of a training camera; 0 where it is not known.
@@ -59,77 +99,169 @@ impl NormalMaps {
         let at = |v: f32, of: f32, n: usize| ((v / of * n as f32) as usize).min(n - 1);
         map.normals[at(y, h, map.height) * map.width + at(x, w, map.width)]
     }
+
+    /// Distances to the planes, of about `count` pixels of the cameras' photographs.
+    pub fn observations(&self, count: usize) -> Vec<Observation> {
+        let known = |m: &Map| m.distances.iter().filter(|d| **d > 0.0).count();
+        let all: usize = self.of.iter().map(|(map, _)| known(&self.maps[*map])).sum();
+        let every = all.div_ceil(count).max(1);
+        let of_one = |(image, (map, size)): (usize, &(usize, [f32; 2]))| {
+            let map = &self.maps[*map];
+            let at = move |i: usize, n: usize, full: f32| ((i as f32 + 0.5) * full / n as f32) as u32;
+            let size = *size;
+            let all = map.distances.iter().enumerate().filter(|(_, d)| **d > 0.0);
+            all.skip(image % every).step_by(every).map(move |(i, distance)| {
+                let (x, y) = (at(i % map.width, map.width, size[0]), at(i / map.width, map.height, size[1]));
+                Observation { image: image as u32, x, y, distance: *distance }
+            })
+        };
+        self.of.iter().enumerate().flat_map(of_one).collect()
+    }
 }
 
-/// Depth of a view and its normals.
-fn map(model: &SceneModel, camera: &PosedCamera) -> Map {
-    let c = &camera.camera;
-    let shrink = (LONGEST as f64 / c.width.max(c.height) as f64).min(1.0);
-    let size = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
-    let small = PosedCamera { camera: c.resized(size(c.width), size(c.height)), pose: camera.pose };
-    // The same surfaces whether light is about to be told apart or has been.
-    let tracer = Tracer { cube: model.cube_in(Stage::Light), ..model.tracer(Quality::Full) };
-    let codes: &[&[f32]] = if model.stage == Stage::Light { &[&[0.0; 9]] } else { &[] };
-    let view = tracer.layers(&small, codes, &mut |_| {});
-    let (w, h) = (view.depth.width, view.depth.height);
-    let rays: Vec<DVec3> = (0..w * h).map(|i| small.camera.direction((i % w) as f64 + 0.5, (i / w) as f64 + 0.5)).collect();
-    let inverse = |i: usize| {
-        let (d, r) = (view.depth.data[i] as f64, rays[i]);
-        // Depth along the view axis is the distance times the ray's third component.
-        if view.opacity.data[i] > SURFACE && d > 0.0 { 1.0 / (d * r.z / r.length()) } else { 0.0 }
-    };
-    let inverse: Vec<f64> = (0..w * h).map(inverse).collect();
-    let to_model = small.pose.rotation;
-    let normals = (0..w * h).into_par_iter().map(|i| normal_at(i, w, h, &rays, &inverse, &to_model));
-    Map { width: w, height: h, normals: normals.collect() }
+impl Seen {
+    fn of(model: &SceneModel, camera: &PosedCamera) -> Seen {
+        let c = &camera.camera;
+        let shrink = (LONGEST as f64 / c.width.max(c.height) as f64).min(1.0);
+        let size = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
+        let small = PosedCamera { camera: c.resized(size(c.width), size(c.height)), pose: camera.pose };
+        // The same surfaces whether light is about to be told apart or has been.
+        let tracer = Tracer { cube: model.cube_in(Stage::Light), ..model.tracer(Quality::Full) };
+        let codes: &[&[f32]] = if model.stage == Stage::Light { &[&[0.0; 9]] } else { &[] };
+        let view = tracer.layers(&small, codes, &mut |_| {});
+        let (w, h) = (view.depth.width, view.depth.height);
+        let rays: Vec<DVec3> = (0..w * h).map(|i| small.camera.direction((i % w) as f64 + 0.5, (i / w) as f64 + 0.5)).collect();
+        let inverse = |i: usize| {
+            let (d, r) = (view.depth.data[i] as f64, rays[i]);
+            // Depth along the view axis is the distance times the ray's third component.
+            if view.opacity.data[i] > SURFACE && d > 0.0 && r.z > 0.0 { r.length() / (d * r.z) } else { 0.0 }
+        };
+        let inverse = (0..w * h).map(inverse).collect();
+        Seen { width: w, height: h, to_model: small.pose.rotation, rays: rays.iter().map(|r| *r / r.z).collect(), inverse }
+    }
+
+    /// Rays and inverse depths around a pixel, and how many there would be in a full window.
+    fn window(&self, i: usize) -> (Vec<(DVec3, f64)>, usize) {
+        let (px, py) = ((i % self.width) as i32, (i / self.width) as i32);
+        let (mut near, mut all) = (Vec::with_capacity(81), 0);
+        for dy in (-REACH..=REACH).step_by(STRIDE) {
+            for dx in (-REACH..=REACH).step_by(STRIDE) {
+                let (x, y) = (px + dx, py + dy);
+                if x < 0 || y < 0 || x >= self.width as i32 || y >= self.height as i32 {
+                    continue;
+                }
+                all += 1;
+                let at = y as usize * self.width + x as usize;
+                if self.inverse[at] > 0.0 {
+                    near.push((self.rays[at], self.inverse[at]));
+                }
+            }
+        }
+        (near, all)
+    }
+
+    /// The plane through the distances around each pixel.
+    fn free_planes(&self) -> Vec<Option<Plane>> {
+        (0..self.inverse.len()).into_par_iter().map(|i| self.free_plane(i)).collect()
+    }
+
+    fn free_plane(&self, i: usize) -> Option<Plane> {
+        let own = self.inverse[i];
+        if own <= 0.0 {
+            return None;
+        }
+        let (near, all) = self.window(i);
+        let center = DVec3::new(self.rays[i].x, self.rays[i].y, 0.0);
+        let (mut plane, mut support) = (DVec3::new(0.0, 0.0, own), 0.0);
+        for round in 0..ROUNDS {
+            let (mut m, mut v) = (DMat3::from_diagonal(DVec3::splat(1e-12)), DVec3::ZERO);
+            support = 0.0;
+            for (ray, value) in &near {
+                let row = *ray - center;
+                // At first, all that is as far away counts alike, whatever its slope.
+                let (off, wide) = if round == 0 { (value - own, 10.0) } else { (row.dot(plane) - value, 1.0) };
+                let weight = agreement(off / (wide * APART * own));
+                support += weight;
+                m += DMat3::from_cols(weight * row.x * row, weight * row.y * row, weight * row.z * row);
+                v += weight * value * row;
+            }
+            plane = m.inverse() * v;
+        }
+        let of = DVec3::new(plane.x, plane.y, plane.z - plane.x * center.x - plane.y * center.y);
+        (of.is_finite() && support >= PLANE * all as f64).then_some(Plane { of, support })
+    }
+
+    /// The plane of a given normal, in the camera's space, that most distances around a pixel agree on; none where it faces away.
+    fn plane_along(&self, i: usize, near: &[(DVec3, f64)], normal: DVec3) -> Option<Plane> {
+        let offset = |ray: DVec3, inverse: f64| normal.dot(ray) / inverse;
+        let mut at = offset(self.rays[i], self.inverse[i]);
+        if at * self.inverse[i] > -0.05 * self.rays[i].length() {
+            return None;
+        }
+        let mut support = 0.0;
+        for _ in 0..ROUNDS {
+            let (mut sum, mut weights) = (0.0, 0.0);
+            for (ray, inverse) in near {
+                let own = offset(*ray, *inverse);
+                let weight = if own < 0.0 { agreement((at / own - 1.0) / APART) } else { 0.0 };
+                (sum, weights) = (sum + weight * own, weights + weight);
+            }
+            if weights <= 0.0 {
+                return None;
+            }
+            (at, support) = (sum / weights, weights);
+        }
+        Some(Plane { of: normal / at, support })
+    }
+
+    /// The normals, each of the free plane or of one along a main direction.
+    fn map(&self, free: &[Option<Plane>], main: &[Vec3]) -> Map {
+        let main: Vec<DVec3> = main.iter().map(|m| self.to_model.transpose() * m.as_dvec3()).collect();
+        let of = |i: usize| {
+            let Some(own) = free[i] else { return (Vec3::ZERO, 0.0) };
+            let (near, all) = self.window(i);
+            let along = main.iter().filter_map(|m| self.plane_along(i, &near, *m));
+            let best = along.max_by(|a, b| a.support.total_cmp(&b.support));
+            let plane = best.filter(|b| b.support >= SUPPORTED * own.support).unwrap_or(own);
+            let inverse = plane.of.dot(self.rays[i]);
+            let is_on = plane.support > FLAT * all as f64 && (inverse / self.inverse[i] - 1.0).abs() < FLATTENED;
+            (self.normal(i, plane), if is_on { (self.rays[i].length() / inverse) as f32 } else { 0.0 })
+        };
+        let (normals, distances) = (0..free.len()).into_par_iter().map(of).unzip();
+        Map { width: self.width, height: self.height, normals, distances }
+    }
+
+    /// Normal of a plane in model space, toward the camera.
+    fn normal(&self, i: usize, plane: Plane) -> Vec3 {
+        let sign = if plane.of.dot(self.rays[i]) > 0.0 { -1.0 } else { 1.0 };
+        (sign * (self.to_model * plane.of).normalize_or_zero()).as_vec3()
+    }
 }
 
-/// Normal at one pixel.
-fn normal_at(i: usize, w: usize, h: usize, rays: &[DVec3], inverse: &[f64], to_model: &DMat3) -> Vec3 {
-    if inverse[i] <= 0.0 || rays[i].z <= 0.0 {
-        return Vec3::ZERO;
-    }
-    let on_plane = |r: DVec3| [r.x / r.z, r.y / r.z];
-    let [x0, y0] = on_plane(rays[i]);
-    let (px, py) = ((i % w) as i32, (i / w) as i32);
-    let mut near: Vec<([f64; 3], f64)> = Vec::with_capacity(49);
-    let mut all = 0;
-    for dy in (-REACH..=REACH).step_by(STRIDE) {
-        for dx in (-REACH..=REACH).step_by(STRIDE) {
-            let (x, y) = (px + dx, py + dy);
-            if x < 0 || y < 0 || x >= w as i32 || y >= h as i32 {
-                continue;
-            }
-            all += 1;
-            let at = y as usize * w + x as usize;
-            if inverse[at] > 0.0 && rays[at].z > 0.0 {
-                let [x, y] = on_plane(rays[at]);
-                near.push(([x - x0, y - y0, 1.0], inverse[at]));
-            }
+/// How much a relative difference counts (Geman–McClure).
+fn agreement(off: f64) -> f64 {
+    1.0 / (1.0 + off * off).powi(2)
+}
+
+/// Directions that many normals share, the most frequent first.
+fn main_directions(seen: &[Seen], free: &[Vec<Option<Plane>>]) -> Vec<Vec3> {
+    let count: usize = free.iter().map(Vec::len).sum();
+    let all = seen.iter().zip(free).flat_map(|(s, f)| f.iter().enumerate().map(move |(i, p)| p.map(|p| s.normal(i, p))));
+    let mut normals: Vec<Vec3> = all.step_by(count.div_ceil(SAMPLED).max(1)).flatten().filter(|n| *n != Vec3::ZERO).collect();
+    let least = SHARE * normals.len() as f32;
+    let mut main = Vec::new();
+    while main.len() < MOST {
+        let within = |d: Vec3, angle: f32| normals.iter().filter(move |n| n.dot(d) > angle.cos());
+        let tried = (0..TRIED).into_par_iter().map(|i| spread(i, TRIED).as_vec3());
+        let Some((votes, mut best)) = tried.map(|d| (within(d, NEAR).count(), d)).max_by_key(|t| t.0) else { break };
+        if (votes as f32) < least {
+            break;
         }
-    }
-    let (mut plane, mut weights) = (DVec3::new(0.0, 0.0, inverse[i]), 0.0);
-    for round in 0..ROUNDS {
-        let (mut m, mut v) = (DMat3::from_diagonal(DVec3::splat(1e-12)), DVec3::ZERO);
-        weights = 0.0;
-        for (row, value) in &near {
-            let row = DVec3::from(*row);
-            // At first, all that is as far away counts alike, whatever its slope.
-            let (off, wide) = if round == 0 { (value - inverse[i], 10.0) } else { (row.dot(plane) - value, 1.0) };
-            let s = off / (wide * APART * inverse[i]);
-            let weight = 1.0 / (1.0 + s * s).powi(2);
-            weights += weight;
-            m += DMat3::from_cols(weight * row.x * row, weight * row.y * row, weight * row.z * row);
-            v += weight * value * row;
+        for _ in 0..5 {
+            best = within(best, NEAR).sum::<Vec3>().normalize_or(best);
         }
-        plane = m.inverse() * v;
+        main.push(best);
+        normals.retain(|n| n.dot(best) < OWN.cos());
     }
-    if !plane.is_finite() || weights < PLANE * all as f64 {
-        return Vec3::ZERO;
-    }
-    let facing = -DVec3::new(plane.x, plane.y, plane.z - plane.x * x0 - plane.y * y0);
-    let normal = (*to_model * facing).normalize_or_zero();
-    // Surfaces face the camera.
-    let sign = if facing.dot(rays[i]) > 0.0 { -1.0 } else { 1.0 };
-    (sign * normal).as_vec3()
+    main
 }

@@ -2,8 +2,8 @@
 
 use super::config::Stage;
 use super::model::SceneModel;
-use super::shading::{self, CHANNELS, NORMAL, Sunlit, gray};
-use super::sun::{self, SUN};
+use super::shading::{self, CHANNELS, NORMAL, gray};
+use super::sun::SUN;
 use diorama_engine::renderers::layers::Layers;
 use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_geom::Image;
@@ -17,7 +17,7 @@ pub struct ViewLight {
     pub light: ShLight,
     /// `[16, 3]`
     pub sky: Vec<f32>,
-    /// A sun apart, whose light the harmonics then lack: direction, power, light from surfaces.
+    /// A sun apart, whose light the harmonics then lack: direction, power.
     pub sun: Option<[f32; SUN]>,
 }
 
@@ -40,7 +40,6 @@ impl ViewLight {
         let mut numbers = [0.0; SUN];
         numbers[..3].copy_from_slice(&direction.as_vec3().to_array());
         (0..3).for_each(|k| numbers[3 + k] = (irradiance[k] / std::f64::consts::PI) as f32);
-        sun::set_bounced(&mut numbers, &out.numbers());
         out.sun = Some(numbers);
         out
     }
@@ -91,19 +90,23 @@ impl SceneModel {
         let image = |channels| Image::zeros(w, h, channels);
         let mut out =
             SceneView { color: image(3), albedo: image(3), normal: image(3), shadow: image(1), irradiance: image(3), depth, opacity };
+        let around = self.surroundings.as_deref();
+        let ambient = around.zip(light.sun.as_ref()).map(|(a, sun)| a.ambient(sun, &numbers)).unwrap_or_default();
+        let around = around.map(|a| (a, &ambient));
         for (i, v) in values.data.chunks_exact(CHANNELS).enumerate() {
             let mut v: [f32; CHANNELS] = std::array::from_fn(|k| v[k]);
             let o = out.opacity.data[i];
             // The shadow is composited before 1.
             v[3] += 1.0 - o;
             let at = 3 * i..3 * i + 3;
-            let ray = (o, out.depth.data[i] * o);
-            let reach = |sun: &[f32]| {
-                let visibility = self.visibility.as_ref().expect("suns are told apart");
-                shading::reach(visibility, sun, &v[NORMAL..], ray, &origins[at.clone()], &dirs[at.clone()])
-            };
-            let sunlit = light.sun.as_ref().map(|sun| Sunlit { sun, reach: reach(sun) });
-            let color = shading::color(&v, o, &dirs[at.clone()], &numbers, &light.sky, sunlit);
+            let hit = (o, out.depth.data[i] * o);
+            let ray = (&origins[at.clone()], &dirs[at.clone()]);
+            let sunlit = light
+                .sun
+                .as_ref()
+                .zip(around)
+                .map(|(sun, (a, ambient))| shading::sunlit((&a.visibility, ambient), (sun, &numbers), &v[NORMAL..], hit, ray));
+            let color = shading::color(&v, o, ray.1, &numbers, &light.sky, sunlit);
             let length = v[NORMAL..NORMAL + 3].iter().map(|n| n * n).sum::<f32>().sqrt().max(1e-20);
             for k in 0..3 {
                 out.color.data[3 * i + k] = color.rgb[k];

@@ -1,12 +1,12 @@
 //! Loss of the scene model: `C = S · A ⊙ max(0, Lᵀ b(N)) + (1 − o) · sky(d)` in linear light, compared in sRGB, and its gradient. With a
-//! sun apart, its light, the sky's and that of surfaces (see [`super::sun`]) take the place of `S · max(0, Lᵀ b(N))`.
+//! sun apart, its light, the sky's and that of surfaces around (see [`super::sun`]) take the place of `S · max(0, Lᵀ b(N))`, and are given.
 //!
 //! Per ray, the field composites albedo `A` (premultiplied by the opacity `o`), shadow `S` (1 where nothing is hit) and the normal that a
 //! head of the network says, whose direction `N` counts. Light `L` `[9, 3]` and sky `[16, 3]` are of the ray's session. In training, the
 //! normal is that of the surfaces as they were learned, which the head is taught.
 
-use super::sun::SUN;
-use super::visibility::{Visibility, spread};
+use super::sun::{BOUNCED, SUN, level};
+use super::visibility::{Ambient, Visibility, spread};
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
 use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
@@ -80,8 +80,10 @@ pub struct SceneLoss<'a> {
 /// Suns of the lights, and what hides them.
 #[derive(Clone, Copy)]
 pub struct Suns<'a> {
-    /// `[lights, 9]`: direction, power, light from surfaces.
+    /// `[lights, 6]`: direction, power.
     pub values: &'a [f32],
+    /// Of the sky and of surfaces in each light.
+    pub ambients: &'a [Ambient],
     pub visibility: &'a Visibility,
     /// Of the rays, `[R, 3]`.
     pub origins: &'a [f32],
@@ -90,7 +92,7 @@ pub struct Suns<'a> {
 /// A sun and a sky of each ray, with what hides them.
 #[derive(Clone, Copy)]
 pub struct TracedLight<'a> {
-    /// `[R, 9]`: direction, power, light from surfaces.
+    /// `[R, 6]`: direction, power.
     pub suns: &'a [f32],
     /// `[R, 9, 3]`
     pub skies: &'a [f32],
@@ -99,23 +101,42 @@ pub struct TracedLight<'a> {
     pub origins: &'a [f32],
 }
 
-/// Sun of a surface point, and the shares of its light and the sky's that reach the point.
+/// Sun of a surface point, the shares of its light and the sky's that reach the point, and light from sky and surfaces.
 #[derive(Clone, Copy)]
 pub struct Sunlit<'a> {
     pub sun: &'a [f32],
     pub reach: [f32; 2],
+    pub ambient: Vec3,
 }
 
-/// Shares of a sun's and the sky's light that reach what a ray shows, `[sun, sky]`; `depth` is `Σ w t`.
-pub fn reach(visibility: &Visibility, sun: &[f32], normal: &[f32], (opacity, depth): (f32, f32), origin: &[f32], dir: &[f32]) -> [f32; 2] {
-    if opacity < FAINT {
-        return [1.0; 2];
-    }
-    let normal = Vec3::from(unit(normal).0);
-    let point = Vec3::from_slice(origin) + Vec3::from_slice(dir) * (depth / opacity);
+/// What a ray shows: a point and its normal; none where it meets nothing. `depth` is `Σ w t`.
+fn surface(normal: &[f32], (opacity, depth): (f32, f32), origin: &[f32], dir: &[f32]) -> Option<(Vec3, Vec3)> {
+    let point = Vec3::from_slice(origin) + Vec3::from_slice(dir) * (depth / opacity.max(FAINT));
+    (opacity >= FAINT).then(|| (point, Vec3::from(unit(normal).0)))
+}
+
+/// Shares of a sun's and the sky's light that reach a surface, `[sun, sky]`.
+fn reach(visibility: &Visibility, sun: &[f32], (point, normal): (Vec3, Vec3)) -> [f32; 2] {
     let toward = Vec3::from_slice(sun);
     let direct = if normal.dot(toward) > 0.0 { visibility.from_sun(point, normal, toward) } else { 1.0 };
-    [direct, visibility.from_sky(point, normal)]
+    [direct, visibility.from_sky(&visibility.corners(point, normal), normal)]
+}
+
+/// The light of a sun and what is around it at what a ray shows; `sky` `[9, 3]` is that of the light.
+pub fn sunlit<'a>(
+    (visibility, ambient): (&Visibility, &Ambient),
+    (sun, sky): (&'a [f32], &[f32]),
+    normal: &[f32],
+    hit: (f32, f32),
+    (origin, dir): (&[f32], &[f32]),
+) -> Sunlit<'a> {
+    match surface(normal, hit, origin, dir) {
+        None => Sunlit { sun, reach: [1.0; 2], ambient: Vec3::ONE },
+        Some(at) => {
+            let corners = visibility.corners(at.0, at.1);
+            Sunlit { sun, reach: reach(visibility, sun, at), ambient: ambient.at(&corners, at.1, sky) }
+        }
+    }
 }
 
 /// Gradients of the tables, and figures of the step.
@@ -124,7 +145,6 @@ pub struct SceneGradients {
     pub lights: Vec<f32>,
     pub skies: Vec<f32>,
     pub gains: Vec<f32>,
-    pub suns: Vec<f32>,
     /// Mean squared error in sRGB of the pixels that count.
     pub mse: f64,
     /// Median over the pixels of the greatest error of a channel.
@@ -202,16 +222,26 @@ fn shade(normal: &[f32], dir: &[f32], light: &[f32], sky: &[f32]) -> Shaded {
 
 /// Light that a white surface sends, with its shadow.
 fn received(values: &[f32], s: &Shaded, sunlit: Option<Sunlit>, k: usize) -> f32 {
-    sunlit.map_or(values[3] * s.lit[k].max(0.0), |l| l.received(&s.normal, &s.lit, k))
+    sunlit.map_or(values[3] * s.lit[k].max(0.0), |l| l.received(&s.normal)[k])
+}
+
+/// Light of a sun that reaches a surface without shadows.
+fn unhidden(sun: &[f32], normal: &[f32; 3]) -> Vec3 {
+    Vec3::from_slice(&sun[3..]) * (0..3).map(|a| normal[a] * sun[a]).sum::<f32>().max(0.0)
 }
 
 impl Sunlit<'_> {
-    /// Light that a white surface sends, `lit` being that of the whole sky.
-    fn received(&self, normal: &[f32; 3], lit: &[f32; 3], k: usize) -> f32 {
-        let Sunlit { sun, reach } = self;
-        let facing = (0..3).map(|a| normal[a] * sun[a]).sum::<f32>().max(0.0);
-        sun[3 + k] * reach[0] * facing + reach[1] * lit[k].max(0.0) + (1.0 - reach[1]) * sun[6 + k]
+    /// Light that a white surface sends.
+    fn received(&self, normal: &[f32; 3]) -> Vec3 {
+        self.reach[0] * unhidden(self.sun, normal) + self.ambient
     }
+}
+
+/// Share of the light of a sun and a sky that reaches a surface; `lit` is that of the whole sky, `sent` what surfaces send where they hide it.
+fn arriving(sun: &[f32], reach: [f32; 2], normal: &[f32; 3], lit: [f32; 3], sent: Vec3) -> f32 {
+    let (direct, sky) = (unhidden(sun, normal), Vec3::from(lit).max(Vec3::ZERO));
+    let all = gray(&(direct + sky).to_array()).max(1e-6);
+    (gray(&(reach[0] * direct + reach[1] * sky + (1.0 - reach[1]) * sent).to_array()) / all).clamp(0.0, 1.0)
 }
 
 /// Color of a ray, and what makes it.
@@ -229,25 +259,17 @@ pub fn color(values: &[f32], opacity: f32, dir: &[f32], light: &[f32], sky: &[f3
     let s = shade(&values[NORMAL..], dir, light, sky);
     let irradiance: [f32; 3] = std::array::from_fn(|k| received(values, &s, sunlit, k));
     let rgb = std::array::from_fn(|k| values[k] * irradiance[k] + (1.0 - opacity) * s.sky[k].max(0.0));
-    let shadow = sunlit.map_or(values[3], |l| {
-        let bare = |reach| {
-            let sun: [f32; 9] = std::array::from_fn(|i| if i < 6 { l.sun[i] } else { 0.0 });
-            gray(&[0, 1, 2].map(|k| received(values, &s, Some(Sunlit { sun: &sun, reach }), k)))
-        };
-        if opacity < FAINT { 1.0 } else { (bare(l.reach) / bare([1.0; 2]).max(1e-6)).clamp(0.0, 1.0) }
-    });
+    let shadow = match sunlit {
+        Some(_) if opacity < FAINT => 1.0,
+        Some(l) => arriving(l.sun, l.reach, &s.normal, s.lit, Vec3::ZERO),
+        None => values[3],
+    };
     RayColor { rgb, irradiance, shadow }
 }
 
 /// Luminance of a color or coefficient.
 pub fn gray(c: &[f32]) -> f32 {
     (0..3).map(|k| LUMINANCE[k] * c[k]).sum()
-}
-
-/// Adds the gradient of a sun's power, for one channel and the gradient `d` of the light that a surface receives.
-fn sun_gradient(l: &Sunlit, normal: [f32; 3], d: f32, k: usize, d_sun: &mut [f32]) {
-    let facing = (0..3).map(|a| normal[a] * l.sun[a]).sum::<f32>();
-    d_sun[3 + k] += d * l.reach[0] * facing.max(0.0);
 }
 
 /// What the loss of a ray reads.
@@ -271,11 +293,10 @@ impl SceneLoss<'_> {
 
     /// Sun of a ray and what of its light arrives.
     fn sunlit(&self, r: usize, out: &RayOutputs) -> Option<Sunlit<'_>> {
-        let s = self.suns.as_ref()?;
-        let sun = &s.values[SUN * self.light[r] as usize..][..SUN];
-        let at = 3 * r..3 * r + 3;
-        let reach = reach(s.visibility, sun, &self.normal(r, out), (out.opacity[r], out.depth[r]), &s.origins[at.clone()], &self.dirs[at]);
-        Some(Sunlit { sun, reach })
+        let (s, l, at) = (self.suns.as_ref()?, self.light[r] as usize, 3 * r..3 * r + 3);
+        let light = (&s.values[SUN * l..][..SUN], &self.lights[LIGHT * l..][..LIGHT]);
+        let hit = (out.opacity[r], out.depth[r]);
+        Some(sunlit((s.visibility, &s.ambients[l]), light, &self.normal(r, out), hit, (&s.origins[at.clone()], &self.dirs[at])))
     }
 
     /// Share of the light of a ray's sun and sky that arrives; none where the ray meets no surface.
@@ -283,10 +304,9 @@ impl SceneLoss<'_> {
         let t = self.traced.as_ref().filter(|_| out.opacity[r] > SOLID)?;
         let (sun, sky, at) = (&t.suns[SUN * r..][..SUN], &t.skies[LIGHT * r..][..LIGHT], 3 * r..3 * r + 3);
         let normal = self.normal(r, out);
-        let reach = reach(t.visibility, sun, &normal, (out.opacity[r], out.depth[r]), &t.origins[at.clone()], &self.dirs[at]);
+        let hit = surface(&normal, (out.opacity[r], out.depth[r]), &t.origins[at.clone()], &self.dirs[at])?;
         let lit = irradiance(sky, &sh_light::basis(DVec3::from(normal.map(f64::from))));
-        let of = |reach| gray(&[0, 1, 2].map(|k| Sunlit { sun, reach }.received(&normal, &lit, k)));
-        Some((of(reach) / of([1.0; 2]).max(1e-6)).clamp(0.0, 1.0))
+        Some(arriving(sun, reach(t.visibility, sun, hit), &normal, lit, BOUNCED * level(sun, sky)))
     }
 
     /// One ray: its loss; adds gradients. `share` is its part of the sum. Returns the loss, the squared error and the largest error.
@@ -300,8 +320,6 @@ impl SceneLoss<'_> {
         let w = self.weights;
         let (mut errors, mut d_colors) = ([0.0; 3], [0.0; 3]);
         let (mut white, mut plain) = ([0.0; 3], [0.0; 3]);
-        // Share of the light of the harmonics that arrives.
-        let arrives = sunlit.map_or(shadow, |l| l.reach[1]);
         for k in 0..3 {
             white[k] = received(values, &s, sunlit, k);
             plain[k] = values[k] * white[k] + (1.0 - opacity) * s.sky[k].max(0.0);
@@ -322,12 +340,9 @@ impl SceneLoss<'_> {
                 tables.gains[3 * image + k] += dc * plain[k];
             }
             d_values[k] += dc * white[k];
-            match sunlit {
-                None => d_values[3] += dc * values[k] * s.lit[k].max(0.0),
-                Some(l) => sun_gradient(&l, s.normal, dc * values[k], k, &mut tables.suns[SUN * light_of..][..SUN]),
-            }
-            if s.lit[k] > 0.0 {
-                let d_lit = dc * arrives * values[k];
+            if sunlit.is_none() && s.lit[k] > 0.0 {
+                d_values[3] += dc * values[k] * s.lit[k];
+                let d_lit = dc * shadow * values[k];
                 (0..9).for_each(|i| tables.lights[light_of * LIGHT + 3 * i + k] += d_lit * s.basis[i] as f32);
             }
             let of_sky = &mut tables.skies[light_of * SKY..][..SKY];
@@ -396,7 +411,6 @@ impl BatchLoss for SceneLoss<'_> {
             lights: vec![0.0; self.lights.len()],
             skies: vec![0.0; self.skies.len()],
             gains: vec![0.0; self.gains.len()],
-            suns: vec![0.0; self.suns.map_or(0, |s| s.values.len())],
             ..SceneGradients::default()
         };
         let share = 1.0 / self.counts.iter().sum::<f32>().max(1.0);
@@ -413,7 +427,10 @@ impl BatchLoss for SceneLoss<'_> {
                 worst.push(error);
             }
         }
-        loss += self.negative(&mut tables) + self.gauge(out, gradients, share);
+        if self.suns.is_none() {
+            loss += self.negative(&mut tables);
+        }
+        loss += self.gauge(out, gradients, share);
         if !worst.is_empty() {
             let at = worst.len() / 2;
             tables.median = *worst.select_nth_unstable_by(at, f32::total_cmp).1;

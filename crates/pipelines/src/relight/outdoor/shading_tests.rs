@@ -1,9 +1,10 @@
 //! The loss against central differences.
 
 use super::shading::*;
-use super::visibility::Visibility;
+use super::visibility::{Ambient, Visibility};
 use diorama_engine::fields::DensityQuery;
 use diorama_engine::samplers::occupancy::Occupancy;
+use diorama_geom::glam::Vec3;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
 use std::sync::{LazyLock, Mutex};
@@ -71,12 +72,13 @@ fn case() -> Case {
 }
 
 fn sunlit_case() -> Case {
-    let sun = |toward: [f32; 3], power: f32| [toward[0], toward[1], toward[2], power, 0.8 * power, 0.6, 0.1, 0.2, 0.3];
+    let sun = |toward: [f32; 3], power: f32| [toward[0], toward[1], toward[2], power, 0.8 * power, 0.6];
     Case { suns: [sun([0.6, 0.0, 0.8], 0.9), sun([0.0, -0.8, 0.6], 0.5)].concat(), ..case() }
 }
 
 fn run(c: &Case) -> (f64, RayGradients, SceneGradients) {
-    let suns = [0.6, 0.0, 0.8, 0.9, 0.8, 0.6, 0.1, 0.2, 0.3].repeat(RAYS);
+    let suns = [0.6, 0.0, 0.8, 0.9, 0.8, 0.6].repeat(RAYS);
+    let ambients: [Ambient; 2] = std::array::from_fn(|l| EMPTY.ambient(&c.lights[LIGHT * l..], &[], Vec3::ZERO));
     let skies = (0..LIGHT).map(|i| if i < 3 { 0.5 } else { 0.05 }).collect::<Vec<f32>>().repeat(RAYS);
     let loss = SceneLoss {
         weights: Weights { huber: 0.4, robust: 0.0, shadow: 0.2, traced: 0.3, negative: 0.5, gauge: 0.0, tie: 0.3 },
@@ -89,7 +91,7 @@ fn run(c: &Case) -> (f64, RayGradients, SceneGradients) {
         lights: &c.lights,
         skies: &c.skies,
         gains: &c.gains,
-        suns: (!c.suns.is_empty()).then(|| Suns { values: &c.suns, visibility: &EMPTY, origins: &[0.5; 3 * RAYS] }),
+        suns: (!c.suns.is_empty()).then(|| Suns { values: &c.suns, ambients: &ambients, visibility: &EMPTY, origins: &[0.5; 3 * RAYS] }),
         traced: c.suns.is_empty().then(|| TracedLight { suns: &suns, skies: &skies, visibility: &HALF, origins: &[0.5; 3 * RAYS] }),
         out: Mutex::default(),
     };
@@ -133,21 +135,8 @@ fn gradients_are_those_of_the_loss() {
 fn gradients_with_suns_apart_are_those_of_the_loss() {
     let (_, d, tables) = run(&sunlit_case());
     check("values", sunlit_case, |c| &mut c.values, &d.values, 3e-3);
-    check("lights", sunlit_case, |c| &mut c.lights, &tables.lights, 3e-3);
-    // Directions are searched, and nothing hides the sky from these surfaces.
-    for l in 0..2 {
-        let powers = 9 * l + 3..9 * l + 6;
-        assert!(tables.suns[9 * l..9 * l + 3] == [0.0; 3] && tables.suns[powers.clone()].iter().all(|d| *d != 0.0), "{:?}", tables.suns);
-        for i in powers {
-            let at = |by: f32| {
-                let mut c = sunlit_case();
-                c.suns[i] += by;
-                run(&c).0
-            };
-            let want = (at(3e-3) - at(-3e-3)) / 6e-3;
-            assert!((tables.suns[i] as f64 - want).abs() < 0.02 * want.abs() + 1e-3, "{i}: {} {want}", tables.suns[i]);
-        }
-    }
+    // Suns and skies are given.
+    assert!(tables.lights.iter().all(|d| *d == 0.0) && d.values.iter().skip(3).step_by(CHANNELS).all(|d| *d == 0.0));
 }
 
 #[test]

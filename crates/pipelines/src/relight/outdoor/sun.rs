@@ -1,27 +1,27 @@
-//! The sun of a session apart from its sky: `E = P V max(0, n · s) + O max(0, Lᵀ b(n)) + (1 − O) B`, with the sun's direction `s` and power
-//! `P`, its visibility `V`, the sky's harmonics `L`, openness `O`, and light `B` from surfaces that hide the sky, a share of what a level one
-//! receives. Directions are searched, the rest then is linear.
+//! The sun of a session apart from its sky: `E = P V max(0, n · s) + max(0, Tᵀ L) + B`, with the sun's direction `s` and power `P`, its
+//! visibility `V`, the sky's harmonics `L` as what stands around lets them through, `T`, and light `B` from surfaces around. Directions are
+//! searched, the rest then is linear; `B` follows from light and albedo, again and again.
 
-use super::visibility::{Visibility, spread};
+use super::visibility::{Ambient, Corners, Visibility, spread};
 use diorama_geom::color::srgb_from_linear;
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
 use rayon::prelude::*;
 
-/// Numbers of a sun: direction, power and light from surfaces, RGB each.
-pub const SUN: usize = 9;
+/// Numbers of a sun: direction and power.
+pub const SUN: usize = 6;
 /// Candidates over the sphere of which those above the horizon are tried.
 const CANDIDATES: usize = 600;
-/// Most pixels by which directions are tried.
-const SEARCH_PIXELS: usize = 1500;
+/// Most points by which directions are tried.
+const SEARCH_POINTS: usize = 1500;
 /// Radii in radians of the circles about the best direction that are tried afterwards, and directions on each.
 const CIRCLES: [f32; 5] = [0.1, 0.05, 0.025, 0.0125, 0.006];
 const AROUND: usize = 10;
 /// Unknowns: sun, nine of the sky.
 const UNKNOWNS: usize = 10;
-/// Light that surfaces send to each other over what a level white one receives: about their albedo.
+/// Light that surfaces send to each other over what a level white one receives, before it is known: about their albedo.
 pub const BOUNCED: f32 = 0.25;
-/// Pull of the unknowns toward 0, per pixel: of the sun and the even sky, and of the sky's first and second band, as normals of few directions
+/// Pull of the unknowns toward 0, per point: of the sun and the even sky, and of the sky's first and second band, as normals of few directions
 /// tell little of them.
 const RIDGE: [f64; 3] = [1e-4, 2e-3, 5e-3];
 /// Albedo on the mean before anything is known, and luminance of the brightest twentieth.
@@ -31,34 +31,14 @@ const BRIGHT: f32 = 0.7;
 const ROUNDS: usize = 5;
 const SEARCHED: usize = 1;
 const SETTLING: usize = 15;
-/// Difference in sRGB beyond which pixels count less and less, and rounds in which that is weighed.
+/// Every so many of these, light from surfaces is found anew.
+const SENT_AGAIN: usize = 3;
+/// Bounces of light between surfaces, where a light is given.
+const BOUNCES: usize = 4;
+/// Difference in sRGB beyond which points count less and less.
 const TRUSTED: f32 = 0.15;
-const REWEIGHTED: usize = 3;
 /// Linear light below which errors do not count more.
 const DARK: f32 = 0.02;
-
-/// A pixel that shows a surface.
-#[derive(Clone, Copy, Debug)]
-pub struct Lit {
-    pub point: Vec3,
-    pub normal: Vec3,
-    pub albedo: Vec3,
-    /// Linear light of the photograph.
-    pub seen: Vec3,
-    /// How much the pixel counts: shadows that are a little off must not blur what is told apart.
-    pub trust: f32,
-}
-
-/// Light that explains pixels.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Fitted {
-    /// Direction, power, light from surfaces.
-    pub sun: [f32; SUN],
-    /// `[9, 3]`
-    pub sky: [f32; 27],
-    /// Mean squared error, about that of sRGB.
-    pub error: f64,
-}
 
 /// A surface point and its linear color in each light.
 #[derive(Clone, Debug)]
@@ -68,54 +48,196 @@ pub struct Seen {
     pub colors: Vec<Vec3>,
 }
 
-/// Lights that explain how surfaces look in each of them, and the albedo of each point. Both are found in turn; how bright albedo is, and
-/// its tint, is chosen such that its brightest twentieth has a luminance of 0.7 and the lights together are white.
-pub fn tell_apart(seen: &[Seen], visibility: &Visibility) -> (Vec<Fitted>, Vec<Vec3>) {
+/// Light that explains points.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Fitted {
+    /// Direction, power.
+    pub sun: [f32; SUN],
+    /// `[9, 3]`
+    pub sky: [f32; 27],
+    /// Mean squared error, about that of sRGB.
+    pub error: f64,
+}
+
+/// Points of surfaces with their albedo, which send light to each other.
+#[derive(Clone, Default)]
+pub struct Surfaces {
+    points: Vec<Place>,
+    pub albedos: Vec<Vec3>,
+}
+
+/// A point and what does not depend on light.
+#[derive(Clone)]
+struct Place {
+    point: Vec3,
+    normal: Vec3,
+    cell: u32,
+    corners: Corners,
+    /// Light that arrives for each of the sky's coefficients.
+    sky: [f32; 9],
+}
+
+impl Surfaces {
+    /// Points with normals and albedos.
+    pub fn new(points: impl Iterator<Item = (Vec3, Vec3)>, albedos: Vec<Vec3>, visibility: &Visibility) -> Surfaces {
+        let points: Vec<(Vec3, Vec3)> = points.collect();
+        let place = |(point, normal): &(Vec3, Vec3)| {
+            let corners = visibility.corners(*point, *normal);
+            let sky = visibility.sky_row(&corners, *normal);
+            Place { point: *point, normal: *normal, cell: visibility.cell_of(*point), corners, sky }
+        };
+        Surfaces { points: points.par_iter().map(place).collect(), albedos }
+    }
+
+    /// The same from [`Surfaces::numbers`].
+    pub fn from_numbers(numbers: &[f32], visibility: &Visibility) -> Surfaces {
+        let at = |p: &[f32], k: usize| Vec3::from_slice(&p[3 * k..]);
+        let points = numbers.chunks_exact(9).map(|p| (at(p, 0), at(p, 1)));
+        Surfaces::new(points, numbers.chunks_exact(9).map(|p| at(p, 2)).collect(), visibility)
+    }
+
+    /// Points, normals and albedos as a checkpoint keeps them, `[N, 9]`.
+    pub fn numbers(&self) -> Vec<f32> {
+        let each = self.points.iter().zip(&self.albedos);
+        each.flat_map(|(p, a)| [p.point, p.normal, *a].into_iter().flat_map(|v| v.to_array())).collect()
+    }
+
+    /// Share of a sun's light that reaches each point, times the cosine.
+    fn sunlit(&self, visibility: &Visibility, toward: Vec3) -> Vec<f32> {
+        self.points.par_iter().map(|p| p.sunlit(visibility, toward)).collect()
+    }
+
+    /// Light of the sky and of surfaces, of which each receives `irradiance`.
+    fn ambient(&self, visibility: &Visibility, sky: &[f32], irradiance: &[Vec3]) -> Ambient {
+        let mut sent: Vec<(Vec3, f32)> = vec![(Vec3::ZERO, 0.0); super::visibility::OPEN_CELLS.pow(3)];
+        let mut mean = Vec3::ZERO;
+        for ((p, a), e) in self.points.iter().zip(&self.albedos).zip(irradiance) {
+            let of = &mut sent[p.cell as usize];
+            *of = (of.0 + *a * *e, of.1 + 1.0);
+            mean += *a * *e / self.points.len() as f32;
+        }
+        let radiosity: Vec<Option<Vec3>> = sent.into_iter().map(|(sum, n)| (n > 0.0).then(|| sum / n)).collect();
+        visibility.ambient(sky, &radiosity, mean)
+    }
+
+    /// What of the sky and of surfaces reaches any place in a light.
+    pub fn spread(&self, visibility: &Visibility, sun: &[f32], sky: &[f32]) -> Ambient {
+        let power = Vec3::from_slice(&sun[3..]);
+        let direct: Vec<Vec3> = self.sunlit(visibility, Vec3::from_slice(sun)).iter().map(|v| *v * power).collect();
+        let mut irradiance: Vec<Vec3> = self.points.iter().zip(&direct).map(|(p, d)| *d + p.of_sky(sky).max(Vec3::ZERO)).collect();
+        let mut ambient = Ambient::default();
+        for _ in 0..BOUNCES {
+            ambient = self.ambient(visibility, sky, &irradiance);
+            irradiance = self.points.par_iter().zip(&direct).map(|(p, d)| *d + ambient.at(&p.corners, p.normal, sky)).collect();
+        }
+        ambient
+    }
+}
+
+impl Place {
+    fn sunlit(&self, visibility: &Visibility, toward: Vec3) -> f32 {
+        let facing = self.normal.dot(toward);
+        if facing > 0.0 { facing * visibility.from_sun(self.point, self.normal, toward) } else { 0.0 }
+    }
+
+    /// Light of a sky `[9, 3]`.
+    fn of_sky(&self, sky: &[f32]) -> Vec3 {
+        (0..9).map(|i| self.sky[i] * Vec3::from_slice(&sky[3 * i..])).sum()
+    }
+}
+
+/// A point in one light, for a fit.
+#[derive(Clone, Copy)]
+struct Lit {
+    albedo: Vec3,
+    seen: Vec3,
+    /// Light from surfaces.
+    sent: Vec3,
+    /// How much the point counts: shadows that are a little off must not blur what is told apart.
+    trust: f32,
+}
+
+/// State of one light while lights are told apart.
+struct Guess {
+    fitted: Fitted,
+    sunlit: Vec<f32>,
+    /// Light from surfaces at each point.
+    sent: Vec<Vec3>,
+}
+
+impl Guess {
+    /// Irradiance over π of a point.
+    fn irradiance(&self, i: usize, place: &Place) -> Vec3 {
+        self.sunlit[i] * Vec3::from_slice(&self.fitted.sun[3..]) + place.of_sky(&self.fitted.sky).max(Vec3::ZERO) + self.sent[i]
+    }
+}
+
+/// Lights that explain how surfaces look in each of them, and the surfaces with their albedo. Both are found in turn; how bright albedo is,
+/// and its tint, is chosen such that its brightest twentieth has a luminance of 0.7 and the lights together are white. `progress` receives
+/// the share that is done.
+pub fn tell_apart(seen: &[Seen], visibility: &Visibility, progress: &mut dyn FnMut(f64)) -> (Vec<Fitted>, Surfaces) {
     let lights = seen.first().map_or(0, |s| s.colors.len());
-    let open: Vec<f32> = seen.par_iter().map(|p| visibility.from_sky(p.point, p.normal)).collect();
     let mean = |of: &dyn Fn(&Seen) -> Vec3| seen.iter().map(of).sum::<Vec3>() / seen.len().max(1) as f32;
     let means: Vec<Vec3> = (0..lights).map(|l| mean(&|s| s.colors[l]).max(Vec3::splat(1e-4))).collect();
     let relative = |s: &Seen| s.colors.iter().zip(&means).map(|(c, m)| *c / *m).sum::<Vec3>() / lights as f32;
-    let mut albedos: Vec<Vec3> = seen.iter().map(|s| FIRST_ALBEDO * relative(s)).collect();
-    let mut fitted: Vec<Fitted> = Vec::new();
+    let albedos = seen.iter().map(|s| FIRST_ALBEDO * relative(s)).collect();
+    let mut surfaces = Surfaces::new(seen.iter().map(|s| (s.point, s.normal)), albedos, visibility);
+    // Before anything is known, closed places receive a share of what is seen.
+    let first_sent = |l: usize| {
+        let level = BOUNCED / FIRST_ALBEDO * means[l];
+        let open = surfaces.points.iter().map(|p| visibility.from_sky(&p.corners, p.normal));
+        open.map(|o| (1.0 - o) * level).collect()
+    };
+    let first_sent: Vec<Vec<Vec3>> = (0..lights).map(first_sent).collect();
+    let mut guesses: Vec<Guess> = Vec::new();
     for round in 0..ROUNDS {
-        fitted = (0..lights)
+        guesses = (0..lights)
             .map(|l| {
                 // Shadows are in the first albedos, so the sun is looked for twice.
-                let known = (round > SEARCHED).then(|| Vec3::from_slice(&fitted[l].sun));
-                fit(&lit(seen, &albedos, l, None), visibility, known)
+                let known = (round > SEARCHED).then(|| Vec3::from_slice(&guesses[l].fitted.sun));
+                let sent = guesses.get(l).map_or(&first_sent[l], |g| &g.sent);
+                let fitted = fit(&lit(seen, &surfaces, l, sent, None), &surfaces, visibility, known);
+                let sunlit = surfaces.sunlit(visibility, Vec3::from_slice(&fitted.sun));
+                Guess { sunlit, sent: sent.clone(), fitted }
             })
             .collect();
         // Light and albedo approach each other slowly; meanwhile suns stay where they are.
-        for _ in 0..SETTLING {
-            albedos = seen.par_iter().zip(&open).zip(&albedos).map(|((s, o), a)| explained(s, *o, *a, &fitted, visibility)).collect();
-            set_scale(&mut fitted, &mut albedos);
-            fitted = (0..lights)
-                .into_par_iter()
-                .map(|l| {
-                    let trusted = lit(seen, &albedos, l, Some((&fitted[l], &open, visibility)));
-                    solve(&trusted, &open, visibility, Vec3::from_slice(&fitted[l].sun))
-                })
-                .collect();
+        for k in 0..SETTLING {
+            surfaces.albedos = (0..seen.len()).into_par_iter().map(|i| explained(i, &seen[i], &surfaces, &guesses)).collect();
+            set_scale(&mut guesses, &mut surfaces.albedos);
+            let refit = |(l, g): (usize, &mut Guess)| {
+                let trusted = lit(seen, &surfaces, l, &g.sent, Some(g));
+                g.fitted = solve(&trusted, &surfaces.points, &g.sunlit, Vec3::from_slice(&g.fitted.sun));
+                if k % SENT_AGAIN == 0 {
+                    let irradiance: Vec<Vec3> = surfaces.points.iter().enumerate().map(|(i, p)| g.irradiance(i, p)).collect();
+                    let dark = [0.0; 27];
+                    let sent = surfaces.ambient(visibility, &dark, &irradiance);
+                    g.sent = surfaces.points.iter().map(|p| sent.at(&p.corners, p.normal, &dark)).collect();
+                }
+            };
+            guesses.par_iter_mut().enumerate().for_each(refit);
+            progress((round * SETTLING + k + 1) as f64 / (ROUNDS * SETTLING) as f64);
         }
     }
-    (fitted, albedos)
+    (guesses.into_iter().map(|g| g.fitted).collect(), surfaces)
 }
 
-/// Surface points of given albedo in one light, each trusted as an explanation of it says.
-fn lit(seen: &[Seen], albedos: &[Vec3], light: usize, by: Option<(&Fitted, &[f32], &Visibility)>) -> Vec<Lit> {
-    let of = |(i, (s, a)): (usize, (&Seen, &Vec3))| {
-        let trust = by.map_or(1.0, |(f, open, v)| trust(*a * f.irradiance(s.point, s.normal, open[i], v), s.colors[light]));
-        Lit { point: s.point, normal: s.normal, albedo: *a, seen: s.colors[light], trust }
+/// Surface points in one light, each trusted as an explanation of it says.
+fn lit(seen: &[Seen], surfaces: &Surfaces, light: usize, sent: &[Vec3], by: Option<&Guess>) -> Vec<Lit> {
+    let of = |(i, s): (usize, &Seen)| {
+        let (albedo, color) = (surfaces.albedos[i], s.colors[light]);
+        let trust = by.map_or(1.0, |g| trust(albedo * g.irradiance(i, &surfaces.points[i]), color));
+        Lit { albedo, seen: color, sent: sent[i], trust }
     };
-    seen.iter().zip(albedos).enumerate().map(of).collect()
+    seen.iter().enumerate().map(of).collect()
 }
 
-/// Albedo of a point that lights explain best, open to a share of the sky; `before` says which lights to trust.
-fn explained(s: &Seen, open: f32, before: Vec3, fitted: &[Fitted], visibility: &Visibility) -> Vec3 {
+/// Albedo of a point that lights explain best; the one before says which lights to trust.
+fn explained(i: usize, s: &Seen, surfaces: &Surfaces, guesses: &[Guess]) -> Vec3 {
+    let before = surfaces.albedos[i];
     let (mut a, mut b) = (Vec3::ZERO, Vec3::splat(1e-6));
-    for (f, c) in fitted.iter().zip(&s.colors) {
-        let white = f.irradiance(s.point, s.normal, open, visibility);
+    for (g, c) in guesses.iter().zip(&s.colors) {
+        let white = g.irradiance(i, &surfaces.points[i]);
         // The derivative of sRGB at what is seen, squared.
         let weight = Vec3::from(c.max(Vec3::splat(DARK)).to_array().map(|v| v.powf(-1.16))) * trust(before * white, *c);
         (a, b) = (a + weight * white * *c, b + weight * white * white);
@@ -124,40 +246,28 @@ fn explained(s: &Seen, open: f32, before: Vec3, fitted: &[Fitted], visibility: &
 }
 
 /// Shares brightness and tint between lights and albedos.
-fn set_scale(fitted: &mut [Fitted], albedos: &mut [Vec3]) {
-    let above = |f: &Fitted| {
-        let up = sh_light::basis(DVec3::Z);
-        let sky = |k: usize| (0..9).map(|i| f.sky[3 * i + k] * up[i] as f32).sum::<f32>().max(0.0);
-        Vec3::new(sky(0), sky(1), sky(2)) + Vec3::from_slice(&f.sun[3..]) * f.sun[2].max(0.0)
-    };
-    let light = fitted.iter().map(above).sum::<Vec3>().max(Vec3::splat(1e-6));
+fn set_scale(guesses: &mut [Guess], albedos: &mut [Vec3]) {
+    let light = guesses.iter().map(|g| level(&g.fitted.sun, &g.fitted.sky)).sum::<Vec3>().max(Vec3::splat(1e-6));
     let luminance = Vec3::new(0.2126, 0.7152, 0.0722);
     let tint = light / light.dot(luminance);
     let mut bright: Vec<f32> = albedos.iter().map(|a| (*a * tint).dot(luminance)).collect();
     bright.sort_by(f32::total_cmp);
     let by = tint * BRIGHT / bright.get(bright.len() * 19 / 20).copied().unwrap_or(BRIGHT).max(1e-3);
     albedos.iter_mut().for_each(|a| *a *= by);
-    for f in fitted {
+    for g in guesses {
+        g.sent.iter_mut().for_each(|s| *s /= by);
         (0..3).for_each(|k| {
-            f.sun[3 + k] /= by[k];
-            f.sun[6 + k] /= by[k];
-            (0..9).for_each(|i| f.sky[3 * i + k] /= by[k]);
+            g.fitted.sun[3 + k] /= by[k];
+            (0..9).for_each(|i| g.fitted.sky[3 * i + k] /= by[k]);
         });
     }
 }
 
-impl Fitted {
-    /// Irradiance over π of a white surface, open to a share of the sky.
-    fn irradiance(&self, point: Vec3, normal: Vec3, open: f32, visibility: &Visibility) -> Vec3 {
-        let toward = Vec3::from_slice(&self.sun);
-        let facing = normal.dot(toward).max(0.0);
-        let direct = if facing > 0.0 { facing * visibility.from_sun(point, normal, toward) } else { 0.0 };
-        let basis = sh_light::basis(normal.as_dvec3());
-        Vec3::from(std::array::from_fn(|k| {
-            let sky: f32 = (0..9).map(|i| self.sky[3 * i + k] * basis[i] as f32).sum();
-            direct * self.sun[3 + k] + open * sky.max(0.0) + (1.0 - open) * self.sun[6 + k]
-        }))
-    }
+/// Irradiance over π of a level surface in the open.
+pub fn level(sun: &[f32], sky: &[f32]) -> Vec3 {
+    let up = sh_light::basis(DVec3::Z);
+    let above: Vec3 = (0..9).map(|i| up[i] as f32 * Vec3::from_slice(&sky[3 * i..])).sum();
+    above.max(Vec3::ZERO) + Vec3::from_slice(&sun[3..]) * sun[2].max(0.0)
 }
 
 /// Spherical harmonics of a sun's light, `[9, 3]`.
@@ -168,13 +278,16 @@ pub fn harmonics(sun: &[f32]) -> [f32; 27] {
     std::array::from_fn(|i| light.0[i / 3][i % 3] as f32)
 }
 
-/// The light of pixels. Without a direction to begin with, the whole sky is searched.
-pub fn fit(pixels: &[Lit], visibility: &Visibility, near: Option<Vec3>) -> Fitted {
-    let open = |pixels: &[Lit]| -> Vec<f32> { pixels.par_iter().map(|p| visibility.from_sky(p.point, p.normal)).collect() };
-    let few: Vec<Lit> = pixels.iter().step_by(pixels.len().div_ceil(SEARCH_PIXELS).max(1)).copied().collect();
-    let few_open = open(&few);
+/// The light of points. Without a direction to begin with, the whole sky is searched.
+fn fit(lit: &[Lit], surfaces: &Surfaces, visibility: &Visibility, near: Option<Vec3>) -> Fitted {
+    let step = lit.len().div_ceil(SEARCH_POINTS).max(1);
+    let few: Vec<Lit> = lit.iter().step_by(step).copied().collect();
+    let places: Vec<Place> = surfaces.points.iter().step_by(step).cloned().collect();
     let best_of = |directions: Vec<Vec3>| {
-        let tried = directions.into_par_iter().map(|d| solve(&few, &few_open, visibility, d));
+        let tried = directions.into_par_iter().map(|d| {
+            let sunlit: Vec<f32> = places.iter().map(|p| p.sunlit(visibility, d)).collect();
+            solve(&few, &places, &sunlit, d)
+        });
         tried.reduce_with(|a, b| if b.error < a.error { b } else { a }).expect("a direction")
     };
     let all = || (0..CANDIDATES).map(|i| spread(i, CANDIDATES).as_vec3()).filter(|d| d.z > 0.03).collect();
@@ -192,41 +305,27 @@ pub fn fit(pixels: &[Lit], visibility: &Visibility, near: Option<Vec3>) -> Fitte
             best = next;
         }
     }
-    let (all, mut trusted) = (open(pixels), pixels.to_vec());
-    for _ in 0..REWEIGHTED {
-        let found = solve(&trusted, &all, visibility, Vec3::from_slice(&best.sun));
-        let trust = |(p, o): (&Lit, &f32)| trust(p.albedo * found.irradiance(p.point, p.normal, *o, visibility), p.seen);
-        let trusts: Vec<f32> = pixels.par_iter().zip(&all).map(trust).collect();
-        trusted.iter_mut().zip(trusts).for_each(|(p, t)| p.trust = t);
-    }
-    solve(&trusted, &all, visibility, Vec3::from_slice(&best.sun))
+    let direction = Vec3::from_slice(&best.sun);
+    solve(lit, &surfaces.points, &surfaces.sunlit(visibility, direction), direction)
 }
 
-/// How much a pixel counts that should look like another color (Geman–McClure in about sRGB).
+/// How much a point counts that should look like another color (Geman–McClure in about sRGB).
 fn trust(got: Vec3, seen: Vec3) -> f32 {
     let shown = |v: f32| srgb_from_linear(v.clamp(0.0, 1.0));
     let squared: f32 = (0..3).map(|k| (shown(got[k]) - shown(seen[k])).powi(2)).sum();
     (TRUSTED * TRUSTED / (TRUSTED * TRUSTED + squared)).powi(2)
 }
 
-/// Least squares for one direction.
-fn solve(pixels: &[Lit], open: &[f32], visibility: &Visibility, direction: Vec3) -> Fitted {
+/// Least squares for one direction, of which `sunlit` reaches each point.
+fn solve(points: &[Lit], places: &[Place], sunlit: &[f32], direction: Vec3) -> Fitted {
     let mut sums = [[[0.0f64; UNKNOWNS + 1]; UNKNOWNS]; 3];
     let mut squares = 0.0;
-    let up = sh_light::basis(DVec3::Z);
-    for (p, &o) in pixels.iter().zip(open) {
-        let facing = p.normal.dot(direction).max(0.0);
-        let sun = if facing > 0.0 { facing * visibility.from_sun(p.point, p.normal, direction) } else { 0.0 };
-        let basis = sh_light::basis(p.normal.as_dvec3());
-        let sent = (BOUNCED * (1.0 - o)) as f64;
-        let row: [f64; UNKNOWNS] = std::array::from_fn(|i| match i {
-            0 => sun as f64 + sent * direction.z.max(0.0) as f64,
-            _ => o as f64 * basis[i - 1] + sent * up[i - 1],
-        });
+    for ((p, place), sun) in points.iter().zip(places).zip(sunlit) {
+        let row: [f64; UNKNOWNS] = std::array::from_fn(|i| if i == 0 { *sun } else { place.sky[i - 1] } as f64);
         for k in 0..3 {
             // The derivative of sRGB at what is seen.
             let weight = p.trust.sqrt() * 0.44 * p.seen[k].max(DARK).powf(-0.58);
-            let (a, y) = ((weight * p.albedo[k]) as f64, (weight * p.seen[k]) as f64);
+            let (a, y) = ((weight * p.albedo[k]) as f64, (weight * (p.seen[k] - p.albedo[k] * p.sent[k])) as f64);
             for (i, line) in sums[k].iter_mut().enumerate() {
                 (i..UNKNOWNS).for_each(|j| line[j] += a * a * row[i] * row[j]);
                 line[UNKNOWNS] += a * row[i] * y;
@@ -234,7 +333,7 @@ fn solve(pixels: &[Lit], open: &[f32], visibility: &Visibility, direction: Vec3)
             squares += y * y;
         }
     }
-    let n = pixels.len().max(1) as f64;
+    let n = points.len().max(1) as f64;
     let mut found = Fitted { sun: [0.0; SUN], sky: [0.0; 27], error: squares / (3.0 * n) };
     found.sun[..3].copy_from_slice(&direction.to_array());
     for (k, sums) in sums.iter_mut().enumerate() {
@@ -252,17 +351,7 @@ fn solve(pixels: &[Lit], open: &[f32], visibility: &Visibility, direction: Vec3)
             (0..UNKNOWNS).map(|i| x[i] * (2.0 * sums[i][UNKNOWNS] - (0..UNKNOWNS).map(|j| sums[i][j] * x[j]).sum::<f64>())).sum();
         found.error -= explained / (3.0 * n);
     }
-    set_bounced(&mut found.sun, &found.sky);
     found
-}
-
-/// Gives a sun the light that surfaces send, from its own power and that of its sky `[9, 3]`.
-pub fn set_bounced(sun: &mut [f32], sky: &[f32]) {
-    let up = sh_light::basis(DVec3::Z);
-    for k in 0..3 {
-        let above: f32 = (0..9).map(|i| sky[3 * i + k] * up[i] as f32).sum();
-        sun[6 + k] = BOUNCED * (sun[3 + k] * sun[2].max(0.0) + above.max(0.0));
-    }
 }
 
 /// Solution of symmetric equations in which some unknowns are 0, by elimination.
@@ -315,7 +404,7 @@ mod tests {
         let mut sky = ShLight::uniform([0.2, 0.25, 0.35]);
         sky.0[2] = [0.1; 3];
         let rng = Rng::new(5, 5);
-        let pixels: Vec<Lit> = (0..3000)
+        let seen: Vec<(Vec3, Vec3, Vec3, Vec3)> = (0..3000)
             .map(|i| {
                 let at = |k: u64| rng.uniform(8 * i + k);
                 let (point, normal) = match i % 4 {
@@ -324,17 +413,21 @@ mod tests {
                     _ => (Vec3::new(0.6, 0.4 + 0.2 * at(0), 0.2 + 0.4 * at(1)), Vec3::X),
                 };
                 let albedo = Vec3::new(0.2 + 0.5 * at(2), 0.3 + 0.3 * at(3), 0.5);
-                let lit = Vec3::from(sky.shade(DVec3::from(normal)).map(|v| v as f32)) * visibility.from_sky(point, normal);
+                let corners = visibility.corners(point, normal);
+                let lit: Vec3 =
+                    visibility.sky_row(&corners, normal).iter().zip(sky.0).map(|(t, l)| *t * Vec3::from(l.map(|v| v as f32))).sum();
                 let direct = power * normal.dot(sun).max(0.0) * visibility.from_sun(point, normal, sun);
-                Lit { point, normal, albedo, seen: albedo * (lit + direct), trust: 1.0 }
+                (point, normal, albedo, albedo * (lit + direct))
             })
             .collect();
-        let found = fit(&pixels, &visibility, None);
+        let surfaces = Surfaces::new(seen.iter().map(|s| (s.0, s.1)), seen.iter().map(|s| s.2).collect(), &visibility);
+        let pixels: Vec<Lit> = seen.iter().map(|s| Lit { albedo: s.2, seen: s.3, sent: Vec3::ZERO, trust: 1.0 }).collect();
+        let found = fit(&pixels, &surfaces, &visibility, None);
         let direction = Vec3::from_slice(&found.sun[..3]);
         assert!(direction.angle_between(sun).to_degrees() < 2.0, "{direction} {sun}");
         assert!((Vec3::from_slice(&found.sun[3..6]) - power).abs().max_element() < 0.05, "{found:?}");
         // From nearby, only the neighborhood is searched.
-        let again = fit(&pixels, &visibility, Some((sun + Vec3::new(0.05, 0.0, 0.0)).normalize()));
+        let again = fit(&pixels, &surfaces, &visibility, Some((sun + Vec3::new(0.05, 0.0, 0.0)).normalize()));
         assert!(Vec3::from_slice(&again.sun[..3]).angle_between(sun).to_degrees() < 2.0);
     }
 }

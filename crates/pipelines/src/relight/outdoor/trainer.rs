@@ -5,13 +5,13 @@ use super::model::SceneModel;
 use super::normal_maps::NormalMaps;
 use super::shading::SKY;
 use super::viewing::RunView;
-use super::visibility::Visibility;
+use super::visibility::Ambient;
 use crate::error::Result;
 use crate::run::device::{Device, Pictures};
 use crate::run::photographs::StoredPhotographs;
 use diorama_data::checkpoint;
 use diorama_engine::samplers::RayBatch;
-use diorama_engine::samplers::pixels::{self, DrawOptions, Observation};
+use diorama_engine::samplers::pixels::{self, DrawOptions, Observation, PixelSource};
 use diorama_engine::samplers::placement::Placement;
 use diorama_engine::step::{Backdrop, GivenRays, Loss, Probes, RaySource, Step, Trainees};
 use diorama_engine::train::{Scalar, Scalars, StepReport, Trainee};
@@ -40,6 +40,9 @@ const MOST_RAYS: usize = 16_384;
 const MARCH_RAMP: (f32, u64) = (16.0, 1024);
 /// Steps in which the distortion's weight grows.
 const DISTORTION_RAMP: u64 = 2000;
+/// Times that surfaces are flattened in their stage, and pixels that then tell distances.
+const FLATTENED: u64 = 3;
+const FLAT_PIXELS: usize = 100_000;
 /// Steps before robust weights begin.
 const SETTLED: u64 = 200;
 
@@ -49,7 +52,9 @@ mod light;
 pub(super) struct Trainer<'a> {
     pub model: SceneModel,
     photographs: StoredPhotographs,
+    /// Pixels of known distance: those that were given, then those of flat surfaces.
     observations: Vec<Observation>,
+    given: usize,
     cameras: Vec<PosedCamera>,
     device: Device,
     batch: RayBatch,
@@ -58,6 +63,8 @@ pub(super) struct Trainer<'a> {
     recovered: bool,
     /// Normals of the surfaces, once they stay.
     normals: Option<NormalMaps>,
+    /// Of the lights, where suns are apart.
+    ambients: Vec<Ambient>,
 }
 
 /// Rays of a step as the losses read them.
@@ -81,13 +88,16 @@ impl<'a> Trainer<'a> {
             first_skies(&mut model, &photographs, &cameras);
         }
         let normals = (model.stage == Stage::Light).then(|| NormalMaps::of(&model, &cameras));
+        let ambients = if model.stage == Stage::Light { model.ambients() } else { Vec::new() };
         let mut device = Device::cpu(None);
         let occupancy = Some(&mut model.occupancy);
         device.begin(&Trainees { occupancy, ..Trainees::of(&mut model.field) }, scene, None)?;
-        Ok(Trainer {
+        let given = observations.len();
+        let mut trainer = Trainer {
             model,
             photographs,
             observations,
+            given,
             cameras,
             device,
             batch: RayBatch::default(),
@@ -95,7 +105,31 @@ impl<'a> Trainer<'a> {
             view: None,
             recovered: false,
             normals,
-        })
+            ambients,
+        };
+        trainer.observe_flat();
+        Ok(trainer)
+    }
+
+    /// Flattens what is nearly flat if that is due: from then on, distances to planes through the surfaces are observed.
+    fn flatten(&mut self, share: f32) {
+        let due = (share * (FLATTENED + 1) as f32) as u64;
+        if due.min(FLATTENED) <= self.model.flattened || self.model.config.loss.depth == 0.0 {
+            return;
+        }
+        self.model.flattened = due;
+        let flat = NormalMaps::of(&self.model, &self.cameras).observations(FLAT_PIXELS);
+        self.model.flat = flat.iter().flat_map(|o| [o.image as f32, o.x as f32, o.y as f32, o.distance]).collect();
+        self.observe_flat();
+    }
+
+    fn observe_flat(&mut self) {
+        self.observations.truncate(self.given);
+        let near = self.model.config.sampling.near;
+        let flat = self.model.flat.chunks_exact(4).filter(|f| f[3] > near);
+        self.observations.extend(flat.map(|f| Observation { image: f[0] as u32, x: f[1] as u32, y: f[2] as u32, distance: f[3] }));
+        let photographs = &self.photographs;
+        self.observations.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y));
     }
 
     /// Shows the model in the viewer.
@@ -234,7 +268,10 @@ impl Trainee for Trainer<'_> {
             self.show();
         }
         match self.model.config.light.stage(progress as f32) {
-            (Stage::Surfaces, share) => self.look(step, share),
+            (Stage::Surfaces, share) => {
+                self.flatten(share);
+                self.look(step, share)
+            }
             (Stage::Light, share) => {
                 if self.model.stage == Stage::Surfaces {
                     self.begin_light(step)?;
@@ -249,8 +286,8 @@ impl Trainee for Trainer<'_> {
             return Ok(false);
         }
         (self.model.origin.step, self.model.origin.seconds) = (step, seconds);
-        let solid = self.model.visibility.as_ref().map_or(Vec::new(), Visibility::numbers);
-        let (entries, metadata) = self.model.entries(&solid);
+        let around = self.model.around();
+        let (entries, metadata) = self.model.entries(&around);
         checkpoint::save(self.checkpoints, &entries, metadata)?;
         Ok(true)
     }

@@ -1,8 +1,9 @@
 //! The light's stage of training: what is told apart at its beginning, its steps, and the updates of suns.
 
+use super::super::model::Around;
 use super::super::normal_maps::NormalMaps;
-use super::super::shading::{CHANNELS, LIGHT, SceneGradients, SceneLoss, Suns, TracedLight, Weights, gray};
-use super::super::sun::{self, Lit, SUN, Seen};
+use super::super::shading::{LIGHT, SceneGradients, SceneLoss, Suns, TracedLight, Weights, gray};
+use super::super::sun::{self, SUN, Seen};
 use super::super::visibility::Visibility;
 use super::{SETTLED, Trainer};
 use crate::error::Result;
@@ -16,7 +17,7 @@ use diorama_engine::train::StepReport;
 use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::Vec3;
 use diorama_geom::rng::Rng;
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 
 /// Streams of random numbers.
 const NOISE: u64 = 12;
@@ -24,8 +25,6 @@ const SUNS: u64 = 13;
 const TAUGHT: u64 = 14;
 /// Pixels from which the light of all lights together is told apart: most in all, least and most for each light.
 const TELLING: (usize, usize, usize) = (40_000, 1000, 6000);
-/// Pixels from which a sun is found anew.
-const PIXELS_PER_SUN: usize = 4000;
 /// Opacity from which a pixel shows a surface.
 const SURFACE: f32 = 0.9;
 /// Standard deviation of noise on the light that the shadow sees.
@@ -36,7 +35,7 @@ const TAUGHT_RAYS: usize = 3;
 /// Light that shadows are traced in, ray by ray, and what the shadow's head reads of it.
 #[derive(Default)]
 struct Taught {
-    /// `[R, 9]`, `[R, 9, 3]` and `[R, 9]`
+    /// `[R, 6]`, `[R, 9, 3]` and `[R, 9]`
     suns: Vec<f32>,
     skies: Vec<f32>,
     codes: Vec<f32>,
@@ -49,7 +48,7 @@ impl Trainer<'_> {
         let normals = NormalMaps::of(m, &self.cameras);
         let visibility = Visibility::of(&m.field, &m.occupancy, m.shaded_cube(), m.config.light.sun_cells);
         self.model.share_codes();
-        let (fitted, _) = sun::tell_apart(&self.seen(&normals), &visibility);
+        let (fitted, surfaces) = sun::tell_apart(&self.seen(&normals), &visibility, &mut |_| {});
         let m = &mut self.model;
         let is_apart = m.config.light.has_sun();
         for (l, found) in fitted.iter().enumerate() {
@@ -60,8 +59,9 @@ impl Trainer<'_> {
                 light.iter_mut().zip(sun::harmonics(&found.sun)).for_each(|(v, s)| *v += s);
             }
         }
-        (m.visibility, self.normals) = (Some(visibility), Some(normals));
+        (m.surroundings, self.normals) = (Some(Arc::new(Around { visibility, surfaces })), Some(normals));
         m.begin_light()?;
+        self.ambients = m.ambients();
         (m.began, m.median) = (step, 0.1);
         let scene = m.scene();
         let trainees = Trainees { occupancy: Some(&mut m.occupancy), ..Trainees::of(&mut m.field) };
@@ -104,44 +104,6 @@ impl Trainer<'_> {
         batch
     }
 
-    /// Finds suns anew if that is due.
-    fn update_suns(&mut self, share: f32) {
-        let due = self.model.config.light.sun_updates_by(share);
-        if due <= self.model.sun_updates {
-            return;
-        }
-        let pixels = self.lit_pixels();
-        let m = &mut self.model;
-        m.sun_updates = due;
-        let visibility = m.visibility.as_ref().expect("the light's stage");
-        for (l, pixels) in pixels.iter().enumerate() {
-            let known = Vec3::from_slice(&m.suns.values[SUN * l..]);
-            let found = sun::fit(pixels, visibility, Some(known));
-            m.suns.values[SUN * l..][..SUN].copy_from_slice(&found.sun);
-            m.lights.values[LIGHT * l..][..LIGHT].copy_from_slice(&found.sky);
-        }
-    }
-
-    /// Training pixels that show surfaces, by light.
-    fn lit_pixels(&self) -> Vec<Vec<Lit>> {
-        let (m, normals) = (&self.model, self.normals.as_ref().expect("the light's stage"));
-        let lights = m.light_count();
-        let mut batch = self.pixels(PIXELS_PER_SUN * lights);
-        let seen = m.tracer(Quality::Full).trace_layers(&mut batch, &[&[0.0; 9]], &mut FieldBuffers::default());
-        let mut out = vec![Vec::new(); lights];
-        for r in (0..batch.len()).filter(|r| batch.counts[*r] && seen.opacity[*r] > SURFACE) {
-            let normal = normals.at(batch.images[r] as usize, batch.pixels[2 * r], batch.pixels[2 * r + 1]);
-            if normal == Vec3::ZERO {
-                continue;
-            }
-            let albedo = Vec3::from_slice(&seen.rgb[r * CHANNELS..]) / seen.opacity[r];
-            let target = [0, 1, 2].map(|k| linear_from_srgb(batch.target[4 * r + k]));
-            let lit = Lit { point: point(&batch, &seen, r), normal, albedo, seen: Vec3::from(target), trust: 1.0 };
-            out[m.light_of[batch.images[r] as usize] as usize].push(lit);
-        }
-        out
-    }
-
     /// The lights of the rays; every [`TAUGHT_RAYS`]th ray has a sun of its own. Shadows read a little noise besides.
     fn taught(&self, light: &[u32], step: u64) -> Taught {
         let (m, rng, noise) = (&self.model, self.rng(TAUGHT, step), self.rng(NOISE, step));
@@ -158,8 +120,8 @@ impl Trainer<'_> {
                 let across = (1.0 - z * z).max(0.0).sqrt();
                 sun[..3].copy_from_slice(&[across * turn.cos(), across * turn.sin(), z]);
                 let (power, clear) = (2.0 * at(2), 0.3 + at(3));
-                sun[3..6].iter_mut().for_each(|v| *v *= power);
-                sun[6..].iter_mut().chain(&mut sky).for_each(|v| *v *= clear);
+                sun[3..].iter_mut().for_each(|v| *v *= power);
+                sky.iter_mut().for_each(|v| *v *= clear);
                 all = sky;
                 all.iter_mut().zip(sun::harmonics(&sun)).for_each(|(v, s)| *v += s);
             }
@@ -172,7 +134,6 @@ impl Trainer<'_> {
 
     /// One step of the light's stage.
     pub(super) fn relight(&mut self, step: u64, share: f32) -> Result<StepReport> {
-        self.update_suns(share);
         self.draw(step);
         let (n, mut drawn, c) = (self.batch.len(), self.drawn(), self.model.config.clone());
         let is_apart = c.light.has_sun();
@@ -185,8 +146,9 @@ impl Trainer<'_> {
         let normal = |r: usize| maps.at(self.batch.images[r] as usize, self.batch.pixels[2 * r], self.batch.pixels[2 * r + 1]);
         let normals: Vec<f32> = (0..n).flat_map(|r| normal(r).to_array()).collect();
         let (lights, suns) = (self.model.lights.values.clone(), self.model.suns.values.clone());
-        // Taken out of the model, whose field the step changes.
-        let visibility = self.model.visibility.take().expect("the light's stage");
+        // Apart from the model, whose field the step changes.
+        let around = self.model.surroundings.clone().expect("the light's stage");
+        let (visibility, ambients) = (&around.visibility, &self.ambients[..]);
         let origins = &self.batch.origins[..];
         let settled = step >= self.model.began + SETTLED;
         let loss = SceneLoss {
@@ -208,8 +170,8 @@ impl Trainer<'_> {
             lights: &lights,
             skies: &self.model.skies.values,
             gains: &self.model.gains.values,
-            suns: is_apart.then_some(Suns { values: &suns, visibility: &visibility, origins }),
-            traced: (!is_apart).then_some(TracedLight { suns: &taught.suns, skies: &taught.skies, visibility: &visibility, origins }),
+            suns: is_apart.then_some(Suns { values: &suns, ambients, visibility, origins }),
+            traced: (!is_apart).then_some(TracedLight { suns: &taught.suns, skies: &taught.skies, visibility, origins }),
             out: Mutex::default(),
         };
         let unread = vec![0.0; if is_apart { 9 * n } else { 0 }];
@@ -220,7 +182,6 @@ impl Trainer<'_> {
         let (field, occupancy) = (&mut self.model.field, Some(&mut self.model.occupancy));
         let done = self.device.step(&mut Trainees { occupancy, ..Trainees::of(field) }, None, &described, 1);
         let tables = loss.out.into_inner().expect("the step is over");
-        self.model.visibility = Some(visibility);
         let done = done?;
         if done.shown.loss.is_finite() {
             self.model.count(n, done.shown.trained);
@@ -229,21 +190,14 @@ impl Trainer<'_> {
         Ok(StepReport { loss: done.shown.loss, scalars: self.scalars(tables.mse, n, done.shown.trained) })
     }
 
-    /// One optimizer step of lights, skies, gains and suns.
+    /// One optimizer step of lights, skies and gains; where suns are apart, lights stay.
     fn update_lights(&mut self, step: u64, share: f32, tables: &SceneGradients) {
         let m = &mut self.model;
         m.median = 0.95 * m.median + 0.05 * tables.median;
-        let groups = [(&mut m.lights, &tables.lights), (&mut m.skies, &tables.skies), (&mut m.gains, &tables.gains)];
-        for (group, d) in groups.into_iter().chain((!tables.suns.is_empty()).then_some((&mut m.suns, &tables.suns))) {
+        let lights = (!m.config.light.has_sun()).then_some((&mut m.lights, &tables.lights));
+        for (group, d) in [(&mut m.skies, &tables.skies), (&mut m.gains, &tables.gains)].into_iter().chain(lights) {
             group.grads.copy_from_slice(d);
             group.step(step as u32 + 1, group.schedule.scale(share) * m.rate_scale);
-        }
-        // The direction has no gradient; light is not negative.
-        for (sun, sky) in m.suns.values.chunks_exact_mut(SUN).zip(m.lights.values.chunks_exact(LIGHT)) {
-            sun[3..6].iter_mut().for_each(|v| *v = v.max(0.0));
-            if !tables.suns.is_empty() {
-                sun::set_bounced(sun, sky);
-            }
         }
     }
 }
