@@ -141,7 +141,8 @@ impl Prepare {
 }
 
 fn print(made: &Prepared) {
-    let masks = made.static_share.map_or(String::new(), |s| format!(", masks leave {:.0} %", 100.0 * s));
+    let mut masks = made.static_share.map_or(String::new(), |s| format!(", masks leave {:.0} %", 100.0 * s));
+    made.glass_share.filter(|s| *s > 0.0).iter().for_each(|s| masks += &format!(", {:.1} % glass", 100.0 * s));
     println!(
         "{}: {} photographs of {} sessions, {} held out, {} undistorted, {} points{masks}",
         made.folder.display(),
