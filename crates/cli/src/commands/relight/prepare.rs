@@ -23,7 +23,7 @@ pub struct Prepare {
     /// Source of the poses: colmap or none
     #[arg(long, default_value = "colmap")]
     sfm: String,
-    /// Folder with a mask NAME.png for each photograph: 255 is static, 0 transient (people, cars, leaves)
+    /// Folder with a mask NAME.png for each photograph: 255 is static, 192 glass, 0 transient (people, cars, leaves)
     #[arg(long)]
     masks: Option<PathBuf>,
     /// exif (pauses of 30 minutes), names (before the number), folders, each, or a file with lines PHOTOGRAPH SESSION [default: as the
