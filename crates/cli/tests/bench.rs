@@ -96,6 +96,19 @@ fn tracing_and_rasterizing_are_measured() {
     assert_eq!(diorama(&["bench", "raster", "--repeats", "0"]).status.code(), Some(2));
 }
 
+#[test]
+fn tables_of_the_thesis_name_what_is_asked_wrongly() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    for (given, named) in
+        [(&["2"][..], "table 2"), (&["1", "--data", "sofa=/tmp"], "head, cape, ficus"), (&["4", "--data", "head"], "OBJECT=FOLDER")]
+    {
+        let o = diorama(&[&["bench", "thesis"], given, &["--quick", "-o", out.to_str().unwrap()]].concat());
+        let said = String::from_utf8_lossy(&o.stderr).into_owned();
+        assert!(o.status.code() == Some(2) && said.contains(named) && !out.exists(), "{given:?}: {said}");
+    }
+}
+
 fn listing(dir: &Path) -> Vec<String> {
     let mut names: Vec<String> = std::fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
     names.sort();

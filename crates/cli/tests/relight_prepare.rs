@@ -20,7 +20,8 @@ fn osr(root: &Path, radius: f64) {
         };
         let im = ImageU8 { width: 32, height: 24, channels: 3, data: (0..32 * 24 * 3).map(|k| (k * (i + 3) % 251) as u8).collect() };
         photo::save_png(&file("rgb", "png"), &im).unwrap();
-        let data = (0..32 * 24).map(|k| if k % 32 < 8 { 0 } else { 255 }).collect();
+        // What moved, glass, and the rest.
+        let data = (0..32 * 24).map(|k| [0, 192, 255, 255][k % 32 / 8]).collect();
         photo::save_png(&file("mask", "png"), &ImageU8 { channels: 1, data, ..im }).unwrap();
         let a = i as f64 * 0.3;
         let p = Pose::look_at(radius * DVec3::new(a.cos(), 0.2, a.sin()), DVec3::ZERO, DVec3::Y);
@@ -47,6 +48,7 @@ fn nerf_osr_folders_become_a_data_set() {
     let (code, text, made) = prepare(&source, &out, &[]);
     assert_eq!(code, Some(0), "{text}");
     assert_eq!((&made["photographs"], &made["sessions"], &made["held_out"]), (&8.into(), &2.into(), &2.into()));
+    assert_eq!((&made["static_share"], &made["glass_share"]), (&0.75.into(), &0.25.into()));
     let read = import::import(&out, &Default::default()).unwrap();
     assert_eq!(read.frames.iter().filter(|f| f.split == Split::Test).count(), 2);
     // Up was y there.
@@ -54,6 +56,8 @@ fn nerf_osr_folders_become_a_data_set() {
     assert!(
         read.frames.iter().all(|f| (f.world_from_camera.translation.length() - 0.7 * (1.04f64).sqrt()).abs() < 1e-6 && f.mask.is_some())
     );
+    let mask = photo::load(read.frames[0].mask.as_ref().unwrap()).unwrap();
+    assert_eq!([4, 12, 20].map(|x| mask.pixel(x, 5)[0]), [0, 192, 255]);
     // Once more: only with leave.
     let (code, text, _) = prepare(&source, &out, &[]);
     assert!(code == Some(2) && text.contains("--force"), "{text}");

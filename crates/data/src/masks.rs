@@ -6,6 +6,7 @@ use diorama_geom::capture::{Frame, MaskMeaning, MaskRule};
 use diorama_geom::{Image, ImageU8};
 use rayon::prelude::*;
 use std::collections::HashMap;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 /// Folder names that may contain masks.
@@ -15,6 +16,9 @@ const EXAMINED_MASKS: usize = 16;
 const EXAMINED_PX: usize = 96;
 /// Mask values from this on are kept.
 pub const COUNTS: u8 = 128;
+/// Mask values of glass, which masks mark with 192: it is kept as a surface, but what it mirrors and lets through tells nothing about the
+/// light on it. Around 192, because masks are resampled.
+pub const GLASS: RangeInclusive<u8> = 176..=208;
 /// Masks show one object if they keep at most this share of the picture and at most this share of its border.
 const OBJECT: (f64, f64) = (0.6, 0.1);
 /// Masks are considered identical if at most this share of their pixels differs.

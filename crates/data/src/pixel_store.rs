@@ -230,6 +230,11 @@ impl PixelStore {
         self.masks[i].as_ref().is_none_or(|m| m[self.square(i, x, y)] >= COUNTS)
     }
 
+    /// Whether such a pixel shows glass.
+    pub fn is_glass(&self, i: usize, x: u32, y: u32) -> bool {
+        self.masks[i].as_ref().is_some_and(|m| masks::GLASS.contains(&m[self.square(i, x, y)]))
+    }
+
     /// Edge of the squares of which one pixel is kept; 1: all pixels are kept.
     pub fn stride(&self) -> u32 {
         self.stride
@@ -440,7 +445,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let mut f = frame(dir.path(), "a.png", 4, 1, 0);
         let mask = dir.path().join("m.png");
-        photo::save_png(&mask, &ImageU8 { width: 4, height: 1, channels: 1, data: vec![0, 255, 0, 255] }).unwrap();
+        photo::save_png(&mask, &ImageU8 { width: 4, height: 1, channels: 1, data: vec![0, 255, 100, 192] }).unwrap();
         f.mask = Some(mask);
         let s = PixelStore::load(
             &[&f],
@@ -449,5 +454,6 @@ mod tests {
         )
         .unwrap();
         assert_eq!([0, 1, 2, 3].map(|x| s.counts(0, x, 0)), [false, true, false, true]);
+        assert_eq!([0, 1, 2, 3].map(|x| s.is_glass(0, x, 0)), [false, false, false, true]);
     }
 }

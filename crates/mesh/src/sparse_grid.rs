@@ -45,8 +45,9 @@ pub fn bytes(blocks: usize) -> u64 {
 }
 
 impl SparseGrid {
-    /// Evaluates a field in `blocks` (see [`candidates`]); `progress` receives the blocks done and their number.
-    pub fn sample(field: &dyn FieldQuery, grid: &Grid, blocks: &[[i32; 3]], progress: &mut dyn FnMut(usize, usize)) -> SparseGrid {
+    /// Evaluates a field in `blocks` (see [`candidates`]); `progress` receives the blocks done and their number, and stops
+    /// the work by returning false.
+    pub fn sample(field: &dyn FieldQuery, grid: &Grid, blocks: &[[i32; 3]], progress: &mut dyn FnMut(usize, usize) -> bool) -> SparseGrid {
         let (cell, limits) = (grid.cell(), grid.points());
         let mut out = HashMap::with_capacity(blocks.len());
         let (mut points, mut sigma) = (Vec::with_capacity(AT_ONCE * POINTS), vec![0.0; AT_ONCE * POINTS]);
@@ -72,7 +73,9 @@ impl SparseGrid {
                 }
                 out.insert(*b, values);
             }
-            progress(i * AT_ONCE + part.len(), blocks.len());
+            if !progress(i * AT_ONCE + part.len(), blocks.len()) {
+                break;
+            }
         }
         SparseGrid { grid: *grid, blocks: out }
     }
@@ -228,7 +231,7 @@ mod tests {
             field.distance(center) < radius + 0.2
         };
         let (some, all) = (candidates(grid, &may_hold), candidates(grid, &|_, _| true));
-        (SparseGrid::sample(field, grid, &some, &mut |_, _| {}), some.len(), all.len())
+        (SparseGrid::sample(field, grid, &some, &mut |_, _| true), some.len(), all.len())
     }
 
     #[test]

@@ -1,17 +1,19 @@
 //! The scene model on a small generated place: it learns, is interrupted and resumed to the same bits, and its layers are rendered.
 
+use diorama_data::photo;
 use diorama_engine::train::Event;
 use diorama_geom::glam::{DAffine3, DVec3};
 use diorama_geom::model::{Instance, Material, Part};
 use diorama_geom::view_controls::{ControlInput, ControlValue, ControlValues, check_lists};
 use diorama_geom::view_source::{ViewRequest, ViewSource};
-use diorama_geom::{Camera, Mesh, Model, Pose};
+use diorama_geom::{Camera, ImageU8, Mesh, Model, Pose};
 use diorama_pipelines::relight::outdoor::config::{Config, Preset};
 use diorama_pipelines::relight::outdoor::model::SceneModel;
 use diorama_pipelines::relight::outdoor::pictures::{self, Layer, PicturesOptions};
 use diorama_pipelines::relight::outdoor::{recipe, scores, viewing};
 use diorama_pipelines::relight::synth::{self, Place, SynthOptions};
 use diorama_pipelines::run::RunFolder;
+use std::ops::Range;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -201,4 +203,56 @@ fn photographs_of_one_light_are_warned_about() {
     })
     .unwrap();
     assert!(notes.iter().any(|n| n.contains("ambiguous")), "{notes:?}");
+}
+
+/// A place whose photographs have masks, the right half of which is glass.
+fn glaze(data: &Path) {
+    std::fs::create_dir(data.join("masks")).unwrap();
+    for entry in std::fs::read_dir(data.join("images")).unwrap().flatten() {
+        let mask = (0..24 * 16).map(|i| if i % 24 < 12 { 255 } else { 192 }).collect();
+        let mask = ImageU8 { width: 24, height: 16, channels: 1, data: mask };
+        photo::save_png(&data.join("masks").join(entry.file_name()), &mask).unwrap();
+    }
+}
+
+/// Turns the colors of some columns of all photographs around.
+fn repaint(data: &Path, columns: Range<usize>) {
+    for entry in std::fs::read_dir(data.join("images")).unwrap().flatten() {
+        let mut image = photo::load(&entry.path()).unwrap();
+        let (w, channels) = (image.width, image.channels);
+        image.data.iter_mut().enumerate().filter(|(i, _)| columns.contains(&(i / channels % w))).for_each(|(_, v)| *v = 255 - *v);
+        photo::save_png(&entry.path(), &image).unwrap();
+    }
+}
+
+#[test]
+fn what_glass_mirrors_teaches_no_light() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("data");
+    generate(&data, 5, (24, 16));
+    glaze(&data);
+    let mut config = config(&data, 12);
+    (config.light.from, config.light.model, config.light.sun_cells, config.loss.depth) = (0.25, "sun".into(), 16, 0.0);
+    (config.run.log_every, config.sampling.max_samples, config.sampling.rays) = (1, 16, 128);
+    // Stopped as soon as surfaces are learned, then gone on with after columns of the photographs were repainted.
+    let train = |name: &str, columns: Range<usize>| {
+        let at = dir.path().join(name);
+        let stop = AtomicBool::new(false);
+        let mut folder = RunFolder::create(&at, false).unwrap();
+        let stopped = recipe::train(&config, &mut folder, false, None, &stop, &mut |e| {
+            if let Event::Progress { step, .. } = e {
+                stop.store(*step >= 3, Ordering::Relaxed);
+            }
+        });
+        assert!(stopped.unwrap().summary.interrupted);
+        drop(folder);
+        repaint(&data, columns.clone());
+        let done = recipe::train(&config, &mut RunFolder::open(&at).unwrap().0, true, None, &AtomicBool::new(false), &mut |_| {});
+        repaint(&data, columns);
+        let model = done.unwrap().model;
+        (model.field.weights.values.clone(), model.lights.values.clone(), model.suns.values.clone())
+    };
+    let plain = train("plain", 0..0);
+    assert!(plain == train("glass", 12..24), "what glass shows changes the light");
+    assert!(plain != train("wall", 0..12), "what walls show changes nothing");
 }

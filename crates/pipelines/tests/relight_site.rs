@@ -6,7 +6,7 @@ use diorama_data::{model_file, photo};
 use diorama_geom::capture::{Frame, Split};
 use diorama_geom::glam::DVec3;
 use diorama_geom::sh_light::ShLight;
-use diorama_geom::{Camera, Capture, Pose, SceneBox, SparsePoint};
+use diorama_geom::{Camera, Capture, ImageU8, Pose, SceneBox, SparsePoint};
 use diorama_mesh::extract::Method;
 use diorama_pipelines::relight::fit_light::{self, FitOptions, Region};
 use diorama_pipelines::relight::meshing::{self, MeshOptions};
@@ -76,6 +76,8 @@ fn a_site_becomes_a_mesh() {
     assert_eq!((image.width, image.height), (128, 128));
     assert!(image.data.chunks_exact(3).all(|p| p.iter().all(|v| v.abs_diff(188) < 6)), "{:?}", &image.data[..9]);
 
+    the_glazed_roof_is_a_part_of_its_own(dir, &options);
+
     let stopped =
         meshing::mesh(model, &MeshOptions { out: dir.join("no.glb"), ..options.clone() }, &AtomicBool::new(true), &mut |_, _, _| {});
     assert!(stopped.unwrap().is_none() && !dir.join("no.glb").exists());
@@ -90,6 +92,38 @@ fn a_site_becomes_a_mesh() {
         assert!(e.is_input() && e.to_string().contains(name), "{e}");
     }
     assert!(!dir.join("e.glb").exists());
+}
+
+/// Masks mark the roof of the box as glass, in front of cameras that look down on it.
+fn the_glazed_roof_is_a_part_of_its_own(dir: &Path, options: &MeshOptions) {
+    let mut model = model();
+    for (i, f) in model.capture.frames.iter_mut().enumerate() {
+        let c = f.camera;
+        let value = |p: usize| {
+            let d = f.world_from_camera.rotation * c.direction((p % 40) as f64 + 0.5, (p / 40) as f64 + 0.5);
+            let from = f.world_from_camera.translation;
+            let at = from + d * ((1.6 - from.z) / d.z);
+            if d.z < 0.0 && at.x.abs() < 1.2 && at.y.abs() < 1.0 { 192 } else { 255 }
+        };
+        let mask = dir.join(format!("mask{i}.png"));
+        photo::save_png(&mask, &ImageU8 { width: 40, height: 30, channels: 1, data: (0..1200).map(value).collect() }).unwrap();
+        f.mask = Some(mask);
+    }
+    let glazed = MeshOptions { out: dir.join("glazed.glb"), resolution: 48, quantize: false, ..options.clone() };
+    // One is gone, which is said.
+    std::fs::remove_file(dir.join("mask0.png")).unwrap();
+    let made = meshing::mesh(&model, &glazed, &AtomicBool::new(false), &mut |_, _, _| {}).unwrap().unwrap();
+    for file in [&made.file, &made.lods[0]] {
+        let read = model_file::read(file).unwrap().model;
+        let [walls, panes] = &read.parts[..] else { panic!("{} parts", read.parts.len()) };
+        let glass = &read.materials[panes.material];
+        assert!(glass.name == "glass" && glass.roughness < 0.1 && glass.base_color[0] < 0.1 && glass.metallic == 0.0, "{glass:?}");
+        assert!(read.materials[walls.material].base_color_texture.is_some());
+        let height = |m: &diorama_geom::Mesh| m.positions.iter().map(|p| p[2] as f64).sum::<f64>() / m.positions.len() as f64;
+        assert!(height(&panes.mesh) > 1.4 && height(&walls.mesh) < 1.3, "{} {}", height(&panes.mesh), height(&walls.mesh));
+    }
+    assert!(made.glass * 10 > made.faces && made.glass * 2 < made.faces, "{made:?}");
+    assert!(made.notes[0].contains("1 of 9 masks are gone"), "{:?}", made.notes);
 }
 
 /// The model's own picture in a known light is explained by that light.
@@ -109,6 +143,24 @@ fn the_light_of_a_photograph_is_found() {
     let rest = f.rest_psnr.unwrap();
     assert!(f.fitted_psnr > 35.0 && rest > 30.0 && rest > f.mean_light_rest_psnr.unwrap() + 3.0, "{f:?}");
     assert!(fit(&FitOptions { region: Region::All, ..options.clone() }).unwrap().unwrap().rest_psnr.is_none());
+
+    // A pane that mirrors something bright spoils the light, unless a mask says that it is glass.
+    let pane = |x: usize| (4..18).contains(&x);
+    let mut glazed = photo::load(&file).unwrap();
+    let (w, channels) = (glazed.width, glazed.channels);
+    glazed.data.iter_mut().enumerate().filter(|(i, _)| pane(i / channels % w)).for_each(|(_, v)| *v = v.saturating_add(40));
+    let mirrored = dir.join("mirrored.png");
+    photo::save_png(&mirrored, &glazed).unwrap();
+    let mirrored = FitOptions { photo: mirrored, ..options.clone() };
+    let spoiled = fit(&mirrored).unwrap().unwrap().rest_psnr.unwrap();
+    let mask = dir.join("pane.png");
+    let data = (0..1200).map(|p| if pane(p % 40) { 192 } else { 255 }).collect();
+    photo::save_png(&mask, &ImageU8 { width: 40, height: 30, channels: 1, data }).unwrap();
+    let mut masked = self::model();
+    masked.capture.frames[frame].mask = Some(mask);
+    let told = fit_light::fit(&masked, &mirrored, &AtomicBool::new(false), &mut |_| {}).unwrap().unwrap();
+    let (fitted, left) = (told.fitted_psnr, told.rest_psnr.unwrap());
+    assert!(fitted > 35.0 && left > 30.0 && left > spoiled + 5.0, "{fitted} {left} {spoiled}");
 
     // The same camera from a file.
     let c = model.capture.frames[frame].camera;

@@ -1,5 +1,5 @@
-//! `diorama bench`: each op against the machine's measured limits, the stages of a training step, networks, and the speed of rendering,
-//! path tracing and rasterization.
+//! `diorama bench`: each op against the machine's measured limits, the stages of a training step, networks, the speed of rendering,
+//! path tracing and rasterization, and tables of the thesis.
 
 pub mod check;
 #[cfg(feature = "gpu")]
@@ -12,6 +12,7 @@ pub mod raster;
 pub mod reduce;
 pub mod render;
 pub mod tetrahedra;
+pub mod thesis;
 pub mod train;
 
 use std::time::Instant;

@@ -65,7 +65,7 @@ pub fn run(resolution: usize, target: usize, folder: &Path) -> Result<ReduceRepo
         hills.distance(center).min(hills.floater_distance(center)) < radius
     };
     let blocks = sparse_grid::candidates(&grid, &may_hold);
-    let sampled = SparseGrid::sample(&hills, &grid, &blocks, &mut |_, _| {});
+    let sampled = SparseGrid::sample(&hills, &grid, &blocks, &mut |_, _| true);
     lap();
     let mut mesh = sampled.surface(hills::LEVEL, Method::Cubes, true);
     drop(sampled);

@@ -9,6 +9,7 @@ mod raster;
 mod reduce;
 mod render;
 mod tetrahedra;
+mod thesis;
 mod train;
 
 use super::Verb;
@@ -23,6 +24,7 @@ pub enum Bench {
     Mesh(mesh::Mesh),
     Reduce(reduce::Reduce),
     Tetrahedra(tetrahedra::Tetrahedra),
+    Thesis(thesis::Thesis),
     Nets(nets::Nets),
     PathTrace(path_trace::PathTrace),
     Raster(raster::RasterBench),
@@ -39,6 +41,7 @@ impl Bench {
             Bench::Mesh(v) => v,
             Bench::Reduce(v) => v,
             Bench::Tetrahedra(v) => v,
+            Bench::Thesis(v) => v,
             Bench::Nets(v) => v,
             Bench::PathTrace(v) => v,
             Bench::Raster(v) => v,

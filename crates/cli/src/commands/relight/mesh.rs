@@ -113,6 +113,9 @@ fn print(made: &Meshed) {
         made.removed.small,
         made.seconds
     );
+    if made.glass > 0 {
+        println!("{} faces are glass", made.glass);
+    }
     for c in &made.candidates {
         println!("density {:.2}: depth differs by {:.2} % from the rendered one", c.level, 100.0 * c.depth_error);
     }

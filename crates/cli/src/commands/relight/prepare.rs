@@ -23,7 +23,7 @@ pub struct Prepare {
     /// Source of the poses: colmap or none
     #[arg(long, default_value = "colmap")]
     sfm: String,
-    /// Folder with a mask NAME.png for each photograph: 255 is static, 0 transient (people, cars, leaves)
+    /// Folder with a mask NAME.png for each photograph: 255 is static, 192 glass, 0 transient (people, cars, leaves)
     #[arg(long)]
     masks: Option<PathBuf>,
     /// exif (pauses of 30 minutes), names (before the number), folders, each, or a file with lines PHOTOGRAPH SESSION [default: as the
@@ -141,7 +141,8 @@ impl Prepare {
 }
 
 fn print(made: &Prepared) {
-    let masks = made.static_share.map_or(String::new(), |s| format!(", masks leave {:.0} %", 100.0 * s));
+    let mut masks = made.static_share.map_or(String::new(), |s| format!(", masks leave {:.0} %", 100.0 * s));
+    made.glass_share.filter(|s| *s > 0.0).iter().for_each(|s| masks += &format!(", {:.1} % glass", 100.0 * s));
     println!(
         "{}: {} photographs of {} sessions, {} held out, {} undistorted, {} points{masks}",
         made.folder.display(),

@@ -90,7 +90,7 @@ fn base(coarse: &SparseGrid) -> f32 {
 pub(super) fn candidates(field: &SurfaceField, grid: &Grid, frames: &[&Frame]) -> Vec<Candidate> {
     let coarse = Grid { resolution: grid.resolution.min(RESOLUTION), ..*grid };
     let blocks = sparse_grid::candidates(&coarse, &|lo, hi| field.may_hold(lo, hi));
-    let sampled = SparseGrid::sample(field, &coarse, &blocks, &mut |_, _| {});
+    let sampled = SparseGrid::sample(field, &coarse, &blocks, &mut |_, _| true);
     let (views, base) = (depth_views(field, frames, CAMERAS, VIEW_PX), base(&sampled));
     let of = |factor: &f32| {
         let level = base * factor;

@@ -1,8 +1,10 @@
 //! Mesh of a trained scene: surface of the density, albedo as a texture, in a GLB that any renderer lights.
 
+mod glass;
 mod level;
 pub mod surface;
 
+use glass::GlassViews;
 pub use level::Candidate;
 
 use super::outdoor::model::SceneModel;
@@ -13,7 +15,7 @@ use diorama_data::{DataError, memory};
 use diorama_engine::samplers::occupancy::MIN_STEP;
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::DVec3;
-use diorama_geom::{Camera, Mesh, Model, Pose};
+use diorama_geom::{Camera, Mesh, Pose};
 use diorama_mesh::extract::{Grid, Method};
 use diorama_mesh::sparse_grid::{self, SparseGrid};
 use diorama_mesh::{atlas, bake, simplify};
@@ -65,6 +67,8 @@ pub struct Meshed {
     pub lods: Vec<PathBuf>,
     pub vertices: usize,
     pub faces: usize,
+    /// Faces that masks mark as glass.
+    pub glass: usize,
     /// Faces before cleaning and reduction.
     pub extracted: usize,
     pub removed: surface::Removed,
@@ -103,7 +107,13 @@ pub fn mesh(
     if is_stopped() {
         return Ok(None);
     }
-    let sampled = SparseGrid::sample(&field, &grid, &blocks, &mut |i, n| progress("density", i, n));
+    let sampled = SparseGrid::sample(&field, &grid, &blocks, &mut |i, n| {
+        progress("density", i, n);
+        !is_stopped()
+    });
+    if is_stopped() {
+        return Ok(None);
+    }
     let mut mesh = sampled.surface(level, o.method, o.interpolate);
     drop(sampled);
     let extracted = mesh.faces.len();
@@ -128,12 +138,16 @@ pub fn mesh(
         return Ok(None);
     }
     to_capture(model, &mut mesh);
-    let lods = write(&mesh, o)?;
+    let slack = surface::SLACK * grid.cell() / model.capture.world_from_capture.scale as f32;
+    let mut views = GlassViews::read(model, &spread(&frames), slack)?;
+    notes.extend(views.note.take());
+    let (lods, glass) = write(&mesh, &views, o)?;
     Ok(Some(Meshed {
         file: o.out.clone(),
         lods,
         vertices: mesh.positions.len(),
         faces: mesh.faces.len(),
+        glass,
         extracted,
         removed,
         level,
@@ -205,10 +219,14 @@ fn grid(field: &SurfaceField, frames: &[&Frame], o: &MeshOptions) -> Result<Grid
     Ok(Grid { min, max, resolution: o.resolution })
 }
 
-/// At most [`CAMERAS`] cameras, spread over all.
-fn cameras(frames: &[&Frame]) -> Vec<(Camera, Pose)> {
+/// At most [`CAMERAS`] frames, spread over all.
+fn spread<'a>(frames: &[&'a Frame]) -> Vec<&'a Frame> {
     let n = frames.len().min(CAMERAS);
-    (0..n).map(|i| frames[i * frames.len() / n]).map(|f| (f.camera, f.world_from_camera)).collect()
+    (0..n).map(|i| frames[i * frames.len() / n]).collect()
+}
+
+fn cameras(frames: &[&Frame]) -> Vec<(Camera, Pose)> {
+    spread(frames).into_iter().map(|f| (f.camera, f.world_from_camera)).collect()
 }
 
 /// A texture of the albedo that short rays meet.
@@ -233,17 +251,18 @@ fn lod_path(out: &Path, lod: usize) -> PathBuf {
     out.with_extension(format!("lod{lod}.glb"))
 }
 
-/// Writes the mesh and its coarser copies, which share the texture coordinates; returns the files of the copies.
-fn write(mesh: &Mesh, o: &MeshOptions) -> Result<Vec<PathBuf>> {
+/// Writes the mesh and its coarser copies, which share the texture coordinates; returns the files of the copies, and the mesh's faces of glass.
+fn write(mesh: &Mesh, glass: &GlassViews, o: &MeshOptions) -> Result<(Vec<PathBuf>, usize)> {
     let options = WriteOptions { quantize: o.quantize };
     let name = o.out.file_stem().map_or("site".into(), |s| s.to_string_lossy().into_owned());
     let (mut coarser, mut files) = (mesh.clone(), Vec::new());
     for lod in 1..=o.lods {
         simplify::collapse(&mut coarser, mesh.faces.len() / LOD_FACTOR.pow(lod as u32));
         let file = lod_path(&o.out, lod);
-        gltf::save(&file, &Model::of(&name, coarser.clone()), options)?;
+        gltf::save(&file, &glass.model(&name, coarser.clone()).0, options)?;
         files.push(file);
     }
-    gltf::save(&o.out, &Model::of(&name, mesh.clone()), options)?;
-    Ok(files)
+    let (model, panes) = glass.model(&name, mesh.clone());
+    gltf::save(&o.out, &model, options)?;
+    Ok((files, panes))
 }

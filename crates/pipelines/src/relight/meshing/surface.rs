@@ -9,7 +9,7 @@ const SEEN_BY: usize = 3;
 /// Components with a smaller share of the area are removed.
 const SMALL: f64 = 1e-3;
 /// Error of the surface in cells, for visibility.
-const SLACK: f32 = 1.5;
+pub(super) const SLACK: f32 = 1.5;
 
 /// Faces removed, by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]

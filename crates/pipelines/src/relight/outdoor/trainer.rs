@@ -157,7 +157,7 @@ impl<'a> Trainer<'a> {
         let (near, cube) = (m.config.sampling.near, m.cube());
         let o = DrawOptions { cameras: &self.cameras, first: m.rays, rng, near, cube, error_map: None, observations: &[] };
         self.batch.resize(rays);
-        pixels::draw(&self.photographs, &o, &mut self.batch);
+        pixels::draw(&WithoutGlass(&self.photographs), &o, &mut self.batch);
     }
 
     /// What the losses read of the drawn rays.
@@ -233,6 +233,30 @@ impl Trainer<'_> {
         let march = m.occupancy.march_config(m.config.sampling.max_samples);
         let placement = Placement::Occupancy { march, pruning: m.pruning() };
         Step { progress: share, rate_scale: m.rate_scale, ..Step::new(step, m.rays, RaySource::Given(given), placement, loss) }
+    }
+}
+
+/// Pixels that do not show glass: what glass mirrors tells nothing about its albedo, shadow and light.
+struct WithoutGlass<'a>(&'a StoredPhotographs);
+
+impl PixelSource for WithoutGlass<'_> {
+    fn images(&self) -> usize {
+        self.0.images()
+    }
+    fn size(&self, image: usize) -> (u32, u32) {
+        self.0.size(image)
+    }
+    fn snap(&self, image: usize, x: u32, y: u32) -> (u32, u32) {
+        self.0.snap(image, x, y)
+    }
+    fn stride(&self) -> u32 {
+        self.0.stride()
+    }
+    fn rgba(&self, image: usize, x: u32, y: u32) -> [f32; 4] {
+        self.0.rgba(image, x, y)
+    }
+    fn counts(&self, image: usize, x: u32, y: u32) -> bool {
+        self.0.counts(image, x, y) && !self.0.store().is_glass(image, x, y)
     }
 }
 

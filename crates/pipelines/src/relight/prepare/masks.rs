@@ -1,5 +1,6 @@
-//! Masks of what moved: 255 is static, 0 transient.
+//! Masks of what moved: 255 is static, 0 transient, 192 static glass.
 
+use diorama_data::masks::GLASS;
 use diorama_data::{DataError, Result, photo};
 use diorama_geom::ImageU8;
 use std::path::{Path, PathBuf};
@@ -65,6 +66,11 @@ pub fn read(file: &Path, image: &Path) -> Result<ImageU8> {
 /// Share of a mask that is static.
 pub fn static_share(mask: &ImageU8) -> f64 {
     mask.data.iter().filter(|v| **v >= STATIC).count() as f64 / mask.data.len().max(1) as f64
+}
+
+/// Share of a mask that is glass.
+pub fn glass_share(mask: &ImageU8) -> f64 {
+    mask.data.iter().filter(|v| GLASS.contains(v)).count() as f64 / mask.data.len().max(1) as f64
 }
 
 fn covers(share: f64) -> String {

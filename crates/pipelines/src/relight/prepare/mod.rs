@@ -38,7 +38,7 @@ pub struct PrepareOptions {
     pub input: PathBuf,
     pub out: PathBuf,
     pub sfm: Sfm,
-    /// Folder with a mask for each photograph, 255 static.
+    /// Folder with a mask for each photograph: 255 is static, 192 static glass, 0 what moved.
     pub masks: Option<PathBuf>,
     /// None: as the capture says, else by names.
     pub sessions: Option<SessionRule>,
@@ -73,6 +73,8 @@ pub struct Prepared {
     pub sessions: usize,
     /// Mean share of the photographs that masks leave; none without masks.
     pub static_share: Option<f64>,
+    /// Mean share of the photographs that is glass, a part of the former.
+    pub glass_share: Option<f64>,
     pub undistorted: usize,
     pub held_out: usize,
     pub points: usize,
@@ -86,8 +88,8 @@ struct Source {
     points: Vec<SparsePoint>,
     /// Whether masks in the frames are NeRF-OSR's or those of `--masks`: 255 static.
     rule: MaskRule,
-    /// Share that each such mask leaves.
-    static_shares: Vec<f64>,
+    /// Shares of each such mask.
+    shares: Vec<Shares>,
     lost: Vec<String>,
     has_own_split: bool,
     rescale: bool,
@@ -140,12 +142,12 @@ fn given(o: &PrepareOptions) -> Result<Source> {
     }
     let with = frames.iter().filter_map(|f| f.mask.clone().map(|m| (m, f.image.clone())));
     let is_static = rule.meaning == MaskMeaning::Unknown && !rule.inverted;
-    let static_shares = if is_static { static_shares(with)? } else { Vec::new() };
+    let shares = if is_static { shares(with)? } else { Vec::new() };
     if let (Some((frame, radius)), false) = (world::outside(&frames), o.rescale) {
         let what = format!("its camera is {radius:.2} from the origin, outside of the unit sphere; give --rescale");
         return Err(DataError::input(&frame.image, what).into());
     }
-    Ok(Source { frames, points, rule, static_shares, lost: Vec::new(), has_own_split: true, rescale: o.rescale, notes })
+    Ok(Source { frames, points, rule, shares, lost: Vec::new(), has_own_split: true, rescale: o.rescale, notes })
 }
 
 /// Photographs without poses, with their sessions and masks.
@@ -153,7 +155,7 @@ struct Photographs {
     files: Vec<PathBuf>,
     sessions: Vec<u32>,
     masks: Option<Vec<PathBuf>>,
-    static_shares: Vec<f64>,
+    shares: Vec<Shares>,
     /// Whether they lie in subfolders.
     in_folders: bool,
 }
@@ -166,8 +168,8 @@ fn photographs(o: &PrepareOptions) -> Result<Photographs> {
     let sessions = sessions::assign(&rule, &files)?;
     let masks = o.masks.as_ref().map(|folder| masks::files(folder, &files)).transpose()?;
     let with = masks.iter().flatten().cloned().zip(files.iter().cloned());
-    let static_shares = static_shares(with)?;
-    Ok(Photographs { files, sessions, masks, static_shares, in_folders })
+    let shares = shares(with)?;
+    Ok(Photographs { files, sessions, masks, shares, in_folders })
 }
 
 fn of_subfolders(input: &Path) -> Result<Vec<PathBuf>> {
@@ -247,13 +249,14 @@ fn posed(p: Photographs, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut 
     let lost = p.files.iter().zip(&has_pose).filter(|(_, has)| !**has);
     let lost = lost.map(|(p, _)| p.file_name().unwrap_or_default().to_string_lossy().into_owned()).collect();
     let rule = MaskRule { meaning: MaskMeaning::Unknown, inverted: false };
-    let (points, static_shares) = (capture.points, p.static_shares);
-    Ok(Some(Source { frames, points, rule, static_shares, lost, has_own_split: false, rescale: true, notes: Vec::new() }))
+    let (points, shares) = (capture.points, p.shares);
+    Ok(Some(Source { frames, points, rule, shares, lost, has_own_split: false, rescale: true, notes: Vec::new() }))
 }
 
 /// Writes photographs, masks and the description; none when interrupted.
 fn complete(mut s: Source, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Prepared>> {
-    let shares = std::mem::take(&mut s.static_shares);
+    let shares = std::mem::take(&mut s.shares);
+    let mean = |of: fn(&Shares) -> f64| (!shares.is_empty()).then(|| shares.iter().map(of).sum::<f64>() / shares.len() as f64);
     let up = o.up.unwrap_or_else(|| world::mean_up(&s.frames));
     world::place(&mut s.frames, &mut s.points, up, s.rescale);
     if !(s.has_own_split && o.split == SplitRule::File) {
@@ -291,7 +294,8 @@ fn complete(mut s: Source, o: &PrepareOptions, interrupt: &AtomicBool, note: &mu
         photographs: capture.frames.len(),
         lost: s.lost,
         sessions: sessions.len(),
-        static_share: (!shares.is_empty()).then(|| shares.iter().sum::<f64>() / shares.len() as f64),
+        static_share: mean(|s| s.fixed),
+        glass_share: mean(|s| s.glass),
         undistorted,
         held_out: capture.indices(Split::Test).len(),
         points: s.points.len(),
@@ -299,14 +303,21 @@ fn complete(mut s: Source, o: &PrepareOptions, interrupt: &AtomicBool, note: &mu
     }))
 }
 
-/// Share that each mask, given with its photograph, leaves.
-fn static_shares(all: impl Iterator<Item = (PathBuf, PathBuf)>) -> Result<Vec<f64>> {
-    let share = |(file, image): (PathBuf, PathBuf)| -> Result<(PathBuf, f64)> {
+/// Parts of a mask.
+struct Shares {
+    /// Static, glass included.
+    fixed: f64,
+    glass: f64,
+}
+
+/// Shares of each mask, given with its photograph.
+fn shares(all: impl Iterator<Item = (PathBuf, PathBuf)>) -> Result<Vec<Shares>> {
+    let of = |(file, image): (PathBuf, PathBuf)| -> Result<(PathBuf, Shares)> {
         let mask = masks::read(&file, &image)?;
-        Ok((file, masks::static_share(&mask)))
+        Ok((file, Shares { fixed: masks::static_share(&mask), glass: masks::glass_share(&mask) }))
     };
-    let all = all.map(share).collect::<Result<Vec<_>>>()?;
-    masks::check_together(&all)?;
+    let all = all.map(of).collect::<Result<Vec<_>>>()?;
+    masks::check_together(&all.iter().map(|(file, s)| (file.clone(), s.fixed)).collect::<Vec<_>>())?;
     Ok(all.into_iter().map(|m| m.1).collect())
 }
 

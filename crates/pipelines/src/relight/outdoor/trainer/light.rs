@@ -5,7 +5,7 @@ use super::super::normal_maps::NormalMaps;
 use super::super::shading::{LIGHT, SceneGradients, SceneLoss, Suns, TracedLight, Weights, gray};
 use super::super::sun::{self, SUN, Seen};
 use super::super::visibility::Visibility;
-use super::{SETTLED, Trainer};
+use super::{SETTLED, Trainer, WithoutGlass};
 use crate::error::Result;
 use diorama_engine::fields::FieldBuffers;
 use diorama_engine::renderers::traced::Traced;
@@ -100,7 +100,7 @@ impl Trainer<'_> {
         let o = DrawOptions { cameras: &self.cameras, first: m.rays, rng, near, cube, error_map: None, observations: &[] };
         let mut batch = RayBatch::default();
         batch.resize(n);
-        pixels::draw(&self.photographs, &o, &mut batch);
+        pixels::draw(&WithoutGlass(&self.photographs), &o, &mut batch);
         batch
     }
 
