@@ -125,7 +125,9 @@ fn a_killed_run_of_the_object_model_ends_with_the_same_bits() {
     let set = ["run.log_every=1", "run.save_every_seconds=0.01"];
     let begin = |run, glb| settings(&[&object[..], &["--run", run, "-o", glb]].concat(), &set);
     // The name of a file is in it.
-    ["a", "b"].map(|folder| std::fs::create_dir(at.join(folder)).unwrap());
+    for folder in ["a", "b"] {
+        std::fs::create_dir(at.join(folder)).unwrap();
+    }
     done(at, &begin("whole", "a/o.glb"));
     let resume = ["object", "--resume", "--run", "killed", "-o", "b/o.glb", "--score-spp", "0"];
     // Once in each stage.

@@ -8,7 +8,6 @@ use diorama_geom::view_controls::{ControlInput, ControlValue, ControlValues, che
 use diorama_geom::view_source::{ViewRequest, ViewSource};
 use diorama_geom::{Camera, ImageU8, Mesh, Model, Pose};
 use diorama_pipelines::relight::outdoor::config::{Config, Preset};
-use diorama_pipelines::relight::outdoor::model::SceneModel;
 use diorama_pipelines::relight::outdoor::pictures::{self, Layer, PicturesOptions};
 use diorama_pipelines::relight::outdoor::{recipe, scores, viewing};
 use diorama_pipelines::relight::synth::{self, Place, SynthOptions};
