@@ -92,8 +92,10 @@ fn luminance(c: [f32; 3]) -> f32 {
     0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2]
 }
 
-/// Light as lobes.
+/// Light as lobes that brighten or darken a first one.
 struct Lobes {
+    /// Light to begin with `[texels]`.
+    first: Vec<[f32; 3]>,
     /// Weights of wide and middle lobes by texel.
     tables: [Vec<f32>; 2],
     counts: [usize; 2],
@@ -101,7 +103,7 @@ struct Lobes {
 }
 
 impl Lobes {
-    fn new(edge: usize) -> Lobes {
+    fn new(edge: usize, first: &[[f32; 3]]) -> Lobes {
         let directions = |edge: usize| -> Vec<[f32; 3]> {
             let of = |i: usize| {
                 let place = |c: usize| (c as f32 + 0.5) / edge as f32;
@@ -114,7 +116,7 @@ impl Lobes {
             let centers = directions(edge);
             texels.iter().flat_map(|d| centers.iter().map(|c| (sharpness * (dot(*c, *d) - 1.0)).exp()).collect::<Vec<_>>()).collect()
         });
-        Lobes { tables, counts: LOBES.map(|(edge, _)| 6 * edge * edge), texels: texels.len() }
+        Lobes { first: first.to_vec(), tables, counts: LOBES.map(|(edge, _)| 6 * edge * edge), texels: texels.len() }
     }
 
     fn len(&self) -> usize {
@@ -137,7 +139,7 @@ impl Lobes {
                     (0..3).for_each(|k| sum[k] += w * lobe[k]);
                 }
             }
-            sum.map(|s| s.clamp(-12.0, 8.0).exp())
+            std::array::from_fn(|k| self.first[i][k] * sum[k].clamp(-12.0, 8.0).exp())
         };
         (0..self.texels).into_par_iter().with_min_len(64).map(of).collect()
     }
@@ -172,16 +174,22 @@ impl Lobes {
     }
 }
 
-/// Coarse light `[texels]` for what the vertices send.
-pub fn estimate(transport: &Transport, observed: &[Option<[f32; 3]>], positions: &[[f32; 3]], seed: u64) -> Vec<[f32; 3]> {
+/// Coarse light `[texels]` for what the vertices send, near the light `first`.
+pub fn estimate(
+    transport: &Transport,
+    first: &[[f32; 3]],
+    observed: &[Option<[f32; 3]>],
+    positions: &[[f32; 3]],
+    seed: u64,
+) -> Vec<[f32; 3]> {
     let sent: Vec<[f32; 3]> = observed.iter().map(|o| o.unwrap_or_default()).collect();
     let indirect = transport.bounced(&sent);
-    let known: Vec<usize> =
-        (0..observed.len()).filter(|v| observed[*v].is_some_and(|c| c.iter().all(|c| *c < CLIPPED) && luminance(c) > 1e-3)).collect();
+    let tells = |v: &usize| observed[*v].is_some_and(|c| c.iter().all(|c| *c < CLIPPED) && luminance(c) > 1e-3);
+    let known: Vec<usize> = (0..observed.len()).filter(tells).collect();
     let chosen: Vec<usize> = known.iter().step_by(known.len().div_ceil(VERTICES).max(1)).copied().collect();
-    let lobes = Lobes::new(transport.edge);
+    let lobes = Lobes::new(transport.edge, first);
     if chosen.len() < PARTNERS {
-        return vec![[0.5; 3]; transport.texels()];
+        return first.to_vec();
     }
     let near = neighbors(&chosen, positions);
     let adam = Adam { rate: RATE, beta2: 0.99, epsilon: 1e-10, ..Adam::default() };
@@ -332,7 +340,7 @@ mod tests {
         let dimmed: Vec<[f32; 3]> = light.iter().map(|l| l.map(|l| 0.6 * l)).collect();
         let truth = t.light(&dimmed, &colors);
         let sent: Vec<Option<[f32; 3]>> = truth.sent.iter().map(|s| Some(*s)).collect();
-        let found = estimate(&t, &sent, &positions, 0);
+        let found = estimate(&t, &vec![[1.0; 3]; t.texels()], &sent, &positions, 0);
         // Base colors under a light, compared after one factor per channel.
         let error = |light: &[[f32; 3]]| {
             let e = t.light(light, &colors);

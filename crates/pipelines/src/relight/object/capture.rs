@@ -55,6 +55,14 @@ impl ObjectView {
         ObjectView { camera, pose, clip: rows.map(|r| r.as_vec4().to_array()), eye: pose.translation.as_vec3().to_array() }
     }
 
+    /// The same view with `times` as many pixels along each axis.
+    pub fn finer(&self, times: usize) -> ObjectView {
+        let (c, k) = (self.camera, times as f64);
+        let (width, height) = (c.width * times as u32, c.height * times as u32);
+        let camera = Camera { width, height, fx: c.fx * k, fy: c.fy * k, cx: c.cx * k, cy: c.cy * k, ..c };
+        ObjectView { camera, ..self.clone() }
+    }
+
     /// Height and width in pixels.
     pub fn size(&self) -> [usize; 2] {
         [self.camera.height as usize, self.camera.width as usize]
@@ -222,6 +230,9 @@ mod tests {
             let got = [(c[0] / c[3] + 1.0) * 32.0, (c[1] / c[3] + 1.0) * 24.0];
             assert!((got[0] as f64 - want.x).abs() < 1e-3 && (got[1] as f64 - want.y).abs() < 1e-3, "{got:?} {want}");
             assert!((-1.0..1.0).contains(&(c[2] / c[3])));
+            let fine = view.finer(2);
+            let there = fine.camera.project(fine.pose.inverse().point(DVec3::from(p.map(f64::from)))).unwrap();
+            assert!(fine.clip == view.clip && (there - 2.0 * want).length() < 1e-9, "{there} {want}");
         }
     }
 }

@@ -130,8 +130,15 @@ pub struct RunConfig {
     pub traced_steps: u64,
     /// Photographs per step.
     pub batch: usize,
+    /// Samples per pixel and axis in the second and third stage; runs from before there was a choice have one.
+    #[serde(default = "one_sample")]
+    pub samples: usize,
     pub log_every: u64,
     pub save_every_seconds: f64,
+}
+
+fn one_sample() -> usize {
+    1
 }
 
 /// The whole configuration.
@@ -194,6 +201,7 @@ impl Config {
                 texture_steps: pick(100, 3000) as u64,
                 traced_steps: 0,
                 batch: 1,
+                samples: pick(1, 2),
                 log_every: pick(20, 50) as u64,
                 save_every_seconds: 60.0,
             },
@@ -288,6 +296,9 @@ impl Configuration for Config {
         if self.data.downscale == 0 || self.run.batch == 0 || self.run.log_every == 0 || self.steps() == 0 {
             return fault("data.downscale, run.batch, run.log_every and the steps of both stages must be at least 1");
         }
+        if !(1..=4).contains(&self.run.samples) {
+            return fault("run.samples: must lie between 1 and 4");
+        }
         if self.run.texture_steps == 0 {
             return fault("run.texture_steps: must be at least 1: the second stage makes the mesh with its textures");
         }
@@ -312,6 +323,7 @@ mod tests {
             ("light.cube", "48"),
             ("optim.final_scale", "0"),
             ("run.batch", "0"),
+            ("run.samples", "5"),
             ("run.texture_steps", "0"),
         ] {
             let e = c.clone().set(key, value).unwrap_err();

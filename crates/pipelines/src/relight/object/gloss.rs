@@ -23,6 +23,8 @@ const EXPLAINED: f64 = 0.08;
 /// Bounds of the factor. The light before it is one under which the brightest colors are nearly white: much less light is impossible, and a
 /// smaller factor tells of an object whose gloss differs from place to place.
 const BOUNDS: [f64; 2] = [0.6, 8.0];
+/// Value from which on photographs are clipped: such places hardly change, however glossy they are.
+const CLIPPED: f32 = 0.97;
 /// Distance from the surface at which rays begin, in object space.
 const OFFSET: f32 = 1e-3;
 
@@ -113,30 +115,33 @@ fn rows(transport: &Transport, sightings: &[Vec<Sighting>], (positions, normals)
 
 /// The factor of a channel and the share of the changes that it explains.
 fn factor(rows: &Rows, mirrored: &[f32], k: usize) -> (f64, f64) {
-    let n = rows.color.len();
-    let (mut weights, mut s) = (vec![1.0f64; n], 0.0);
+    let kept: Vec<_> = rows.ranges.iter().filter(|r| rows.color[(*r).clone()].iter().all(|c| c[k] < CLIPPED)).collect();
+    let (mut weights, mut s) = (vec![1.0f64; rows.color.len()], 0.0);
     let mut explained = 0.0;
     for _ in 0..ROUNDS {
         let (mut both, mut square, mut total) = (0.0, 0.0, 0.0);
-        let mut centered = vec![[0.0f64; 2]; n];
-        for range in &rows.ranges {
-            let sum = |f: &dyn Fn(usize) -> f64| range.clone().map(|i| weights[i] * f(i)).sum::<f64>();
+        let mut centered = Vec::with_capacity(rows.color.len());
+        for range in &kept {
+            let sum = |f: &dyn Fn(usize) -> f64| (*range).clone().map(|i| weights[i] * f(i)).sum::<f64>();
             let all = sum(&|_| 1.0).max(1e-12);
             let (c, m) = (sum(&|i| rows.color[i][k] as f64) / all, sum(&|i| mirrored[3 * i + k] as f64) / all);
-            for i in range.clone() {
-                centered[i] = [rows.color[i][k] as f64 - c, mirrored[3 * i + k] as f64 - m];
-                both += weights[i] * centered[i][0] * centered[i][1];
-                square += weights[i] * centered[i][1].powi(2);
-                total += weights[i] * centered[i][0].powi(2);
+            for i in (*range).clone() {
+                let [c, m] = [rows.color[i][k] as f64 - c, mirrored[3 * i + k] as f64 - m];
+                both += weights[i] * c * m;
+                square += weights[i] * m.powi(2);
+                total += weights[i] * c.powi(2);
+                centered.push((i, c, m));
             }
         }
         s = both / square.max(1e-12);
         explained = both * s / total.max(1e-12);
-        let mut off: Vec<f64> = centered.iter().map(|[c, m]| (c - s * m).abs()).collect();
-        weights.iter_mut().zip(&off).for_each(|(w, o)| *w = *o);
+        let mut off: Vec<f64> = centered.iter().map(|(_, c, m)| (c - s * m).abs()).collect();
+        for ((i, ..), off) in centered.iter().zip(&off) {
+            weights[*i] = *off;
+        }
         off.sort_by(f64::total_cmp);
-        let width = 2.0 * off[n / 2] + 1e-6;
-        weights.iter_mut().for_each(|w| *w = 1.0 / (1.0 + (*w / width).powi(2)));
+        let width = 2.0 * off.get(off.len() / 2).copied().unwrap_or(0.0) + 1e-6;
+        centered.iter().for_each(|(i, ..)| weights[*i] = 1.0 / (1.0 + (weights[*i] / width).powi(2)));
     }
     (s, explained)
 }

@@ -18,6 +18,7 @@ pub mod loss;
 pub mod material;
 mod memory;
 pub mod model;
+mod pixel_means;
 pub mod placement;
 pub mod probe;
 pub mod raster;

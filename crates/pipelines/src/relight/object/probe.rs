@@ -85,9 +85,9 @@ impl Probe {
         self.d_texels.fill(0.0);
     }
 
-    /// Replaces light that is learned by a coarse one, `edge`² texels per face, and forgets how it was trained.
-    pub fn set_coarse(&mut self, coarse: &[[f32; 3]], rate: f32) {
-        let (size, edge) = (self.shape().size, (coarse.len() / 6).isqrt());
+    /// Replaces light that is learned by `values` times a coarse factor, `edge`² squares per face, and forgets how it was trained.
+    pub fn set_scaled(&mut self, values: &[f32], factor: &[[f32; 3]], rate: f32) {
+        let (size, edge) = (self.shape().size, (factor.len() / 6).isqrt());
         let t = Texture { kind: Kind::Cube, filter: Filter::Bilinear, images: 1, size: [edge; 2], channels: 3 };
         let directions: Vec<f32> = (0..6 * size * size)
             .flat_map(|i| {
@@ -95,10 +95,11 @@ impl Probe {
                 cube_direction(i / (size * size), place(i % size), place(i / size % size))
             })
             .collect();
-        let mut values = vec![0.0; self.group.values.len()];
-        texture::cpu::forward(&t, coarse.as_flattened(), &directions, &[], &mut values);
+        let mut scaled = vec![0.0; values.len()];
+        texture::cpu::forward(&t, factor.as_flattened(), &directions, &[], &mut scaled);
+        scaled.iter_mut().zip(values).for_each(|(s, v)| *s *= v);
         let adam = Adam { rate, ..self.group.adam };
-        self.group = ParamGroup::dense("light", values, adam);
+        self.group = ParamGroup::dense("light", scaled, adam);
         self.update();
     }
 
@@ -110,14 +111,7 @@ impl Probe {
 
     /// Means of the light over `edge`² squares of each face.
     pub fn coarse(&self, edge: usize) -> Vec<[f32; 3]> {
-        let (size, mut out) = (self.shape().size, vec![[0.0f32; 3]; 6 * edge * edge]);
-        let wide = size / edge;
-        let share = 1.0 / (wide * wide) as f32;
-        for (i, v) in self.group.values.as_chunks::<3>().0.iter().enumerate() {
-            let to = &mut out[coarse_of(i, size, edge)];
-            (0..3).for_each(|k| to[k] += share * v[k]);
-        }
-        out
+        coarse(&self.group.values, edge)
     }
 
     /// Keeps the gradient of [`Probe::coarse`].
@@ -234,6 +228,18 @@ impl Probe {
             out.map(|v| v.max(0.0) as f64)
         })
     }
+}
+
+/// Means of a cube map `[6, S, S, 3]` over `edge`² squares of each face.
+pub fn coarse(values: &[f32], edge: usize) -> Vec<[f32; 3]> {
+    let (size, mut out) = ((values.len() / 18).isqrt(), vec![[0.0f32; 3]; 6 * edge * edge]);
+    let wide = size / edge;
+    let share = 1.0 / (wide * wide) as f32;
+    for (i, v) in values.as_chunks::<3>().0.iter().enumerate() {
+        let to = &mut out[coarse_of(i, size, edge)];
+        (0..3).for_each(|k| to[k] += share * v[k]);
+    }
+    out
 }
 
 /// The square of a coarse light that holds a texel.

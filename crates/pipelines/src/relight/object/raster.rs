@@ -2,6 +2,7 @@
 
 use super::capture::ObjectView;
 use diorama_geom::mesh::{cross, sub};
+use diorama_geom::rng::Rng;
 use diorama_kernels::ops::antialias::{self, Antialias, Crossing, Visible};
 use diorama_kernels::ops::interpolate::cpu::Pixels;
 use diorama_kernels::ops::interpolate::{self, Interpolate};
@@ -138,6 +139,29 @@ impl Surface {
         let mut all = vec![0.0; self.raster.ids.len() * each];
         interpolate::cpu::derivatives(&s, chosen, attributes, faces, &self.raster.ids, &self.raster.derivatives, &mut all);
         self.covered.iter().flat_map(|p| all[*p as usize * each..(*p as usize + 1) * each].iter().copied()).collect()
+    }
+
+    /// Pairs of covered pixels that show points near each other: of one in `sparsity` pixels with another one at a normally distributed way,
+    /// `pixels` wide, unless the latter's plane passes the former at more than `most`.
+    pub fn neighbors(&self, (pixels, most): (f32, f32), sparsity: usize, rng: Rng) -> Vec<[usize; 2]> {
+        let [h, w] = self.size;
+        let mut place = vec![u32::MAX; w * h];
+        self.covered.iter().enumerate().for_each(|(i, p)| place[*p as usize] = i as u32);
+        let pair = |i: usize| {
+            let pixel = self.covered[i] as usize;
+            let moved = |at: usize, k: u64| at as i64 + (pixels * rng.normal(2 * i as u64 + k)).round() as i64;
+            let (x, y) = (moved(pixel % w, 0), moved(pixel / w, 1));
+            if !(0..w as i64).contains(&x) || !(0..h as i64).contains(&y) {
+                return None;
+            }
+            let j = place[y as usize * w + x as usize] as usize;
+            if j == u32::MAX as usize || j == i {
+                return None;
+            }
+            let away = |n: &[f32]| (0..3).map(|k| n[3 * j + k] * (self.position[3 * j + k] - self.position[3 * i + k])).sum::<f32>().abs();
+            (away(&self.face_normal) < most).then_some([i, j])
+        };
+        (rng.below(u64::MAX >> 1, sparsity as u64) as usize..self.covered.len()).step_by(sparsity).filter_map(pair).collect()
     }
 
     /// The picture `[H, W, 4]` of colors `[P, 3]`, multiplied by the opacity in the fourth channel.

@@ -8,7 +8,7 @@ use diorama_geom::rng::Rng;
 use diorama_kernels::ops::ray_triangles::Ray;
 use rayon::prelude::*;
 
-/// Rays of a pixel.
+/// Rays of a pixel, whatever samples it has.
 const RAYS: usize = 8;
 /// Distance from the surface at which they begin, in object space.
 const OFFSET: f32 = 1e-3;
@@ -24,6 +24,8 @@ pub struct Surroundings {
     /// Unit normals of the vertices.
     normals: Vec<[f32; 3]>,
     faces: Vec<[u32; 3]>,
+    /// Rays of a sample.
+    rays: usize,
 }
 
 /// Light of a probe at the vertices.
@@ -43,9 +45,14 @@ impl LitVertices {
 }
 
 impl Surroundings {
-    pub fn new(positions: &[[f32; 3]], normals: &[[f32; 3]], faces: &[[u32; 3]], seed: u64) -> Surroundings {
+    pub fn new(positions: &[[f32; 3]], normals: &[[f32; 3]], faces: &[[u32; 3]], seed: u64, samples: usize) -> Surroundings {
         let normals: Vec<[f32; 3]> = normals.iter().map(|n| unit(*n)).collect();
-        Surroundings { transport: Transport::new(positions, &normals, faces, seed), normals, faces: faces.to_vec() }
+        Surroundings {
+            transport: Transport::new(positions, &normals, faces, seed),
+            normals,
+            faces: faces.to_vec(),
+            rays: (RAYS / (samples * samples)).max(1),
+        }
     }
 
     /// Light at the vertices, which have the base colors `colors` `[V]`.
@@ -65,7 +72,7 @@ impl Surroundings {
     /// What surface points see, with `normal` and `roughness`; `rng` draws the mirrored rays.
     pub fn seen(&self, lit: &LitVertices, surface: &Surface, (normal, ks): (&[f32], &[f32]), rng: Rng) -> Seen {
         let values = surface.interpolate(&lit.attributes, ATTRIBUTES, &self.faces);
-        let n = surface.covered.len();
+        let (n, each) = (surface.covered.len(), self.rays);
         let mut seen =
             Seen { share: Vec::with_capacity(3 * n), added: Vec::with_capacity(3 * n), open: vec![0.0; n], reflected: vec![0.0; 3 * n] };
         for v in values.as_chunks::<ATTRIBUTES>().0 {
@@ -73,15 +80,15 @@ impl Surroundings {
             seen.added.extend_from_slice(&v[3..]);
         }
         let three = |v: &[f32], i: usize| -> [f32; 3] { std::array::from_fn(|k| v[3 * i + k]) };
-        let rays: Vec<Ray> = (0..n * RAYS)
+        let rays: Vec<Ray> = (0..n * each)
             .into_par_iter()
             .with_min_len(1024)
             .map(|r| {
-                let i = r / RAYS;
+                let i = r / each;
                 let (n, flat) = (three(normal, i), three(&surface.face_normal, i));
                 let (p, view) = (three(&surface.position, i), three(&surface.view, i));
-                let stratum = (r % RAYS) as f32;
-                let random = [(stratum + rng.uniform(2 * r as u64)) / RAYS as f32, rng.uniform(2 * r as u64 + 1)];
+                let stratum = (r % each) as f32;
+                let random = [(stratum + rng.uniform(2 * r as u64)) / each as f32, rng.uniform(2 * r as u64 + 1)];
                 let direction = mirrored(n, view, ks[3 * i + 1], random);
                 // Not into the surface itself.
                 let below = dot(direction, flat).min(0.0);
@@ -90,10 +97,10 @@ impl Surroundings {
             })
             .collect();
         let met = self.transport.reflected(&rays);
-        for (i, met) in met.chunks_exact(RAYS).enumerate() {
-            seen.open[i] = met.iter().filter(|m| m.is_none()).count() as f32 / RAYS as f32;
+        for (i, met) in met.chunks_exact(each).enumerate() {
+            seen.open[i] = met.iter().filter(|m| m.is_none()).count() as f32 / each as f32;
             for v in met.iter().flatten() {
-                (0..3).for_each(|k| seen.reflected[3 * i + k] += lit.light.sent[*v as usize][k] / RAYS as f32);
+                (0..3).for_each(|k| seen.reflected[3 * i + k] += lit.light.sent[*v as usize][k] / each as f32);
             }
         }
         seen

@@ -5,6 +5,7 @@ use super::capture::ObjectView;
 use super::config::{CHANNELS, Config};
 use super::loss;
 use super::material::{self, Material};
+use super::pixel_means::{means, means_backward};
 use super::probe::{Probe, Seen};
 use super::raster::{Shape, Surface, SurfaceGradient};
 use super::surroundings::{LitVertices, Surroundings};
@@ -23,10 +24,10 @@ use std::collections::HashMap;
 
 /// Numbers of a vertex of the texture: coordinates and tangent.
 const ATTRIBUTES: usize = 6;
-/// Of so many surface points, one is compared with a texel nearby.
-const SPARSITY: usize = 4;
-/// Standard deviation of the way to that texel, in texture coordinates.
-const JITTER: f32 = 0.01;
+/// Of so many surface points, one is compared with a point nearby.
+const SPARSITY: usize = 2;
+/// Standard deviation of the way to that point in pixels, and largest distance of its plane in object space.
+const NEAR: (f32, f32) = (2.0, 0.02);
 /// Steps over which rates rise.
 const WARMUP: f32 = 100.0;
 const OCCLUSION: f32 = 0.001;
@@ -82,6 +83,8 @@ pub struct Textured {
     pub positions: ParamGroup,
     pub texels: ParamGroup,
     color: [f32; 2],
+    /// Samples per pixel and axis.
+    samples: usize,
     /// Third stage: what the surface casts onto itself. The mesh no longer moves then.
     pub surroundings: Option<Box<Surroundings>>,
 }
@@ -125,6 +128,7 @@ impl Textured {
             texels: ParamGroup::dense("texels", texels, adam(config.optim.texture_rate)),
             layout,
             color: config.material.color,
+            samples: config.run.samples,
             surroundings: None,
         }
     }
@@ -183,11 +187,12 @@ impl Textured {
     /// The picture `[H, W, 4]` of a view, linear light times opacity, and that of the base color.
     pub fn picture(&self, view: &ObjectView, probe: &Probe) -> [Vec<f32>; 2] {
         let drawn = self.drawn();
-        let looked = self.look(view, &drawn);
+        let fine = view.finer(self.samples);
+        let looked = self.look(&fine, &drawn);
         let values = self.lookup(&drawn, &looked.uv, &looked.level);
         let around = self.light(&drawn, probe);
         let lit = looked.shade(&values, probe, self.around(around.as_ref(), Rng::new(0, PICTURE)));
-        [&lit.shaded.color, &lit.kd].map(|c| looked.surface.picture(&drawn.shape(self), c).rgba)
+        [&lit.shaded.color, &lit.kd].map(|c| means(&looked.surface.picture(&drawn.shape(self), c).rgba, view.size(), self.samples))
     }
 
     /// Lets the textures' optimizer begin anew.
@@ -226,7 +231,7 @@ impl Textured {
             shares: vec![0.0; self.surroundings.as_ref().map_or(0, |s| s.attributes())],
         };
         for (i, photo) in input.photos.iter().enumerate() {
-            let looked = self.look(&photo.view, &drawn);
+            let looked = self.look(&photo.view.finer(self.samples), &drawn);
             let pass = ViewPass { config, photo, share, rng: Rng::new(input.rng.bits(i as u64), 0), progress: input.progress };
             self.view(&pass, (&drawn, &looked, lit.as_ref()), probe, &mut loss, &mut gradient);
         }
@@ -274,37 +279,30 @@ impl Textured {
         loss: &mut StepLoss,
         gradient: &mut Gradient,
     ) {
-        let (ViewPass { config, photo, share, rng, .. }, (drawn, looked, lit_vertices)) = (*pass, of);
+        let (ViewPass { config, photo, share, rng, progress }, (drawn, looked, lit_vertices)) = (*pass, of);
         let (shape, surface) = (drawn.shape(self), &looked.surface);
         let n = surface.covered.len();
-        // Texels nearby follow the points' own.
-        let (mut uv, mut level) = (looked.uv.clone(), looked.level.clone());
-        let near: Vec<usize> = (0..n).skip(rng.below(0, SPARSITY as u64) as usize).step_by(SPARSITY).collect();
-        let jitter = Rng::new(rng.bits(1), 1);
-        for (j, i) in near.iter().enumerate() {
-            uv.extend((0..2).map(|k| looked.uv[2 * i + k] + JITTER * jitter.normal((2 * j + k) as u64)));
-            level.push(looked.level[*i]);
-        }
-        let values = self.lookup(drawn, &uv, &level);
+        let values = self.lookup(drawn, &looked.uv, &looked.level);
         let around = self.around(lit_vertices, Rng::new(rng.bits(3), 3));
-        let lit = looked.shade(&values[..n * CHANNELS], probe, around);
+        let lit = looked.shade(&values, probe, around);
         let picture = surface.picture(&shape, &lit.shaded.color);
-        let mut d = vec![0.0; picture.rgba.len()];
-        let of = loss::picture(&picture.rgba, &photo.rgba.data, config.loss.mask, Rng::new(rng.bits(2), 2), &mut d);
-        d.par_iter_mut().with_min_len(4096).for_each(|d| *d *= share);
+        let shown = means(&picture.rgba, photo.view.size(), self.samples);
+        let mut d = vec![0.0; shown.len()];
+        let of = loss::picture(&shown, &photo.rgba.data, config.loss.mask, Rng::new(rng.bits(2), 2), &mut d);
         loss.add(of, share as f64);
+        let d = means_backward(&d, photo.view.size(), self.samples, share);
         let (d_color, d_clip) = surface.picture_backward(&picture, &d);
+        let covered = n as f32 / (picture.rgba.len() / 4) as f32;
         let at = Points { normal: &lit.bent, view: &surface.view, kd: &lit.kd, ks: &lit.ks };
         let [mut d_normal, mut d_kd, d_ks, d_share] = probe.shade_backward(&at, (&lit.shaded, lit.seen.as_ref()), &d_color);
         if let Some(around) = around {
             around.surroundings.seen_backward(around.lit, surface, &d_share, &mut gradient.shares);
-            let weight = share * n as f32 / (photo.rgba.width * photo.rgba.height) as f32 * config.loss.color_entropy;
+            let weight = share * covered * config.loss.color_entropy * (1.0 - progress);
             loss.regularizers += few_colors(&lit.kd, weight, Rng::new(rng.bits(4), 4), &mut d_kd);
         }
         surface.bent_backward(&lit.normal, &mut d_normal);
         let mut d_values = vec![0.0; values.len()];
         let d_smooth = looked.tangent_backward(&lit, &values, &d_normal, &mut d_values);
-        let covered = n as f32 / (photo.rgba.width * photo.rgba.height) as f32;
         let occlusion = share * covered * OCCLUSION / n.max(1) as f32;
         for i in 0..n {
             let d = &mut d_values[i * CHANNELS..][..6];
@@ -313,18 +311,19 @@ impl Textured {
             d[3] += occlusion;
             loss.regularizers += (occlusion * lit.ks[3 * i]) as f64;
         }
+        // Charts end anywhere on the surface: neighbors in the picture are near each other, neighbors in the texture need not be.
+        let near = surface.neighbors((NEAR.0 * self.samples as f32, NEAR.1), SPARSITY * self.samples, Rng::new(rng.bits(1), 1));
         let color = |i: usize| values[i * CHANNELS..][..3].iter().copied();
-        let own: Vec<f32> = near.iter().flat_map(|i| color(*i)).collect();
-        let other: Vec<f32> = (n..level.len()).flat_map(color).collect();
+        let [own, other]: [Vec<f32>; 2] = [0, 1].map(|k| near.iter().flat_map(|pair| color(pair[k])).collect());
         loss.regularizers += material::smoothness(&own, &other, share * covered * config.loss.color_smoothness, |i, d| {
-            d_values[near[i / 3] * CHANNELS + i % 3] += d;
-            d_values[(n + i / 3) * CHANNELS + i % 3] -= d;
+            d_values[near[i / 3][0] * CHANNELS + i % 3] += d;
+            d_values[near[i / 3][1] * CHANNELS + i % 3] -= d;
         });
         let mut d_texels = vec![0.0; gradient.texels.len()];
-        texture::cpu::backward_texels(&self.texture, &uv, &level, &d_values, &mut d_texels);
+        texture::cpu::backward_texels(&self.texture, &looked.uv, &looked.level, &d_values, &mut d_texels);
         gradient.texels.par_iter_mut().zip(&d_texels).with_min_len(4096).for_each(|(g, d)| *g += d);
         let d = SurfaceGradient { normal: &d_smooth, position: None };
-        surface.backward(&photo.view, &shape, &d, d_clip, &mut gradient.positions);
+        surface.backward(&photo.view.finer(self.samples), &shape, &d, d_clip, &mut gradient.positions);
     }
 }
 

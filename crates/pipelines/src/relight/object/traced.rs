@@ -4,8 +4,8 @@
 use super::albedo_entropy;
 use super::capture::ObjectCapture;
 use super::config::{CHANNELS, Config};
-use super::gloss;
-use super::probe::Probe;
+use super::gloss::{self, Gloss};
+use super::probe::{self, Probe};
 use super::surroundings::Surroundings;
 use super::textured::Textured;
 use super::transport::{dot, unit};
@@ -22,11 +22,13 @@ const LEFT: f32 = 0.1;
 /// Largest base color to begin with, and least light.
 const BRIGHTEST: f32 = 0.95;
 const DARK: f32 = 1e-3;
+/// Least light of the second stage that the third begins with, over its mean.
+const DIMMEST: f32 = 0.1;
 
 /// What the mesh casts onto itself.
 pub fn surroundings(m: &Textured, config: &Config) -> Surroundings {
     let normals = vertex_normals::cpu::forward(&m.layout.faces, m.places());
-    Surroundings::new(m.places(), &normals, &m.layout.faces, config.seed)
+    Surroundings::new(m.places(), &normals, &m.layout.faces, config.seed, config.run.samples)
 }
 
 /// Traces the surroundings, finds the light unless it is given, and divides it out.
@@ -38,31 +40,7 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
     let size = config.material.texture;
     let texels = bake::texels(&flat, size);
     let before = probe.diffuse(texels.normals.as_flattened());
-    let normals: Vec<[f32; 3]> = vertex_normals::cpu::forward(&m.layout.faces, m.places()).into_iter().map(unit).collect();
-    let photos: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.photos[i]).collect();
-    let at = (m.places(), &normals[..]);
-    let sightings = albedo_entropy::sightings(&photos, at, &around.transport);
-    let mut gloss = None;
-    if probe.group.frozen {
-        gloss = gloss::fit(probe, &around.transport, &sightings, at);
-        // The light is as bright as it is.
-        if let Some(g) = &mut gloss {
-            g.mirrored.iter_mut().for_each(|m| (0..3).for_each(|k| m[k] /= g.scale[k]));
-        }
-    } else {
-        let mut observed = albedo_entropy::observed(&sightings);
-        for _ in 0..ROUNDS {
-            let coarse = albedo_entropy::estimate(&around.transport, &observed, m.places(), config.seed);
-            probe.set_coarse(&coarse, config.optim.traced_light_rate);
-            gloss = gloss::fit(probe, &around.transport, &sightings, at);
-            let Some(g) = &gloss else { break };
-            probe.scale(g.scale);
-            observed = albedo_entropy::observed(&sightings);
-            for (o, mirrored) in observed.iter_mut().zip(&g.mirrored) {
-                *o = o.map(|c| std::array::from_fn(|k| (c[k] - mirrored[k]).max(LEFT * c[k])));
-            }
-        }
-    }
+    let gloss = find_light(m, config, capture, (&around, probe));
     let roughness = gloss.as_ref().map_or(ROUGHNESS, |g| g.roughness);
     let mirrored = gloss.map_or_else(|| vec![[0.0; 3]; m.places().len()], |g| g.mirrored);
     // Two rounds: light between surfaces depends on their colors.
@@ -97,6 +75,41 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
     }
     m.forget_steps();
     m.surroundings = Some(Box::new(around));
+}
+
+/// Finds the light, beginning with that of the second stage, and what gloss tells of its brightness.
+fn find_light(m: &Textured, config: &Config, capture: &ObjectCapture, (around, probe): (&Surroundings, &mut Probe)) -> Option<Gloss> {
+    let normals: Vec<[f32; 3]> = vertex_normals::cpu::forward(&m.layout.faces, m.places()).into_iter().map(unit).collect();
+    let photos: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.photos[i]).collect();
+    let at = (m.places(), &normals[..]);
+    let sightings = albedo_entropy::sightings(&photos, at, &around.transport);
+    if probe.group.frozen {
+        let mut gloss = gloss::fit(probe, &around.transport, &sightings, at);
+        // The light is as bright as it is.
+        if let Some(g) = &mut gloss {
+            g.mirrored.iter_mut().for_each(|m| (0..3).for_each(|k| m[k] /= g.scale[k]));
+        }
+        return gloss;
+    }
+    // About 1, and nowhere so dark that it could not be brightened.
+    let mean = probe.group.values.iter().sum::<f32>() / probe.group.values.len() as f32;
+    let learned: Vec<f32> = probe.group.values.iter().map(|v| (v / mean.max(DARK)).max(DIMMEST)).collect();
+    let first = probe::coarse(&learned, around.transport.edge);
+    let mut observed = albedo_entropy::observed(&sightings);
+    let mut gloss = None;
+    for _ in 0..ROUNDS {
+        let coarse = albedo_entropy::estimate(&around.transport, &first, &observed, m.places(), config.seed);
+        let factor: Vec<[f32; 3]> = coarse.iter().zip(&first).map(|(c, f)| std::array::from_fn(|k| c[k] / f[k])).collect();
+        probe.set_scaled(&learned, &factor, config.optim.traced_light_rate);
+        gloss = gloss::fit(probe, &around.transport, &sightings, at);
+        let Some(g) = &gloss else { break };
+        probe.scale(g.scale);
+        observed = albedo_entropy::observed(&sightings);
+        for (o, mirrored) in observed.iter_mut().zip(&g.mirrored) {
+            *o = o.map(|c| std::array::from_fn(|k| (c[k] - mirrored[k]).max(LEFT * c[k])));
+        }
+    }
+    gloss
 }
 
 /// Weights of a triangle's corners at a point of it.
