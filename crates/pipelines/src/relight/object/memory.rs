@@ -77,6 +77,7 @@ mod tests {
         let e = refusal(&config, 60, 4096);
         assert!(e.contains("second stage") && e.contains("--texture 4096"), "{e}");
         (config.grid.cells, config.material.texture, config.material.levels, config.run.traced_steps) = (30, 512, 1, 10);
+        config.run.samples = 1;
         let e = refusal(&config, 60, 280);
         assert!(e.contains("third stage") && e.contains("--mc"), "{e}");
     }
