@@ -69,6 +69,14 @@ impl Progress {
                     eprintln!("{text}");
                 }
             }
+            Event::Preparing { what, share } => {
+                if let Some(b) = &self.bar {
+                    b.set_message(format!("{what}: {:.0} %", 100.0 * share));
+                } else if self.last_line.is_none_or(|t| t.elapsed() >= LINE_EVERY) {
+                    self.last_line = Some(Instant::now());
+                    eprintln!("{what}: {:.0} %", 100.0 * share);
+                }
+            }
             Event::Evaluated { scores, .. } => self.scores = scores.clone(),
             Event::Recovered { step, to_step, why } => self.line(&format!("step {step}: {why}; back to step {to_step}")),
             Event::Note(n) => self.line(&format!("note: {n}")),

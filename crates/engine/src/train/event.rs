@@ -44,6 +44,11 @@ pub enum Event {
         to_step: u64,
         why: String,
     },
+    /// Work before a step, of which a share is done, 0 to 1.
+    Preparing {
+        what: &'static str,
+        share: f64,
+    },
     Note(String),
     Finished {
         step: u64,

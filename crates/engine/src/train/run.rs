@@ -27,6 +27,10 @@ pub struct RunOptions {
 /// A model in training, as the loop drives it.
 pub trait Trainee {
     type Error;
+    /// Long work that is due before a step; after an interrupt, the step is not taken.
+    fn prepare(&mut self, _step: u64, _progress: f64, _interrupt: &AtomicBool, _events: &mut dyn FnMut(&Event)) -> Result<(), Self::Error> {
+        Ok(())
+    }
     /// One optimizer step; `progress` in [0, 1] drives the schedules.
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport, Self::Error>;
     /// Writes a checkpoint that `step` steps and `seconds` have gone into; false, with nothing written, where a
@@ -107,6 +111,10 @@ pub fn run<T: Trainee>(
                 evaluations.evaluate(trainee, step, &clock, &mut summary, events)?;
             }
             break;
+        }
+        trainee.prepare(step, progress, interrupt, events).map_err(RunError::Failed)?;
+        if interrupt.load(Ordering::Relaxed) {
+            continue;
         }
         let report = trainee.step(step, progress).map_err(RunError::Failed)?;
         if !report.loss.is_finite() {

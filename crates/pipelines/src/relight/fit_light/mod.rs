@@ -163,8 +163,9 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
     let small = shot.resized(FIT_PX);
     let (mut light, mut sky, mut pixels) = (None, None, Vec::new());
     let lit_by = |light: ShLight, sky: &Option<Vec<f32>>| {
-        let even = ViewLight::of(light);
-        ViewLight { sky: sky.clone().unwrap_or_else(|| even.sky.clone()), ..even }
+        let mut shown = ViewLight::of(light);
+        sky.iter().for_each(|sky| shown.sky.clone_from(sky));
+        shown
     };
     for round in 0..ROUNDS {
         let own = lit_by(light.unwrap_or(mean), &sky);

@@ -35,13 +35,6 @@ pub struct Around {
     pub surfaces: Surfaces,
 }
 
-impl Around {
-    /// Light of a sky `[9, 3]`, and of surfaces that it and a sun light.
-    pub fn ambient(&self, sun: &[f32], sky: &[f32]) -> Ambient {
-        self.surfaces.spread(&self.visibility, sun, sky)
-    }
-}
-
 /// Field, lights and capture of one run.
 pub struct SceneModel {
     pub config: Config,
@@ -254,11 +247,9 @@ impl SceneModel {
         }
     }
 
-    /// Numbers of what stands around, as a checkpoint keeps them: solid cells, surfaces, distances of flat ones.
-    pub fn around(&self) -> [Vec<f32>; 3] {
-        let [solid, surfaces] =
-            self.surroundings.as_ref().map_or_else(Default::default, |a| [a.visibility.numbers(), a.surfaces.numbers()]);
-        [solid, surfaces, self.flat.clone()]
+    /// Numbers of what stands around, as a checkpoint keeps them: solid cells, surfaces.
+    pub fn around(&self) -> Option<[Vec<f32>; 2]> {
+        self.surroundings.as_ref().map(|a| [a.visibility.numbers(), a.surfaces.numbers()])
     }
 
     /// Everything that is trained by gradients.
@@ -295,19 +286,23 @@ impl SceneModel {
     pub fn ambients(&self) -> Vec<Ambient> {
         let Some(around) = self.surroundings.as_ref().filter(|_| self.has_suns()) else { return Vec::new() };
         let lights = self.suns.values.chunks_exact(SUN).zip(self.lights.values.chunks_exact(LIGHT));
-        lights.map(|(sun, sky)| around.ambient(sun, sky)).collect()
+        lights.map(|(sun, sky)| around.surfaces.light(&around.visibility, sun, sky)).collect()
     }
 
-    /// Gives each light the mean code of its photographs, in place of the photographs' codes.
-    pub fn share_codes(&mut self) {
-        let lights = self.light_count();
-        let Some(a) = &mut self.field.codes.appearance else { return };
+    /// A field that renders each light by the mean code of its photographs, in place of the photographs' codes.
+    ///
+    /// # Panics
+    /// In the light's stage, where surfaces have no codes.
+    pub fn with_shared_codes(&self) -> Field {
+        let (lights, mut field) = (self.light_count(), self.field.for_rendering());
+        let a = field.codes.appearance.as_mut().expect("the stage of surfaces");
         let mean = |l: usize, k: usize| {
             let own = || (0..self.train.len()).filter(|i| self.light_of[*i] as usize == l);
             own().map(|i| a.group.values[i * a.dims + k]).sum::<f32>() / own().count().max(1) as f32
         };
         let means: Vec<f32> = (0..lights).flat_map(|l| (0..a.dims).map(move |k| (l, k))).map(|(l, k)| mean(l, k)).collect();
         a.group.values = means;
+        field
     }
 
     /// Goes on to the stage of light: surfaces stay, and albedo, shadow and normal are to be learned on them.
@@ -321,7 +316,7 @@ impl SceneModel {
     }
 
     /// Everything that a checkpoint holds; `around` are the numbers of what stands around.
-    pub fn entries<'a>(&'a mut self, around: &'a [Vec<f32>; 3]) -> (Vec<Entry<'a>>, HashMap<String, String>) {
+    pub fn entries<'a>(&'a mut self, around: &'a Option<[Vec<f32>; 2]>) -> (Vec<Entry<'a>>, HashMap<String, String>) {
         let metadata = HashMap::from([
             ("method".to_string(), "relight".to_string()),
             ("stage".into(), if self.stage == Stage::Light { "light" } else { "surfaces" }.into()),
@@ -339,8 +334,8 @@ impl SceneModel {
         params.add("", [&mut self.lights, &mut self.skies, &mut self.gains, &mut self.suns]);
         let mut entries = param_state::entries(params);
         entries.extend([entry("occupancy", &self.occupancy.grid.density), entry("occupancy.fresh", &self.occupancy.grid.fresh)]);
-        entries
-            .extend(["solid", "surfaces", "flat"].into_iter().zip(around).filter(|(_, v)| !v.is_empty()).map(|(name, v)| entry(name, v)));
+        entries.push(entry("flat", &self.flat));
+        entries.extend(around.iter().flat_map(|a| ["solid", "surfaces"].into_iter().zip(a)).map(|(name, v)| entry(name, v)));
         (entries, metadata)
     }
 
@@ -353,7 +348,11 @@ impl SceneModel {
             let value = c.metadata.get(key).and_then(|v| v.parse().ok());
             value.ok_or_else(|| PipelineError::Usage(format!("{}: metadata {key} is missing or malformed", file.display())))
         }
-        if c.metadata.get("stage").is_some_and(|s| s == "light") && self.stage == Stage::Surfaces {
+        fn tensor(c: &mut Checkpoint, name: &str, file: &Path) -> Result<Vec<f32>> {
+            c.take(name).ok_or_else(|| PipelineError::Usage(format!("{}: {name} is missing", file.display())))
+        }
+        let is_light = c.metadata.get("stage").is_some_and(|s| s == "light");
+        if is_light && self.stage == Stage::Surfaces {
             self.begin_light()?;
         }
         self.origin = Origin { step: number(&c, "step", file)?, seconds: f64::from_bits(number(&c, "seconds_bits", file)?) };
@@ -361,20 +360,21 @@ impl SceneModel {
         self.samples_per_ray = f64::from_bits(number(&c, "samples_per_ray_bits", file)?);
         self.began = number(&c, "began", file)?;
         self.flattened = number(&c, "flattened", file)?;
-        self.flat = c.take("flat").unwrap_or_default();
+        self.flat = tensor(&mut c, "flat", file)?;
         self.median = f32::from_bits(number(&c, "median_bits", file)?);
         self.rate_scale = f32::from_bits(number(&c, "rate_scale_bits", file)?);
         param_state::restore(&mut self.params(), &mut c, file)?;
         param_state::take(&mut self.occupancy.grid.density, "occupancy", &mut c, file)?;
         param_state::take(&mut self.occupancy.grid.fresh, "occupancy.fresh", &mut c, file)?;
         self.occupancy.grid.refresh();
-        if let Some(solid) = c.take("solid") {
+        if is_light {
+            let solid = tensor(&mut c, "solid", file)?;
             let cells = self.config.light.sun_cells;
             if solid.len() != visibility::numbers_len(cells) {
                 return Err(PipelineError::Usage(format!("{}: solid does not have {cells} cells per axis", file.display())));
             }
             let visibility = Visibility::from_numbers(&solid, self.shaded_cube(), cells);
-            let surfaces = Surfaces::from_numbers(&c.take("surfaces").unwrap_or_default(), &visibility);
+            let surfaces = Surfaces::from_numbers(&tensor(&mut c, "surfaces", file)?, &visibility);
             self.surroundings = Some(Arc::new(Around { visibility, surfaces }));
         }
         Ok(())

@@ -4,6 +4,7 @@ use super::config::Stage;
 use super::model::SceneModel;
 use super::shading::{self, CHANNELS, NORMAL, gray};
 use super::sun::SUN;
+use super::visibility::Ambient;
 use diorama_engine::renderers::layers::Layers;
 use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_geom::Image;
@@ -11,14 +12,17 @@ use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::DVec3;
 use diorama_geom::sh_light::ShLight;
 use diorama_kernels::ops::ray_generation::{self, PosedCamera};
+use std::sync::OnceLock;
 
-/// Light in which a view is shown: spherical harmonics, and the sky behind.
+/// Light in which views are shown: spherical harmonics, and the sky behind.
 pub struct ViewLight {
     pub light: ShLight,
     /// `[16, 3]`
     pub sky: Vec<f32>,
     /// A sun apart, whose light the harmonics then lack: direction, power.
     pub sun: Option<[f32; SUN]>,
+    /// What of sky and surfaces reaches places in this light; found with the first view.
+    ambient: OnceLock<Ambient>,
 }
 
 impl ViewLight {
@@ -26,7 +30,7 @@ impl ViewLight {
     pub fn of(light: ShLight) -> ViewLight {
         let above = light.shade(DVec3::Z);
         let sky = (0..shading::SKY).map(|i| if i < 3 { above[i].max(0.0) as f32 / 0.282_094_8 } else { 0.0 }).collect();
-        ViewLight { light, sky, sun: None }
+        ViewLight { light, sky, sun: None, ambient: OnceLock::new() }
     }
 
     /// Harmonics, and a sun (direction and irradiance) besides, as a model takes them: apart, if it tells suns apart.
@@ -46,7 +50,7 @@ impl ViewLight {
 
     /// The light that a model learned.
     pub fn learned(model: &SceneModel, index: usize) -> ViewLight {
-        ViewLight { light: model.light(index), sky: model.sky(index).to_vec(), sun: model.sun(index) }
+        ViewLight { light: model.light(index), sky: model.sky(index).to_vec(), sun: model.sun(index), ambient: OnceLock::new() }
     }
 
     fn numbers(&self) -> Vec<f32> {
@@ -90,9 +94,11 @@ impl SceneModel {
         let image = |channels| Image::zeros(w, h, channels);
         let mut out =
             SceneView { color: image(3), albedo: image(3), normal: image(3), shadow: image(1), irradiance: image(3), depth, opacity };
-        let around = self.surroundings.as_deref();
-        let ambient = around.zip(light.sun.as_ref()).map(|(a, sun)| a.ambient(sun, &numbers)).unwrap_or_default();
-        let around = around.map(|a| (a, &ambient));
+        let sunlight = light.sun.as_ref().map(|sun| {
+            let around = self.surroundings.as_deref().expect("a model with suns apart knows what stands around");
+            let ambient = light.ambient.get_or_init(|| around.surfaces.light(&around.visibility, sun, &numbers));
+            (sun, &around.visibility, ambient)
+        });
         for (i, v) in values.data.chunks_exact(CHANNELS).enumerate() {
             let mut v: [f32; CHANNELS] = std::array::from_fn(|k| v[k]);
             let o = out.opacity.data[i];
@@ -101,11 +107,8 @@ impl SceneModel {
             let at = 3 * i..3 * i + 3;
             let hit = (o, out.depth.data[i] * o);
             let ray = (&origins[at.clone()], &dirs[at.clone()]);
-            let sunlit = light
-                .sun
-                .as_ref()
-                .zip(around)
-                .map(|(sun, (a, ambient))| shading::sunlit((&a.visibility, ambient), (sun, &numbers), &v[NORMAL..], hit, ray));
+            let sunlit =
+                sunlight.map(|(sun, visibility, ambient)| shading::sunlit((visibility, ambient), (sun, &numbers), &v[NORMAL..], hit, ray));
             let color = shading::color(&v, o, ray.1, &numbers, &light.sky, sunlit);
             let length = v[NORMAL..NORMAL + 3].iter().map(|n| n * n).sum::<f32>().sqrt().max(1e-20);
             for k in 0..3 {

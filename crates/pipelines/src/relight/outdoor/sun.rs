@@ -7,11 +7,14 @@ use diorama_geom::color::srgb_from_linear;
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
 use rayon::prelude::*;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Numbers of a sun: direction and power.
 pub const SUN: usize = 6;
 /// Candidates over the sphere of which those above the horizon are tried.
 const CANDIDATES: usize = 600;
+/// Least height of a sun, as the sine of its elevation.
+const HORIZON: f32 = 0.03;
 /// Most points by which directions are tried.
 const SEARCH_POINTS: usize = 1500;
 /// Radii in radians of the circles about the best direction that are tried afterwards, and directions on each.
@@ -27,6 +30,10 @@ const RIDGE: [f64; 3] = [1e-4, 2e-3, 5e-3];
 /// Albedo on the mean before anything is known, and luminance of the brightest twentieth.
 const FIRST_ALBEDO: f32 = 0.3;
 const BRIGHT: f32 = 0.7;
+/// Lights at most that are taken for one without a sun, to begin with.
+const TAKEN_FOR_EVEN: usize = 8;
+/// Times that light and albedo approach each other before beginnings are compared.
+const BEGUN: usize = 5;
 /// Times that lights and albedos are found in turn, and after which the sun's direction is followed only.
 const ROUNDS: usize = 5;
 const SEARCHED: usize = 1;
@@ -120,8 +127,8 @@ impl Surfaces {
         visibility.ambient(sky, &radiosity, mean)
     }
 
-    /// What of the sky and of surfaces reaches any place in a light.
-    pub fn spread(&self, visibility: &Visibility, sun: &[f32], sky: &[f32]) -> Ambient {
+    /// What of the sky, and of surfaces that it and a sun light, reaches any place.
+    pub fn light(&self, visibility: &Visibility, sun: &[f32], sky: &[f32]) -> Ambient {
         let power = Vec3::from_slice(&sun[3..]);
         let direct: Vec<Vec3> = self.sunlit(visibility, Vec3::from_slice(sun)).iter().map(|v| *v * power).collect();
         let mut irradiance: Vec<Vec3> = self.points.iter().zip(&direct).map(|(p, d)| *d + p.of_sky(sky).max(Vec3::ZERO)).collect();
@@ -174,75 +181,153 @@ impl Guess {
 
 /// Lights that explain how surfaces look in each of them, and the surfaces with their albedo. Both are found in turn; how bright albedo is,
 /// and its tint, is chosen such that its brightest twentieth has a luminance of 0.7 and the lights together are white. `progress` receives
-/// the share that is done.
-pub fn tell_apart(seen: &[Seen], visibility: &Visibility, progress: &mut dyn FnMut(f64)) -> (Vec<Fitted>, Surfaces) {
+/// the share that is done. None after an interrupt.
+pub fn tell_apart(
+    seen: &[Seen],
+    visibility: &Visibility,
+    interrupt: &AtomicBool,
+    progress: &mut dyn FnMut(f64),
+) -> Option<(Vec<Fitted>, Surfaces)> {
     let lights = seen.first().map_or(0, |s| s.colors.len());
     let mean = |of: &dyn Fn(&Seen) -> Vec3| seen.iter().map(of).sum::<Vec3>() / seen.len().max(1) as f32;
     let means: Vec<Vec3> = (0..lights).map(|l| mean(&|s| s.colors[l]).max(Vec3::splat(1e-4))).collect();
-    let relative = |s: &Seen| s.colors.iter().zip(&means).map(|(c, m)| *c / *m).sum::<Vec3>() / lights as f32;
-    let albedos = seen.iter().map(|s| FIRST_ALBEDO * relative(s)).collect();
-    let mut surfaces = Surfaces::new(seen.iter().map(|s| (s.point, s.normal)), albedos, visibility);
+    let mut surfaces = Surfaces::new(seen.iter().map(|s| (s.point, s.normal)), vec![Vec3::ZERO; seen.len()], visibility);
     // Before anything is known, closed places receive a share of what is seen.
-    let first_sent = |l: usize| {
-        let level = BOUNCED / FIRST_ALBEDO * means[l];
-        let open = surfaces.points.iter().map(|p| visibility.from_sky(&p.corners, p.normal));
-        open.map(|o| (1.0 - o) * level).collect()
+    let open: Vec<f32> = surfaces.points.iter().map(|p| visibility.from_sky(&p.corners, p.normal)).collect();
+    let sent = |l: usize| open.iter().map(|o| (1.0 - o) * BOUNCED / FIRST_ALBEDO * means[l]).collect();
+    let first_sent: Vec<Vec<Vec3>> = (0..lights).map(sent).collect();
+    // What is seen in a light without a sun shows albedos best, and each may be such a light.
+    let step = lights.div_ceil(TAKEN_FOR_EVEN).max(1);
+    let begun: Vec<usize> = (0..lights).step_by(step).collect();
+    let total = (begun.len() * (1 + BEGUN) + (ROUNDS - 1) * SETTLING) as f64;
+    let mut done = 0;
+    let mut go_on = || {
+        done += 1;
+        progress(done as f64 / total);
+        !interrupt.load(Ordering::Relaxed)
     };
-    let first_sent: Vec<Vec<Vec3>> = (0..lights).map(first_sent).collect();
-    let mut guesses: Vec<Guess> = Vec::new();
-    for round in 0..ROUNDS {
-        guesses = (0..lights)
-            .map(|l| {
-                // Shadows are in the first albedos, so the sun is looked for twice.
-                let known = (round > SEARCHED).then(|| Vec3::from_slice(&guesses[l].fitted.sun));
-                let sent = guesses.get(l).map_or(&first_sent[l], |g| &g.sent);
-                let fitted = fit(&lit(seen, &surfaces, l, sent, None), &surfaces, visibility, known);
-                let sunlit = surfaces.sunlit(visibility, Vec3::from_slice(&fitted.sun));
-                Guess { sunlit, sent: sent.clone(), fitted }
-            })
-            .collect();
-        // Light and albedo approach each other slowly; meanwhile suns stay where they are.
-        for k in 0..SETTLING {
-            surfaces.albedos = (0..seen.len()).into_par_iter().map(|i| explained(i, &seen[i], &surfaces, &guesses)).collect();
-            set_scale(&mut guesses, &mut surfaces.albedos);
-            let refit = |(l, g): (usize, &mut Guess)| {
-                let trusted = lit(seen, &surfaces, l, &g.sent, Some(g));
-                g.fitted = solve(&trusted, &surfaces.points, &g.sunlit, Vec3::from_slice(&g.fitted.sun));
-                if k % SENT_AGAIN == 0 {
-                    let irradiance: Vec<Vec3> = surfaces.points.iter().enumerate().map(|(i, p)| g.irradiance(i, p)).collect();
-                    let dark = [0.0; 27];
-                    let sent = surfaces.ambient(visibility, &dark, &irradiance);
-                    g.sent = surfaces.points.iter().map(|p| sent.at(&p.corners, p.normal, &dark)).collect();
-                }
-            };
-            guesses.par_iter_mut().enumerate().for_each(refit);
-            progress((round * SETTLING + k + 1) as f64 / (ROUNDS * SETTLING) as f64);
+    let mut best: Option<(f64, Vec<Guess>, Vec<Vec3>)> = None;
+    for even in begun {
+        surfaces.albedos = albedos_under(seen, even, &open);
+        let find = |l: usize, albedos: Vec<Vec3>| guess(seen, &surfaces, visibility, albedos, l, &first_sent[l], None);
+        let mut guesses: Vec<Guess> = (0..lights).map(|l| find(l, surfaces.albedos.clone())).collect();
+        guesses[even] = find(even, explained(seen, &surfaces, &guesses, Some(even)));
+        if !go_on() || !settle(seen, &mut surfaces, visibility, &mut guesses, BEGUN, &mut go_on) {
+            return None;
+        }
+        let misfit = misfit(seen, &surfaces, &guesses);
+        if best.as_ref().is_none_or(|b| misfit < b.0) {
+            best = Some((misfit, guesses, surfaces.albedos.clone()));
         }
     }
-    (guesses.into_iter().map(|g| g.fitted).collect(), surfaces)
+    let (_, mut guesses, albedos) = best?;
+    surfaces.albedos = albedos;
+    for round in 1..ROUNDS {
+        // Shadows may still be in the albedos, so the suns are looked for once more.
+        let again = |(l, g): (usize, &Guess)| {
+            let near = (round > SEARCHED).then(|| Vec3::from_slice(&g.fitted.sun));
+            let albedos = explained(seen, &surfaces, &guesses, Some(l));
+            guess(seen, &surfaces, visibility, albedos, l, &g.sent, near)
+        };
+        guesses = guesses.iter().enumerate().map(again).collect();
+        if !settle(seen, &mut surfaces, visibility, &mut guesses, SETTLING, &mut go_on) {
+            return None;
+        }
+    }
+    Some((guesses.into_iter().map(|g| g.fitted).collect(), surfaces))
+}
+
+/// Albedos if one light were an even sky: what is seen over how open a surface is.
+fn albedos_under(seen: &[Seen], light: usize, open: &[f32]) -> Vec<Vec3> {
+    let plain: Vec<Vec3> = seen.iter().zip(open).map(|(s, o)| s.colors[light] / (o + BOUNCED * (1.0 - o))).collect();
+    let by = FIRST_ALBEDO / (plain.iter().sum::<Vec3>() / plain.len().max(1) as f32).max(Vec3::splat(1e-4));
+    plain.into_iter().map(|a| a * by).collect()
+}
+
+/// A light that explains what is seen best with given albedos, near a direction of the sun or anywhere.
+fn guess(
+    seen: &[Seen],
+    surfaces: &Surfaces,
+    visibility: &Visibility,
+    albedos: Vec<Vec3>,
+    light: usize,
+    sent: &[Vec3],
+    near: Option<Vec3>,
+) -> Guess {
+    let points = lit(seen, &albedos, light, sent, None, &surfaces.points);
+    let fitted = fit(&points, surfaces, visibility, near);
+    Guess { sunlit: surfaces.sunlit(visibility, Vec3::from_slice(&fitted.sun)), sent: sent.to_vec(), fitted }
+}
+
+/// Lets albedo and light approach each other a number of times, which they do slowly; meanwhile suns stay where they are. Ends early, with
+/// false, once `go_on` says so.
+fn settle(
+    seen: &[Seen],
+    surfaces: &mut Surfaces,
+    visibility: &Visibility,
+    guesses: &mut [Guess],
+    times: usize,
+    go_on: &mut dyn FnMut() -> bool,
+) -> bool {
+    for k in 0..times {
+        surfaces.albedos = explained(seen, surfaces, guesses, None);
+        set_scale(guesses, &mut surfaces.albedos);
+        let refit = |(l, g): (usize, &mut Guess)| {
+            let trusted = lit(seen, &surfaces.albedos, l, &g.sent, Some(g), &surfaces.points);
+            g.fitted = solve(&trusted, &surfaces.points, &g.sunlit, Vec3::from_slice(&g.fitted.sun));
+            if k % SENT_AGAIN == 0 {
+                let irradiance: Vec<Vec3> = surfaces.points.iter().enumerate().map(|(i, p)| g.irradiance(i, p)).collect();
+                let dark = [0.0; 27];
+                let sent = surfaces.ambient(visibility, &dark, &irradiance);
+                g.sent = surfaces.points.iter().map(|p| sent.at(&p.corners, p.normal, &dark)).collect();
+            }
+        };
+        guesses.par_iter_mut().enumerate().for_each(refit);
+        if !go_on() {
+            return false;
+        }
+    }
+    true
+}
+
+/// How badly lights and albedos explain what is seen: mean of `e² / (e² + t²)` over points and lights, in sRGB.
+fn misfit(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess]) -> f64 {
+    let of = |(i, s): (usize, &Seen)| -> f64 {
+        let each = guesses.iter().zip(&s.colors);
+        each.map(|(g, c)| (1.0 - trust(surfaces.albedos[i] * g.irradiance(i, &surfaces.points[i]), *c).sqrt()) as f64).sum()
+    };
+    seen.iter().enumerate().map(of).sum::<f64>() / (seen.len() * guesses.len()).max(1) as f64
 }
 
 /// Surface points in one light, each trusted as an explanation of it says.
-fn lit(seen: &[Seen], surfaces: &Surfaces, light: usize, sent: &[Vec3], by: Option<&Guess>) -> Vec<Lit> {
+fn lit(seen: &[Seen], albedos: &[Vec3], light: usize, sent: &[Vec3], by: Option<&Guess>, places: &[Place]) -> Vec<Lit> {
     let of = |(i, s): (usize, &Seen)| {
-        let (albedo, color) = (surfaces.albedos[i], s.colors[light]);
-        let trust = by.map_or(1.0, |g| trust(albedo * g.irradiance(i, &surfaces.points[i]), color));
+        let (albedo, color) = (albedos[i], s.colors[light]);
+        let trust = by.map_or(1.0, |g| trust(albedo * g.irradiance(i, &places[i]), color));
         Lit { albedo, seen: color, sent: sent[i], trust }
     };
     seen.iter().enumerate().map(of).collect()
 }
 
-/// Albedo of a point that lights explain best; the one before says which lights to trust.
-fn explained(i: usize, s: &Seen, surfaces: &Surfaces, guesses: &[Guess]) -> Vec3 {
-    let before = surfaces.albedos[i];
-    let (mut a, mut b) = (Vec3::ZERO, Vec3::splat(1e-6));
-    for (g, c) in guesses.iter().zip(&s.colors) {
-        let white = g.irradiance(i, &surfaces.points[i]);
-        // The derivative of sRGB at what is seen, squared.
-        let weight = Vec3::from(c.max(Vec3::splat(DARK)).to_array().map(|v| v.powf(-1.16))) * trust(before * white, *c);
-        (a, b) = (a + weight * white * *c, b + weight * white * white);
-    }
-    (a / b).max(Vec3::ZERO)
+/// Albedos that lights explain best, with one of the lights left out: what it casts is not in them then, and it can be looked for. The albedos
+/// before say which lights to trust.
+fn explained(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess], left_out: Option<usize>) -> Vec<Vec3> {
+    let is_only = guesses.len() == 1;
+    let of = |(i, s): (usize, &Seen)| {
+        let before = surfaces.albedos[i];
+        let (mut a, mut b) = (Vec3::ZERO, Vec3::splat(1e-6));
+        for (l, (g, c)) in guesses.iter().zip(&s.colors).enumerate() {
+            if left_out == Some(l) && !is_only {
+                continue;
+            }
+            let white = g.irradiance(i, &surfaces.points[i]);
+            // The derivative of sRGB at what is seen, squared.
+            let weight = Vec3::from(c.max(Vec3::splat(DARK)).to_array().map(|v| v.powf(-1.16))) * trust(before * white, *c);
+            (a, b) = (a + weight * white * *c, b + weight * white * white);
+        }
+        (a / b).max(Vec3::ZERO)
+    };
+    seen.par_iter().enumerate().map(of).collect()
 }
 
 /// Shares brightness and tint between lights and albedos.
@@ -288,10 +373,10 @@ fn fit(lit: &[Lit], surfaces: &Surfaces, visibility: &Visibility, near: Option<V
             let sunlit: Vec<f32> = places.iter().map(|p| p.sunlit(visibility, d)).collect();
             solve(&few, &places, &sunlit, d)
         });
-        tried.reduce_with(|a, b| if b.error < a.error { b } else { a }).expect("a direction")
+        tried.reduce_with(|a, b| if b.error < a.error { b } else { a })
     };
-    let all = || (0..CANDIDATES).map(|i| spread(i, CANDIDATES).as_vec3()).filter(|d| d.z > 0.03).collect();
-    let mut best = best_of(near.map_or_else(all, |d| vec![d]));
+    let all = || (0..CANDIDATES).map(|i| spread(i, CANDIDATES).as_vec3()).filter(|d| d.z > HORIZON).collect();
+    let mut best = best_of(near.map_or_else(all, |d| vec![d])).expect("a direction");
     for radius in CIRCLES {
         let center = Vec3::new(best.sun[0], best.sun[1], best.sun[2]);
         let (a, b) = center.any_orthonormal_pair();
@@ -300,8 +385,8 @@ fn fit(lit: &[Lit], surfaces: &Surfaces, visibility: &Visibility, near: Option<V
             let (y, x) = (i as f32 / AROUND as f32 * std::f32::consts::TAU).sin_cos();
             (cos * center + sin * (x * a + y * b)).normalize()
         });
-        let next = best_of(circle.collect());
-        if next.error < best.error {
+        let next = best_of(circle.filter(|d| d.z > HORIZON).collect());
+        if let Some(next) = next.filter(|n| n.error < best.error) {
             best = next;
         }
     }

@@ -14,12 +14,13 @@ use diorama_engine::samplers::RayBatch;
 use diorama_engine::samplers::pixels::{self, DrawOptions, Observation, PixelSource};
 use diorama_engine::samplers::placement::Placement;
 use diorama_engine::step::{Backdrop, GivenRays, Loss, Probes, RaySource, Step, Trainees};
-use diorama_engine::train::{Scalar, Scalars, StepReport, Trainee};
+use diorama_engine::train::{Event, Scalar, Scalars, StepReport, Trainee};
 use diorama_geom::color::linear_from_srgb;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::photometric_loss::{ColorLoss, Terms};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 /// Streams of random numbers.
 const PIXELS: u64 = 10;
@@ -112,12 +113,13 @@ impl<'a> Trainer<'a> {
     }
 
     /// Flattens what is nearly flat if that is due: from then on, distances to planes through the surfaces are observed.
-    fn flatten(&mut self, share: f32) {
+    fn flatten(&mut self, share: f32, events: &mut dyn FnMut(&Event)) {
         let due = (share * (FLATTENED + 1) as f32) as u64;
         if due.min(FLATTENED) <= self.model.flattened || self.model.config.loss.depth == 0.0 {
             return;
         }
         self.model.flattened = due;
+        events(&Event::Preparing { what: "flattening surfaces", share: due as f64 / FLATTENED as f64 });
         let flat = NormalMaps::of(&self.model, &self.cameras).observations(FLAT_PIXELS);
         self.model.flat = flat.iter().flat_map(|o| [o.image as f32, o.x as f32, o.y as f32, o.distance]).collect();
         self.observe_flat();
@@ -127,9 +129,9 @@ impl<'a> Trainer<'a> {
         self.observations.truncate(self.given);
         let near = self.model.config.sampling.near;
         let flat = self.model.flat.chunks_exact(4).filter(|f| f[3] > near);
-        self.observations.extend(flat.map(|f| Observation { image: f[0] as u32, x: f[1] as u32, y: f[2] as u32, distance: f[3] }));
+        let observed = flat.map(|f| Observation { image: f[0] as u32, x: f[1] as u32, y: f[2] as u32, distance: f[3] });
         let photographs = &self.photographs;
-        self.observations.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y));
+        self.observations.extend(observed.filter(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y)));
     }
 
     /// Shows the model in the viewer.
@@ -287,21 +289,22 @@ fn first_skies(model: &mut SceneModel, photographs: &StoredPhotographs, cameras:
 impl Trainee for Trainer<'_> {
     type Error = crate::error::PipelineError;
 
+    fn prepare(&mut self, step: u64, progress: f64, interrupt: &AtomicBool, events: &mut dyn FnMut(&Event)) -> Result<()> {
+        match self.model.config.light.stage(progress as f32) {
+            (Stage::Surfaces, share) => self.flatten(share, events),
+            (Stage::Light, _) if self.model.stage == Stage::Surfaces => self.begin_light(step, interrupt, events)?,
+            (Stage::Light, _) => {}
+        }
+        Ok(())
+    }
+
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport> {
         if self.view.is_some_and(RunView::wants_update) {
             self.show();
         }
         match self.model.config.light.stage(progress as f32) {
-            (Stage::Surfaces, share) => {
-                self.flatten(share);
-                self.look(step, share)
-            }
-            (Stage::Light, share) => {
-                if self.model.stage == Stage::Surfaces {
-                    self.begin_light(step)?;
-                }
-                self.relight(step, share)
-            }
+            (Stage::Surfaces, share) => self.look(step, share),
+            (Stage::Light, share) => self.relight(step, share),
         }
     }
 
@@ -328,6 +331,9 @@ impl Trainee for Trainer<'_> {
         }
         fresh.rate_scale = 0.3 * self.model.rate_scale;
         self.model = fresh;
+        self.observe_flat();
+        self.ambients = self.model.ambients();
+        self.normals = (self.model.stage == Stage::Light).then(|| NormalMaps::of(&self.model, &self.cameras));
         Ok(Some((self.model.origin.step, "the loss was not finite; the rate is lowered".into())))
     }
 }

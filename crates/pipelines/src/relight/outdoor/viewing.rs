@@ -18,7 +18,7 @@ use diorama_geom::{Capture, ImageU8};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 /// A run of the scene model in the viewer.
 pub type RunView = AnyRunView<ViewedScene>;
@@ -36,6 +36,8 @@ const UNLIT: [&str; 3] = ["albedo", "normal", "depth"];
 pub struct ViewedScene {
     model: SceneModel,
     maps: Arc<Vec<GivenLight>>,
+    /// The last light that was shown, and the controls that describe it.
+    lit: Mutex<Option<(ControlValues, Arc<ViewLight>)>>,
 }
 
 /// A light of a file: harmonics, and the sun (direction and irradiance) that they lack.
@@ -69,18 +71,31 @@ pub fn read_maps(files: &[PathBuf]) -> Result<(Vec<GivenLight>, Vec<String>)> {
 /// # Errors
 /// When what was saved in the viewer before cannot be read.
 pub fn open(run: &Path, model: SceneModel, maps: Vec<GivenLight>, running: bool) -> Result<Arc<RunView>> {
-    RunView::new(run, ViewedScene { model, maps: Arc::new(maps) }, running)
+    RunView::new(run, ViewedScene::new(model, Arc::new(maps)), running)
 }
 
 impl RunView {
     /// Shows a newer state of a model in training.
     pub fn show_model(&self, model: SceneModel) {
         let maps = self.model().maps.clone();
-        self.show(ViewedScene { model, maps });
+        self.show(ViewedScene::new(model, maps));
     }
 }
 
 impl ViewedScene {
+    fn new(model: SceneModel, maps: Arc<Vec<GivenLight>>) -> ViewedScene {
+        ViewedScene { model, maps, lit: Mutex::default() }
+    }
+
+    /// The light that the controls describe, found anew only where they changed.
+    fn lit(&self, values: &ControlValues) -> Arc<ViewLight> {
+        let mut lit = self.lit.lock().expect("no other thread fails with it");
+        match &*lit {
+            Some((of, light)) if of == values => light.clone(),
+            _ => lit.insert((values.clone(), Arc::new(self.light(values)))).1.clone(),
+        }
+    }
+
     /// Options of the light: what was learned, maps, a clear sky.
     fn lights(&self) -> Vec<(String, String)> {
         let m = &self.model;
@@ -140,7 +155,7 @@ impl ViewedScene {
         let mut tracer = m.tracer(Quality::Full);
         let corner = |c: [f32; 3]| m.model_from_world.point(DVec3::from(c.map(f64::from))).as_vec3().to_array();
         tracer.clip = r.clip.map(|(low, high)| (corner(low), corner(high)));
-        m.view_with(tracer, &self.posed(r), &self.light(&r.values), &mut |_| {})
+        m.view_with(tracer, &self.posed(r), &self.lit(&r.values), &mut |_| {})
     }
 }
 

@@ -1,4 +1,4 @@
-//! The light's stage of training: what is told apart at its beginning, its steps, and the updates of suns.
+//! The light's stage of training: what is told apart at its beginning, and its steps.
 
 use super::super::model::Around;
 use super::super::normal_maps::NormalMaps;
@@ -13,10 +13,11 @@ use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_engine::samplers::RayBatch;
 use diorama_engine::samplers::pixels::{self, DrawOptions};
 use diorama_engine::step::{GivenRays, Loss, Trainees};
-use diorama_engine::train::StepReport;
+use diorama_engine::train::{Event, StepReport};
 use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::Vec3;
 use diorama_geom::rng::Rng;
+use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
 /// Streams of random numbers.
@@ -43,12 +44,15 @@ struct Taught {
 
 impl Trainer<'_> {
     /// Goes on to the stage of light: suns, skies and what hides them are found on the surfaces as they are.
-    pub(super) fn begin_light(&mut self, step: u64) -> Result<()> {
+    /// After an interrupt, nothing has changed.
+    pub(super) fn begin_light(&mut self, step: u64, interrupt: &AtomicBool, events: &mut dyn FnMut(&Event)) -> Result<()> {
+        let mut progress = |share: f64| events(&Event::Preparing { what: "telling light from albedo", share });
+        progress(0.0);
         let m = &self.model;
         let normals = NormalMaps::of(m, &self.cameras);
         let visibility = Visibility::of(&m.field, &m.occupancy, m.shaded_cube(), m.config.light.sun_cells);
-        self.model.share_codes();
-        let (fitted, surfaces) = sun::tell_apart(&self.seen(&normals), &visibility, &mut |_| {});
+        let seen = self.seen(&normals);
+        let Some((fitted, surfaces)) = sun::tell_apart(&seen, &visibility, interrupt, &mut progress) else { return Ok(()) };
         let m = &mut self.model;
         let is_apart = m.config.light.has_sun();
         for (l, found) in fitted.iter().enumerate() {
@@ -71,12 +75,12 @@ impl Trainer<'_> {
     /// Random surface points of the photographs as they look in every light.
     fn seen(&self, normals: &NormalMaps) -> Vec<Seen> {
         let m = &self.model;
-        let lights = m.light_count();
+        let (field, lights) = (m.with_shared_codes(), m.light_count());
         let (all, least, most) = TELLING;
         let mut batch = self.pixels((all / lights.max(1)).clamp(least, most));
         let mut out: Vec<Seen> = Vec::new();
         for l in 0..lights {
-            let tracer = Tracer { appearance: Some(l as u32), ..m.tracer(Quality::Full) };
+            let tracer = Tracer { field: &field, appearance: Some(l as u32), ..m.tracer(Quality::Full) };
             let traced = tracer.trace_layers(&mut batch, &[], &mut FieldBuffers::default());
             let shown = (0..batch.len()).filter(|r| batch.counts[*r]).filter_map(|r| {
                 let normal = normals.at(batch.images[r] as usize, batch.pixels[2 * r], batch.pixels[2 * r + 1]);
