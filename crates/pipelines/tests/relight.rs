@@ -105,7 +105,8 @@ fn an_interrupted_run_ends_as_if_it_had_not_been() {
     assert_eq!(whole.lights.values, resumed.lights.values);
     assert_eq!(whole.skies.values, resumed.skies.values);
     assert_eq!(whole.suns.values, resumed.suns.values);
-    assert!(whole.around().iter().all(|v| !v.is_empty()) && whole.around() == resumed.around());
+    assert!(whole.around().is_some_and(|a| a.iter().all(|v| !v.is_empty())) && whole.around() == resumed.around());
+    assert!(!whole.flat.is_empty() && whole.flat == resumed.flat);
 }
 
 #[test]
