@@ -462,57 +462,5 @@ fn without(equations: &[[f64; UNKNOWNS + 1]; UNKNOWNS], out: &[usize]) -> [f64; 
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use diorama_engine::fields::DensityQuery;
-    use diorama_engine::samplers::occupancy::Occupancy;
-    use diorama_geom::rng::Rng;
-    use diorama_geom::sh_light::ShLight;
-
-    /// A plate with a tower.
-    struct Tower;
-
-    fn is_inside(p: Vec3) -> bool {
-        (0.1..0.2).contains(&p.z) || ((p - 0.5).abs().truncate().max_element() < 0.1 && (0.2..0.6).contains(&p.z))
-    }
-
-    impl DensityQuery for Tower {
-        fn density(&self, model: &[f32], sigma: &mut [f32]) {
-            sigma.iter_mut().zip(model.chunks_exact(3)).for_each(|(s, p)| *s = 2000.0 * is_inside(Vec3::from_slice(p)) as u8 as f32);
-        }
-    }
-
-    #[test]
-    fn the_sun_is_found_where_it_stands() {
-        let visibility = Visibility::of(&Tower, &Occupancy::new(64, 1, false), (0.0, 1.0), 64);
-        let (sun, power) = (Vec3::new(0.5, -0.6, 0.7).normalize(), Vec3::new(0.9, 0.8, 0.6));
-        let mut sky = ShLight::uniform([0.2, 0.25, 0.35]);
-        sky.0[2] = [0.1; 3];
-        let rng = Rng::new(5, 5);
-        let seen: Vec<(Vec3, Vec3, Vec3, Vec3)> = (0..3000)
-            .map(|i| {
-                let at = |k: u64| rng.uniform(8 * i + k);
-                let (point, normal) = match i % 4 {
-                    0..2 => (Vec3::new(at(0), at(1), 0.2), Vec3::Z),
-                    2 => (Vec3::new(0.4 + 0.2 * at(0), 0.4, 0.2 + 0.4 * at(1)), Vec3::NEG_Y),
-                    _ => (Vec3::new(0.6, 0.4 + 0.2 * at(0), 0.2 + 0.4 * at(1)), Vec3::X),
-                };
-                let albedo = Vec3::new(0.2 + 0.5 * at(2), 0.3 + 0.3 * at(3), 0.5);
-                let corners = visibility.corners(point, normal);
-                let lit: Vec3 =
-                    visibility.sky_row(&corners, normal).iter().zip(sky.0).map(|(t, l)| *t * Vec3::from(l.map(|v| v as f32))).sum();
-                let direct = power * normal.dot(sun).max(0.0) * visibility.from_sun(point, normal, sun);
-                (point, normal, albedo, albedo * (lit + direct))
-            })
-            .collect();
-        let surfaces = Surfaces::new(seen.iter().map(|s| (s.0, s.1)), seen.iter().map(|s| s.2).collect(), &visibility);
-        let pixels: Vec<Lit> = seen.iter().map(|s| Lit { albedo: s.2, seen: s.3, sent: Vec3::ZERO, trust: 1.0 }).collect();
-        let found = fit(&pixels, &surfaces, &visibility, None);
-        let direction = Vec3::from_slice(&found.sun[..3]);
-        assert!(direction.angle_between(sun).to_degrees() < 2.0, "{direction} {sun}");
-        assert!((Vec3::from_slice(&found.sun[3..6]) - power).abs().max_element() < 0.05, "{found:?}");
-        // From nearby, only the neighborhood is searched.
-        let again = fit(&pixels, &surfaces, &visibility, Some((sun + Vec3::new(0.05, 0.0, 0.0)).normalize()));
-        assert!(Vec3::from_slice(&again.sun[..3]).angle_between(sun).to_degrees() < 2.0);
-    }
-}
+#[path = "sun_tests.rs"]
+mod tests;
