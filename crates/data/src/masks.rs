@@ -14,11 +14,18 @@ const FOLDERS: [&str; 2] = ["masks", "mask"];
 /// Most masks that are decoded to choose their meaning, and the side in pixels at which they are examined.
 const EXAMINED_MASKS: usize = 16;
 const EXAMINED_PX: usize = 96;
+/// What masks of [`MaskMeaning::Classes`] mark: what stays, glass, and the sky.
+pub const STATIC_CLASS: u8 = 255;
+pub const GLASS_CLASS: u8 = 192;
+pub const SKY_CLASS: u8 = 160;
 /// Mask values from this on are kept.
 pub const COUNTS: u8 = 128;
 /// Mask values of glass, which masks mark with 192: it is kept as a surface, but what it mirrors and lets through tells nothing about the
 /// light on it. Around 192, because masks are resampled.
 pub const GLASS: RangeInclusive<u8> = 176..=208;
+/// Mask values of the sky, which masks of [`MaskMeaning::Classes`] mark with 160: it is empty space. Between it and what is static lies glass, so
+/// that borders in resampled masks count as surfaces.
+pub const SKY: RangeInclusive<u8> = 144..=175;
 /// Masks show one object if they keep at most this share of the picture and at most this share of its border.
 const OBJECT: (f64, f64) = (0.6, 0.1);
 /// Masks are considered identical if at most this share of their pixels differs.
@@ -62,13 +69,14 @@ pub struct MaskOptions {
 /// Parses a meaning; `None` for `auto`.
 ///
 /// # Errors
-/// If the text is not auto, object or unknown.
+/// If the text is not auto, object, unknown or classes.
 pub fn parse_meaning(s: &str) -> std::result::Result<Option<MaskMeaning>, String> {
     match s {
         "auto" => Ok(None),
         "object" => Ok(Some(MaskMeaning::Object)),
         "unknown" => Ok(Some(MaskMeaning::Unknown)),
-        _ => Err(format!("mask meaning {s:?}: expected auto, object or unknown")),
+        "classes" => Ok(Some(MaskMeaning::Classes)),
+        _ => Err(format!("mask meaning {s:?}: expected auto, object, unknown or classes")),
     }
 }
 
@@ -115,6 +123,10 @@ pub fn assign(
         MaskMeaning::Unknown => format!(
             "masks for {count} (in {place}{read}): what they leave out is neither trained on nor scored, {why}; \
              --mask-meaning object makes it empty space, --mask invert keeps the rest instead, --mask ignore uses none"
+        ),
+        MaskMeaning::Classes => format!(
+            "masks for {count} (in {place}{read}): 255 is static, 192 glass, 160 sky, which is empty space, and 0 is neither trained on nor \
+             scored, {why}; --mask ignore uses none"
         ),
     });
     Ok(MaskRule { meaning, inverted })
@@ -286,7 +298,7 @@ fn rgba<T: Copy>(data: &[T], channels: usize, opaque: T, mask: &ImageU8, through
     pixels.collect()
 }
 
-/// A photograph with its mask applied: transparent pixels if masks mean an object, else the mask itself.
+/// A photograph with its mask applied: transparent pixels if masks mean an object, else the mask itself, and a transparent sky where masks mark it.
 ///
 /// # Errors
 /// As [`of_frame`].
@@ -294,6 +306,10 @@ pub fn apply(frame: &Frame, rule: &MaskRule, photo: Photo) -> Result<(Photo, Opt
     match of_frame(frame, rule, photo.size())? {
         None => Ok((photo, None)),
         Some(mask) if rule.meaning == MaskMeaning::Object => Ok((cut_out(&photo, &mask), None)),
+        Some(mask) if rule.meaning == MaskMeaning::Classes && mask.data.iter().any(|v| SKY.contains(v)) => {
+            let matter = mask.data.iter().map(|v| if SKY.contains(v) { 0 } else { 255 }).collect();
+            Ok((cut_out(&photo, &ImageU8 { data: matter, ..mask.clone() }), Some(mask)))
+        }
         Some(mask) => Ok((photo, Some(mask))),
     }
 }
@@ -418,6 +434,22 @@ mod tests {
         assert!(e.is_input() && e.to_string().contains("60×40") && e.to_string().contains("40×60"), "{e}");
         std::fs::write(f.mask.as_ref().unwrap(), b"no picture").unwrap();
         assert!(of_frame(f, &rule, SIZE).unwrap_err().to_string().contains("p_0.png"));
+    }
+
+    #[test]
+    fn a_sky_is_cut_out_where_masks_mark_classes() {
+        let dir = tempfile::tempdir().unwrap();
+        let f = &mut frames(dir.path(), 1, |_, x, _| x < 0.5)[0];
+        let path = dir.path().join("masks/p_0.png");
+        photo::save_png(&path, &ImageU8 { width: 4, height: 1, channels: 1, data: vec![255, 192, 160, 0] }).unwrap();
+        f.mask = Some(path);
+        let gray = ImageU8 { width: 4, height: 1, channels: 3, data: vec![9; 12] };
+        let of = |meaning| apply(f, &MaskRule { meaning, inverted: false }, Photo::Eight(gray.clone())).unwrap();
+        let (Photo::Eight(cut), Some(mask)) = of(MaskMeaning::Classes) else { panic!("8 bits and a mask") };
+        assert_eq!(cut.data.chunks_exact(4).map(|p| (p[0], p[3])).collect::<Vec<_>>(), [(9, 255), (9, 255), (9, 0), (9, 255)]);
+        assert_eq!(mask.data.iter().map(|v| *v >= COUNTS).collect::<Vec<_>>(), [true, true, true, false]);
+        // The same shade means nothing where masks do not mark classes.
+        assert_eq!(of(MaskMeaning::Unknown).0, Photo::Eight(gray.clone()));
     }
 
     #[test]

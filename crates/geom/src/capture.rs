@@ -140,6 +140,8 @@ pub enum MaskMeaning {
     Object,
     /// Unknown: these pixels are neither trained on nor scored.
     Unknown,
+    /// As unknown; but masks mark classes besides, of which the sky is empty space.
+    Classes,
 }
 
 /// How the masks of a capture are read.

@@ -4,13 +4,14 @@
 
 use super::truth::{self, LightTruth, Truth, ViewTruth};
 use crate::error::{PipelineError, Result};
+use diorama_data::masks::{GLASS_CLASS, SKY_CLASS, STATIC_CLASS};
 use diorama_data::{DataError, atomic, photo};
 use diorama_geom::color::srgb_from_linear;
 use diorama_geom::daylight::Daylight;
 use diorama_geom::environment::Environment;
 use diorama_geom::glam::DVec3;
 use diorama_geom::sky::Sky;
-use diorama_geom::{Camera, Image, Model, Pose};
+use diorama_geom::{Camera, Image, ImageU8, Model, Pose};
 use diorama_kernels::ops::denoise;
 use diorama_kernels::ops::path_trace::{Film, Scene, Settings, View, cpu};
 use diorama_scenes::street;
@@ -170,7 +171,7 @@ pub fn generate(
     if !(1..LIGHTS.len()).contains(&options.lights) || place.cameras.len() < HOLD_OUT {
         return Err(PipelineError::Usage(format!("a benchmark has 1 to {} lights and at least {HOLD_OUT} views", LIGHTS.len() - 1)));
     }
-    for folder in ["images", "truth"] {
+    for folder in ["images", "masks", "truth"] {
         let folder = out.join(folder);
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
@@ -203,11 +204,14 @@ pub fn generate(
             let name = format!("v{v:03}_{}", LIGHTS[lights[l]].0);
             save_photograph(&out.join("images").join(format!("{name}.png")), &film)?;
             truth::save_shadow(out, &name, &film)?;
+            let mask = format!("masks/v{v:03}.png");
             if l == 0 {
-                let is_valid = valid_pixels(&scene, &view, model, &film);
+                let classes = classes(&scene, &view, model);
+                let is_valid = valid_pixels(&classes, &film);
                 truth::save_view(out, &format!("v{v:03}"), &film, &is_valid)?;
+                photo::save_png(&out.join(&mask), &classes)?;
             }
-            frames[is_held_out as usize].push(frame(&name, camera, pose, l));
+            frames[is_held_out as usize].push(frame(&name, &mask, camera, pose, l));
             views.push(ViewTruth { photograph: name, view: format!("v{v:03}"), light: l, held_out: is_held_out });
             *(if is_held_out { &mut made.held_out } else { &mut made.photographs }) += 1;
             progress((v * lights.len() + l + 1) as f64 / total);
@@ -235,21 +239,31 @@ fn save_photograph(path: &Path, film: &Film) -> Result<()> {
     Ok(photo::save_png(path, &srgb.to_u8())?)
 }
 
-/// Where a pixel shows an opaque surface: neither sky nor glass.
-fn valid_pixels(scene: &Scene, view: &View, model: &Model, film: &Film) -> Image {
-    let first = cpu::first_hits(scene, view, true);
+/// The mask of a view: what is at the middle of each pixel.
+fn classes(scene: &Scene, view: &View, model: &Model) -> ImageU8 {
     let is_glass = |i: u32| model.materials[model.parts[model.instances[i as usize].part].material].transmission > 0.0;
-    let valid =
-        first.iter().zip(&film.pixels).map(|(hit, p)| (p.opacity > 0.99 && hit.is_some_and(|h| !is_glass(h.instance))) as u32 as f32);
+    let data = cpu::first_hits(scene, view, true).into_iter().map(|hit| match hit {
+        None => SKY_CLASS,
+        Some(h) if is_glass(h.instance) => GLASS_CLASS,
+        Some(_) => STATIC_CLASS,
+    });
+    let data = data.collect();
+    ImageU8 { width: view.camera.width as usize, height: view.camera.height as usize, channels: 1, data }
+}
+
+/// Where a pixel shows an opaque surface: neither sky nor glass.
+fn valid_pixels(classes: &ImageU8, film: &Film) -> Image {
+    let valid = classes.data.iter().zip(&film.pixels).map(|(class, p)| (p.opacity > 0.99 && *class == STATIC_CLASS) as u32 as f32);
     Image { width: film.width, height: film.height, channels: 1, data: valid.collect() }
 }
 
 /// A frame of `transforms.json`: poses have y up and look along −z there.
-fn frame(name: &str, camera: &Camera, pose: &Pose, session: usize) -> serde_json::Value {
+fn frame(name: &str, mask: &str, camera: &Camera, pose: &Pose, session: usize) -> serde_json::Value {
     let p = pose.flip_y_z();
     let row = |i: usize| [p.rotation.x_axis[i], p.rotation.y_axis[i], p.rotation.z_axis[i], p.translation[i]];
     json!({
         "file_path": format!("images/{name}.png"),
+        "mask_path": mask,
         "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
         "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height,
         "session": session,
@@ -278,5 +292,5 @@ fn capture(frames: Vec<serde_json::Value>, scene: &Scene, cameras: &[(Camera, Po
     let aabb_scale = (farthest / half).min(MOST_SCALE as f64).ceil().max(1.0) as u32;
     let scale = 0.5 / half;
     let offset = DVec3::splat(0.5) - scale * center;
-    json!({ "aabb_scale": aabb_scale.next_power_of_two(), "scale": scale, "offset": [offset.x, offset.y, offset.z], "frames": frames })
+    json!({ "aabb_scale": aabb_scale.next_power_of_two(), "scale": scale, "offset": [offset.x, offset.y, offset.z], "mask_meaning": "classes", "frames": frames })
 }

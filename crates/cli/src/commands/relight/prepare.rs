@@ -23,9 +23,12 @@ pub struct Prepare {
     /// Source of the poses: colmap or none
     #[arg(long, default_value = "colmap")]
     sfm: String,
-    /// Folder with a mask NAME.png for each photograph: 255 is static, 192 glass, 0 transient (people, cars, leaves)
+    /// Folder with a mask NAME.png for each photograph: 255 is static, 192 glass, 160 sky, 0 transient (people, cars, leaves)
     #[arg(long)]
     masks: Option<PathBuf>,
+    /// auto: find the sky of each photograph and mark it in its mask, which may then be edited; none
+    #[arg(long, default_value = "auto", value_parser = ["auto", "none"])]
+    sky: String,
     /// exif (pauses of 30 minutes), names (before the number), folders, each, or a file with lines PHOTOGRAPH SESSION [default: as the
     /// capture says, else names]
     #[arg(long)]
@@ -122,6 +125,7 @@ impl Prepare {
             out: self.out.clone(),
             sfm: self.sfm.parse().map_err(usage)?,
             masks: self.masks.clone(),
+            sky: self.sky == "auto",
             sessions: self.sessions.as_deref().map(str::parse).transpose().map_err(usage)?,
             max_side: self.max_side,
             matcher: self.matcher.parse().map_err(usage)?,
@@ -143,6 +147,10 @@ impl Prepare {
 fn print(made: &Prepared) {
     let mut masks = made.static_share.map_or(String::new(), |s| format!(", masks leave {:.0} %", 100.0 * s));
     made.glass_share.filter(|s| *s > 0.0).iter().for_each(|s| masks += &format!(", {:.1} % glass", 100.0 * s));
+    if let Some(share) = made.sky_share {
+        let without = if made.without_sky > 0 { format!(" ({} photographs without)", made.without_sky) } else { String::new() };
+        masks += &format!(", {:.0} % sky{without}", 100.0 * share);
+    }
     println!(
         "{}: {} photographs of {} sessions, {} held out, {} undistorted, {} points{masks}",
         made.folder.display(),

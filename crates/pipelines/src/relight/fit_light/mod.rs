@@ -109,7 +109,7 @@ struct Shot {
     camera: PosedCamera,
     /// `[H, W, 3]`, 8 bits.
     photo: ImageU8,
-    /// 255 is static, 192 glass, 0 left out.
+    /// 255 is static, 192 glass, 160 sky, 0 left out.
     mask: Option<ImageU8>,
     full: (usize, usize),
 }
@@ -130,7 +130,8 @@ impl Shot {
     }
 
     fn is_kept(&self, i: usize) -> bool {
-        self.mask.as_ref().is_none_or(|m| m.data[i] >= masks::COUNTS && !masks::GLASS.contains(&m.data[i]))
+        let is_surface = |v: u8| v >= masks::COUNTS && !masks::GLASS.contains(&v) && !masks::SKY.contains(&v);
+        self.mask.as_ref().is_none_or(|m| is_surface(m.data[i]))
     }
 
     fn rgb(&self, i: usize) -> [u8; 3] {

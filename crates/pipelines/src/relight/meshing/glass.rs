@@ -2,7 +2,7 @@
 
 use super::super::outdoor::model::SceneModel;
 use crate::error::Result;
-use diorama_data::masks::{self, COUNTS, GLASS};
+use diorama_data::masks::{self, COUNTS, GLASS, SKY};
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::{DAffine3, DVec3};
 use diorama_geom::model::{Instance, Material, Part};
@@ -94,7 +94,7 @@ fn vote(frame: &Frame, mask: &ImageU8, pose: &Pose, p: &[f32; 3]) -> i32 {
     let (x, y) = ((at.x.max(0.0) as usize).min(mask.width - 1), (at.y.max(0.0) as usize).min(mask.height - 1));
     match mask.pixel(x, y)[0] {
         v if GLASS.contains(&v) => 1,
-        v if v >= COUNTS => -1,
+        v if v >= COUNTS && !SKY.contains(&v) => -1,
         _ => 0,
     }
 }

@@ -91,6 +91,13 @@ pub struct LossConfig {
     pub depth: f32,
     /// Brightest twentieth of the albedo beyond a luminance of 0.9.
     pub gauge: f32,
+    /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.
+    #[serde(default = "one_cube")]
+    pub near_scaling: f32,
+}
+
+fn one_cube() -> f32 {
+    1.0
 }
 
 /// Rates and their course.
@@ -191,6 +198,7 @@ impl Config {
                 distortion: 0.1,
                 depth: 0.3,
                 gauge: 0.1,
+                near_scaling: 1.0,
             },
             optim: OptimConfig { grid_rate: 1.5e-2, table_decay: 1e-5, net_rate: 3e-3, light_rate: 5e-3, final_scale: 0.05 },
             sampling: SamplingConfig {
@@ -272,6 +280,7 @@ impl Configuration for Config {
             self.loss.distortion,
             self.loss.depth,
             self.loss.gauge,
+            self.loss.near_scaling,
         ];
         if self.loss.huber <= 0.0 || weights.iter().any(|w| !(*w >= 0.0 && w.is_finite())) {
             return fault("loss: huber must be above 0, weights 0 or more");

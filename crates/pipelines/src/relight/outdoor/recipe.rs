@@ -98,9 +98,12 @@ fn observations(
     if model.config.loss.depth > 0.0 {
         events(&Event::Note(format!("comparing {} photographs with their neighbors to find distances", model.train.len())));
         found = stereo::observe(photographs, &model.cameras(), distance, interrupt);
-        // The distance of what glass mirrors is none of its own.
-        let is_glass = |o: &Observation| photographs.store().is_glass(o.image as usize, o.x, o.y);
-        found.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y) && !is_glass(o));
+        // The distance of what glass mirrors is none of its own, and the sky has none.
+        let is_surface = |o: &Observation| {
+            let image = o.image as usize;
+            !photographs.store().is_glass(image, o.x, o.y) && photographs.rgba(image, o.x, o.y)[3] > 0.5
+        };
+        found.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y) && is_surface(o));
         events(&Event::Note(format!("the distance of {} pixels was found (--set loss.depth=0: do not use it)", found.len())));
     }
     nearest::settle(&mut model.config.sampling.near, &mut found, distance);

@@ -2,6 +2,7 @@
 //! visibility `V`, the sky's harmonics `L` as what stands around lets them through, `T`, and light `B` from surfaces around. Directions are
 //! searched, the rest then is linear; `B` follows from light and albedo, again and again.
 
+use super::shading::gray;
 use super::visibility::{Ambient, Corners, Visibility, spread};
 use diorama_geom::color::srgb_from_linear;
 use diorama_geom::glam::{DVec3, Vec3};
@@ -40,6 +41,10 @@ const SEARCHED: usize = 1;
 const SETTLING: usize = 15;
 /// Every so many of these, light from surfaces is found anew.
 const SENT_AGAIN: usize = 3;
+/// Share of a level surface's light below which a sun may be one that is not there, and factor by which what is seen may then be explained
+/// worse without it.
+const WEAK: f32 = 0.5;
+const NO_WORSE: f64 = 1.01;
 /// Bounces of light between surfaces, where a light is given.
 const BOUNCES: usize = 4;
 /// Difference in sRGB beyond which points count less and less.
@@ -165,6 +170,7 @@ struct Lit {
 }
 
 /// State of one light while lights are told apart.
+#[derive(Clone)]
 struct Guess {
     fitted: Fitted,
     sunlit: Vec<f32>,
@@ -199,7 +205,7 @@ pub fn tell_apart(
     // What is seen in a light without a sun shows albedos best, and each may be such a light.
     let step = lights.div_ceil(TAKEN_FOR_EVEN).max(1);
     let begun: Vec<usize> = (0..lights).step_by(step).collect();
-    let total = (begun.len() * (1 + BEGUN) + (ROUNDS - 1) * SETTLING) as f64;
+    let total = (begun.len() * (1 + BEGUN) + (ROUNDS - 1 + lights) * SETTLING) as f64;
     let mut done = 0;
     let mut go_on = || {
         done += 1;
@@ -232,6 +238,22 @@ pub fn tell_apart(
         guesses = guesses.iter().enumerate().map(again).collect();
         if !settle(seen, &mut surfaces, visibility, &mut guesses, SETTLING, &mut go_on) {
             return None;
+        }
+    }
+    // An overcast sky gets a weak sun that explains shadows of other lights which are still in the albedos.
+    let share = |g: &Guess| g.fitted.sun[2] * gray(&g.fitted.sun[3..]) / gray(&level(&g.fitted.sun, &g.fitted.sky).to_array()).max(1e-6);
+    let mut weak: Vec<usize> = (0..lights).filter(|l| share(&guesses[*l]) < WEAK).collect();
+    weak.sort_by(|a, b| share(&guesses[*a]).total_cmp(&share(&guesses[*b])));
+    for l in weak {
+        let before = misfit(seen, &surfaces, &guesses);
+        let mut without = guesses.clone();
+        let mut dimmed = surfaces.clone();
+        without[l].sunlit.fill(0.0);
+        if !settle(seen, &mut dimmed, visibility, &mut without, SETTLING, &mut go_on) {
+            return None;
+        }
+        if misfit(seen, &dimmed, &without) <= NO_WORSE * before {
+            (guesses, surfaces) = (without, dimmed);
         }
     }
     Some((guesses.into_iter().map(|g| g.fitted).collect(), surfaces))

@@ -19,22 +19,68 @@ impl DensityQuery for Tower {
     }
 }
 
+/// A sky that is brighter above.
+fn sky() -> ShLight {
+    let mut sky = ShLight::uniform([0.2, 0.25, 0.35]);
+    sky.0[2] = [0.1; 3];
+    sky
+}
+
+/// Random points of the plate and the tower, with normals and albedos.
+fn places(n: u64) -> impl Iterator<Item = (Vec3, Vec3, Vec3)> {
+    let rng = Rng::new(5, 5);
+    (0..n).map(move |i| {
+        let at = |k: u64| rng.uniform(8 * i + k);
+        let (point, normal) = match i % 4 {
+            0..2 => (Vec3::new(at(0), at(1), 0.2), Vec3::Z),
+            2 => (Vec3::new(0.4 + 0.2 * at(0), 0.4, 0.2 + 0.4 * at(1)), Vec3::NEG_Y),
+            _ => (Vec3::new(0.6, 0.4 + 0.2 * at(0), 0.2 + 0.4 * at(1)), Vec3::X),
+        };
+        (point, normal, Vec3::new(0.2 + 0.5 * at(2), 0.3 + 0.3 * at(3), 0.5))
+    })
+}
+
+#[test]
+fn suns_are_told_apart_and_an_overcast_sky_has_none() {
+    let visibility = Visibility::of(&Tower, &Occupancy::new(64, 1, false), (0.0, 1.0), 64);
+    let places: Vec<(Vec3, Vec3, Vec3)> = places(1200).collect();
+    let albedos = places.iter().map(|p| p.2).collect();
+    let surfaces = Surfaces::new(places.iter().map(|p| (p.0, p.1)), albedos, &visibility);
+    let sky: Vec<f32> = sky().0.iter().flatten().map(|v| *v as f32).collect();
+    let towards = [Vec3::new(0.7, -0.5, 0.6), Vec3::new(-0.6, -0.6, 0.5)].map(Vec3::normalize);
+    let suns = towards.map(|d| [d.x, d.y, d.z, 0.9, 0.8, 0.6]).into_iter().chain([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]);
+    let lights: Vec<([f32; SUN], Ambient)> = suns.map(|s| (s, surfaces.light(&visibility, &s, &sky))).collect();
+    let look = |(place, (point, normal, albedo)): (&Place, &(Vec3, Vec3, Vec3))| {
+        let color = |(sun, ambient): &([f32; SUN], Ambient)| {
+            let direct = place.sunlit(&visibility, Vec3::from_slice(sun)) * Vec3::from_slice(&sun[3..]);
+            *albedo * (direct + ambient.at(&place.corners, *normal, &sky))
+        };
+        Seen { point: *point, normal: *normal, colors: lights.iter().map(color).collect() }
+    };
+    let seen: Vec<Seen> = surfaces.points.iter().zip(&places).map(look).collect();
+    let (found, told) = tell_apart(&seen, &visibility, &AtomicBool::new(false), &mut |_| {}).expect("no interrupt");
+    for (fitted, toward) in found.iter().zip(towards) {
+        let off = Vec3::from_slice(&fitted.sun).angle_between(toward).to_degrees();
+        assert!(off < 3.0, "{off}° off: {fitted:?}");
+        assert!(fitted.sun[3] > 0.5, "{fitted:?}");
+    }
+    assert_eq!(found[2].sun[3..], [0.0; 3], "a sun in an overcast sky");
+    // Up to a factor.
+    let (got, want) = (told.albedos.iter().map(|a| a.x), places.iter().map(|p| p.2.x));
+    let by = want.clone().sum::<f32>() / got.clone().sum::<f32>();
+    let off = got.zip(want).map(|(g, w)| (by * g - w).abs()).sum::<f32>() / places.len() as f32;
+    assert!(off < 0.03, "albedos are {off} off");
+    // Once stopped, nothing is told.
+    assert!(tell_apart(&seen, &visibility, &AtomicBool::new(true), &mut |_| {}).is_none());
+}
+
 #[test]
 fn the_sun_is_found_where_it_stands() {
     let visibility = Visibility::of(&Tower, &Occupancy::new(64, 1, false), (0.0, 1.0), 64);
     let (sun, power) = (Vec3::new(0.5, -0.6, 0.7).normalize(), Vec3::new(0.9, 0.8, 0.6));
-    let mut sky = ShLight::uniform([0.2, 0.25, 0.35]);
-    sky.0[2] = [0.1; 3];
-    let rng = Rng::new(5, 5);
-    let seen: Vec<(Vec3, Vec3, Vec3, Vec3)> = (0..3000)
-        .map(|i| {
-            let at = |k: u64| rng.uniform(8 * i + k);
-            let (point, normal) = match i % 4 {
-                0..2 => (Vec3::new(at(0), at(1), 0.2), Vec3::Z),
-                2 => (Vec3::new(0.4 + 0.2 * at(0), 0.4, 0.2 + 0.4 * at(1)), Vec3::NEG_Y),
-                _ => (Vec3::new(0.6, 0.4 + 0.2 * at(0), 0.2 + 0.4 * at(1)), Vec3::X),
-            };
-            let albedo = Vec3::new(0.2 + 0.5 * at(2), 0.3 + 0.3 * at(3), 0.5);
+    let sky = sky();
+    let seen: Vec<(Vec3, Vec3, Vec3, Vec3)> = places(3000)
+        .map(|(point, normal, albedo)| {
             let corners = visibility.corners(point, normal);
             let lit: Vec3 = visibility.sky_row(&corners, normal).iter().zip(sky.0).map(|(t, l)| *t * Vec3::from(l.map(|v| v as f32))).sum();
             let direct = power * normal.dot(sun).max(0.0) * visibility.from_sun(point, normal, sun);

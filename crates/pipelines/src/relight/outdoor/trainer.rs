@@ -32,8 +32,6 @@ const SKY_RAYS: usize = 4000;
 const HIGHEST: usize = 10;
 /// Steps during which an occupancy sample stands for a block of cells, and that block's edge.
 const OCCUPANCY_WARMUP: (u64, usize) = (256, 2);
-/// Distance in inner cubes within which samples learn more slowly, so that no fog gathers at the cameras.
-const NEAR: f32 = 1.0;
 /// Steps between which the number of rays grows to what is wanted, and their number at most.
 const BATCH_RAMP: (u64, u64) = (256, 1024);
 const MOST_RAYS: usize = 16_384;
@@ -214,7 +212,7 @@ impl Trainer<'_> {
                 points: s.occupancy_points,
                 block: if step <= until { block } else { 1 },
             }),
-            near_scaling: NEAR,
+            near_scaling: m.config.loss.near_scaling,
             progress: share,
             rate_scale: m.rate_scale,
             ..Step::new(step, m.rays, rays, placement, Loss::Photometric(terms))

@@ -2,19 +2,20 @@
 //! cameras, and a world whose cameras lie in the unit sphere.
 
 mod masks;
+mod sky;
 mod undistort;
 mod world;
 
 use crate::error::{PipelineError, Result};
 use crate::run::prepare::{self as poses, Finish, Matcher, Sfm};
 use diorama_data::import::{self, ImportOptions};
-use diorama_data::masks::MaskOptions;
+use diorama_data::masks::{MaskOptions, SKY_CLASS, STATIC_CLASS};
 use diorama_data::sessions::{self, SessionRule};
 use diorama_data::split::{self, SplitRule};
 use diorama_data::video::Choice;
 use diorama_data::{DataError, atomic, lock, nerf_osr, photo, photo_import, sparse_ply, transforms_json};
 use diorama_geom::capture::{Frame, MaskMeaning, MaskRule, Split};
-use diorama_geom::glam::DVec3;
+use diorama_geom::glam::{DVec2, DVec3};
 use diorama_geom::{Capture, ImageU8, Lens, SparsePoint};
 use serde::Serialize;
 use std::collections::HashMap;
@@ -38,8 +39,10 @@ pub struct PrepareOptions {
     pub input: PathBuf,
     pub out: PathBuf,
     pub sfm: Sfm,
-    /// Folder with a mask for each photograph: 255 is static, 192 static glass, 0 what moved.
+    /// Folder with a mask for each photograph: 255 is static, 192 static glass, 160 sky, 0 what moved.
     pub masks: Option<PathBuf>,
+    /// Looks for the sky in each photograph and marks it in its mask.
+    pub sky: bool,
     /// None: as the capture says, else by names.
     pub sessions: Option<SessionRule>,
     /// Longest side in pixels; larger photographs are downsampled.
@@ -75,6 +78,9 @@ pub struct Prepared {
     pub static_share: Option<f64>,
     /// Mean share of the photographs that is glass, a part of the former.
     pub glass_share: Option<f64>,
+    /// Mean share of the photographs in which sky was found or marked, and the number of photographs without any.
+    pub sky_share: Option<f64>,
+    pub without_sky: usize,
     pub undistorted: usize,
     pub held_out: usize,
     pub points: usize,
@@ -266,16 +272,22 @@ fn complete(mut s: Source, o: &PrepareOptions, interrupt: &AtomicBool, note: &mu
         return Err(PipelineError::Usage(format!("--split {}: leaves fewer than 2 training views; choose another", o.split)));
     }
     let images: Vec<PathBuf> = s.frames.iter().map(|f| f.image.clone()).collect();
-    let (stems, mut undistorted) = (poses::stems(&images), 0);
+    let (stems, mut undistorted, mut skies) = (poses::stems(&images), 0, Vec::new());
+    let has_classes = s.rule.meaning != MaskMeaning::Object;
     for (i, (frame, stem)) in s.frames.iter_mut().zip(&stems).enumerate() {
         if interrupt.load(Ordering::Relaxed) {
             return Ok(None);
         }
         undistorted += write_frame(frame, &s.rule, stem, o)? as usize;
+        if has_classes && o.sky {
+            skies.push(mark_sky(frame, i, &s.points, &o.out.join(MASKS).join(format!("{stem}.png")))?);
+        }
         note(&format!("undistorting: {} of {}", i + 1, stems.len()));
     }
+    let without_sky = skies.iter().filter(|share| **share == 0.0).count();
     let scene = world::scene(&s.frames, &s.points);
-    let capture = Capture { masks: MaskRule { meaning: s.rule.meaning, inverted: false }, ..Capture::new(s.frames, scene) };
+    let meaning = if has_classes { MaskMeaning::Classes } else { s.rule.meaning };
+    let capture = Capture { masks: MaskRule { meaning, inverted: false }, ..Capture::new(s.frames, scene) };
     if !s.points.is_empty() {
         sparse_ply::write(&o.out.join(POINTS), &s.points, &capture.frames, &o.out)?;
     }
@@ -296,6 +308,8 @@ fn complete(mut s: Source, o: &PrepareOptions, interrupt: &AtomicBool, note: &mu
         sessions: sessions.len(),
         static_share: mean(|s| s.fixed),
         glass_share: mean(|s| s.glass),
+        sky_share: (!skies.is_empty()).then(|| skies.iter().sum::<f64>() / skies.len() as f64),
+        without_sky,
         undistorted,
         held_out: capture.indices(Split::Test).len(),
         points: s.points.len(),
@@ -352,6 +366,27 @@ fn write_frame(frame: &mut Frame, rule: &MaskRule, stem: &str, o: &PrepareOption
     }
     (frame.camera, frame.image) = (to.unwrap_or(from).resized(w, h), file);
     Ok(to.is_some())
+}
+
+/// Looks for the sky in the photograph of frame `i` and marks it in the frame's mask, which is written where there was none; returns its share
+/// of the picture, what was marked before included.
+fn mark_sky(frame: &mut Frame, i: usize, points: &[SparsePoint], file: &Path) -> Result<f64> {
+    let photo = photo::load(&frame.image)?;
+    let camera_from_world = frame.world_from_camera.inverse();
+    let shows = |p: &&SparsePoint| p.frames.binary_search(&(i as u32)).is_ok();
+    let seen = points.iter().filter(shows).filter_map(|p| frame.camera.project(camera_from_world.point(p.position)));
+    let seen: Vec<DVec2> = seen.collect();
+    let rises = |p: DVec2| (frame.world_from_camera.rotation * frame.camera.direction(p.x, p.y)).z > 0.0;
+    let is_sky = sky::find(&photo, &sky::Known { points: &seen, rises: &rises });
+    let mut mask = match &frame.mask {
+        Some(file) => photo::load_mask(file)?,
+        None => ImageU8 { width: photo.width, height: photo.height, channels: 1, data: vec![STATIC_CLASS; photo.width * photo.height] },
+    };
+    let marked = mask.data.iter_mut().zip(&is_sky).filter(|(v, s)| **s && **v == STATIC_CLASS);
+    marked.for_each(|(v, _)| *v = SKY_CLASS);
+    photo::save_png(file, &mask)?;
+    frame.mask = Some(file.to_path_buf());
+    Ok(mask.data.iter().filter(|v| diorama_data::masks::SKY.contains(v)).count() as f64 / mask.data.len() as f64)
 }
 
 /// Creates or clears the output folder and locks it; fails if the folder holds anything but an earlier data set.
