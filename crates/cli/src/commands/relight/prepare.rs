@@ -54,7 +54,7 @@ pub struct Prepare {
     /// Seed of all random numbers
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Up direction x,y,z in the coordinates of the poses [default: the mean of the cameras' up directions]
+    /// Up direction x,y,z in the coordinates of the poses [default: across the cameras' horizontal axes]
     #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true)]
     up: Option<String>,
     /// Move and scale given poses so that the cameras lie in the unit sphere (poses of COLMAP always are)

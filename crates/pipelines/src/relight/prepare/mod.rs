@@ -29,6 +29,8 @@ const POINTS: &str = "points.ply";
 /// Poses as COLMAP found them, and photographs of subfolders gathered for it.
 const POSES: &str = "poses";
 const GATHERED: &str = "photographs";
+/// Height of a ray of length 1 from which on it may show sky: up is known to a few degrees.
+const BELOW_HORIZON: f64 = -0.1;
 /// Marks the folder as a data set of this command.
 const MARK: &str = ".relight_prepare";
 
@@ -56,7 +58,7 @@ pub struct PrepareOptions {
     pub min_registered: f64,
     pub split: SplitRule,
     pub seed: u64,
-    /// Up direction in the coordinates of the poses; none: the mean of the cameras'.
+    /// Up direction in the coordinates of the poses; none: that of level cameras.
     pub up: Option<DVec3>,
     /// Moves and scales given poses so that the cameras lie in the unit sphere; poses of COLMAP always are.
     pub rescale: bool,
@@ -263,7 +265,7 @@ fn posed(p: Photographs, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut 
 fn complete(mut s: Source, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<Option<Prepared>> {
     let shares = std::mem::take(&mut s.shares);
     let mean = |of: fn(&Shares) -> f64| (!shares.is_empty()).then(|| shares.iter().map(of).sum::<f64>() / shares.len() as f64);
-    let up = o.up.unwrap_or_else(|| world::mean_up(&s.frames));
+    let up = o.up.unwrap_or_else(|| world::up(&s.frames));
     world::place(&mut s.frames, &mut s.points, up, s.rescale);
     if !(s.has_own_split && o.split == SplitRule::File) {
         split::apply(&o.split, &mut s.frames, false, o.seed);
@@ -376,7 +378,7 @@ fn mark_sky(frame: &mut Frame, i: usize, points: &[SparsePoint], file: &Path) ->
     let shows = |p: &&SparsePoint| p.frames.binary_search(&(i as u32)).is_ok();
     let seen = points.iter().filter(shows).filter_map(|p| frame.camera.project(camera_from_world.point(p.position)));
     let seen: Vec<DVec2> = seen.collect();
-    let rises = |p: DVec2| (frame.world_from_camera.rotation * frame.camera.direction(p.x, p.y)).z > 0.0;
+    let rises = |p: DVec2| (frame.world_from_camera.rotation * frame.camera.direction(p.x, p.y)).z > BELOW_HORIZON;
     let is_sky = sky::find(&photo, &sky::Known { points: &seen, rises: &rises });
     let mut mask = match &frame.mask {
         Some(file) => photo::load_mask(file)?,

@@ -1,5 +1,6 @@
 //! The world of a scene: cameras in the unit sphere around their mean, up along +z, and a box that holds what they see.
 
+use crate::run::prepare::cameras_up;
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::DVec3;
 use diorama_geom::transform::rotation_between;
@@ -15,9 +16,9 @@ const MARGIN: f64 = 0.05;
 const FEWEST: usize = 100;
 const UNKNOWN: f64 = 2.0;
 
-/// Mean of the cameras' up directions.
-pub fn mean_up(frames: &[Frame]) -> DVec3 {
-    frames.iter().map(|f| -f.world_from_camera.rotation.y_axis).sum::<DVec3>().normalize_or(DVec3::Z)
+/// The up direction by cameras that are held level, though they may look up.
+pub fn up(frames: &[Frame]) -> DVec3 {
+    cameras_up(&frames.iter().map(|f| f.world_from_camera).collect::<Vec<_>>())
 }
 
 /// The first frame whose camera is outside of the unit sphere, with its distance from the origin.
@@ -71,12 +72,13 @@ mod tests {
     use super::*;
     use diorama_geom::{Camera, Pose};
 
+    /// Cameras in a ring that look up a little.
     fn ring(radius: f64, tilt: DVec3) -> Vec<Frame> {
         let turn = rotation_between(DVec3::Z, tilt.normalize());
         let pose = |i: usize| {
             let a = i as f64;
             let eye = DVec3::new(5.0 + radius * a.cos(), radius * a.sin(), 2.0);
-            let p = Pose::look_at(eye, DVec3::new(5.0, 0.0, 2.0), DVec3::Z);
+            let p = Pose::look_at(eye, DVec3::new(5.0, 0.0, 2.0 + 0.4 * radius), DVec3::Z);
             Pose { rotation: turn * p.rotation, translation: turn * p.translation }
         };
         (0..12).map(|i| Frame::new(format!("f{i}"), "", Camera::pinhole(8, 6, 1.0), pose(i))).collect()
@@ -87,12 +89,26 @@ mod tests {
         let mut frames = ring(3.0, DVec3::new(0.3, -0.8, 0.4));
         assert_eq!(outside(&frames).unwrap().0.name, "f0");
         let mut points = vec![SparsePoint { position: DVec3::ZERO, color: [0; 3], error: 0.0, frames: vec![0, 1, 2] }];
-        let up = mean_up(&frames);
+        let up = up(&frames);
         let moved = place(&mut frames, &mut points, up, true);
         let radii: Vec<f64> = frames.iter().map(|f| f.world_from_camera.translation.length()).collect();
         let farthest = radii.iter().copied().fold(0.0, f64::max);
         assert!((farthest - 1.0 / ROOM).abs() < 1e-9 && outside(&frames).is_none());
-        assert!(frames.iter().all(|f| (-f.world_from_camera.rotation.y_axis).dot(DVec3::Z) > 0.999));
+        assert!(frames.iter().all(|f| f.world_from_camera.rotation.x_axis.z.abs() < 1e-6));
+        assert!(frames.iter().all(|f| f.world_from_camera.rotation.z_axis.z > 0.3));
+    }
+
+    #[test]
+    fn up_is_told_by_cameras_that_look_up_to_one_side() {
+        // All see one façade from below, so their mean up direction leans away from it.
+        let mut frames: Vec<Frame> = ring(3.0, DVec3::Z).into_iter().filter(|f| f.world_from_camera.translation.y < -1.0).collect();
+        assert!(frames.len() > 2);
+        let mean: DVec3 = frames.iter().map(|f| -f.world_from_camera.rotation.y_axis).sum();
+        assert!(mean.normalize().dot(DVec3::Z) < 0.97);
+        let up = up(&frames);
+        assert!(up.dot(DVec3::Z) > 0.9999, "{up}");
+        let mut points = vec![SparsePoint { position: DVec3::ZERO, color: [0; 3], error: 0.0, frames: vec![0, 1, 2] }];
+        let moved = place(&mut frames, &mut points, up, true);
         assert_eq!(points[0].position, moved.point(DVec3::ZERO));
     }
 
@@ -100,7 +116,7 @@ mod tests {
     fn without_rescale_only_the_direction_of_up_changes() {
         let mut frames = ring(0.3, DVec3::X);
         let before: Vec<f64> = frames.iter().map(|f| f.world_from_camera.translation.length()).collect();
-        let up = mean_up(&frames);
+        let up = up(&frames);
         let moved = place(&mut frames, &mut [], up, false);
         assert_eq!((moved.scale, moved.translation), (1.0, DVec3::ZERO));
         assert!(frames.iter().zip(&before).all(|(f, r)| (f.world_from_camera.translation.length() - r).abs() < 1e-9));

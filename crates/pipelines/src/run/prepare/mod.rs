@@ -21,6 +21,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 pub use finish::Finish;
 pub use sfm::Matcher;
+pub(crate) use world::cameras_up;
 
 /// Source of the camera poses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

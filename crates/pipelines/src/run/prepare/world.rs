@@ -61,7 +61,7 @@ pub fn place(frames: &mut [Frame], points: &[Point]) -> Placed {
 
 /// Estimates the up direction from the poses, assuming level cameras: the normal of the plane that the horizontal image axes span; the mean
 /// of the cameras' up directions where these axes span no plane.
-fn cameras_up(poses: &[Pose]) -> DVec3 {
+pub fn cameras_up(poses: &[Pose]) -> DVec3 {
     let mean = poses.iter().map(|p| -p.rotation.y_axis).sum::<DVec3>().normalize_or(DVec3::Z);
     let mut a = DMat3::ZERO;
     for p in poses {
