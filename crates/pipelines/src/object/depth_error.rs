@@ -3,8 +3,8 @@
 
 use super::fog::median;
 use super::model::ObjectModel;
-use super::observations::LARGEST_ERROR;
 use super::scored_view::{ScoredView, admits};
+use crate::run::sparse_points::LARGEST_ERROR;
 use diorama_geom::capture::SparsePoint;
 use rayon::prelude::*;
 use serde::Serialize;

@@ -12,6 +12,7 @@ pub mod param_state;
 pub mod photographs;
 pub mod prepare;
 pub mod profile;
+pub mod sparse_points;
 pub mod summary;
 pub mod viewer_files;
 pub mod viewing;

@@ -198,7 +198,7 @@ impl Config {
                 distortion: 0.1,
                 depth: 0.3,
                 gauge: 0.1,
-                near_scaling: 1.0,
+                near_scaling: 0.0,
             },
             optim: OptimConfig { grid_rate: 1.5e-2, table_decay: 1e-5, net_rate: 3e-3, light_rate: 5e-3, final_scale: 0.05 },
             sampling: SamplingConfig {

@@ -5,9 +5,9 @@ use super::model::SceneModel;
 use super::trainer::Trainer;
 use super::viewing::RunView;
 use crate::error::{PipelineError, Result};
-use crate::run::nearest;
 use crate::run::photographs::StoredPhotographs;
 use crate::run::{RunDescription, RunFolder, folder, kept_capture};
+use crate::run::{nearest, sparse_points};
 use diorama_data::checkpoint;
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
@@ -96,15 +96,22 @@ fn observations(
 ) -> Vec<Observation> {
     let (distance, mut found) = (model.capture.viewing_distance(), Vec::new());
     if model.config.loss.depth > 0.0 {
-        events(&Event::Note(format!("comparing {} photographs with their neighbors to find distances", model.train.len())));
-        found = stereo::observe(photographs, &model.cameras(), distance, interrupt);
+        let reduction = Reduction::Times(model.config.data.downscale);
+        found = sparse_points::observe(&model.capture, &model.train, reduction, model.model_from_world.scale);
+        let from = if found.len() < sparse_points::ENOUGH {
+            events(&Event::Note(format!("comparing {} photographs with their neighbors to find distances", model.train.len())));
+            found = stereo::observe(photographs, &model.cameras(), distance, interrupt);
+            "by comparing photographs"
+        } else {
+            "by sparse points"
+        };
         // The distance of what glass mirrors is none of its own, and the sky has none.
         let is_surface = |o: &Observation| {
             let image = o.image as usize;
             !photographs.store().is_glass(image, o.x, o.y) && photographs.rgba(image, o.x, o.y)[3] > 0.5
         };
         found.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y) && is_surface(o));
-        events(&Event::Note(format!("the distance of {} pixels was found (--set loss.depth=0: do not use it)", found.len())));
+        events(&Event::Note(format!("the distance of {} pixels was found {from} (--set loss.depth=0: do not use it)", found.len())));
     }
     nearest::settle(&mut model.config.sampling.near, &mut found, distance);
     found
