@@ -80,7 +80,7 @@ fn looking_at_one_place(model: &Model, candidates: Vec<(Camera, Pose)>, n: usize
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SynthOptions {
     pub views: usize,
-    /// Lights of training, 1 to 4; another one is held out.
+    /// Lights of training, 1 to 4; a sun and a veiled sun are held out besides.
     pub lights: usize,
     pub size: (u32, u32),
     /// Samples per pixel.
@@ -105,26 +105,51 @@ impl SynthOptions {
 /// Dust of an ordinary summer's day over that of the clearest: a fifth of the light then comes from the sky.
 const HAZE: f64 = 3.0;
 
-/// Name, sun's elevation and azimuth in degrees; none: overcast. The last one is held out.
-const LIGHTS: [(&str, Option<(f64, f64)>); 5] = [
-    ("morning", Some((30.0, 125.0))),
-    ("noon", Some((58.0, 185.0))),
-    ("evening", Some((20.0, 245.0))),
-    ("overcast", None),
-    ("unseen", Some((38.0, 215.0))),
+/// Sharpness of the glow into which thin clouds spread a sun (a von Mises–Fisher lobe): 17 degrees to its inflection.
+const VEIL: f64 = 12.0;
+
+/// What stands above the street; suns by elevation and azimuth in degrees.
+#[derive(Clone, Copy)]
+enum Above {
+    Sun(f64, f64),
+    Overcast,
+    /// A sun behind thin clouds.
+    Veiled(f64, f64),
+}
+
+/// Lights with their names; the last [`HELD_OUT_LIGHTS`] are held out.
+const LIGHTS: [(&str, Above); 6] = [
+    ("morning", Above::Sun(30.0, 125.0)),
+    ("noon", Above::Sun(58.0, 185.0)),
+    ("evening", Above::Sun(20.0, 245.0)),
+    ("overcast", Above::Overcast),
+    ("unseen", Above::Sun(38.0, 215.0)),
+    ("veiled", Above::Veiled(45.0, 150.0)),
 ];
+const HELD_OUT_LIGHTS: usize = 2;
 
 /// The light of a name in [`LIGHTS`], exposed.
 fn light(index: usize) -> Daylight {
+    let clear = |elevation: f64, azimuth: f64| {
+        let clear = Sky::clear(elevation.to_radians(), azimuth.to_radians());
+        Daylight::clear(&Sky { dust: HAZE, ..clear }, ROWS)
+    };
     let light = match LIGHTS[index].1 {
-        Some((elevation, azimuth)) => {
-            let clear = Sky::clear(elevation.to_radians(), azimuth.to_radians());
-            Daylight::clear(&Sky { dust: HAZE, ..clear }, ROWS)
-        }
+        Above::Sun(elevation, azimuth) => clear(elevation, azimuth),
         // CIE overcast sky (Moon and Spencer 1942).
-        None => Daylight::of(Environment::from_fn(ROWS, |d| {
+        Above::Overcast => Daylight::of(Environment::from_fn(ROWS, |d| {
             [0.95, 1.0, 1.05].map(|c| if d.z > 0.0 { c * (1.0 + 2.0 * d.z) / 3.0 } else { 0.0 })
         })),
+        Above::Veiled(elevation, azimuth) => {
+            let clear = clear(elevation, azimuth);
+            let sun = clear.sun.expect("above the horizon");
+            let lobe = |d: DVec3| VEIL / std::f64::consts::TAU * (VEIL * (d.dot(sun.direction) - 1.0)).exp();
+            let sky = |d: DVec3| {
+                let radiance = clear.environment.radiance(d);
+                [0, 1, 2].map(|k| radiance[k] + if d.z > 0.0 { sun.irradiance[k] * lobe(d) } else { 0.0 })
+            };
+            Daylight::of(Environment::from_fn(ROWS, sky))
+        }
     };
     let up = irradiance(&light, DVec3::Z);
     let gray = 0.2126 * up[0] + 0.7152 * up[1] + 0.0722 * up[2];
@@ -168,15 +193,16 @@ pub fn generate(
     if out.join("transforms_train.json").exists() && !force {
         return Err(PipelineError::Usage(format!("{}: holds a capture; give --force to replace it", out.display())));
     }
-    if !(1..LIGHTS.len()).contains(&options.lights) || place.cameras.len() < HOLD_OUT {
-        return Err(PipelineError::Usage(format!("a benchmark has 1 to {} lights and at least {HOLD_OUT} views", LIGHTS.len() - 1)));
+    let most = LIGHTS.len() - HELD_OUT_LIGHTS;
+    if !(1..=most).contains(&options.lights) || place.cameras.len() < HOLD_OUT {
+        return Err(PipelineError::Usage(format!("a benchmark has 1 to {most} lights and at least {HOLD_OUT} views")));
     }
     for folder in ["images", "masks", "truth"] {
         let folder = out.join(folder);
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
     let (model, cameras) = (&place.model, &place.cameras);
-    let lights: Vec<usize> = (0..options.lights).chain([LIGHTS.len() - 1]).collect();
+    let lights: Vec<usize> = (0..options.lights).chain(most..LIGHTS.len()).collect();
     let daylights: Vec<Daylight> = lights.iter().map(|l| light(*l)).collect();
     let mut scene = Scene::new(model, &daylights[0]);
     let mut made = Synthesized { photographs: 0, held_out: 0, triangles: model.face_count(), interrupted: false };
@@ -186,9 +212,9 @@ pub fn generate(
         let view = View { camera: *camera, world_from_camera: *pose, lens: None };
         for (l, daylight) in daylights.iter().enumerate() {
             scene.set_light(daylight);
-            let is_unseen = l + 1 == daylights.len();
+            let is_unseen = l >= options.lights;
             let is_held_out = v % HOLD_OUT == HOLD_OUT - 1;
-            // Of the light that is held out, only the views that are held out.
+            // Of lights that are held out, only the views that are held out.
             if is_unseen && !is_held_out {
                 continue;
             }
@@ -222,7 +248,8 @@ pub fn generate(
         }
     }
     let of_light = |l: usize| LightTruth::of(LIGHTS[lights[l]].0, &daylights[l]);
-    let truth = Truth { lights: (0..lights.len()).map(of_light).collect(), views, unseen: lights.len() - 1 };
+    let truth =
+        Truth { lights: (0..lights.len()).map(of_light).collect(), views, unseen: options.lights, veiled: Some(options.lights + 1) };
     for (l, daylight) in daylights.iter().enumerate() {
         truth::save_light(out, &truth.lights[l].name, daylight)?;
     }

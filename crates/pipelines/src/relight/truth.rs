@@ -20,6 +20,9 @@ pub struct Truth {
     pub views: Vec<ViewTruth>,
     /// The light that no photograph of training has.
     pub unseen: usize,
+    /// Another one, without shadows that have edges.
+    #[serde(default)]
+    pub veiled: Option<usize>,
 }
 
 /// A light.
@@ -58,6 +61,11 @@ impl LightTruth {
 }
 
 impl Truth {
+    /// Whether training has photographs in a light.
+    pub fn is_seen(&self, light: usize) -> bool {
+        light != self.unseen && Some(light) != self.veiled
+    }
+
     /// Whether a data set has a truth.
     pub fn exists(data: &Path) -> bool {
         file(data, NAME).exists()

@@ -53,6 +53,12 @@ impl Verb for Eval {
                 "unseen light     {:.2} dB (exact layers {:.2}, mean light {:.2})",
                 s.unseen_light_psnr, s.oracle_psnr, s.mean_light_psnr
             );
+            if s.veiled_light_psnr.is_finite() {
+                println!(
+                    "veiled sun       {:.2} dB (exact layers {:.2}, mean light {:.2})",
+                    s.veiled_light_psnr, s.veiled_oracle_psnr, s.veiled_mean_psnr
+                );
+            }
             println!("seen lights      {:.2} dB (with a sun {:.2}), light {}", s.seen_light_psnr, s.sunlit_psnr, s.light);
             println!("albedo           {:.2} dB", s.albedo_psnr);
             println!("normals          {:.1}° median", s.normal_median_deg);

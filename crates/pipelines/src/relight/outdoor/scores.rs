@@ -22,6 +22,10 @@ pub struct SceneScores {
     pub oracle_psnr: f64,
     /// The mean of the pictures in all lights of training in place of the model's.
     pub mean_light_psnr: f64,
+    /// The same three in a second light that training never saw, whose sun is veiled; NaN where the benchmark has none.
+    pub veiled_light_psnr: f64,
+    pub veiled_oracle_psnr: f64,
+    pub veiled_mean_psnr: f64,
     /// Views that were held out in the lights of training.
     pub seen_light_psnr: f64,
     /// Those of them whose light has a sun.
@@ -38,10 +42,18 @@ pub struct SceneScores {
     pub views: usize,
 }
 
-/// A held-out view in the unseen light, layer by layer: picture, albedo, normal, shadow and depth.
+/// A held-out view in an unseen light, layer by layer: picture, albedo, normal, shadow and depth.
 pub struct Sheet {
     pub ours: Vec<ImageU8>,
     pub exact: Vec<ImageU8>,
+}
+
+/// Errors in a light that training never saw: the model's, those of exact layers under the light's harmonics, and those of the mean picture.
+#[derive(Default)]
+struct InLight {
+    ours: Errors,
+    oracle: Errors,
+    mean: Errors,
 }
 
 /// Sum of squares of errors in sRGB.
@@ -61,11 +73,11 @@ impl Errors {
     }
 
     fn psnr(&self) -> f64 {
-        -10.0 * (self.sum / self.n.max(1) as f64).log10()
+        -10.0 * (self.sum / self.n as f64).log10()
     }
 }
 
-/// Judges a model; `look` receives the name of each held-out photograph in the unseen light, and its layers.
+/// Judges a model; `look` receives the name of each held-out photograph in a light that training never saw, and its layers.
 ///
 /// # Errors
 /// When the data set has no truth, or files are missing.
@@ -75,7 +87,7 @@ pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &Sheet)
     }
     let truth = Truth::read(data)?;
     let gauge = gauge(model, data, &truth)?;
-    let (mut unseen, mut oracle, mut mean, mut seen, mut sunlit) = <(Errors, Errors, Errors, Errors, Errors)>::default();
+    let (mut unseen, mut veiled, mut seen, mut sunlit) = <(InLight, InLight, Errors, Errors)>::default();
     let (mut albedos, mut angles, mut shadows, mut depths) = <(Vec<_>, Vec<_>, Vec<_>, Vec<_>)>::default();
     let per_meter = model.model_from_world.scale as f32;
     let mut views = 0;
@@ -85,29 +97,35 @@ pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &Sheet)
         let photograph = photo::load(&model.capture.frames[frame].image)?;
         let layers = truth::read_view(data, &of.view)?;
         let (light, is_unseen) = (&truth.lights[of.light], of.light == truth.unseen);
-        let view_light = match model.light_of_frame(frame).filter(|_| !is_unseen) {
+        let is_seen = truth.is_seen(of.light);
+        let view_light = match model.light_of_frame(frame).filter(|_| is_seen) {
             Some(l) => ViewLight::learned(model, l),
             None => given(model, light, gauge),
         };
         let view = model.view(&model.posed(frame), &view_light, &mut |_| {});
         let shadow = truth::read_shadow(data, &of.photograph)?;
-        let others = if is_unseen { mean_picture(data, &truth, &of.view)? } else { None };
+        let others = if is_seen { None } else { mean_picture(data, &truth, &of.view)? };
+        let of_light = if is_unseen { &mut unseen } else { &mut veiled };
         let exact = light.light();
         for i in valid(&layers) {
             let rgb = |image: &Image| -> [f32; 3] { std::array::from_fn(|k| image.data[3 * i + k]) };
             let photo: [f32; 3] = std::array::from_fn(|k| photograph.data[photograph.channels * i + k] as f32 / 255.0);
             let (got, normal) = (rgb(&view.color), rgb(&view.normal));
             let n = DVec3::from(rgb(&layers.normal).map(f64::from)).normalize_or_zero();
-            (if is_unseen { &mut unseen } else { &mut seen }).add(got, photo);
-            if !is_unseen && light.sun.is_some() {
-                sunlit.add(got, photo);
-            }
+            let albedo = rgb(&layers.albedo);
             shadows.push((view.shadow.data[i] as f64, shadow.data[3 * i] as f64));
-            if is_unseen {
+            if is_seen {
+                seen.add(got, photo);
+                if light.sun.is_some() {
+                    sunlit.add(got, photo);
+                }
+            } else {
                 let lit = exact.shade(n);
-                let albedo = rgb(&layers.albedo);
-                oracle.add(std::array::from_fn(|k| albedo[k] * lit[k].max(0.0) as f32 * shadow.data[3 * i]), photo);
-                others.iter().for_each(|o| mean.add(rgb(o), photo));
+                of_light.ours.add(got, photo);
+                of_light.oracle.add(std::array::from_fn(|k| albedo[k] * lit[k].max(0.0) as f32 * shadow.data[3 * i]), photo);
+                others.iter().for_each(|o| of_light.mean.add(rgb(o), photo));
+            }
+            if is_unseen {
                 albedos.push((rgb(&view.albedo), albedo));
                 let depth = per_meter * layers.depth.data[i];
                 depths.push(((view.depth.data[i] - depth) / depth).abs() as f64);
@@ -116,13 +134,18 @@ pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &Sheet)
         }
         if is_unseen {
             views += 1;
+        }
+        if !is_seen {
             look(&of.photograph, &sheet(&view, &photograph, &layers, &shadow, per_meter))?;
         }
     }
     Ok(SceneScores {
-        unseen_light_psnr: unseen.psnr(),
-        oracle_psnr: oracle.psnr(),
-        mean_light_psnr: mean.psnr(),
+        unseen_light_psnr: unseen.ours.psnr(),
+        oracle_psnr: unseen.oracle.psnr(),
+        mean_light_psnr: unseen.mean.psnr(),
+        veiled_light_psnr: veiled.ours.psnr(),
+        veiled_oracle_psnr: veiled.oracle.psnr(),
+        veiled_mean_psnr: veiled.mean.psnr(),
         seen_light_psnr: seen.psnr(),
         sunlit_psnr: sunlit.psnr(),
         light: if model.has_suns() { "sun" } else { "sh" }.into(),
@@ -212,7 +235,7 @@ fn given(model: &SceneModel, exact: &LightTruth, by: [f64; 3]) -> ViewLight {
 fn mean_picture(data: &Path, truth: &Truth, view: &str) -> Result<Option<Image>> {
     let mut sum: Option<Image> = None;
     let mut n = 0.0;
-    for v in truth.views.iter().filter(|v| v.view == view && v.light != truth.unseen) {
+    for v in truth.views.iter().filter(|v| v.view == view && truth.is_seen(v.light)) {
         let mut photograph = photo::load(&data.join("images").join(format!("{}.png", v.photograph)))?.to_f32();
         photograph.data.iter_mut().for_each(|v| *v = linear_from_srgb(*v));
         match &mut sum {
