@@ -5,7 +5,7 @@
 use crate::error::{DataError, Result};
 use crate::masks::{self, COUNTS};
 use crate::photo::{self, Depth, Photo};
-use diorama_geom::capture::{ColorSpace, Frame, MaskRule};
+use diorama_geom::capture::{ColorSpace, Frame, MaskMeaning, MaskRule};
 use diorama_geom::color::{linear_from_srgb, srgb_from_linear, u8_from_unit, u16_from_unit};
 use diorama_geom::rng::Rng;
 use diorama_geom::{ImageU8, PixelFormat, Reduction};
@@ -271,8 +271,10 @@ fn decode(frame: &Frame, rule: &MaskRule, size: (u32, u32)) -> Result<(Photo, Op
         );
         return Err(DataError::input(&frame.image, message));
     }
-    let (full, mask) = masks::apply(frame, rule, full)?;
     let (w, h) = (size.0 as usize, size.1 as usize);
+    // An object's colors must not mix with those around it; the sky's, though transparent, are kept.
+    let full = if rule.meaning == MaskMeaning::Classes { full.downsampled(w, h) } else { full };
+    let (full, mask) = masks::apply(frame, rule, full)?;
     Ok((full.downsampled(w, h), mask.map(|m| m.downsampled(w, h))))
 }
 

@@ -16,7 +16,7 @@ const SUN: f64 = Sky::SUN_DIAMETER;
 /// Source of light before it is turned and scaled.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Source {
-    /// An environment map, or the nine rows of spherical harmonics.
+    /// An environment map, or nine rows of spherical harmonics and perhaps a sun.
     File(PathBuf),
     /// A clear sky: elevation of its sun above the horizon and rotation from the center of the map to the right, in degrees.
     Sky { elevation: f64, rotation: f64 },
@@ -51,7 +51,11 @@ impl LightOptions {
         }
         let mut notes = Vec::new();
         let light = match &self.source {
-            Source::File(path) if is_text(path) => Daylight::of(sh_text::read(path)?.environment(ROWS)),
+            Source::File(path) if is_text(path) => {
+                let text = sh_text::read(path)?;
+                let sun = text.sun.map(|(direction, irradiance)| Sun { direction, diameter: SUN, irradiance });
+                Daylight { sun, ..Daylight::of(text.light.environment(ROWS)) }
+            }
             Source::File(path) => {
                 let read = environment::read(path)?;
                 notes.extend(read.notes);
@@ -68,7 +72,7 @@ impl LightOptions {
         let mut light = light.turned(self.rotate_deg.to_radians(), self.strength);
         if let Some([azimuth, elevation, power]) = self.sun {
             if light.sun.is_some() {
-                return Err(PipelineError::Usage("a sky has a sun of its own; leave out the second one".into()));
+                return Err(PipelineError::Usage("the light has a sun of its own; leave out the second one".into()));
             }
             let (up, level) = elevation.to_radians().sin_cos();
             let (right, ahead) = azimuth.to_radians().sin_cos();

@@ -124,7 +124,7 @@ pub fn save_light(data: &Path, name: &str, light: &Daylight) -> Result<()> {
         map.add_disc(sun.direction, sun.diameter, sun.irradiance);
     }
     environment::save_hdr(&file(data, &format!("{name}.hdr")), &map)?;
-    Ok(sh_text::save(&file(data, &format!("{name}.txt")), &LightTruth::of(name, light).light())?)
+    Ok(sh_text::save(&file(data, &format!("{name}.txt")), &LightTruth::of(name, light).light(), None)?)
 }
 
 fn read_exr(data: &Path, name: &str) -> Result<Image> {

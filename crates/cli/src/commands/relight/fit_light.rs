@@ -10,7 +10,7 @@ use diorama_pipelines::relight::fit_light::{self, FitOptions, FittedLight};
 use diorama_pipelines::relight::outdoor::recipe;
 use std::path::PathBuf;
 
-/// Find the light of a photograph that training never saw, as spherical harmonics
+/// Find the light of a photograph that training never saw: spherical harmonics, and a sun where the run tells suns apart
 #[derive(Args, Clone, Debug)]
 #[command(
     after_help = "Examples:\n  diorama relight fit-light runs/site data/site/images/new.jpg -o light.txt\n  diorama relight fit-light runs/site new.jpg --camera pose.json --region left --pictures fit\n  diorama relight render runs/site --light light.txt"
@@ -26,7 +26,7 @@ pub struct FitLight {
     /// Part of the photograph that is fitted; the rest is scored: all, left, right, or x0,y0,x1,y1 in pixels
     #[arg(long, default_value = "all")]
     region: String,
-    /// Nine rows of spherical harmonics, for --light of the other commands
+    /// Nine rows of spherical harmonics and perhaps a sun, for --light of the other commands
     #[arg(short, long, default_value = "light.txt")]
     out: PathBuf,
     /// Folder for the photograph, and the model's picture in its light and in the mean light of training
@@ -55,7 +55,7 @@ impl Verb for FitLight {
         let fitted = fit_light::fit(&model, &options, &INTERRUPT, &mut |s| shown.show(s, "light"))?;
         shown.finish();
         let Some(fitted) = fitted else { return Ok(Outcome::Interrupted) };
-        sh_text::save(&self.out, &fitted.light)?;
+        sh_text::save(&self.out, &fitted.light, fitted.sun.as_ref())?;
         if let Some(folder) = &self.pictures {
             std::fs::create_dir_all(folder).map_err(diorama_data::DataError::io(folder, "create"))?;
             let all = [("photograph", &fitted.photograph), ("fitted", &fitted.picture), ("mean_light", &fitted.mean_picture)];
@@ -74,7 +74,7 @@ impl FitLight {
             println!(
                 "{}",
                 serde_json::json!({
-                    "light": self.out, "gain": f.gain, "pixels": f.pixels,
+                    "light": self.out, "sun": f.sun.map(|(d, e)| (d.to_array(), e)), "gain": f.gain, "pixels": f.pixels,
                     "fitted_psnr": f.fitted_psnr, "rest_psnr": f.rest_psnr,
                     "mean_light_fitted_psnr": f.mean_light_fitted_psnr, "mean_light_rest_psnr": f.mean_light_rest_psnr,
                 })
@@ -87,6 +87,10 @@ impl FitLight {
         );
         if let (Some(rest), Some(mean)) = (f.rest_psnr, f.mean_light_rest_psnr) {
             println!("the rest: {rest:.2} dB (mean light of training: {mean:.2} dB)");
+        }
+        if let Some((d, [r, g, b])) = f.sun {
+            let (elevation, power) = (d.z.clamp(-1.0, 1.0).asin().to_degrees(), 0.2126 * r + 0.7152 * g + 0.0722 * b);
+            println!("a sun {elevation:.0}° above the horizon, azimuth {:.0}°, irradiance {power:.2}", d.x.atan2(d.y).to_degrees());
         }
         println!("{}", self.out.display());
     }

@@ -1,18 +1,22 @@
-//! Light of a photograph that training never saw: spherical harmonics, from what the model knows of the place.
+//! Light of a photograph that training never saw: spherical harmonics, and a sun where the model tells suns apart, from what the model knows of
+//! the place.
 //!
 //! The model's albedo, normals and shadow at the photograph's camera explain its pixels under an unknown light, which [`solve`] finds. The
-//! shadow depends on the light, so both are found in turn.
+//! shadow depends on the light, so both are found in turn; with suns apart, the sun is searched whose shadows fit. Only surfaces count that
+//! other photographs show as well: what nobody saw has no albedo.
 
+mod known;
 pub mod solve;
 
 use super::outdoor::model::SceneModel;
 use super::outdoor::render::{SceneView, ViewLight};
 use super::outdoor::shading::{LIGHT, SKY};
+use super::outdoor::sun::{self, Shown};
 use crate::error::{PipelineError, Result};
 use diorama_data::{DataError, masks, photo, transforms_json};
 use diorama_geom::capture::Frame;
 use diorama_geom::color::{linear_from_srgb, srgb_from_linear};
-use diorama_geom::glam::DVec3;
+use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light::ShLight;
 use diorama_geom::{Camera, Image, ImageU8, Similarity};
 use diorama_kernels::ops::ray_generation::PosedCamera;
@@ -88,6 +92,8 @@ pub struct FitOptions {
 #[derive(Clone, Debug)]
 pub struct FittedLight {
     pub light: ShLight,
+    /// A sun, whose light the harmonics then lack: direction, and the irradiance of a surface that faces it.
+    pub sun: Option<(DVec3, [f64; 3])>,
     /// Luminance of the light over that of the mean light of training.
     pub gain: f64,
     pub fitted_psnr: f64,
@@ -159,44 +165,63 @@ fn even_sky(shot: &Shot, view: &SceneView, region: &Region) -> Option<Vec<f32>> 
 /// # Errors
 /// When the photograph or its camera cannot be read, or the region shows hardly any surface that the model knows.
 pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut dyn FnMut(f64)) -> Result<Option<FittedLight>> {
-    let shot = shot(model, o)?;
+    let mut shot = shot(model, o)?;
     let mean = mean_light(model);
-    let small = shot.resized(FIT_PX);
-    let (mut light, mut sky, mut pixels) = (None, None, Vec::new());
-    let lit_by = |light: ShLight, sky: &Option<Vec<f32>>| {
-        let mut shown = ViewLight::of(light);
+    let mut small = shot.resized(FIT_PX);
+    let (mut light, mut sun, mut sky, mut pixels) = (None, None, None, 0);
+    let lit_by = |light: ShLight, sun: Option<(DVec3, [f64; 3])>, sky: &Option<Vec<f32>>| {
+        let mut shown = ViewLight::new(model, light, sun);
         sky.iter().for_each(|sky| shown.sky.clone_from(sky));
         shown
     };
-    for round in 0..ROUNDS {
-        let own = lit_by(light.unwrap_or(mean), &sky);
+    let known = known::Known::of(model);
+    let rounds = if model.has_suns() { 1 } else { ROUNDS };
+    for round in 0..rounds {
+        let own = lit_by(light.unwrap_or(mean), None, &sky);
         let view = model.view(&small.camera, &own, &mut |_| {});
+        if round == 0 {
+            known.keep(&mut small, &view);
+        }
         sky = sky.or_else(|| even_sky(&small, &view, &o.region));
-        pixels = lit_pixels(&small, &view, &lit_by(own.light, &sky), &o.region);
-        if pixels.len() < FEWEST {
-            let why = "the region shows hardly any well-exposed surface that the model knows; give another --region or --camera";
+        let used = used_pixels(&small, &view, &o.region);
+        pixels = used.len();
+        if pixels < FEWEST {
+            let why = "the region shows hardly any well-exposed surface that the model and other photographs know; give another --region or --camera";
             return Err(DataError::input(&o.photo, why).into());
         }
-        light = Some(solve::light(&pixels, &mean, light.as_ref()));
-        progress((round + 1) as f64 / (ROUNDS + 2) as f64);
+        if let Some(around) = model.surroundings.as_deref().filter(|_| model.has_suns()) {
+            let shown: Vec<Shown> = used.iter().map(|i| shown(&small, &view, *i)).collect();
+            let Some(found) = sun::of_photograph(&shown, &around.surfaces, &around.visibility, stop) else { return Ok(None) };
+            light = Some(ShLight(std::array::from_fn(|i| std::array::from_fn(|k| found.sky[3 * i + k] as f64))));
+            let power: [f64; 3] = std::array::from_fn(|k| found.sun[3 + k] as f64 * std::f64::consts::PI);
+            sun = (power != [0.0; 3]).then(|| (DVec3::new(found.sun[0] as f64, found.sun[1] as f64, found.sun[2] as f64), power));
+        } else {
+            let lit: Vec<LitPixel> = used.iter().map(|i| lit_pixel(&small, &view, &lit_by(own.light, None, &sky), *i)).collect();
+            light = Some(solve::light(&lit, &mean, light.as_ref()));
+        }
+        progress((round + 1) as f64 / (rounds + 2) as f64);
         if stop.load(Ordering::Relaxed) {
             return Ok(None);
         }
     }
     let light = light.unwrap_or(mean);
-    let view = model.view(&shot.camera, &lit_by(light, &sky), &mut |_| {});
-    progress((ROUNDS + 1) as f64 / (ROUNDS + 2) as f64);
-    let plain = model.view(&shot.camera, &lit_by(mean, &sky), &mut |_| {});
+    let view = model.view(&shot.camera, &lit_by(light, sun, &sky), &mut |_| {});
+    known.keep(&mut shot, &view);
+    progress((rounds + 1) as f64 / (rounds + 2) as f64);
+    let plain = model.view(&shot.camera, &lit_by(mean, None, &sky), &mut |_| {});
     let (fitted, rest) = (psnr(&shot, &view, &o.region, true), psnr(&shot, &view, &o.region, false));
     let (mean_fitted, mean_rest) = (psnr(&shot, &plain, &o.region, true), psnr(&shot, &plain, &o.region, false));
+    let mut whole = light;
+    sun.iter().for_each(|(direction, irradiance)| whole.add_sun(*direction, *irradiance));
     Ok(Some(FittedLight {
-        gain: luminance(&light) / luminance(&mean).max(1e-9),
+        gain: luminance(&whole) / luminance(&mean).max(1e-9),
         light,
+        sun,
         fitted_psnr: fitted.unwrap_or(f64::NAN),
         rest_psnr: rest,
         mean_light_fitted_psnr: mean_fitted.unwrap_or(f64::NAN),
         mean_light_rest_psnr: mean_rest,
-        pixels: pixels.len(),
+        pixels,
         photograph: shot.photo.clone(),
         picture: encoded(&view.color),
         mean_picture: encoded(&plain.color),
@@ -229,7 +254,7 @@ fn encoded(linear: &Image) -> ImageU8 {
 }
 
 /// Well-exposed pixels of a region that show surfaces.
-fn lit_pixels(shot: &Shot, view: &SceneView, light: &ViewLight, region: &Region) -> Vec<LitPixel> {
+fn used_pixels(shot: &Shot, view: &SceneView, region: &Region) -> Vec<usize> {
     let size = (shot.photo.width, shot.photo.height);
     let is_used = |i: &usize| {
         let rgb = shot.rgb(*i);
@@ -239,16 +264,28 @@ fn lit_pixels(shot: &Shot, view: &SceneView, light: &ViewLight, region: &Region)
             && rgb.iter().all(|v| *v < EXPOSED.1)
             && region.holds((i % size.0, i / size.0), size, shot.full)
     };
-    let of = |i: usize| {
-        let through = view.opacity.data[i] * view.shadow.data[i];
-        LitPixel {
-            reflected: std::array::from_fn(|k| view.albedo.data[3 * i + k] * through),
-            behind: std::array::from_fn(|k| (1.0 - view.opacity.data[i]) * (light.sky[k] * FIRST).max(0.0)),
-            normal: std::array::from_fn(|k| view.normal.data[3 * i + k]),
-            target_srgb: shot.rgb(i).map(|v| v as f32 / 255.0),
-        }
-    };
-    (0..size.0 * size.1).filter(is_used).map(of).collect()
+    (0..size.0 * size.1).filter(is_used).collect()
+}
+
+fn lit_pixel(shot: &Shot, view: &SceneView, light: &ViewLight, i: usize) -> LitPixel {
+    let through = view.opacity.data[i] * view.shadow.data[i];
+    LitPixel {
+        reflected: std::array::from_fn(|k| view.albedo.data[3 * i + k] * through),
+        behind: std::array::from_fn(|k| (1.0 - view.opacity.data[i]) * (light.sky[k] * FIRST).max(0.0)),
+        normal: std::array::from_fn(|k| view.normal.data[3 * i + k]),
+        target_srgb: shot.rgb(i).map(|v| v as f32 / 255.0),
+    }
+}
+
+/// A pixel as the search for suns reads it.
+fn shown(shot: &Shot, view: &SceneView, i: usize) -> Shown {
+    let at = |image: &Image| Vec3::from_slice(&image.data[3 * i..]);
+    Shown {
+        point: known::point(&shot.camera, view, i).as_vec3(),
+        normal: at(&view.normal),
+        albedo: at(&view.albedo),
+        color: Vec3::from(shot.rgb(i).map(|v| linear_from_srgb(v as f32 / 255.0))),
+    }
 }
 
 /// PSNR in sRGB over the surfaces inside (or outside) of a region; none without pixels.

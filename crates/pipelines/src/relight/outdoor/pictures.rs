@@ -13,6 +13,9 @@ use diorama_geom::sh_light::ShLight;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+/// Opacity from which a pixel shows a surface.
+const SURFACE: f32 = 0.5;
+
 /// A layer of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Layer {
@@ -95,7 +98,7 @@ pub fn render(model: &SceneModel, options: &PicturesOptions, stop: &AtomicBool, 
         for layer in &options.layers {
             let extension = if options.is_linear { "exr" } else { "png" };
             let file = options.out.join(format!("{title}_{}.{extension}", layer.name()));
-            let image = layer_of(&view, *layer);
+            let image = &matter(&view, *layer);
             match options.is_linear {
                 true => photo::save_exr(&file, &three_channels(image))?,
                 false => photo::save_png(&file, &shown(image, *layer).to_u8())?,
@@ -151,6 +154,16 @@ fn three_channels(image: &Image) -> Image {
         3 => image.clone(),
         _ => Image { width: image.width, height: image.height, channels: 3, data: image.data.iter().flat_map(|v| [*v; 3]).collect() },
     }
+}
+
+/// A layer that is 0 where a view shows no surface; the picture shows the sky there.
+fn matter(view: &SceneView, layer: Layer) -> Image {
+    let mut image = layer_of(view, layer).clone();
+    if layer != Layer::Rgb {
+        let pixels = image.data.chunks_exact_mut(image.channels).zip(&view.opacity.data);
+        pixels.filter(|(_, o)| **o < SURFACE).for_each(|(p, _)| p.fill(0.0));
+    }
+    image
 }
 
 /// Values between 0 and 1 as people look at them, `[H, W, 3]`: light along the sRGB curve, normals from −1 on, depth by its largest value.

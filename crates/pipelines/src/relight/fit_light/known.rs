@@ -1,0 +1,78 @@
+//! Which surfaces of a view training knows: those that at least two of its cameras see.
+
+use super::Shot;
+use crate::relight::outdoor::model::SceneModel;
+use crate::relight::outdoor::render::SceneView;
+use diorama_engine::renderers::volume::{Quality, Tracer};
+use diorama_geom::glam::DVec3;
+use diorama_geom::{Image, ImageU8};
+use diorama_kernels::ops::ray_generation::PosedCamera;
+
+/// Pixels along the longer side of the distances that are compared, and cameras at most.
+const LONGEST: f64 = 96.0;
+const CAMERAS: usize = 48;
+/// Cameras that must see a surface, and the difference of distances that is none.
+const FEWEST: usize = 2;
+const SAME: f64 = 0.05;
+
+/// Distances that the cameras of training see.
+pub struct Known(Vec<(PosedCamera, Image)>);
+
+impl Known {
+    pub fn of(model: &SceneModel) -> Known {
+        let mut cameras: Vec<PosedCamera> = Vec::new();
+        for c in model.cameras() {
+            if !cameras.iter().any(|other| other.pose == c.pose && other.camera == c.camera) {
+                cameras.push(c);
+            }
+        }
+        let step = cameras.len().div_ceil(CAMERAS).max(1);
+        let seen = cameras.into_iter().step_by(step).map(|c| {
+            let shrink = (LONGEST / c.camera.width.max(c.camera.height) as f64).min(1.0);
+            let size = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
+            let small = PosedCamera { camera: c.camera.resized(size(c.camera.width), size(c.camera.height)), pose: c.pose };
+            let tracer: Tracer = model.tracer(Quality::Full);
+            (small, tracer.layers(&small, &[&[0.0; 9]], &mut |_| {}).depth)
+        });
+        Known(seen.collect())
+    }
+
+    /// Leaves out of a photograph what fewer than two cameras of training see.
+    pub fn keep(&self, shot: &mut Shot, view: &SceneView) {
+        let (w, h) = (shot.photo.width, shot.photo.height);
+        let all = || ImageU8 { width: w, height: h, channels: 1, data: vec![255; w * h] };
+        let camera = shot.camera;
+        let mask = shot.mask.get_or_insert_with(all);
+        for (i, v) in mask.data.iter_mut().enumerate() {
+            let point = point(&camera, view, i);
+            // The sky is no surface and needs nobody to see it.
+            if view.opacity.data[i] > super::SURFACE
+                && self.0.iter().filter(|(c, depth)| sees(c, depth, point)).take(FEWEST).count() < FEWEST
+            {
+                *v = 0;
+            }
+        }
+    }
+}
+
+/// Where the ray of a pixel meets its surface.
+pub fn point(camera: &PosedCamera, view: &SceneView, i: usize) -> DVec3 {
+    let (x, y) = (i % view.depth.width, i / view.depth.width);
+    let direction = camera.pose.rotation * camera.camera.direction(x as f64 + 0.5, y as f64 + 0.5).normalize();
+    camera.pose.translation + direction * view.depth.data[i] as f64
+}
+
+/// Whether a camera sees a point at its distance, or a neighboring pixel does.
+fn sees(camera: &PosedCamera, depth: &Image, point: DVec3) -> bool {
+    let local = camera.pose.inverse().point(point);
+    let Some(at) = camera.camera.project(local).filter(|_| local.z > 0.0) else { return false };
+    let (x, y, distance) = (at.x.floor() as isize, at.y.floor() as isize, local.length());
+    let is_inside = |x: isize, y: isize| (0..depth.width as isize).contains(&x) && (0..depth.height as isize).contains(&y);
+    is_inside(x, y)
+        && (-1..=1).any(|dy| {
+            (-1..=1).any(|dx| {
+                let (x, y) = (x + dx, y + dy);
+                is_inside(x, y) && (depth.data[y as usize * depth.width + x as usize] as f64 / distance - 1.0).abs() < SAME
+            })
+        })
+}
