@@ -134,6 +134,25 @@ fn footprints(from: usize, to: usize) -> Vec<Vec<(usize, f32)>> {
         .collect()
 }
 
+/// Means of values `[H, W]` over squares of a radius around each, in which border pixels are repeated.
+pub fn box_means(values: &[f64], w: usize, h: usize, radius: usize) -> Vec<f64> {
+    let pass = |values: &[f64], n: usize, lines: usize, at: &dyn Fn(usize, usize) -> usize| -> Vec<f64> {
+        let mut out = vec![0.0; values.len()];
+        let r = radius as isize;
+        for line in 0..lines {
+            let v = |k: isize| values[at(line, k.clamp(0, n as isize - 1) as usize)];
+            let mut sum: f64 = (-r..=r).map(v).sum();
+            for k in 0..n as isize {
+                out[at(line, k as usize)] = sum / (2 * r + 1) as f64;
+                sum += v(k + r + 1) - v(k - r);
+            }
+        }
+        out
+    };
+    let rows = pass(values, w, h, &|y, x| y * w + x);
+    pass(&rows, h, w, &|x, y| y * w + x)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -148,6 +167,13 @@ mod tests {
     fn transparent_pixels_do_not_bleed_color() {
         let im = ImageU8 { width: 2, height: 1, channels: 4, data: vec![255, 0, 0, 255, 0, 255, 0, 0] };
         assert_eq!(im.downsampled(1, 1).data, vec![255, 0, 0, 128]);
+    }
+
+    #[test]
+    fn box_means_repeat_the_border() {
+        let values = [0.0, 3.0, 6.0, 0.0, 3.0, 6.0];
+        let means = box_means(&values, 3, 2, 1);
+        assert!(means.iter().zip([1.0, 3.0, 5.0, 1.0, 3.0, 5.0]).all(|(m, want)| (m - want as f64).abs() < 1e-12), "{means:?}");
     }
 
     #[test]

@@ -29,7 +29,7 @@ pub struct FitLight {
     /// Nine rows of spherical harmonics and perhaps a sun, for --light of the other commands
     #[arg(short, long, default_value = "light.txt")]
     out: PathBuf,
-    /// Folder for the photograph, and the model's picture in its light and in the mean light of training
+    /// Folder for the photograph, the model's picture in its light and in the mean light of training, and which pixels are scored
     #[arg(long)]
     pictures: Option<PathBuf>,
     /// Number of CPU threads [default: all]
@@ -58,8 +58,8 @@ impl Verb for FitLight {
         sh_text::save(&self.out, &fitted.light, fitted.sun.as_ref())?;
         if let Some(folder) = &self.pictures {
             std::fs::create_dir_all(folder).map_err(diorama_data::DataError::io(folder, "create"))?;
-            let all = [("photograph", &fitted.photograph), ("fitted", &fitted.picture), ("mean_light", &fitted.mean_picture)];
-            for (name, image) in all {
+            let all = [&fitted.photograph, &fitted.picture, &fitted.mean_picture, &fitted.scored];
+            for (name, image) in ["photograph", "fitted", "mean_light", "scored"].into_iter().zip(all) {
                 photo::save_png(&folder.join(format!("{name}.png")), image)?;
             }
         }
@@ -77,6 +77,7 @@ impl FitLight {
                     "light": self.out, "sun": f.sun.map(|(d, e)| (d.to_array(), e)), "gain": f.gain, "pixels": f.pixels,
                     "fitted_psnr": f.fitted_psnr, "rest_psnr": f.rest_psnr,
                     "mean_light_fitted_psnr": f.mean_light_fitted_psnr, "mean_light_rest_psnr": f.mean_light_rest_psnr,
+                    "alike_rest_psnr": f.alike_rest_psnr, "mean_light_alike_rest_psnr": f.mean_light_alike_rest_psnr,
                 })
             );
             return;
@@ -87,6 +88,9 @@ impl FitLight {
         );
         if let (Some(rest), Some(mean)) = (f.rest_psnr, f.mean_light_rest_psnr) {
             println!("the rest: {rest:.2} dB (mean light of training: {mean:.2} dB)");
+        }
+        if let (Some(rest), Some(mean)) = (f.alike_rest_psnr, f.mean_light_alike_rest_psnr) {
+            println!("of it, what looks like the model: {rest:.2} dB (mean light of training: {mean:.2} dB)");
         }
         if let Some((d, [r, g, b])) = f.sun {
             let (elevation, power) = (d.z.clamp(-1.0, 1.0).asin().to_degrees(), 0.2126 * r + 0.7152 * g + 0.0722 * b);

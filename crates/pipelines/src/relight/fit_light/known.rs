@@ -1,10 +1,13 @@
-//! Which surfaces of a view training knows: those that at least two of its cameras see.
+//! Which surfaces of a view training knows: those that at least two of its cameras see. And which of them a photograph shows as well, whatever
+//! its light: people and cars before them have no likeness to their albedo.
 
 use super::Shot;
 use crate::relight::outdoor::model::SceneModel;
 use crate::relight::outdoor::render::SceneView;
 use diorama_engine::renderers::volume::{Quality, Tracer};
+use diorama_geom::color::srgb_from_linear;
 use diorama_geom::glam::DVec3;
+use diorama_geom::image::box_means;
 use diorama_geom::{Image, ImageU8};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 
@@ -14,6 +17,12 @@ const CAMERAS: usize = 48;
 /// Cameras that must see a surface, and the difference of distances that is none.
 const FEWEST: usize = 2;
 const SAME: f64 = 0.05;
+
+/// Share of the longer side by which windows reach to each side, and the correlation in them from which pictures are alike; deviation up to
+/// which a window is even.
+const LIKENESS: usize = 32;
+const ALIKE: f64 = 0.4;
+const EVEN: f64 = 0.02;
 
 /// Distances that the cameras of training see.
 pub struct Known(Vec<(PosedCamera, Image)>);
@@ -53,6 +62,31 @@ impl Known {
             }
         }
     }
+}
+
+/// Whether the photograph looks like the model's albedo around each pixel, up to brightness and contrast; where both are even, it does.
+pub fn alike(shot: &Shot, view: &SceneView) -> Vec<bool> {
+    let (w, h) = (shot.photo.width, shot.photo.height);
+    let gray = |rgb: [f32; 3]| (0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]) as f64;
+    let photo: Vec<f64> = (0..w * h).map(|i| gray(shot.rgb(i).map(|v| v as f32 / 255.0))).collect();
+    // Of the model, what it has no surface for looks like the photograph.
+    let model: Vec<f64> = (0..w * h)
+        .map(|i| {
+            let albedo: [f32; 3] = std::array::from_fn(|k| srgb_from_linear(view.albedo.data[3 * i + k].clamp(0.0, 1.0)));
+            if view.opacity.data[i] > super::SURFACE { gray(albedo) } else { photo[i] }
+        })
+        .collect();
+    let radius = (w.max(h) / LIKENESS).max(2);
+    let mean = |of: &dyn Fn(usize) -> f64| box_means(&(0..w * h).map(of).collect::<Vec<_>>(), w, h, radius);
+    let (a, b) = (mean(&|i| photo[i]), mean(&|i| model[i]));
+    let (aa, bb, ab) = (mean(&|i| photo[i] * photo[i]), mean(&|i| model[i] * model[i]), mean(&|i| photo[i] * model[i]));
+    (0..w * h)
+        .map(|i| {
+            let (va, vb) = ((aa[i] - a[i] * a[i]).max(0.0), (bb[i] - b[i] * b[i]).max(0.0));
+            let is_even = va.max(vb) < EVEN * EVEN;
+            is_even || (ab[i] - a[i] * b[i]) > ALIKE * (va * vb).sqrt()
+        })
+        .collect()
 }
 
 /// Where the ray of a pixel meets its surface.

@@ -102,12 +102,17 @@ pub struct FittedLight {
     /// The same under the mean light of training.
     pub mean_light_fitted_psnr: f64,
     pub mean_light_rest_psnr: Option<f64>,
+    /// The rest again, only where the photograph looks like the model's albedo: without who stands before it.
+    pub alike_rest_psnr: Option<f64>,
+    pub mean_light_alike_rest_psnr: Option<f64>,
     /// Pixels that were fitted, at the size at which lights are compared.
     pub pixels: usize,
     /// sRGB: the photograph at the run's size, and the model's picture in the new and in the mean light.
     pub photograph: ImageU8,
     pub picture: ImageU8,
     pub mean_picture: ImageU8,
+    /// 255 where a pixel is scored, 128 where the photograph looks like something else there.
+    pub scored: ImageU8,
 }
 
 /// A photograph with its camera, at one size.
@@ -183,10 +188,12 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
             known.keep(&mut small, &view);
         }
         sky = sky.or_else(|| even_sky(&small, &view, &o.region));
-        let used = used_pixels(&small, &view, &o.region);
+        let alike = known::alike(&small, &view);
+        let used: Vec<usize> = used_pixels(&small, &view, &o.region, model.has_suns()).into_iter().filter(|i| alike[*i]).collect();
         pixels = used.len();
         if pixels < FEWEST {
-            let why = "the region shows hardly any well-exposed surface that the model and other photographs know; give another --region or --camera";
+            let why = "the region shows hardly any well-exposed surface that the model and other photographs know; give another --region or \
+                       --camera";
             return Err(DataError::input(&o.photo, why).into());
         }
         if let Some(around) = model.surroundings.as_deref().filter(|_| model.has_suns()) {
@@ -209,8 +216,15 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
     known.keep(&mut shot, &view);
     progress((rounds + 1) as f64 / (rounds + 2) as f64);
     let plain = model.view(&shot.camera, &lit_by(mean, None, &sky), &mut |_| {});
-    let (fitted, rest) = (psnr(&shot, &view, &o.region, true), psnr(&shot, &view, &o.region, false));
-    let (mean_fitted, mean_rest) = (psnr(&shot, &plain, &o.region, true), psnr(&shot, &plain, &o.region, false));
+    let alike = known::alike(&shot, &view);
+    let inside = |i: usize| {
+        let (w, h) = (shot.photo.width, shot.photo.height);
+        o.region.holds((i % w, i / w), (w, h), shot.full)
+    };
+    let of = |view: &SceneView, which: &dyn Fn(usize) -> bool| psnr(&shot, view, which);
+    let (fitted, rest) = (of(&view, &inside), of(&view, &|i| !inside(i)));
+    let (mean_fitted, mean_rest) = (of(&plain, &inside), of(&plain, &|i| !inside(i)));
+    let is_alike = |i: usize| !inside(i) && alike[i];
     let mut whole = light;
     sun.iter().for_each(|(direction, irradiance)| whole.add_sun(*direction, *irradiance));
     Ok(Some(FittedLight {
@@ -221,10 +235,13 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
         rest_psnr: rest,
         mean_light_fitted_psnr: mean_fitted.unwrap_or(f64::NAN),
         mean_light_rest_psnr: mean_rest,
+        alike_rest_psnr: of(&view, &is_alike),
+        mean_light_alike_rest_psnr: of(&plain, &is_alike),
         pixels,
         photograph: shot.photo.clone(),
         picture: encoded(&view.color),
         mean_picture: encoded(&plain.color),
+        scored: scored(&shot, &view, &alike),
     }))
 }
 
@@ -253,15 +270,15 @@ fn encoded(linear: &Image) -> ImageU8 {
     Image { data, ..linear.clone() }.to_u8()
 }
 
-/// Well-exposed pixels of a region that show surfaces.
-fn used_pixels(shot: &Shot, view: &SceneView, region: &Region) -> Vec<usize> {
+/// Pixels of a region that show surfaces and are well exposed, or overexposed where that is `bright`.
+fn used_pixels(shot: &Shot, view: &SceneView, region: &Region, bright: bool) -> Vec<usize> {
     let size = (shot.photo.width, shot.photo.height);
     let is_used = |i: &usize| {
         let rgb = shot.rgb(*i);
         view.opacity.data[*i] > SURFACE
             && shot.is_kept(*i)
             && rgb.iter().any(|v| *v > EXPOSED.0)
-            && rgb.iter().all(|v| *v < EXPOSED.1)
+            && (bright || rgb.iter().all(|v| *v < EXPOSED.1))
             && region.holds((i % size.0, i / size.0), size, shot.full)
     };
     (0..size.0 * size.1).filter(is_used).collect()
@@ -288,13 +305,11 @@ fn shown(shot: &Shot, view: &SceneView, i: usize) -> Shown {
     }
 }
 
-/// PSNR in sRGB over the surfaces inside (or outside) of a region; none without pixels.
-fn psnr(shot: &Shot, view: &SceneView, region: &Region, inside: bool) -> Option<f64> {
-    let size = (shot.photo.width, shot.photo.height);
+/// PSNR in sRGB over the surfaces among some pixels; none without pixels.
+fn psnr(shot: &Shot, view: &SceneView, which: &dyn Fn(usize) -> bool) -> Option<f64> {
     let (mut sum, mut n) = (0.0, 0);
-    for i in 0..size.0 * size.1 {
-        let counts = view.opacity.data[i] > SURFACE && shot.is_kept(i);
-        if counts && region.holds((i % size.0, i / size.0), size, shot.full) == inside {
+    for i in 0..shot.photo.width * shot.photo.height {
+        if counts(shot, view, i) && which(i) {
             let rgb = shot.rgb(i);
             for k in 0..3 {
                 let e = srgb_from_linear(view.color.data[3 * i + k].clamp(0.0, 1.0)) - rgb[k] as f32 / 255.0;
@@ -304,6 +319,22 @@ fn psnr(shot: &Shot, view: &SceneView, region: &Region, inside: bool) -> Option<
         }
     }
     (n > 0).then(|| -10.0 * (sum / n as f64).log10())
+}
+
+fn scored(shot: &Shot, view: &SceneView, alike: &[bool]) -> ImageU8 {
+    let (w, h) = (shot.photo.width, shot.photo.height);
+    let of = |i: usize| match (counts(shot, view, i), alike[i]) {
+        (false, _) => 0,
+        (true, false) => 128,
+        (true, true) => 255,
+    };
+    let data = (0..w * h).map(of).collect();
+    ImageU8 { width: w, height: h, channels: 1, data }
+}
+
+/// Whether a pixel shows a surface that is known.
+fn counts(shot: &Shot, view: &SceneView, i: usize) -> bool {
+    view.opacity.data[i] > SURFACE && shot.is_kept(i)
 }
 
 /// The photograph at the run's size, with its camera in model space.

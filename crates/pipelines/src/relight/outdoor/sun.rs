@@ -33,6 +33,8 @@ const FIRST_ALBEDO: f32 = 0.3;
 const BRIGHT: f32 = 0.7;
 /// Lights at most that are taken for one without a sun, to begin with.
 const TAKEN_FOR_EVEN: usize = 8;
+/// Linear value of a channel from which on a photograph is overexposed.
+const OVEREXPOSED: f32 = 0.97;
 /// Times that the light of a photograph and what surfaces send are found in turn.
 const PHOTOGRAPH_ROUNDS: usize = 5;
 /// Times that light and albedo approach each other before beginnings are compared.
@@ -280,12 +282,21 @@ pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility
     let mean = shown.iter().map(|s| s.color).sum::<Vec3>() / shown.len().max(1) as f32;
     let sent_first = |p: &Place| (1.0 - visibility.from_sky(&p.corners, p.normal)) * BOUNCED / FIRST_ALBEDO * mean;
     let mut sent: Vec<Vec3> = places.points.iter().map(sent_first).collect();
+    // What is overexposed says that there is at least so much light.
+    let counting = |found: &Option<Guess>, sent: &[Vec3]| {
+        let mut points = lit(&seen, &albedos, 0, sent, found.as_ref(), &places.points);
+        for (i, p) in points.iter_mut().enumerate().filter(|(_, p)| p.seen.max_element() > OVEREXPOSED) {
+            let is_reached = |g: &Guess| (p.albedo * g.irradiance(i, &places.points[i])).max_element() >= p.seen.max_element();
+            p.trust *= found.as_ref().is_some_and(|g| !is_reached(g)) as u8 as f32;
+        }
+        points
+    };
     let mut found: Option<Guess> = None;
     for round in 0..PHOTOGRAPH_ROUNDS {
         if interrupt.load(Ordering::Relaxed) {
             return None;
         }
-        let points = lit(&seen, &albedos, 0, &sent, found.as_ref(), &places.points);
+        let points = counting(&found, &sent);
         let near = found.as_ref().filter(|_| round > SEARCHED).map(|g| Vec3::from_slice(&g.fitted.sun));
         let fitted = fit(&points, &places, visibility, near);
         let ambient = around.light(visibility, &fitted.sun, &fitted.sky);
@@ -293,8 +304,8 @@ pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility
         sent = places.points.iter().map(bounced).collect();
         found = Some(Guess { sunlit: places.sunlit(visibility, Vec3::from_slice(&fitted.sun)), sent: sent.clone(), fitted });
     }
+    let points = counting(&found, &sent);
     let found = found?;
-    let points = lit(&seen, &albedos, 0, &sent, Some(&found), &places.points);
     let none = vec![0.0; shown.len()];
     let fitted = solve(&points, &places.points, &none, Vec3::from_slice(&found.fitted.sun));
     let without = Guess { sunlit: none, sent, fitted };

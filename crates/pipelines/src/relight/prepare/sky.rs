@@ -3,6 +3,7 @@
 
 use diorama_geom::ImageU8;
 use diorama_geom::glam::{DMat3, DVec2, DVec3};
+use diorama_geom::image::box_means;
 
 /// Longer side in pixels at which the sky is looked for.
 const WORKING: usize = 320;
@@ -91,7 +92,7 @@ impl Picture {
         let colors: Vec<DVec3> = photo.data.chunks_exact(c).map(color).collect();
         let gray: Vec<f64> = colors.iter().map(|c| luma(*c)).collect();
         let squares: Vec<f64> = gray.iter().map(|g| g * g).collect();
-        let (mean, mean_square) = (boxed(&gray, w, h, 2), boxed(&squares, w, h, 2));
+        let (mean, mean_square) = (box_means(&gray, w, h, 2), box_means(&squares, w, h, 2));
         let texture = mean.iter().zip(&mean_square).map(|(m, s)| (s - m * m).max(0.0).sqrt());
         let features = colors.iter().zip(texture).enumerate().map(|(i, (c, t))| {
             let y = (i / w) as f64 / (h - 1) as f64;
@@ -180,7 +181,7 @@ impl Picture {
     /// Takes out what only hangs together with the sky across an edge.
     fn bordered(&self, is_sky: &[bool]) -> Vec<bool> {
         let smooth: [Vec<f64>; 3] =
-            std::array::from_fn(|k| boxed(&self.colors.iter().map(|c| c[k]).collect::<Vec<_>>(), self.w, self.h, 1));
+            std::array::from_fn(|k| box_means(&self.colors.iter().map(|c| c[k]).collect::<Vec<_>>(), self.w, self.h, 1));
         let gradient = |i: usize| -> f64 {
             let (x, y) = ((i % self.w) as isize, (i / self.w) as isize);
             let at = |dx: isize, dy: isize| {
@@ -200,7 +201,7 @@ impl Picture {
 
     /// Guided filter of values by the colors.
     fn guided(&self, values: &[f64], radius: usize, regularizer: f64) -> Vec<f64> {
-        let mean = |of: &dyn Fn(usize) -> f64| boxed(&(0..values.len()).map(of).collect::<Vec<_>>(), self.w, self.h, radius);
+        let mean = |of: &dyn Fn(usize) -> f64| box_means(&(0..values.len()).map(of).collect::<Vec<_>>(), self.w, self.h, radius);
         let color: [Vec<f64>; 3] = std::array::from_fn(|k| mean(&|i| self.colors[i][k]));
         let cross: [Vec<f64>; 3] = std::array::from_fn(|k| mean(&|i| self.colors[i][k] * values[i]));
         let squares: [[Vec<f64>; 3]; 3] =
@@ -230,25 +231,6 @@ impl Picture {
 
 fn luma(c: DVec3) -> f64 {
     c.dot(DVec3::new(0.299, 0.587, 0.114))
-}
-
-/// Means over squares, in which border pixels are repeated.
-fn boxed(values: &[f64], w: usize, h: usize, radius: usize) -> Vec<f64> {
-    let pass = |values: &[f64], n: usize, lines: usize, at: &dyn Fn(usize, usize) -> usize| -> Vec<f64> {
-        let mut out = vec![0.0; values.len()];
-        let r = radius as isize;
-        for line in 0..lines {
-            let v = |k: isize| values[at(line, k.clamp(0, n as isize - 1) as usize)];
-            let mut sum: f64 = (-r..=r).map(v).sum();
-            for k in 0..n as isize {
-                out[at(line, k as usize)] = sum / (2 * r + 1) as f64;
-                sum += v(k + r + 1) - v(k - r);
-            }
-        }
-        out
-    };
-    let rows = pass(values, w, h, &|y, x| y * w + x);
-    pass(&rows, h, w, &|x, y| y * w + x)
 }
 
 /// A weighted sum of Gaussians.
