@@ -119,15 +119,18 @@ pub fn environment_seeds() -> Vec<Vec<u8>> {
 /// Reads coefficients of light.
 pub fn sh_text(data: &[u8]) {
     let path = file("light.txt", data);
-    if let Ok(light) = sh_text::read(&path) {
-        sh_text::save(&path, &light).expect("a scratch file");
-        assert_eq!(sh_text::read(&path).ok(), Some(light));
+    if let Ok(text) = sh_text::read(&path) {
+        sh_text::save(&path, &text.light, text.sun.as_ref()).expect("a scratch file");
+        let again = sh_text::read(&path).expect("what was written");
+        assert_eq!((again.light, again.sun.map(|s| s.1)), (text.light, text.sun.map(|s| s.1)));
+        assert!(again.sun.is_none_or(|s| (s.0 - text.sun.expect("one").0).length() < 1e-12));
     }
 }
 
 pub fn sh_seeds() -> Vec<Vec<u8>> {
     let path = file("light.txt", b"");
-    sh_text::save(&path, &ShLight(std::array::from_fn(|i| [i as f64, 0.25, -1e-3]))).expect("a scratch file");
+    let light = ShLight(std::array::from_fn(|i| [i as f64, 0.25, -1e-3]));
+    sh_text::save(&path, &light, Some(&(DVec3::Z, [1.0, 0.5, 0.0]))).expect("a scratch file");
     vec![std::fs::read(path).expect("a scratch file"), b"# light\n1,2,3\n4 5 6\n".to_vec()]
 }
 

@@ -69,6 +69,37 @@ fn an_object_stands_on_the_ground_and_casts_a_shadow() {
 }
 
 #[test]
+fn what_passes_through_an_object_is_refused() {
+    let dir = folder();
+    // A post through the middle of the cube, wider than none of its faces: no edge of the cube crosses it.
+    let corner = |i: usize| [-0.1, 0.1].map(|v: f64| v)[i & 1];
+    let mut post = String::from(FLOOR);
+    let first = FLOOR.lines().filter(|l| l.starts_with("v ")).count();
+    for i in 0..8 {
+        post += &format!("v {} {} {}\n", corner(i), [0.5, 3.0][i >> 1 & 1], corner(i >> 2));
+    }
+    for face in [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]] {
+        post += &format!("f {} {} {} {}\n", first + 1 + face[0], first + 1 + face[1], first + 1 + face[2], first + 1 + face[3]);
+    }
+    std::fs::write(dir.path().join("floor.obj"), post).unwrap();
+    let text = SCENE.replace("snap = \"ground\"", "").replace("[0, 3, 0]", "[0, 1.2, 0]");
+    std::fs::write(dir.path().join("scene.toml"), &text).unwrap();
+    refused(dir.path(), &["compose", "scene.toml", "-o", "b.exr"], &["object 0", "edges of the scene", "overlap"]);
+}
+
+#[test]
+fn what_does_not_fit_into_memory_is_refused_before_anything_is_written() {
+    let dir = folder();
+    let text = SCENE.replace("size = [96, 64]", "size = [4096, 4096]");
+    assert_ne!(text, SCENE);
+    std::fs::write(dir.path().join("scene.toml"), &text).unwrap();
+    let o = command(dir.path(), &["compose", "scene.toml", "-o", "b.exr"]).env("DIORAMA_MEMORY", "1GiB").output().unwrap();
+    let said = String::from_utf8_lossy(&o.stderr);
+    assert!(o.status.code() == Some(1) && said.contains("out of memory: the picture") && said.contains("smaller size"), "{said}");
+    assert!(!dir.path().join("b.exr").exists());
+}
+
+#[test]
 #[cfg(unix)]
 fn an_interrupted_picture_goes_on_to_the_same_bits() {
     let dir = folder();
@@ -123,7 +154,11 @@ fn wrong_requests_are_refused_in_one_line() {
     diorama_data::photo::save_png(&at.join("square.png"), &square).unwrap();
     let compose = |name: &'static str| vec!["compose", name, "-o", "x.png"];
     refused(at, &compose("key.toml"), &["key.toml", "line 8", "did you mean scale?"]);
-    refused(at, &compose("missing.toml"), &["nothing.obj", "object 0"]);
+    refused(at, &compose("missing.toml"), &["missing.toml", "line ", "nothing.obj", "object 0"]);
+    let second = format!("{SCENE}\n[[object]]\nmesh = \"cube.obj\"\ntranslate = [1, 3, 0]\nscale = -1\n");
+    std::fs::write(at.join("second.toml"), &second).unwrap();
+    let line = format!("line {}", second.lines().position(|l| l == "scale = -1").unwrap() + 1);
+    refused(at, &compose("second.toml"), &["second.toml", &line, "object.scale"]);
     refused(at, &compose("air.toml"), &["cube.obj", "no ground below"]);
     refused(at, &compose("hdri.toml"), &["square.png", "1.00 : 1"]);
     refused(at, &["compose", "scene.toml", "-o", "x.jpg"], &["x.jpg", ".exr"]);

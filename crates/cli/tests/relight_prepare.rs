@@ -93,3 +93,37 @@ fn what_does_not_fit_is_named_before_anything_is_written() {
     let (code, text, _) = prepare(&source, &out, &["--rescale"]);
     assert!(code == Some(2) && text.contains("32×20") && text.contains("32×24"), "{text}");
 }
+
+/// Paints a bluish sky onto the upper third of all photographs, of which the masks say that nothing moved.
+fn paint_sky(root: &Path) {
+    for part in ["train", "test"] {
+        for entry in std::fs::read_dir(root.join(part).join("rgb")).unwrap().flatten() {
+            let mut im = photo::load(&entry.path()).unwrap();
+            im.data[..32 * 8 * 3].chunks_exact_mut(3).enumerate().for_each(|(i, p)| p.copy_from_slice(&[150, 185, 225 + (i / 32) as u8]));
+            photo::save_png(&entry.path(), &im).unwrap();
+            let mask = ImageU8 { width: 32, height: 24, channels: 1, data: vec![255; 32 * 24] };
+            photo::save_png(&root.join(part).join("mask").join(entry.file_name()), &mask).unwrap();
+        }
+    }
+}
+
+#[test]
+fn the_sky_is_marked_in_masks() {
+    let dir = tempfile::tempdir().unwrap();
+    let (source, out) = (dir.path().join("site"), dir.path().join("data"));
+    osr(&source, 0.7);
+    paint_sky(&source);
+    let (code, text, made) = prepare(&source, &out, &[]);
+    assert_eq!(code, Some(0), "{text}");
+    assert!((made["sky_share"].as_f64().unwrap() - 1.0 / 3.0).abs() < 0.05 && made["without_sky"] == 0, "{made}");
+    let read = import::import(&out, &Default::default()).unwrap();
+    assert_eq!(read.masks.meaning, diorama_geom::capture::MaskMeaning::Classes);
+    for frame in &read.frames {
+        let mask = photo::load(frame.mask.as_ref().unwrap()).unwrap();
+        assert_eq!([2, 18].map(|y| mask.pixel(16, y)[0]), [160, 255], "{}", frame.name);
+    }
+    let (code, text, made) = prepare(&source, &out, &["--force", "--sky", "none"]);
+    assert!(code == Some(0) && made["sky_share"].is_null(), "{text}");
+    let read = import::import(&out, &Default::default()).unwrap();
+    assert_eq!(photo::load(read.frames[0].mask.as_ref().unwrap()).unwrap().pixel(16, 2)[0], 255);
+}

@@ -90,6 +90,16 @@ mod tests {
     }
 
     #[test]
+    fn other_numbers_of_poses_and_photographs_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::create_dir(dir.path().join("images")).unwrap();
+        std::fs::write(dir.path().join("images/0.png"), b"x").unwrap();
+        std::fs::write(dir.path().join("poses_bounds.npy"), npy("2, 17", &[1.0; 34])).unwrap();
+        let e = read(dir.path()).unwrap_err();
+        assert!(e.is_input() && e.to_string().contains("2 poses") && e.to_string().contains("1 photographs"), "{e}");
+    }
+
+    #[test]
     fn another_shape_is_refused() {
         let dir = tempfile::tempdir().unwrap();
         std::fs::write(dir.path().join("poses_bounds.npy"), npy("2, 15", &[1.0; 30])).unwrap();

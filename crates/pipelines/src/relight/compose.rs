@@ -14,8 +14,12 @@ use diorama_kernels::ops::path_trace::{Film, Scene, Settings, ThinLens, View, cp
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+/// Lowest share of an object that may be in the ground.
+const FOOT: f64 = 0.02;
 /// Share of an object's edges that may cross the scene's surfaces.
 const PIERCED: f64 = 0.02;
+/// Edges of the scene, once for each of their triangles, that may cross an object: specks of photographed scenes do.
+const PIERCING: usize = 4;
 /// Edges that are tested.
 const EDGES: usize = 4000;
 /// Largest change of a photograph by light that objects throw onto it.
@@ -79,13 +83,17 @@ pub fn load(file: &SceneFile) -> Result<Composition> {
             lowered.add(placed, stands);
             placed = lowered;
         }
-        let pierced = pierced(&ground, &placed);
-        if pierced > PIERCED && !o.overlap {
-            let message = format!(
-                "object {i} stands in the scene: {:.0} % of its edges cross surfaces; change translate, or set overlap = true",
-                100.0 * pierced
-            );
-            return Err(DataError::input(&o.mesh, message).into());
+        if !o.overlap {
+            let cure = "change translate, or set overlap = true";
+            let refused = |what: String| Err(DataError::input(&o.mesh, format!("object {i} stands in the scene: {what}; {cure}")).into());
+            let share = pierced(&ground, &placed);
+            if share > PIERCED {
+                return refused(format!("{:.0} % of its edges cross surfaces", 100.0 * share));
+            }
+            let through = piercing(&model, place, &placed)?;
+            if through > PIERCING {
+                return refused(format!("{through} edges of the scene cross its surfaces"));
+            }
         }
         objects.push(placed.bounds());
         model.add(placed, DAffine3::IDENTITY);
@@ -155,10 +163,31 @@ fn height_above_ground(ground: &Scene, object: &Model) -> Option<f64> {
     Some(low[2] - hit.position.z)
 }
 
+/// Edges of the scene, which is the first `place` instances of a model, that pass through an object above its lowest part: a post through a wall
+/// crosses none of the object's own edges.
+fn piercing(model: &Model, place: usize, object: &Model) -> Result<usize> {
+    let Some((low, high)) = object.bounds().map(|(l, h)| (DVec3::from(l), DVec3::from(h))) else { return Ok(0) };
+    let floor = low.z + FOOT * (high.z - low.z);
+    let solid = Scene::new(object, &LightOptions::of(Source::Uniform(1.0)).read()?.0);
+    let mut crossing = 0;
+    for instance in &model.instances[..place] {
+        let mesh = &model.parts[instance.part].mesh;
+        for face in &mesh.faces {
+            let [a, b, c] = face.map(|i| instance.world_from_part.transform_point3(DVec3::from(mesh.positions[i as usize].map(f64::from))));
+            let is_apart = a.min(b).min(c).cmpgt(high).any() || a.max(b).max(c).cmplt(low.with_z(floor)).any();
+            if !is_apart {
+                let edges = [(a, b), (b, c), (c, a)].into_iter().filter(|(p, q)| p.z.min(q.z) > floor);
+                crossing += edges.filter(|(p, q)| cpu::is_between(&solid, *p, *q)).count();
+            }
+        }
+    }
+    Ok(crossing)
+}
+
 /// Share of an object's edges that cross the scene's surfaces, without what is near its lowest point, which may touch the ground.
 fn pierced(ground: &Scene, object: &Model) -> f64 {
     let Some((low, high)) = object.bounds().filter(|_| ground.triangles() > 0) else { return 0.0 };
-    let floor = low[2] + 0.02 * (high[2] - low[2]);
+    let floor = low[2] + FOOT * (high[2] - low[2]);
     let faces: usize = object.face_count().max(1);
     let (step, mut n, mut tested, mut crossing) = (faces.div_ceil(EDGES), 0usize, 0usize, 0usize);
     for instance in &object.instances {

@@ -1,6 +1,7 @@
 //! Pictures that are refined in passes, kept when they are interrupted, and written as EXR or PNG.
 
 use crate::error::{PipelineError, Result};
+use crate::run::memory;
 use diorama_data::checkpoint::{self, Entry};
 use diorama_data::{DataError, photo};
 use diorama_geom::color::{srgb_from_linear, u8_from_unit};
@@ -17,6 +18,8 @@ const PASS: u32 = 16;
 const KEEP: Duration = Duration::from_secs(30);
 /// Share of the pixels that automatic exposure lets be brighter than [`BRIGHT`].
 const ABOVE: f64 = 0.05;
+/// Bytes of a pixel: the film, and the same numbers once more where it is kept or filtered.
+const PIXEL: u64 = 2 * 4 * Pixel::LEN as u64;
 /// Linear value of nearly white.
 const BRIGHT: f64 = 0.85;
 
@@ -38,6 +41,8 @@ pub struct Job<'a> {
 /// # Errors
 /// When the unfinished picture cannot be written.
 pub fn render(job: &Job, stop: &AtomicBool, progress: &mut dyn FnMut(f64)) -> Result<(Film, bool)> {
+    let pixels = job.view.camera.width as u64 * job.view.camera.height as u64;
+    memory::require("the picture", pixels * PIXEL, "render a smaller size")?;
     let mut film = job.continued().unwrap_or_else(|| Film::new(&job.view.camera));
     let mut last = Instant::now();
     while film.samples < job.samples {

@@ -213,12 +213,40 @@ pub fn read(path: &Path) -> Result<SceneFile> {
     if let Some((run, frame)) = file.camera.frame.as_deref().and_then(|f| f.rsplit_once(':')) {
         file.camera.frame = Some(format!("{}:{frame}", folder.join(run).display()));
     }
-    check(&file).map_err(|(key, message)| {
-        let last = key.rsplit('.').next().unwrap_or(key);
-        let line = text.lines().position(|l| l.trim_start().starts_with(last)).map_or(String::new(), |i| format!("line {}: ", i + 1));
-        DataError::input(path, format!("{line}{key}: {message}"))
-    })?;
-    Ok(file)
+    let faulty = |(table, nth, key, message): Fault| {
+        let (line, dot) = (line_of(&text, table, nth, key), if key.is_empty() { "" } else { "." });
+        let line = line.map_or(String::new(), |i| format!("line {i}: "));
+        DataError::input(path, format!("{line}{table}{dot}{key}: {message}"))
+    };
+    check(&file).map_err(faulty)?;
+    missing(&file).map_or(Ok(file), |f| Err(faulty(f).into()))
+}
+
+/// Table, which of its name, key in it, and what is wrong.
+type Fault = (&'static str, usize, &'static str, String);
+
+/// The line of a key of the `nth` table of a name, or else of the table, from 1 on.
+fn line_of(text: &str, table: &str, nth: usize, key: &str) -> Option<usize> {
+    let name = |l: &str| l.trim().trim_start_matches('[').split(']').next().unwrap_or_default().trim().to_string();
+    let lines: Vec<&str> = text.lines().collect();
+    let is_head = |l: &&str| l.trim_start().starts_with('[');
+    let heads = lines.iter().enumerate().filter(|(_, l)| is_head(l) && name(l) == table);
+    let head = heads.map(|(i, _)| i).nth(nth)?;
+    let within = lines[head + 1..].iter().take_while(|l| !is_head(l));
+    let is_key = |l: &&str| l.split('=').next().is_some_and(|k| k.trim() == key) && l.contains('=');
+    Some(within.into_iter().position(is_key).map_or(head, |i| head + 1 + i) + 1)
+}
+
+/// The first file that a description names and that is not there.
+fn missing(file: &SceneFile) -> Option<Fault> {
+    let scene = file.scene.iter().map(|s| ("scene", 0, "mesh", &s.mesh));
+    let objects = file.objects.iter().enumerate().map(|(i, o)| ("object", i, "mesh", &o.mesh));
+    let light = file.light.hdri.iter().map(|p| ("light", 0, "hdri", p));
+    let photograph = file.camera.photograph.iter().map(|p| ("camera", 0, "photograph", p));
+    let mut all = scene.chain(objects).chain(light).chain(photograph);
+    let (table, nth, key, path) = all.find(|f| !f.3.is_file())?;
+    let of = if table == "object" { format!("object {nth}: ") } else { String::new() };
+    Some((table, nth, key, format!("{of}there is no such file as {}", path.display())))
 }
 
 /// The error in one line: where, what, and the nearest key to an unknown one.
@@ -236,19 +264,22 @@ fn explain(text: &str, error: &toml::de::Error) -> String {
     line.map_or(message.clone(), |l| format!("line {l}: {message}"))
 }
 
-/// What no type says; the key and the fault.
-fn check(file: &SceneFile) -> std::result::Result<(), (&'static str, String)> {
-    let fault = |key, message: &str| Err((key, message.to_string()));
+/// What no type says.
+fn check(file: &SceneFile) -> std::result::Result<(), Fault> {
+    let fault = |key: &'static str, message: &str| {
+        let (table, key) = key.split_once('.').unwrap_or((key, ""));
+        Err((table, 0, key, message.to_string()))
+    };
     let positive = |v: f64| v.is_finite() && v > 0.0;
     if file.scene.is_none() && file.objects.is_empty() {
         return fault("object", "nothing to render; add [scene] or [[object]] with a mesh");
     }
-    for o in &file.objects {
+    for (i, o) in file.objects.iter().enumerate() {
         if !positive(o.scale) {
-            return fault("object.scale", "must be a number above 0");
+            return Err(("object", i, "scale", "must be a number above 0".into()));
         }
         if o.snap == Snap::Ground && file.scene.is_none() {
-            return fault("object.snap", "there is no [scene] to stand on");
+            return Err(("object", i, "snap", "there is no [scene] to stand on".into()));
         }
     }
     if file.light.hdri.is_some() && file.light.sky.is_some() {
@@ -275,7 +306,7 @@ fn check(file: &SceneFile) -> std::result::Result<(), (&'static str, String)> {
     match &c.focus {
         Some(Focus::Distance(d)) if !positive(*d) => return fault("camera.focus", "must be a distance above 0 or \"object:NUMBER\""),
         Some(Focus::Object(name)) if object_of(name).is_none_or(|i| i >= file.objects.len()) => {
-            return Err(("camera.focus", format!("{name:?}: expected object:NUMBER below {}", file.objects.len())));
+            return Err(("camera", 0, "focus", format!("{name:?}: expected object:NUMBER below {}", file.objects.len())));
         }
         _ => {}
     }
@@ -340,6 +371,9 @@ denoise = "atrous"
         let dir = tempfile::tempdir().unwrap();
         let file = dir.path().join("scene.toml");
         std::fs::write(&file, WHOLE).unwrap();
+        let e = read(&file).unwrap_err().to_string();
+        assert!(e.contains("line 3: scene.mesh") && e.contains("site.glb"), "{e}");
+        ["site.glb", "chair.glb", "dusk.hdr"].iter().for_each(|f| std::fs::write(dir.path().join(f), b"").unwrap());
         let s = read(&file).unwrap();
         assert_eq!(s.objects[0].mesh, dir.path().join("chair.glb"));
         assert_eq!((s.objects[0].snap, s.render.denoise, s.render.size), (Snap::Ground, Denoise::Atrous, Some([1920, 1080])));
@@ -360,6 +394,8 @@ denoise = "atrous"
         assert!(e.contains("line 18") && e.contains("below 1"), "{e}");
         let e = fault(&WHOLE.replace("scale = 0.8", "scale = -1"));
         assert!(e.contains("line 8") && e.contains("above 0"), "{e}");
+        let e = fault(&format!("{WHOLE}[[object]]\nmesh = \"chair.glb\"\nscale = 0\n"));
+        assert!(e.contains("line 25") && e.contains("object.scale"), "{e}");
         let e = fault(&WHOLE.replace("eye = [0, 1.6, 4]", ""));
         assert!(e.contains("eye and target"), "{e}");
         let e = fault(&WHOLE.replace("spp = 4096", "backplate = \"photo\""));

@@ -6,6 +6,7 @@ pub mod description;
 pub mod device;
 pub mod folder;
 pub mod kept_capture;
+pub mod memory;
 pub mod metrics;
 pub mod nearest;
 pub mod param_state;

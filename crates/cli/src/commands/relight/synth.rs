@@ -1,7 +1,7 @@
 //! `diorama relight synth`
 
 use super::light_flags::LightFlags;
-use crate::commands::process::{INTERRUPT, usage, use_threads, watch_interrupts};
+use crate::commands::process::{INTERRUPT, note, usage, use_threads, watch_interrupts};
 use crate::commands::render::parse_size;
 use crate::commands::{Outcome, Verb};
 use crate::terminal::ShareShown;
@@ -115,6 +115,7 @@ impl Synth {
         let (start, mut shown) = (Instant::now(), ShareShown::new());
         let made = object_synth::generate(&self.out, &options, self.force, &INTERRUPT, &mut |s| shown.show(s, "photographs"))?;
         shown.finish();
+        made.notes.iter().for_each(|n| note(n));
         if self.json {
             println!("{}", serde_json::to_string(&made).expect("plain values"));
         } else {

@@ -18,11 +18,12 @@ const CAMERAS: usize = 48;
 const FEWEST: usize = 2;
 const SAME: f64 = 0.05;
 
-/// Share of the longer side by which windows reach to each side, and the correlation in them from which pictures are alike; deviation up to
-/// which a window is even.
+/// Share of the longer side by which windows reach to each side, and the correlation in them from which pictures are alike; deviations up to
+/// which a window of albedo is even, and one of the photograph shows shades.
 const LIKENESS: usize = 32;
 const ALIKE: f64 = 0.4;
 const EVEN: f64 = 0.02;
+const SHADED: f64 = 0.1;
 
 /// Distances that the cameras of training see.
 pub struct Known(Vec<(PosedCamera, Image)>);
@@ -64,7 +65,8 @@ impl Known {
     }
 }
 
-/// Whether the photograph looks like the model's albedo around each pixel, up to brightness and contrast; where both are even, it does.
+/// Whether the photograph looks like the model's albedo around each pixel, up to brightness and contrast; where albedo is even, whether the
+/// photograph shows no more than shades.
 pub fn alike(shot: &Shot, view: &SceneView) -> Vec<bool> {
     let (w, h) = (shot.photo.width, shot.photo.height);
     let gray = |rgb: [f32; 3]| (0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]) as f64;
@@ -83,7 +85,7 @@ pub fn alike(shot: &Shot, view: &SceneView) -> Vec<bool> {
     (0..w * h)
         .map(|i| {
             let (va, vb) = ((aa[i] - a[i] * a[i]).max(0.0), (bb[i] - b[i] * b[i]).max(0.0));
-            let is_even = va.max(vb) < EVEN * EVEN;
+            let is_even = vb < EVEN * EVEN && va < SHADED * SHADED;
             is_even || (ab[i] - a[i] * b[i]) > ALIKE * (va * vb).sqrt()
         })
         .collect()

@@ -10,8 +10,9 @@ pub use level::Candidate;
 use super::outdoor::model::SceneModel;
 use super::outdoor::surface_field::SurfaceField;
 use crate::error::{PipelineError, Result};
+use crate::run::memory;
+use diorama_data::DataError;
 use diorama_data::gltf::{self, WriteOptions};
-use diorama_data::{DataError, memory};
 use diorama_engine::samplers::occupancy::MIN_STEP;
 use diorama_geom::capture::Frame;
 use diorama_geom::glam::DVec3;
@@ -36,6 +37,8 @@ const FEWEST: usize = 100;
 /// Cells before and behind the surface whose albedo makes a texel, and the same in steps of marching at least.
 const REACH: f32 = 3.0;
 const REACH_STEPS: f32 = 4.0;
+/// Bytes per texel while a texture is baked.
+const TEXEL: u64 = 64;
 /// Faces of a level of detail over those of the next.
 const LOD_FACTOR: usize = 4;
 
@@ -101,7 +104,7 @@ pub fn mesh(
     let frames: Vec<&Frame> = model.train.iter().map(|i| &model.capture.frames[*i]).collect();
     let grid = grid(&field, &frames, o)?;
     let blocks = sparse_grid::candidates(&grid, &|lo, hi| field.may_hold(lo, hi));
-    check_memory(blocks.len(), o.resolution)?;
+    check_memory(blocks.len(), o)?;
     let candidates = if o.level.is_none() { level::candidates(&field, &grid, &frames) } else { Vec::new() };
     let level = o.level.or(level::best(&candidates)).unwrap_or(1.0);
     if is_stopped() {
@@ -179,18 +182,11 @@ fn check(o: &MeshOptions) -> Result<()> {
     Ok(())
 }
 
-/// Blocks of densities, and as much again for the surface.
-fn check_memory(blocks: usize, resolution: usize) -> Result<()> {
-    let needs = 2 * sparse_grid::bytes(blocks);
-    match memory::of_machine().available {
-        Some(has) if needs > has => Err(PipelineError::Memory(format!(
-            "sampling the density needs about {} MB, {} MB are available; try --resolution {}",
-            needs >> 20,
-            has >> 20,
-            (resolution / 2).max(16)
-        ))),
-        _ => Ok(()),
-    }
+/// Blocks of densities, and as much again for the surface; the texture while it is baked.
+fn check_memory(blocks: usize, o: &MeshOptions) -> Result<()> {
+    let cure = format!("use --resolution {}", (o.resolution / 2).max(16));
+    memory::require("sampling the density", 2 * sparse_grid::bytes(blocks), &cure)?;
+    memory::require("baking the texture", TEXEL * o.bake as u64 * o.bake as u64, &format!("use --bake {}", (o.bake / 2).max(64)))
 }
 
 /// The box of the scene: around the points of structure from motion, or else around the surfaces that the training cameras see.

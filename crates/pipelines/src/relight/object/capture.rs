@@ -140,7 +140,7 @@ pub fn load(config: &Config, capture: &Capture) -> Result<ObjectCapture> {
         .collect();
     check_box(&photos, found.scale)?;
     let pixels = photos.iter().map(|p| p.rgba.width * p.rgba.height).max().unwrap_or(0);
-    memory::check(config, photos.len(), pixels, diorama_data::memory::of_machine().available)?;
+    memory::check(config, photos.len(), pixels, crate::run::memory::available()?)?;
     Ok(ObjectCapture { photos, placement, silhouettes })
 }
 

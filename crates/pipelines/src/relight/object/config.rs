@@ -45,6 +45,9 @@ pub struct DataConfig {
 pub struct GridConfig {
     /// Cubes of the lattice along an axis; a cube has 12 tetrahedra.
     pub cells: usize,
+    /// Tetrahedra of an `.npz` file as nvdiffrec has them, in place of the lattice: `vertices` between −½ and ½, and `indices`.
+    #[serde(default)]
+    pub file: PathBuf,
     /// Half the edge of the box that holds the object, in units of the capture; auto: from the masks.
     pub scale: Auto,
     /// First surface: `hull`, what all masks allow, or `random`.
@@ -166,7 +169,7 @@ impl Config {
             seed: 0,
             base_mesh: PathBuf::new(),
             data: DataConfig { path, downscale: 1, split: "file".into() },
-            grid: GridConfig { cells: pick(8, 26), scale: Auto::Auto, start: "hull".into() },
+            grid: GridConfig { cells: pick(8, 26), file: PathBuf::new(), scale: Auto::Auto, start: "hull".into() },
             material: MaterialConfig {
                 levels: pick(8, 16),
                 log2_size: pick(14, 19) as u32,

@@ -64,7 +64,7 @@ impl ObjectModel {
         let mut model = ObjectModel {
             probe: first_probe(&config)?,
             placement: capture.placement,
-            stage: Stage::Topology(Box::new(Topology::new(&config, &capture.silhouettes, &capture.placement, 0.0))),
+            stage: Stage::Topology(Box::new(Topology::new(&config, &capture.silhouettes, &capture.placement, 0.0)?)),
             origin: Origin::default(),
             rate_scale: 1.0,
             bias: 0.0,
@@ -82,7 +82,7 @@ impl ObjectModel {
     pub fn begin_again(&mut self, capture: &ObjectCapture, bias: f32, rate_scale: f32) -> Result<()> {
         self.probe = first_probe(&self.config)?;
         (self.bias, self.rate_scale, self.beginnings) = (bias, rate_scale, self.beginnings + 1);
-        self.stage = Stage::Topology(Box::new(Topology::new(&self.config, &capture.silhouettes, &self.placement, bias)));
+        self.stage = Stage::Topology(Box::new(Topology::new(&self.config, &capture.silhouettes, &self.placement, bias)?));
         Ok(())
     }
 

@@ -49,13 +49,16 @@ pub struct ObjectSynthesized {
     pub held_out: usize,
     pub triangles: usize,
     pub interrupted: bool,
+    /// What was mended in files or is missing there.
+    pub notes: Vec<String>,
 }
 
 impl ObjectSynth {
-    fn model(&self) -> Result<Model> {
+    /// The model, and notes about what its file lacks.
+    fn model(&self) -> Result<(Model, Vec<String>)> {
         match self.object.as_str() {
-            "chair" => Ok(chair::model(self.seed)),
-            "still-life" => Ok(still_life_model::model()),
+            "chair" => Ok((chair::model(self.seed), Vec::new())),
+            "still-life" => Ok((still_life_model::model(), Vec::new())),
             file => {
                 let path = Path::new(file);
                 if !path.is_file() {
@@ -63,7 +66,8 @@ impl ObjectSynth {
                         DataError::input(path, "there is no such model; give chair, still-life, or a .glb, .gltf or .obj file").into()
                     );
                 }
-                Ok(model_file::read(path)?.model)
+                let read = model_file::read(path)?;
+                Ok((read.model, read.notes))
             }
         }
     }
@@ -86,19 +90,25 @@ pub fn generate(
     if options.views < HOLD_OUT || options.samples == 0 {
         return Err(PipelineError::Usage(format!("an object needs at least {HOLD_OUT} views and one sample per pixel")));
     }
-    let model = options.model()?;
+    let (model, more_notes) = options.model()?;
     let Some((low, high)) = model.bounds().map(|(l, h)| (DVec3::from(l), DVec3::from(h))) else {
         return Err(DataError::input(Path::new(&options.object), "holds no triangles").into());
     };
-    let lights = [options.light.read()?.0, options.unseen.read()?.0];
+    let (mut notes, mut lights) = (Vec::new(), Vec::new());
+    for of in [&options.light, &options.unseen] {
+        let (light, more) = of.read()?;
+        lights.push(light);
+        notes.extend(more);
+    }
+    notes.extend(more_notes);
     for folder in ["images", "truth"] {
         let folder = out.join(folder);
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
     let cameras = cameras(options, 0.5 * (low + high), 0.5 * (high - low).length());
     let mut scene = Scene::new(&model, &lights[0]);
-    let lights = lights.map(|l| exposed(&mut scene, l, &cameras[0]));
-    let mut made = ObjectSynthesized { photographs: 0, held_out: 0, triangles: model.face_count(), interrupted: false };
+    let lights: Vec<_> = lights.into_iter().map(|l| exposed(&mut scene, l, &cameras[0])).collect();
+    let mut made = ObjectSynthesized { photographs: 0, held_out: 0, triangles: model.face_count(), interrupted: false, notes };
     let (mut frames, mut views) = ([Vec::new(), Vec::new()], Vec::new());
     for (v, (camera, pose)) in cameras.iter().enumerate() {
         let (name, is_held_out) = (format!("{v:03}"), v % HOLD_OUT == HOLD_OUT - 1);

@@ -9,6 +9,8 @@ use super::material::{self, Material};
 use super::placement::Placement;
 use super::probe::Probe;
 use super::raster::{Shape, Surface, SurfaceGradient};
+use crate::error::Result;
+use diorama_data::tetrahedra_npz;
 use diorama_engine::params::ParamGroup;
 use diorama_geom::Mesh;
 use diorama_geom::glam::DVec3;
@@ -92,8 +94,14 @@ pub struct Topology {
 
 impl Topology {
     /// The surface to begin with; `bias` is added to all distances, in cells.
-    pub fn new(config: &Config, silhouettes: &[hull::Silhouette], placement: &Placement, bias: f32) -> Topology {
-        let grid = TetrahedralGrid::lattice(config.grid.cells, BOX_EDGE);
+    ///
+    /// # Errors
+    /// When the grid comes from a file that cannot be read.
+    pub fn new(config: &Config, silhouettes: &[hull::Silhouette], placement: &Placement, bias: f32) -> Result<Topology> {
+        let grid = match config.grid.file.as_os_str().is_empty() {
+            true => TetrahedralGrid::lattice(config.grid.cells, BOX_EDGE),
+            false => TetrahedralGrid::new(tetrahedra_npz::read(&config.grid.file)?, BOX_EDGE),
+        };
         let cell = grid.cell as f64;
         let mut distances = match config.grid.start.as_str() {
             "random" => grid.random_distances(config.seed),
@@ -112,7 +120,8 @@ impl Topology {
         let adam = Adam { rate: config.optim.shape_rate, beta2: 0.999, epsilon: 1e-8, ..Adam::default() };
         let offsets = ParamGroup::dense("offsets", vec![0.0; 3 * grid.vertices()], adam);
         let limits = SurfaceLimits::of(&grid);
-        Topology { limits, distances: ParamGroup::dense("distances", distances, adam), offsets, grid, material: Material::new(config) }
+        let material = Material::new(config);
+        Ok(Topology { limits, distances: ParamGroup::dense("distances", distances, adam), offsets, grid, material })
     }
 
     fn positions(&self) -> Vec<[f32; 3]> {
@@ -154,7 +163,7 @@ impl Topology {
     ///
     /// # Errors
     /// When the surface has vanished or exploded; nothing is changed then.
-    pub fn step(&mut self, config: &Config, input: &StepInput, probe: &mut Probe) -> Result<StepLoss, SurfaceFault> {
+    pub fn step(&mut self, config: &Config, input: &StepInput, probe: &mut Probe) -> std::result::Result<StepLoss, SurfaceFault> {
         let positions = self.positions();
         let surface = self.extract(&positions);
         self.limits.check(&surface)?;

@@ -29,7 +29,7 @@ pub(super) struct Trainer<'a> {
     pub capture: ObjectCapture,
     train: Vec<usize>,
     checkpoints: &'a Path,
-    fault: Option<SurfaceFault>,
+    fault: Option<(u64, SurfaceFault)>,
     recovered: bool,
 }
 
@@ -96,7 +96,7 @@ impl Trainee for Trainer<'_> {
             Stage::Topology(m) => match m.step(config, &input, probe) {
                 Ok(loss) => loss,
                 Err(fault) => {
-                    self.fault = Some(fault);
+                    self.fault = Some((step, fault));
                     StepLoss { color: f64::NAN, ..StepLoss::default() }
                 }
             },
@@ -114,16 +114,18 @@ impl Trainee for Trainer<'_> {
     }
 
     fn recover(&mut self) -> Result<Option<(u64, String)>> {
-        if let Some(fault) = self.fault.take() {
+        if let Some((step, fault)) = self.fault.take() {
             let m = &mut self.model;
             if m.beginnings >= BEGINNINGS {
                 let cure = "check that masks and poses belong together, or lower optim.shape_rate";
-                return Err(PipelineError::Usage(format!("{fault}, and did so {} times before: {cure}", m.beginnings - 1)));
+                let before = m.beginnings - 1;
+                return Err(PipelineError::Usage(format!("step {step}: {fault}, and did so {before} times before: {cure}")));
             }
             let by = if fault.is_vanished() { BIAS } else { -BIAS };
             let (bias, rate_scale) = (m.bias + by, 0.5 * m.rate_scale);
             m.begin_again(&self.capture, bias, rate_scale)?;
-            return Ok(Some((0, format!("{fault}; the first stage begins again, {by:+.1} cells larger and at half the rate"))));
+            let than = if by > 0.0 { "larger" } else { "smaller" };
+            return Ok(Some((0, format!("{fault}; the first stage begins again, {:.1} cells {than} and at half the rate", by.abs()))));
         }
         if self.recovered {
             return Ok(None);
@@ -192,12 +194,29 @@ mod tests {
         for (bias, rate) in [(-8.7, 0.5), (-8.4, 0.25)] {
             assert!(trainer.step(0, 0.0).unwrap().loss.is_nan());
             let (to, why) = trainer.recover().unwrap().unwrap();
-            assert!(to == 0 && why.contains("vanished") && why.contains("+0.3"), "{why}");
+            assert!(to == 0 && why.contains("vanished") && why.contains("0.3 cells larger") && why.contains("half the rate"), "{why}");
             assert!((trainer.model.bias - bias).abs() < 1e-5 && trainer.model.rate_scale == rate);
         }
-        assert!(trainer.step(0, 0.0).unwrap().loss.is_nan());
+        assert!(trainer.step(7, 0.0).unwrap().loss.is_nan());
         let e = trainer.recover().unwrap_err();
-        assert!(e.is_input() && e.to_string().contains("optim.shape_rate"), "{e}");
+        assert!(e.is_input() && e.to_string().contains("step 7: ") && e.to_string().contains("optim.shape_rate"), "{e}");
+    }
+
+    #[test]
+    fn a_surface_that_explodes_begins_again_smaller() {
+        let capture = ball();
+        let mut config = Config::new(Preset::Ci, "d".into());
+        config.grid.start = "random".into();
+        let mut model = ObjectModel::new(config, &capture).unwrap();
+        let Stage::Topology(first) = &mut model.stage else { panic!("the first stage") };
+        // Every other vertex is inside: more surface than an object has.
+        let n = first.distances.values.len();
+        (0..n).for_each(|i| first.distances.values[i] = if i % 2 == 0 { 1.0 } else { -1.0 });
+        let folder = tempfile::tempdir().unwrap();
+        let mut trainer = Trainer::new(model, capture, folder.path());
+        assert!(trainer.step(3, 0.0).unwrap().loss.is_nan());
+        let (to, why) = trainer.recover().unwrap().unwrap();
+        assert!(to == 0 && why.contains("exploded") && why.contains("0.3 cells smaller") && why.contains("half the rate"), "{why}");
     }
 
     #[test]

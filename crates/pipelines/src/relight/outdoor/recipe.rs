@@ -7,17 +7,20 @@ use super::viewing::RunView;
 use crate::error::{PipelineError, Result};
 use crate::run::photographs::StoredPhotographs;
 use crate::run::{RunDescription, RunFolder, folder, kept_capture};
-use crate::run::{nearest, sparse_points};
-use diorama_data::checkpoint;
+use crate::run::{memory, nearest, sparse_points};
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
+use diorama_data::{DataError, checkpoint};
 use diorama_engine::samplers::pixels::{Observation, PixelSource};
 use diorama_engine::samplers::stereo;
 use diorama_engine::train::{self, Event, RunError, RunOptions, Summary};
-use diorama_geom::capture::Split;
+use diorama_geom::capture::{Frame, Split};
 use diorama_geom::{Capture, Reduction};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
+
+/// Share of a photograph that its mask must leave.
+const LEAST_COUNTING: f64 = 0.05;
 
 /// Result of training.
 pub struct Trained {
@@ -40,6 +43,7 @@ pub fn train(
     let capture = if resume { folder.capture()? } else { load_capture(config)? };
     capture.notes.iter().for_each(|n| events(&Event::Note(n.clone())));
     single_light(&capture).into_iter().for_each(|n| events(&Event::Note(n)));
+    check_memory(config, &capture)?;
     let photographs = load_pixels(config, &capture)?;
     let mut model = SceneModel::new(config.clone(), capture)?;
     let observations = observations(&mut model, &photographs, interrupt, events);
@@ -87,6 +91,22 @@ pub fn train(
     Ok(Trained { model: trainer.model, summary })
 }
 
+/// Refuses sizes that do not fit into memory.
+fn check_memory(config: &Config, capture: &Capture) -> Result<()> {
+    let reduction = Reduction::Times(config.data.downscale);
+    let size = |f: &Frame| reduction.size((f.camera.width, f.camera.height));
+    let pixels: u64 = capture.frames.iter().filter(|f| f.split == Split::Train).map(|f| size(f).0 as u64 * size(f).1 as u64).sum();
+    // With their masks.
+    let photographs = (5 * pixels).min(config.data.memory_budget);
+    memory::require("the photographs", photographs, "use --set data.memory_budget=BYTES, or --set data.downscale=2")?;
+    let f = &config.field;
+    // Two features a row; value, gradient and two moments of each.
+    let table = (f.levels as u64) << f.log2_size;
+    memory::require("the field", photographs + 2 * 16 * table, &format!("use --set field.log2_size={}", f.log2_size.saturating_sub(1)))?;
+    let cells = config.sampling.occupancy_resolution.pow(3) as u64;
+    memory::require("the occupancy grid", photographs + 2 * 16 * table + 9 * cells, "use --set sampling.occupancy_resolution=128")
+}
+
 /// Pixels whose distance comparing photographs tells, and where that is left open, how near matter may be.
 fn observations(
     model: &mut SceneModel,
@@ -128,11 +148,11 @@ pub fn load_capture(config: &Config) -> Result<Capture> {
 
 /// A warning where all photographs are of one light: then albedo and light cannot be told apart.
 fn single_light(capture: &Capture) -> Option<String> {
-    let mut sessions: Vec<Option<u32>> = capture.frames.iter().map(|f| f.session).collect();
+    let mut sessions: Vec<Option<u32>> = capture.frames.iter().filter(|f| f.split == Split::Train).map(|f| f.session).collect();
     sessions.sort_unstable();
     sessions.dedup();
     (sessions.len() == 1).then(|| {
-        "all photographs are of one session: albedo and light are ambiguous; photograph at other times of day, or name sessions".into()
+        "all photographs to train on are of one session: albedo and light are ambiguous; photograph at other times of day, or name sessions".into()
     })
 }
 
@@ -140,7 +160,19 @@ fn load_pixels(config: &Config, capture: &Capture) -> Result<StoredPhotographs> 
     let frames: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.frames[i]).collect();
     let reduction = Reduction::Times(config.data.downscale);
     let options = StoreOptions { reduction, budget: config.data.memory_budget, masks: capture.masks, white: 0.0 };
-    Ok(StoredPhotographs::new(PixelStore::load(&frames, &options, &|| {})?))
+    let store = PixelStore::load(&frames, &options, &|| {})?;
+    for (i, frame) in frames.iter().enumerate() {
+        let Some(counting) = store.counting(i) else { continue };
+        let share = counting.filter(|c| *c).count() as f64 / store.kept(i).max(1) as f64;
+        if share < LEAST_COUNTING {
+            let what = format!(
+                "its mask covers {:.0} % as transient; 255 is static, 0 transient: invert the masks if they are",
+                100.0 * (1.0 - share)
+            );
+            return Err(DataError::input(&frame.image, what).into());
+        }
+    }
+    Ok(StoredPhotographs::new(store))
 }
 
 /// A trained model, and notes.

@@ -149,8 +149,8 @@ fn given(o: &PrepareOptions) -> Result<Source> {
         frames.iter_mut().zip(masks::files(folder, &images)?).for_each(|(f, file)| f.mask = Some(file));
     }
     let with = frames.iter().filter_map(|f| f.mask.clone().map(|m| (m, f.image.clone())));
-    let is_static = rule.meaning == MaskMeaning::Unknown && !rule.inverted;
-    let shares = if is_static { shares(with)? } else { Vec::new() };
+    // Whatever masks cut out elsewhere, here they keep the place and leave out what moved.
+    let shares = if rule.inverted { Vec::new() } else { shares(with)? };
     if let (Some((frame, radius)), false) = (world::outside(&frames), o.rescale) {
         let what = format!("its camera is {radius:.2} from the origin, outside of the unit sphere; give --rescale");
         return Err(DataError::input(&frame.image, what).into());
@@ -296,18 +296,19 @@ fn complete(mut s: Source, o: &PrepareOptions, interrupt: &AtomicBool, note: &mu
     transforms_json::write(&o.out.join("transforms.json"), &o.out, &capture, (!s.points.is_empty()).then_some(POINTS))?;
     // The written data set must be readable.
     import::import(&o.out, &ImportOptions { format: Some(import::Format::Transforms), ..ImportOptions::default() })?;
-    let mut sessions: Vec<Option<u32>> = capture.frames.iter().map(|f| f.session).collect();
-    sessions.sort_unstable();
-    sessions.dedup();
-    if sessions.len() == 1 {
+    let sessions_of = |split: Option<Split>| -> usize {
+        let of = capture.frames.iter().filter(|f| split.is_none_or(|s| f.split == s)).map(|f| f.session);
+        of.collect::<std::collections::HashSet<_>>().len()
+    };
+    if sessions_of(Some(Split::Train)) == 1 {
         let cure = "photograph at other times of day, or name sessions with --sessions";
-        s.notes.push(format!("all photographs are of one session: albedo and light are ambiguous; {cure}"));
+        s.notes.push(format!("all photographs to train on are of one session: albedo and light are ambiguous; {cure}"));
     }
     Ok(Some(Prepared {
         folder: o.out.clone(),
         photographs: capture.frames.len(),
         lost: s.lost,
-        sessions: sessions.len(),
+        sessions: sessions_of(None),
         static_share: mean(|s| s.fixed),
         glass_share: mean(|s| s.glass),
         sky_share: (!skies.is_empty()).then(|| skies.iter().sum::<f64>() / skies.len() as f64),

@@ -6,7 +6,7 @@ use super::super::shading::{LIGHT, SceneGradients, SceneLoss, Suns, TracedLight,
 use super::super::sun::{self, SUN, Seen};
 use super::super::visibility::Visibility;
 use super::{SETTLED, Trainer, WithoutGlass};
-use crate::error::Result;
+use crate::error::{PipelineError, Result};
 use diorama_engine::fields::FieldBuffers;
 use diorama_engine::renderers::traced::Traced;
 use diorama_engine::renderers::volume::{Quality, Tracer};
@@ -52,6 +52,10 @@ impl Trainer<'_> {
         let normals = NormalMaps::of(m, &self.cameras);
         let visibility = Visibility::of(&m.field, &m.occupancy, m.shaded_cube(), m.config.light.sun_cells);
         let seen = self.seen(&normals);
+        if seen.is_empty() {
+            let what = format!("after {step} steps, no surface is opaque: there is nothing to tell light from; give more --steps");
+            return Err(PipelineError::Usage(what));
+        }
         let Some((fitted, surfaces)) = sun::tell_apart(&seen, &visibility, interrupt, &mut progress) else { return Ok(()) };
         let m = &mut self.model;
         let is_apart = m.config.light.has_sun();
