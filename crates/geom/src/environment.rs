@@ -161,6 +161,59 @@ impl Environment {
     }
 }
 
+/// A rectangle of pixels: columns and rows, first and one past the last.
+type Region = ([usize; 2], [usize; 2]);
+
+impl Environment {
+    /// What is brighter than `above` times the mean as at most `n` directional lights (direction, irradiance of a surface that faces it), by median
+    /// cuts of energy (Debevec 2005), and the map without it. `n` is a power of two.
+    pub fn with_lamps(&self, above: f64, n: usize) -> (Environment, Vec<(DVec3, [f64; 3])>) {
+        let luminance = |c: [f64; 3]| 0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2];
+        let (w, h) = (self.image.width, self.image.height);
+        let mut pixels = Vec::with_capacity(w * h);
+        self.for_each_pixel(|d, solid_angle, radiance| pixels.push((d, solid_angle, radiance)));
+        let limit = above * pixels.iter().map(|p| p.1 * luminance(p.2)).sum::<f64>() / (4.0 * PI);
+        let mut rest = self.clone();
+        for (i, (_, solid_angle, radiance)) in pixels.iter_mut().enumerate() {
+            let kept = (limit / luminance(*radiance).max(1e-12)).min(1.0);
+            (0..3).for_each(|k| rest.image.data[3 * i + k] *= kept as f32);
+            *radiance = radiance.map(|v| v * (1.0 - kept) * *solid_angle);
+        }
+        let energy = |x: usize, y: usize| luminance(pixels[y * w + x].2);
+        let mut regions: Vec<Region> = vec![([0, w], [0, h])];
+        while regions.len() < n {
+            regions = regions.into_iter().flat_map(|r| halves(r, h, &energy)).collect();
+        }
+        let lamps = regions.into_iter().filter_map(|(columns, rows)| {
+            let (mut toward, mut irradiance) = (DVec3::ZERO, [0.0; 3]);
+            for (d, _, flux) in (rows[0]..rows[1]).flat_map(|y| &pixels[y * w + columns[0]..y * w + columns[1]]) {
+                toward += *d * luminance(*flux);
+                (0..3).for_each(|k| irradiance[k] += flux[k]);
+            }
+            Some((toward.try_normalize()?, irradiance))
+        });
+        let lamps = lamps.collect();
+        (rest, lamps)
+    }
+}
+
+/// A region cut across its longer side such that both parts have the same energy.
+fn halves((columns, rows): Region, height: usize, energy: &dyn Fn(usize, usize) -> f64) -> [Region; 2] {
+    let middle = 0.5 * (rows[0] + rows[1]) as f64 / height as f64;
+    let is_wide = (columns[1] - columns[0]) as f64 * (PI * middle).sin() > (rows[1] - rows[0]) as f64;
+    let [from, to] = if is_wide { columns } else { rows };
+    let line = |k: usize| -> f64 {
+        if is_wide { (rows[0]..rows[1]).map(|y| energy(k, y)).sum() } else { (columns[0]..columns[1]).map(|x| energy(x, k)).sum() }
+    };
+    let lines: Vec<f64> = (from..to).map(line).collect();
+    let (half, mut below, mut cut) = (0.5 * lines.iter().sum::<f64>(), 0.0, from);
+    while cut < to && below + 0.5 * lines[cut - from] < half {
+        below += lines[cut - from];
+        cut += 1;
+    }
+    if is_wide { [([from, cut], rows), ([cut, to], rows)] } else { [(columns, [from, cut]), (columns, [cut, to])] }
+}
+
 fn direction_of(uv: DVec2) -> DVec3 {
     let (azimuth, polar) = ((uv.x - 0.5) * 2.0 * PI, uv.y * PI);
     DVec3::new(polar.sin() * azimuth.sin(), polar.sin() * azimuth.cos(), polar.cos())
@@ -169,6 +222,37 @@ fn direction_of(uv: DVec2) -> DVec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn lamps_and_the_rest_are_the_whole_light() {
+        let glow = DVec3::new(0.6, 0.3, 0.5).normalize();
+        let map = Environment::from_fn(64, |d| {
+            let lobe = 6.0 * (12.0 * (d.dot(glow) - 1.0)).exp();
+            [0.2 + lobe, 0.25 + lobe, 0.4 + 0.5 * lobe]
+        });
+        let map = Environment { turn: 0.7, strength: 1.5, ..map };
+        let (rest, lamps) = map.with_lamps(2.0, 16);
+        assert!((8..=16).contains(&lamps.len()), "{}", lamps.len());
+        let flux = |e: &Environment| {
+            let mut sum = [0.0; 3];
+            e.for_each_pixel(|_, solid_angle, radiance| (0..3).for_each(|k| sum[k] += solid_angle * radiance[k]));
+            sum
+        };
+        for k in 0..3 {
+            let both = flux(&rest)[k] + lamps.iter().map(|l| l.1[k]).sum::<f64>();
+            assert!((both / flux(&map)[k] - 1.0).abs() < 1e-5, "channel {k}");
+        }
+        // What they give a surface is what the map gives.
+        for n in [glow, DVec3::Z, DVec3::X, DVec3::NEG_Y] {
+            let mut whole = 0.0;
+            map.for_each_pixel(|d, solid_angle, radiance| whole += solid_angle * radiance[1] * d.dot(n).max(0.0));
+            let mut parts = lamps.iter().map(|l| l.1[1] * l.0.dot(n).max(0.0)).sum::<f64>();
+            rest.for_each_pixel(|d, solid_angle, radiance| parts += solid_angle * radiance[1] * d.dot(n).max(0.0));
+            assert!((parts / whole - 1.0).abs() < 0.02, "{n}: {parts} {whole}");
+        }
+        // An even sky has none.
+        assert!(Environment::uniform([1.0; 3], 16).with_lamps(2.0, 8).1.is_empty());
+    }
 
     #[test]
     fn directions_lie_where_the_convention_says() {

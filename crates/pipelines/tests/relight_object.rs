@@ -222,7 +222,7 @@ fn bad_captures_are_refused_with_a_cure() {
     let mut config = Config::new(Preset::Ci, photographs().to_path_buf());
     config.grid.file = "no_tets.npz".into();
     let capture = capture::load(&config, &capture::import(&config).unwrap()).unwrap();
-    let e = ObjectModel::new(config, &capture).err().expect("it is refused").to_string();
+    let e = diorama_pipelines::relight::object::model::ObjectModel::new(config, &capture).err().expect("it is refused").to_string();
     assert!(e.contains("no_tets.npz"), "{e}");
     let e = refusal(|_, config| config.grid.scale = diorama_pipelines::run::config::Auto::Is(0.5)).to_string();
     assert!(e.contains("pixels") && e.contains("grid.scale=1.") && e.contains("auto"), "{e}");

@@ -102,6 +102,11 @@ fn file(data: &Path, name: &str) -> PathBuf {
     data.join("truth").join(name)
 }
 
+/// The map of a light.
+pub fn light_file(data: &Path, name: &str) -> PathBuf {
+    file(data, &format!("{name}.hdr"))
+}
+
 /// Writes albedo and normals, and depth with validity.
 pub fn save_view(data: &Path, view: &str, film: &Film, valid: &Image) -> Result<()> {
     photo::save_exr(&file(data, &format!("{view}_albedo.exr")), &film.image(|p| p.albedo))?;

@@ -8,8 +8,7 @@ use diorama_data::{DataError, photo};
 use diorama_geom::Image;
 use diorama_geom::capture::Split;
 use diorama_geom::color::srgb_from_linear;
-use diorama_geom::glam::DVec3;
-use diorama_geom::sh_light::ShLight;
+use diorama_geom::daylight::Daylight;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -82,8 +81,7 @@ pub fn render(model: &SceneModel, options: &PicturesOptions, stop: &AtomicBool, 
         Some(light) => {
             let (daylight, notes) = light.read()?;
             made.notes = notes;
-            let daylight = daylight.sun_apart();
-            Some((ShLight::of(&daylight.environment), daylight.sun.map(|s| (s.direction, s.irradiance))))
+            Some(daylight.sun_apart())
         }
     };
     let frames = if options.frames.is_empty() { model.capture.indices(Split::Test) } else { named(model, &options.frames)? };
@@ -127,9 +125,9 @@ fn named(model: &SceneModel, names: &[String]) -> Result<Vec<usize>> {
     names.iter().map(find).collect()
 }
 
-fn light_of(model: &SceneModel, frame: usize, given: Option<&(ShLight, Option<(DVec3, [f64; 3])>)>) -> Result<ViewLight> {
-    if let Some((harmonics, sun)) = given {
-        return Ok(ViewLight::new(model, *harmonics, *sun));
+fn light_of(model: &SceneModel, frame: usize, given: Option<&Daylight>) -> Result<ViewLight> {
+    if let Some(light) = given {
+        return Ok(ViewLight::of_daylight(model, light, [1.0; 3]));
     }
     let own = model.light_of_frame(frame).ok_or_else(|| {
         let name = &model.capture.frames[frame].name;

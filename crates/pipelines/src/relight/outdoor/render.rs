@@ -2,17 +2,24 @@
 
 use super::config::Stage;
 use super::model::SceneModel;
-use super::shading::{self, CHANNELS, NORMAL, gray};
+use super::shading::{self, CHANNELS, NORMAL, RayColor, gray};
 use super::sun::SUN;
 use super::visibility::Ambient;
 use diorama_engine::renderers::layers::Layers;
 use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_geom::Image;
 use diorama_geom::color::linear_from_srgb;
-use diorama_geom::glam::DVec3;
+use diorama_geom::daylight::Daylight;
+use diorama_geom::environment::Environment;
+use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light::ShLight;
 use diorama_kernels::ops::ray_generation::{self, PosedCamera};
+use rayon::prelude::*;
 use std::sync::OnceLock;
+
+/// Radiance over the mean of a map from which on it casts shadows, and lamps at most by which it does.
+const GLARING: f64 = 20.0;
+const LAMPS: usize = 32;
 
 /// Light in which views are shown: spherical harmonics, and the sky behind.
 pub struct ViewLight {
@@ -21,6 +28,10 @@ pub struct ViewLight {
     pub sky: Vec<f32>,
     /// A sun apart, whose light the harmonics then lack: direction, power.
     pub sun: Option<[f32; SUN]>,
+    /// More of them, from what is bright in a map: their shadows together are soft.
+    lamps: Vec<f32>,
+    /// The sky behind as a map, to which `sky` is added.
+    behind: Option<Environment>,
     /// What of sky and surfaces reaches places in this light; found with the first view.
     ambient: OnceLock<Ambient>,
 }
@@ -30,7 +41,7 @@ impl ViewLight {
     pub fn of(light: ShLight) -> ViewLight {
         let above = light.shade(DVec3::Z);
         let sky = (0..shading::SKY).map(|i| if i < 3 { above[i].max(0.0) as f32 / 0.282_094_8 } else { 0.0 }).collect();
-        ViewLight { light, sky, sun: None, ambient: OnceLock::new() }
+        ViewLight { light, sky, sun: None, lamps: Vec::new(), behind: None, ambient: OnceLock::new() }
     }
 
     /// Harmonics, and a sun (direction and irradiance) besides, as a model takes them: apart, if it tells suns apart.
@@ -48,9 +59,37 @@ impl ViewLight {
         out
     }
 
+    /// A map and its sun, times a factor per channel, as a model takes them: if it tells suns apart, what is bright in the map casts shadows.
+    pub fn of_daylight(model: &SceneModel, light: &Daylight, by: [f64; 3]) -> ViewLight {
+        let (map, lamps) =
+            if model.has_suns() { light.environment.with_lamps(GLARING, LAMPS) } else { (light.environment.clone(), Vec::new()) };
+        let scaled = |c: [f64; 3]| std::array::from_fn(|k| c[k] * by[k]);
+        let sun = light.sun.map(|s| (s.direction, scaled(s.irradiance)));
+        let mut out = ViewLight::new(model, ShLight(ShLight::of(&map).0.map(scaled)), sun);
+        out.sky.fill(0.0);
+        out.behind = Some(light.environment.clone());
+        for (direction, irradiance) in lamps {
+            out.lamps.extend(direction.as_vec3().to_array());
+            out.lamps.extend(scaled(irradiance).map(|v: f64| (v / std::f64::consts::PI) as f32));
+        }
+        out
+    }
+
+    /// Sun and lamps, `[N, 6]`; none where suns are not apart.
+    fn suns(&self) -> Option<Vec<f32>> {
+        self.sun.map(|sun| sun.into_iter().chain(self.lamps.iter().copied()).collect())
+    }
+
     /// The light that a model learned.
     pub fn learned(model: &SceneModel, index: usize) -> ViewLight {
-        ViewLight { light: model.light(index), sky: model.sky(index).to_vec(), sun: model.sun(index), ambient: OnceLock::new() }
+        ViewLight {
+            light: model.light(index),
+            sky: model.sky(index).to_vec(),
+            sun: model.sun(index),
+            lamps: Vec::new(),
+            behind: None,
+            ambient: OnceLock::new(),
+        }
     }
 
     fn numbers(&self) -> Vec<f32> {
@@ -94,22 +133,32 @@ impl SceneModel {
         let image = |channels| Image::zeros(w, h, channels);
         let mut out =
             SceneView { color: image(3), albedo: image(3), normal: image(3), shadow: image(1), irradiance: image(3), depth, opacity };
-        let sunlight = light.sun.as_ref().map(|sun| {
+        let suns = light.suns();
+        let sunlight = suns.as_ref().map(|suns| {
             let around = self.surroundings.as_deref().expect("a model with suns apart knows what stands around");
-            let ambient = light.ambient.get_or_init(|| around.surfaces.light(&around.visibility, sun, &numbers));
-            (sun, &around.visibility, ambient)
+            let ambient = light.ambient.get_or_init(|| around.surfaces.light(&around.visibility, suns, &numbers));
+            (suns, &around.visibility, ambient)
         });
-        for (i, v) in values.data.chunks_exact(CHANNELS).enumerate() {
-            let mut v: [f32; CHANNELS] = std::array::from_fn(|k| v[k]);
+        let shaded = |i: usize| {
+            let mut v: [f32; CHANNELS] = std::array::from_fn(|k| values.data[CHANNELS * i + k]);
             let o = out.opacity.data[i];
             // The shadow is composited before 1.
             v[3] += 1.0 - o;
             let at = 3 * i..3 * i + 3;
             let hit = (o, out.depth.data[i] * o);
-            let ray = (&origins[at.clone()], &dirs[at.clone()]);
-            let sunlit =
-                sunlight.map(|(sun, visibility, ambient)| shading::sunlit((visibility, ambient), (sun, &numbers), &v[NORMAL..], hit, ray));
-            let color = shading::color(&v, o, ray.1, &numbers, &light.sky, sunlit);
+            let ray = (&origins[at.clone()], &dirs[at]);
+            let sunlit = sunlight
+                .map(|(suns, visibility, ambient)| shading::sunlit((visibility, ambient), (suns, &numbers), &v[NORMAL..], hit, ray));
+            let mut color = shading::color(&v, o, ray.1, &numbers, &light.sky, sunlit);
+            if let Some(map) = light.behind.as_ref().filter(|_| o < 1.0) {
+                let radiance = map.radiance(Vec3::from_slice(ray.1).as_dvec3());
+                (0..3).for_each(|k| color.rgb[k] += (1.0 - o) * radiance[k] as f32);
+            }
+            (v, color)
+        };
+        let all: Vec<([f32; CHANNELS], RayColor)> = (0..w * h).into_par_iter().map(shaded).collect();
+        for (i, (v, color)) in all.into_iter().enumerate() {
+            let o = out.opacity.data[i];
             let length = v[NORMAL..NORMAL + 3].iter().map(|n| n * n).sum::<f32>().sqrt().max(1e-20);
             for k in 0..3 {
                 out.color.data[3 * i + k] = color.rgb[k];

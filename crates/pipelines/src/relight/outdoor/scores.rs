@@ -3,12 +3,12 @@
 use super::model::SceneModel;
 use super::render::{SceneView, ViewLight};
 use crate::error::{PipelineError, Result};
+use crate::relight::light::{LightOptions, Source};
 use crate::relight::truth::{self, LightTruth, Truth, ViewLayers};
 use diorama_data::photo;
 use diorama_geom::capture::Split;
 use diorama_geom::color::{linear_from_srgb, srgb_from_linear};
 use diorama_geom::glam::DVec3;
-use diorama_geom::sh_light::ShLight;
 use diorama_geom::{Image, ImageU8};
 use serde::Serialize;
 use std::path::Path;
@@ -100,7 +100,7 @@ pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &Sheet)
         let is_seen = truth.is_seen(of.light);
         let view_light = match model.light_of_frame(frame).filter(|_| is_seen) {
             Some(l) => ViewLight::learned(model, l),
-            None => given(model, light, gauge),
+            None => given(model, data, light, gauge)?,
         };
         let view = model.view(&model.posed(frame), &view_light, &mut |_| {});
         let shadow = truth::read_shadow(data, &of.photograph)?;
@@ -201,8 +201,8 @@ pub fn encoded(linear: &Image) -> ImageU8 {
     Image { data, ..linear.clone() }.to_u8()
 }
 
-/// Factor by channel from exact light to the model's: that by which the model's albedo is too dark, as brightness is shared between albedo and
-/// light by chance.
+/// Factor by channel from exact light to the model's: that by which the model's albedo is too dark in the median, as brightness is shared between
+/// albedo and light by chance.
 fn gauge(model: &SceneModel, data: &Path, truth: &Truth) -> Result<[f64; 3]> {
     let mut pairs = Vec::new();
     for frame in model.capture.indices(Split::Test) {
@@ -213,7 +213,8 @@ fn gauge(model: &SceneModel, data: &Path, truth: &Truth) -> Result<[f64; 3]> {
         let rgb = |image: &Image, i: usize| -> [f32; 3] { std::array::from_fn(|k| image.data[3 * i + k]) };
         pairs.extend(valid(&layers).map(|i| (rgb(&view.albedo, i), rgb(&layers.albedo, i))));
     }
-    Ok(std::array::from_fn(|k| factor(&pairs, k)))
+    let ratio = |k: usize| pairs.iter().map(|(got, want)| want[k] as f64 / got[k].max(1e-3) as f64).collect();
+    Ok(std::array::from_fn(|k| median(ratio(k))))
 }
 
 /// The factor by which a channel of the first colors comes nearest to that of the second.
@@ -222,13 +223,10 @@ fn factor(pairs: &[([f32; 3], [f32; 3])], k: usize) -> f64 {
     of(&|g, w| g * w) / of(&|g, _| g * g).max(1e-12)
 }
 
-/// An exact light, scaled.
-fn given(model: &SceneModel, exact: &LightTruth, by: [f64; 3]) -> ViewLight {
-    let mut sky = exact.light();
-    let sun = exact.sun.map(|(direction, irradiance)| (DVec3::from(direction), irradiance));
-    sun.iter().for_each(|(direction, irradiance)| sky.add_sun(*direction, irradiance.map(|v| -v)));
-    let scaled = |c: [f64; 3]| std::array::from_fn(|k| c[k] * by[k]);
-    ViewLight::new(model, ShLight(sky.0.map(scaled)), sun.map(|(direction, irradiance)| (direction, scaled(irradiance))))
+/// An exact light, scaled, as a file gives it to users.
+fn given(model: &SceneModel, data: &Path, exact: &LightTruth, by: [f64; 3]) -> Result<ViewLight> {
+    let (light, _) = LightOptions::of(Source::File(truth::light_file(data, &exact.name))).read()?;
+    Ok(ViewLight::of_daylight(model, &light.sun_apart(), by))
 }
 
 /// Mean in linear light of the photographs of a view in the lights of training.

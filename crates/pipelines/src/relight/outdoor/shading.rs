@@ -122,19 +122,26 @@ fn reach(visibility: &Visibility, sun: &[f32], (point, normal): (Vec3, Vec3)) ->
     [direct, visibility.from_sky(&visibility.corners(point, normal), normal)]
 }
 
-/// The light of a sun and what is around it at what a ray shows; `sky` `[9, 3]` is that of the light.
+/// The light of a sun, perhaps more suns after it, and what is around at what a ray shows; `sky` `[9, 3]` is that of the light.
 pub fn sunlit<'a>(
     (visibility, ambient): (&Visibility, &Ambient),
-    (sun, sky): (&'a [f32], &[f32]),
+    (suns, sky): (&'a [f32], &[f32]),
     normal: &[f32],
     hit: (f32, f32),
     (origin, dir): (&[f32], &[f32]),
 ) -> Sunlit<'a> {
+    let (sun, lamps) = suns.split_at(SUN);
     match surface(normal, hit, origin, dir) {
         None => Sunlit { sun, reach: [1.0; 2], ambient: Vec3::ONE },
         Some(at) => {
             let corners = visibility.corners(at.0, at.1);
-            Sunlit { sun, reach: reach(visibility, sun, at), ambient: ambient.at(&corners, at.1, sky) }
+            let from_lamp = |lamp: &[f32]| {
+                let facing = at.1.dot(Vec3::from_slice(lamp));
+                let arrives = if facing > 0.0 { facing * visibility.from_sun(at.0, at.1, Vec3::from_slice(lamp)) } else { 0.0 };
+                arrives * Vec3::from_slice(&lamp[3..])
+            };
+            let lamps: Vec3 = lamps.chunks_exact(SUN).map(from_lamp).sum();
+            Sunlit { sun, reach: reach(visibility, sun, at), ambient: ambient.at(&corners, at.1, sky) + lamps }
         }
     }
 }

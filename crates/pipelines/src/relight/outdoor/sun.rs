@@ -136,10 +136,13 @@ impl Surfaces {
         visibility.ambient(sky, &radiosity, mean)
     }
 
-    /// What of the sky, and of surfaces that it and a sun light, reaches any place.
-    pub fn light(&self, visibility: &Visibility, sun: &[f32], sky: &[f32]) -> Ambient {
-        let power = Vec3::from_slice(&sun[3..]);
-        let direct: Vec<Vec3> = self.sunlit(visibility, Vec3::from_slice(sun)).iter().map(|v| *v * power).collect();
+    /// What of the sky, and of surfaces that it and suns `[N, 6]` light, reaches any place.
+    pub fn light(&self, visibility: &Visibility, suns: &[f32], sky: &[f32]) -> Ambient {
+        let of_suns = |p: &Place| {
+            let of = |sun: &[f32]| p.sunlit(visibility, Vec3::from_slice(sun)) * Vec3::from_slice(&sun[3..]);
+            suns.chunks_exact(SUN).map(of).sum::<Vec3>()
+        };
+        let direct: Vec<Vec3> = self.points.par_iter().map(of_suns).collect();
         let mut irradiance: Vec<Vec3> = self.points.iter().zip(&direct).map(|(p, d)| *d + p.of_sky(sky).max(Vec3::ZERO)).collect();
         let mut ambient = Ambient::default();
         for _ in 0..BOUNCES {
