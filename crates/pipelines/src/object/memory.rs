@@ -213,16 +213,6 @@ mod tests {
     }
 
     #[test]
-    fn sizes_have_units() {
-        for (text, want) in [("1000", 1000), ("2MiB", 2 << 20), ("1.5 GiB", 3 << 29)] {
-            assert_eq!(bytes(text), Ok(want), "{text}");
-        }
-        for text in ["", "GiB", "8 GB", "-1", "0", "nan", "eight"] {
-            assert!(bytes(text).unwrap_err().starts_with(text), "{text}");
-        }
-    }
-
-    #[test]
     fn an_export_grows_with_its_grid_and_its_texture() {
         let dir = tempfile::tempdir().unwrap();
         let (c, capture) = still_life(dir.path(), &[("field.log2_size", "8")]);

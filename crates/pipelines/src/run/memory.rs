@@ -49,3 +49,18 @@ pub fn require(what: &str, bytes: u64, cure: &str) -> Result<()> {
         _ => Ok(()),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_have_units() {
+        for (text, want) in [("1000", 1000), ("2MiB", 2 << 20), ("1.5 GiB", 3 << 29)] {
+            assert_eq!(bytes(text), Ok(want), "{text}");
+        }
+        for text in ["", "GiB", "8 GB", "-1", "0", "nan", "eight"] {
+            assert!(bytes(text).unwrap_err().starts_with(text), "{text}");
+        }
+    }
+}
