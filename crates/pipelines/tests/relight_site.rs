@@ -143,7 +143,7 @@ fn the_light_of_a_photograph_is_found() {
     let view = model.view(&model.posed(frame), &ViewLight::of(truth), &mut |_| {});
     let file = dir.join("new.png");
     photo::save_png(&file, &encoded(&view.color)).unwrap();
-    let options = FitOptions { photo: file.clone(), camera: Some(frame.to_string()), region: Region::Left };
+    let options = FitOptions { photo: file.clone(), camera: Some(frame.to_string()), region: Region::Left, all_surfaces: true };
     let fit = |o: &FitOptions| fit_light::fit(model, o, &AtomicBool::new(false), &mut |_| {});
     let f = fit(&options).unwrap().unwrap();
     let rest = f.rest_psnr.unwrap();

@@ -176,8 +176,13 @@ fn piercing(model: &Model, place: usize, object: &Model) -> Result<usize> {
             let [a, b, c] = face.map(|i| instance.world_from_part.transform_point3(DVec3::from(mesh.positions[i as usize].map(f64::from))));
             let is_apart = a.min(b).min(c).cmpgt(high).any() || a.max(b).max(c).cmplt(low.with_z(floor)).any();
             if !is_apart {
-                let edges = [(a, b), (b, c), (c, a)].into_iter().filter(|(p, q)| p.z.min(q.z) > floor);
-                crossing += edges.filter(|(p, q)| cpu::is_between(&solid, *p, *q)).count();
+                for (p, q) in [(a, b), (b, c), (c, a)] {
+                    let (low, high) = if p.z < q.z { (p, q) } else { (q, p) };
+                    if high.z > floor {
+                        let low = if low.z < floor { low + (high - low) * ((floor - low.z) / (high.z - low.z)) } else { low };
+                        crossing += cpu::is_between(&solid, low, high) as usize;
+                    }
+                }
             }
         }
     }

@@ -26,6 +26,9 @@ pub struct FitLight {
     /// Part of the photograph that is fitted; the rest is scored: all, left, right, or x0,y0,x1,y1 in pixels
     #[arg(long, default_value = "all")]
     region: String,
+    /// Fit and score surfaces that no other photograph shows, too
+    #[arg(long)]
+    all_surfaces: bool,
     /// Nine rows of spherical harmonics and perhaps a sun, for --light of the other commands
     #[arg(short, long, default_value = "light.txt")]
     out: PathBuf,
@@ -47,7 +50,12 @@ impl Verb for FitLight {
 
     fn run(&self) -> Result<Outcome> {
         use_threads(self.threads)?;
-        let options = FitOptions { photo: self.photo.clone(), camera: self.camera.clone(), region: self.region.parse().map_err(usage)? };
+        let options = FitOptions {
+            photo: self.photo.clone(),
+            camera: self.camera.clone(),
+            region: self.region.parse().map_err(usage)?,
+            all_surfaces: self.all_surfaces,
+        };
         let (model, notes) = recipe::load(&self.run)?;
         notes.iter().for_each(|n| note(n));
         watch_interrupts();

@@ -22,8 +22,8 @@ const SAME: f64 = 0.05;
 /// which a window of albedo is even, and one of the photograph shows shades.
 const LIKENESS: usize = 32;
 const ALIKE: f64 = 0.4;
-const EVEN: f64 = 0.02;
-const SHADED: f64 = 0.1;
+const EVEN: f64 = 0.06;
+const SHADED: f64 = 0.15;
 
 /// Distances that the cameras of training see.
 pub struct Known(Vec<(PosedCamera, Image)>);

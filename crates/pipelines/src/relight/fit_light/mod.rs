@@ -86,6 +86,8 @@ pub struct FitOptions {
     /// Name or number of a frame whose camera took the photograph, or a `transforms.json` that lists it; none: the frame of its name.
     pub camera: Option<String>,
     pub region: Region,
+    /// Surfaces that no other photograph shows count as well.
+    pub all_surfaces: bool,
 }
 
 /// A light, and how well it explains the photograph: PSNR in sRGB over pixels that show surfaces, inside and outside of the fitted region.
@@ -184,7 +186,7 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
     for round in 0..rounds {
         let own = lit_by(light.unwrap_or(mean), None, &sky);
         let view = model.view(&small.camera, &own, &mut |_| {});
-        if round == 0 {
+        if round == 0 && !o.all_surfaces {
             known.keep(&mut small, &view);
         }
         sky = sky.or_else(|| even_sky(&small, &view, &o.region));
@@ -213,7 +215,9 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
     }
     let light = light.unwrap_or(mean);
     let view = model.view(&shot.camera, &lit_by(light, sun, &sky), &mut |_| {});
-    known.keep(&mut shot, &view);
+    if !o.all_surfaces {
+        known.keep(&mut shot, &view);
+    }
     progress((rounds + 1) as f64 / (rounds + 2) as f64);
     let plain = model.view(&shot.camera, &lit_by(mean, None, &sky), &mut |_| {});
     let alike = known::alike(&shot, &view);
