@@ -173,7 +173,7 @@ mod tests {
     fn box_means_repeat_the_border() {
         let values = [0.0, 3.0, 6.0, 0.0, 3.0, 6.0];
         let means = box_means(&values, 3, 2, 1);
-        assert!(means.iter().zip([1.0, 3.0, 5.0, 1.0, 3.0, 5.0]).all(|(m, want)| (m - want as f64).abs() < 1e-12), "{means:?}");
+        assert!(means.iter().zip([1.0, 3.0, 5.0, 1.0, 3.0, 5.0]).all(|(m, want)| (m - want).abs() < 1e-12), "{means:?}");
     }
 
     #[test]
