@@ -1,0 +1,62 @@
+//! The light of a photograph that shows surfaces of known albedo.
+
+use super::{BOUNCED, FIRST_ALBEDO, Fitted, Guess, NO_WORSE, Place, SEARCHED, Seen, Surfaces, fit, lit, misfit, solve};
+use crate::relight::outdoor::visibility::Visibility;
+use diorama_geom::glam::Vec3;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Linear value of a channel from which on a photograph is overexposed.
+const OVEREXPOSED: f32 = 0.97;
+/// Times that the light of a photograph and what surfaces send are found in turn.
+const PHOTOGRAPH_ROUNDS: usize = 5;
+
+/// A surface point in one photograph, with what a model knows of it.
+#[derive(Clone, Copy, Debug)]
+pub struct Shown {
+    pub point: Vec3,
+    pub normal: Vec3,
+    pub albedo: Vec3,
+    /// Linear.
+    pub color: Vec3,
+}
+
+/// The light of a photograph that shows surfaces of known albedo, among surfaces that send light to them; without a sun where one explains
+/// hardly more. None after an interrupt.
+pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility, interrupt: &AtomicBool) -> Option<Fitted> {
+    let albedos: Vec<Vec3> = shown.iter().map(|s| s.albedo).collect();
+    let places = Surfaces::new(shown.iter().map(|s| (s.point, s.normal)), albedos.clone(), visibility);
+    let seen: Vec<Seen> = shown.iter().map(|s| Seen { point: s.point, normal: s.normal, colors: vec![s.color] }).collect();
+    let mean = shown.iter().map(|s| s.color).sum::<Vec3>() / shown.len().max(1) as f32;
+    let sent_first = |p: &Place| (1.0 - visibility.from_sky(&p.corners, p.normal)) * BOUNCED / FIRST_ALBEDO * mean;
+    let mut sent: Vec<Vec3> = places.points.iter().map(sent_first).collect();
+    // What is overexposed says that there is at least so much light.
+    let counting = |found: &Option<Guess>, sent: &[Vec3]| {
+        let mut points = lit(&seen, &albedos, 0, sent, found.as_ref(), &places.points);
+        for (i, p) in points.iter_mut().enumerate().filter(|(_, p)| p.seen.max_element() > OVEREXPOSED) {
+            let is_reached = |g: &Guess| (p.albedo * g.irradiance(i, &places.points[i])).max_element() >= p.seen.max_element();
+            p.trust *= found.as_ref().is_some_and(|g| !is_reached(g)) as u8 as f32;
+        }
+        points
+    };
+    let mut found: Option<Guess> = None;
+    for round in 0..PHOTOGRAPH_ROUNDS {
+        if interrupt.load(Ordering::Relaxed) {
+            return None;
+        }
+        let points = counting(&found, &sent);
+        let near = found.as_ref().filter(|_| round > SEARCHED).map(|g| Vec3::from_slice(&g.fitted.sun));
+        let fitted = fit(&points, &places, visibility, near);
+        let ambient = around.light(visibility, &fitted.sun, &fitted.sky);
+        let bounced = |p: &Place| ambient.at(&p.corners, p.normal, &fitted.sky) - p.of_sky(&fitted.sky).max(Vec3::ZERO);
+        sent = places.points.iter().map(bounced).collect();
+        found = Some(Guess { sunlit: places.sunlit(visibility, Vec3::from_slice(&fitted.sun)), sent: sent.clone(), fitted });
+    }
+    let points = counting(&found, &sent);
+    let found = found?;
+    let none = vec![0.0; shown.len()];
+    let fitted = solve(&points, &places.points, &none, Vec3::from_slice(&found.fitted.sun));
+    let without = Guess { sunlit: none, sent, fitted };
+    let is_needed =
+        misfit(&seen, &places, std::slice::from_ref(&without)) > NO_WORSE * misfit(&seen, &places, std::slice::from_ref(&found));
+    Some(if is_needed { found } else { without }.fitted)
+}
