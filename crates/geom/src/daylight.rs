@@ -1,5 +1,6 @@
 //! Distant light: an environment and, apart from it, a sun, whose shadows are sharp.
 
+use crate::color::luminance;
 use crate::environment::Environment;
 use crate::sky::Sky;
 use glam::DVec3;
@@ -55,7 +56,6 @@ impl Daylight {
         if self.sun.is_some() {
             return self;
         }
-        let luminance = |c: [f64; 3]| 0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2];
         let (mut peak, mut total) = ((0.0, DVec3::Z), 0.0);
         self.environment.for_each_pixel(|d, solid_angle, radiance| {
             let l = luminance(radiance);

@@ -1,5 +1,6 @@
 //! Light from all directions as an equirectangular image.
 
+use crate::color::luminance;
 use crate::image::Image;
 use glam::{DVec2, DVec3};
 use std::f64::consts::PI;
@@ -168,7 +169,6 @@ impl Environment {
     /// What is brighter than `above` times the mean as at most `n` directional lights (direction, irradiance of a surface that faces it), by median
     /// cuts of energy (Debevec 2005), and the map without it. `n` is a power of two.
     pub fn with_lamps(&self, above: f64, n: usize) -> (Environment, Vec<(DVec3, [f64; 3])>) {
-        let luminance = |c: [f64; 3]| 0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2];
         let (w, h) = (self.image.width, self.image.height);
         let mut pixels = Vec::with_capacity(w * h);
         self.for_each_pixel(|d, solid_angle, radiance| pixels.push((d, solid_angle, radiance)));

@@ -1,5 +1,6 @@
 //! Distant light as spherical harmonics of degree 2 (Ramamoorthi and Hanrahan 2001), and what it does to diffuse surfaces.
 
+use crate::color::luminance;
 use crate::environment::Environment;
 use glam::{DMat3, DVec3};
 use std::f64::consts::{FRAC_PI_4, PI};
@@ -117,7 +118,6 @@ impl ShLight {
 
     /// Direction from which most light comes, by luminance, for a first guess of the sun; none for light without direction.
     pub fn brightest(&self) -> Option<DVec3> {
-        let luminance = |c: [f64; 3]| 0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2];
         let [y, z, x] = [1, 2, 3].map(|i| luminance(self.0[i]));
         DVec3::new(x, y, z).try_normalize()
     }

@@ -1,6 +1,6 @@
 //! Renders a composition: models in a scene under one light, or before a photograph that receives their shadows.
 
-use super::light::{LightOptions, Source, require_file};
+use super::light::{LightOptions, Source};
 use super::picture::{self, Job};
 use super::scene_file::{Backplate, Denoise, Focus, SceneFile, Snap, object_of};
 use crate::error::{PipelineError, Result};
@@ -58,18 +58,17 @@ pub struct Composed {
 /// When a file is missing or wrong, an object stands in a wall or above nothing, or the camera's frame does not exist.
 pub fn load(file: &SceneFile) -> Result<Composition> {
     let mut notes = Vec::new();
-    let mut read = |path: &Path, field: &str| -> Result<Model> {
-        require_file(path, field)?;
+    let mut read = |path: &Path| -> Result<Model> {
         let read = model_file::read(path)?;
         notes.extend(read.notes);
         Ok(read.model)
     };
-    let mut model = file.scene.as_ref().map(|s| read(&s.mesh, "scene.mesh")).transpose()?.unwrap_or_default();
+    let mut model = file.scene.as_ref().map(|s| read(&s.mesh)).transpose()?.unwrap_or_default();
     let place = model.instances.len();
     let ground = Scene::new(&model, &LightOptions::of(Source::Uniform(1.0)).read()?.0);
     let mut objects = Vec::new();
     for (i, o) in file.objects.iter().enumerate() {
-        let object = read(&o.mesh, &format!("object {i}"))?;
+        let object = read(&o.mesh)?;
         let mut stands = placement(o.translate, o.rotate_deg, o.scale);
         let mut placed = Model::default();
         placed.add(object, stands);
@@ -176,17 +175,19 @@ fn piercing(model: &Model, place: usize, object: &Model) -> Result<usize> {
             let [a, b, c] = face.map(|i| instance.world_from_part.transform_point3(DVec3::from(mesh.positions[i as usize].map(f64::from))));
             let is_apart = a.min(b).min(c).cmpgt(high).any() || a.max(b).max(c).cmplt(low.with_z(floor)).any();
             if !is_apart {
-                for (p, q) in [(a, b), (b, c), (c, a)] {
-                    let (low, high) = if p.z < q.z { (p, q) } else { (q, p) };
-                    if high.z > floor {
-                        let low = if low.z < floor { low + (high - low) * ((floor - low.z) / (high.z - low.z)) } else { low };
-                        crossing += cpu::is_between(&solid, low, high) as usize;
-                    }
-                }
+                let edges = [(a, b), (b, c), (c, a)].into_iter().filter_map(|(p, q)| above(floor, p, q));
+                crossing += edges.filter(|(low, high)| cpu::is_between(&solid, *low, *high)).count();
             }
         }
     }
     Ok(crossing)
+}
+
+/// The part of an edge above a floor, its lower end first.
+fn above(floor: f64, p: DVec3, q: DVec3) -> Option<(DVec3, DVec3)> {
+    let (low, high) = if p.z < q.z { (p, q) } else { (q, p) };
+    let cut = if low.z < floor { low + (high - low) * ((floor - low.z) / (high.z - low.z)) } else { low };
+    (high.z > floor).then_some((cut, high))
 }
 
 /// Share of an object's edges that cross the scene's surfaces, without what is near its lowest point, which may touch the ground.
@@ -201,10 +202,7 @@ fn pierced(ground: &Scene, object: &Model) -> f64 {
             n += 1;
             let at = |i: u32| instance.world_from_part.transform_point3(DVec3::from(mesh.positions[i as usize].map(f64::from)));
             for (i, j) in [(0, 1), (1, 2), (2, 0)].into_iter().filter(|_| n.is_multiple_of(step)) {
-                let (p, q) = (at(face[i]), at(face[j]));
-                let (low, high) = if p.z < q.z { (p, q) } else { (q, p) };
-                if high.z > floor {
-                    let low = if low.z < floor { low + (high - low) * ((floor - low.z) / (high.z - low.z)) } else { low };
+                if let Some((low, high)) = above(floor, at(face[i]), at(face[j])) {
                     tested += 1;
                     crossing += cpu::is_between(ground, low, high) as usize;
                 }
@@ -218,10 +216,7 @@ fn pierced(ground: &Scene, object: &Model) -> f64 {
 fn light_options(file: &SceneFile) -> Result<LightOptions> {
     let l = &file.light;
     let (source, intensity) = match (&l.hdri, l.sky) {
-        (Some(path), _) => {
-            require_file(path, "light.hdri")?;
-            (Source::File(path.clone()), 1.0)
-        }
+        (Some(path), _) => (Source::File(path.clone()), 1.0),
         (None, Some(sky)) => (Source::Sky { elevation: sky.elevation, rotation: sky.rotation }, sky.intensity),
         (None, None) => (Source::Uniform(1.0), 1.0),
     };
@@ -241,7 +236,6 @@ fn camera(file: &SceneFile) -> Result<(View, Option<Image>)> {
             let up = if (target - eye).normalize().z.abs() > 0.9999 { DVec3::Y } else { DVec3::Z };
             let (mut size, mut photograph) = ((960, 540), None);
             if let Some(path) = &part.photograph {
-                require_file(path, "camera.photograph")?;
                 size = photo::size(path)?;
                 photograph = (file.render.backplate == Backplate::Photo).then(|| path.clone());
             }

@@ -6,7 +6,7 @@ use super::truth::{self, LightTruth, Truth, ViewTruth};
 use crate::error::{PipelineError, Result};
 use diorama_data::masks::{GLASS_CLASS, SKY_CLASS, STATIC_CLASS};
 use diorama_data::{DataError, atomic, photo};
-use diorama_geom::color::srgb_from_linear;
+use diorama_geom::color::{luminance, srgb_from_linear};
 use diorama_geom::daylight::Daylight;
 use diorama_geom::environment::Environment;
 use diorama_geom::glam::DVec3;
@@ -152,7 +152,7 @@ fn light(index: usize) -> Daylight {
         }
     };
     let up = irradiance(&light, DVec3::Z);
-    let gray = 0.2126 * up[0] + 0.7152 * up[1] + 0.0722 * up[2];
+    let gray = luminance(up);
     light.turned(0.0, EXPOSED * std::f64::consts::PI / gray)
 }
 

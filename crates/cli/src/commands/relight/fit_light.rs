@@ -5,6 +5,7 @@ use crate::commands::{Outcome, Verb};
 use crate::terminal::ShareShown;
 use clap::Args;
 use diorama_data::{photo, sh_text};
+use diorama_geom::color::luminance;
 use diorama_pipelines::Result;
 use diorama_pipelines::relight::fit_light::{self, FitOptions, FittedLight};
 use diorama_pipelines::relight::outdoor::recipe;
@@ -100,8 +101,8 @@ impl FitLight {
         if let (Some(rest), Some(mean)) = (f.alike_rest_psnr, f.mean_light_alike_rest_psnr) {
             println!("of it, what looks like the model: {rest:.2} dB (mean light of training: {mean:.2} dB)");
         }
-        if let Some((d, [r, g, b])) = f.sun {
-            let (elevation, power) = (d.z.clamp(-1.0, 1.0).asin().to_degrees(), 0.2126 * r + 0.7152 * g + 0.0722 * b);
+        if let Some((d, irradiance)) = f.sun {
+            let (elevation, power) = (d.z.clamp(-1.0, 1.0).asin().to_degrees(), luminance(irradiance));
             println!("a sun {elevation:.0}° above the horizon, azimuth {:.0}°, irradiance {power:.2}", d.x.atan2(d.y).to_degrees());
         }
         println!("{}", self.out.display());

@@ -15,7 +15,7 @@ use super::outdoor::sun::{self, Shown};
 use crate::error::{PipelineError, Result};
 use diorama_data::{DataError, masks, photo, transforms_json};
 use diorama_geom::capture::Frame;
-use diorama_geom::color::{linear_from_srgb, srgb_from_linear};
+use diorama_geom::color::{self, linear_from_srgb, srgb_from_linear};
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light::ShLight;
 use diorama_geom::{Camera, Image, ImageU8, Similarity};
@@ -181,12 +181,12 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
         sky.iter().for_each(|sky| shown.sky.clone_from(sky));
         shown
     };
-    let known = known::Known::of(model);
+    let known = (!o.all_surfaces).then(|| known::Known::of(model));
     let rounds = if model.has_suns() { 1 } else { ROUNDS };
     for round in 0..rounds {
         let own = lit_by(light.unwrap_or(mean), None, &sky);
         let view = model.view(&small.camera, &own, &mut |_| {});
-        if round == 0 && !o.all_surfaces {
+        if let Some(known) = known.as_ref().filter(|_| round == 0) {
             known.keep(&mut small, &view);
         }
         sky = sky.or_else(|| even_sky(&small, &view, &o.region));
@@ -205,7 +205,8 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
             let power: [f64; 3] = std::array::from_fn(|k| found.sun[3 + k] as f64 * std::f64::consts::PI);
             sun = (power != [0.0; 3]).then(|| (DVec3::new(found.sun[0] as f64, found.sun[1] as f64, found.sun[2] as f64), power));
         } else {
-            let lit: Vec<LitPixel> = used.iter().map(|i| lit_pixel(&small, &view, &lit_by(own.light, None, &sky), *i)).collect();
+            let before = lit_by(own.light, None, &sky);
+            let lit: Vec<LitPixel> = used.iter().map(|i| lit_pixel(&small, &view, &before, *i)).collect();
             light = Some(solve::light(&lit, &mean, light.as_ref()));
         }
         progress((round + 1) as f64 / (rounds + 2) as f64);
@@ -215,9 +216,7 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
     }
     let light = light.unwrap_or(mean);
     let view = model.view(&shot.camera, &lit_by(light, sun, &sky), &mut |_| {});
-    if !o.all_surfaces {
-        known.keep(&mut shot, &view);
-    }
+    known.iter().for_each(|known| known.keep(&mut shot, &view));
     progress((rounds + 1) as f64 / (rounds + 2) as f64);
     let plain = model.view(&shot.camera, &lit_by(mean, None, &sky), &mut |_| {});
     let alike = known::alike(&shot, &view);
@@ -265,8 +264,7 @@ pub fn mean_light(model: &SceneModel) -> ShLight {
 }
 
 fn luminance(light: &ShLight) -> f64 {
-    let [r, g, b] = light.0[0];
-    0.2126 * r + 0.7152 * g + 0.0722 * b
+    color::luminance(light.0[0])
 }
 
 fn encoded(linear: &Image) -> ImageU8 {

@@ -53,6 +53,8 @@ pub struct ObjectModel {
     /// Added to the first distances, in cells, and how often the first stage began.
     pub bias: f32,
     pub beginnings: u32,
+    /// What was mended in the file of a given light.
+    pub notes: Vec<String>,
 }
 
 impl ObjectModel {
@@ -61,8 +63,10 @@ impl ObjectModel {
     /// # Errors
     /// When a given light or mesh cannot be read.
     pub fn new(config: Config, capture: &ObjectCapture) -> Result<ObjectModel> {
+        let (probe, notes) = first_probe(&config)?;
         let mut model = ObjectModel {
-            probe: first_probe(&config)?,
+            probe,
+            notes,
             placement: capture.placement,
             stage: Stage::Topology(Box::new(Topology::new(&config, &capture.silhouettes, &capture.placement, 0.0)?)),
             origin: Origin::default(),
@@ -80,7 +84,7 @@ impl ObjectModel {
 
     /// Begins the first stage again.
     pub fn begin_again(&mut self, capture: &ObjectCapture, bias: f32, rate_scale: f32) -> Result<()> {
-        self.probe = first_probe(&self.config)?;
+        self.probe = first_probe(&self.config)?.0;
         (self.bias, self.rate_scale, self.beginnings) = (bias, rate_scale, self.beginnings + 1);
         self.stage = Stage::Topology(Box::new(Topology::new(&self.config, &capture.silhouettes, &self.placement, bias)?));
         Ok(())
@@ -195,15 +199,15 @@ impl ObjectModel {
     }
 }
 
-/// The light to begin with, or the one that is given.
-fn first_probe(config: &Config) -> Result<Probe> {
+/// The light to begin with, or the one that is given, with notes about its file.
+fn first_probe(config: &Config) -> Result<(Probe, Vec<String>)> {
     let size = config.light.cube;
     if config.light.fixed.as_os_str().is_empty() {
         let adam = Adam { rate: config.optim.light_rate, beta2: 0.999, epsilon: 1e-8, ..Adam::default() };
-        return Ok(Probe::new(size, adam));
+        return Ok((Probe::new(size, adam), Vec::new()));
     }
-    let (light, _) = LightOptions::of(Source::File(config.light.fixed.clone())).read()?;
-    Ok(Probe::given(size, &light.environment))
+    let (light, notes) = LightOptions::of(Source::File(config.light.fixed.clone())).read()?;
+    Ok((Probe::given(size, &light.environment), notes))
 }
 
 /// A mesh of a file in object space.

@@ -6,7 +6,6 @@ use super::export;
 use super::model::{ObjectModel, Stage};
 use super::trainer::Trainer;
 use crate::error::{PipelineError, Result};
-use crate::relight::light::{LightOptions, Source};
 use crate::run::{RunDescription, RunFolder, folder, kept_capture};
 use diorama_data::gltf::{self, WriteOptions};
 use diorama_data::{checkpoint, environment};
@@ -38,10 +37,7 @@ pub fn train(
     imported.notes.iter().for_each(|n| events(&Event::Note(n.clone())));
     let photographs = capture::load(config, imported)?;
     let mut model = ObjectModel::new(config.clone(), &photographs)?;
-    if !config.light.fixed.as_os_str().is_empty() {
-        let (_, notes) = LightOptions::of(Source::File(config.light.fixed.clone())).read()?;
-        notes.into_iter().for_each(|n| events(&Event::Note(n)));
-    }
+    std::mem::take(&mut model.notes).into_iter().for_each(|n| events(&Event::Note(n)));
     if resume {
         if checkpoint::exists(&folder.checkpoints()) {
             let (c, note) = checkpoint::load(&folder.checkpoints())?;

@@ -7,6 +7,7 @@
 
 use super::sun::{BOUNCED, SUN, level};
 use super::visibility::{Ambient, Visibility, spread};
+use diorama_geom::color::LUMINANCE;
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
 use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
@@ -23,8 +24,6 @@ pub const SKY: usize = 48;
 pub const CHANNELS: usize = 7;
 /// First channel of the normal.
 pub const NORMAL: usize = 4;
-/// Luminance of linear RGB.
-const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
 /// Luminance of albedo that few surfaces exceed.
 const BRIGHTEST: f32 = 0.9;
 /// Opacity below which a ray shows no surface, and above which it shows little else.

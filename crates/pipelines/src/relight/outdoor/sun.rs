@@ -3,7 +3,7 @@
 //! searched, the rest then is linear; `B` follows from light and albedo, again and again.
 
 use super::visibility::{Ambient, Corners, Visibility, spread};
-use diorama_geom::color::srgb_from_linear;
+use diorama_geom::color::{LUMINANCE, srgb_from_linear};
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
 use rayon::prelude::*;
@@ -358,15 +358,14 @@ fn explained(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess], left_out: Op
     seen.par_iter().enumerate().map(of).collect()
 }
 
-/// Luminance.
 fn gray(c: &[f32]) -> f32 {
-    Vec3::from_slice(c).dot(Vec3::new(0.2126, 0.7152, 0.0722))
+    Vec3::from_slice(c).dot(LUMINANCE.into())
 }
 
 /// Shares brightness and tint between lights and albedos.
 fn set_scale(guesses: &mut [Guess], albedos: &mut [Vec3]) {
     let light = guesses.iter().map(|g| level(&g.fitted.sun, &g.fitted.sky)).sum::<Vec3>().max(Vec3::splat(1e-6));
-    let luminance = Vec3::new(0.2126, 0.7152, 0.0722);
+    let luminance = Vec3::from(LUMINANCE);
     let tint = light / light.dot(luminance);
     let mut bright: Vec<f32> = albedos.iter().map(|a| (*a * tint).dot(luminance)).collect();
     bright.sort_by(f32::total_cmp);

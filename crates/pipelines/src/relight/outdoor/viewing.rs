@@ -8,9 +8,8 @@ use crate::relight::light::{LightOptions, Source};
 use crate::run::viewing::{RunView as AnyRunView, ViewedModel};
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::train::Origin;
-use diorama_geom::daylight::Daylight;
+use diorama_geom::daylight::{Daylight, Sun};
 use diorama_geom::glam::{DMat3, DVec3};
-use diorama_geom::sh_light::ShLight;
 use diorama_geom::sky::Sky;
 use diorama_geom::view_controls::{ControlInput, ControlValues, ViewControl, ViewLayer};
 use diorama_geom::view_source::{MeshRequest, ViewRequest};
@@ -40,11 +39,10 @@ pub struct ViewedScene {
     lit: Mutex<Option<(ControlValues, Arc<ViewLight>)>>,
 }
 
-/// A light of a file: harmonics, and the sun (direction and irradiance) that they lack.
+/// A light of a file, its sun apart.
 pub struct GivenLight {
     name: String,
-    light: ShLight,
-    sun: Option<(DVec3, [f64; 3])>,
+    light: Daylight,
 }
 
 /// Lights of files for the viewer, each with its file name, and notes about what was mended in them.
@@ -55,12 +53,8 @@ pub fn read_maps(files: &[PathBuf]) -> Result<(Vec<GivenLight>, Vec<String>)> {
     let (mut maps, mut notes) = (Vec::new(), Vec::new());
     for file in files {
         let (light, of_file) = LightOptions::of(Source::File(file.clone())).read()?;
-        let light = light.sun_apart();
-        maps.push(GivenLight {
-            name: file.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
-            light: ShLight::of(&light.environment),
-            sun: light.sun.map(|s| (s.direction, s.irradiance)),
-        });
+        let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        maps.push(GivenLight { name, light: light.sun_apart() });
         notes.extend(of_file);
     }
     Ok((maps, notes))
@@ -107,7 +101,8 @@ impl ViewedScene {
     /// The light that the controls describe.
     fn light(&self, values: &ControlValues) -> ViewLight {
         let m = &self.model;
-        let (turn, strength) = (DMat3::from_rotation_z(values.number("rotate").to_radians()), values.number("strength"));
+        let (rotate, strength) = (values.number("rotate").to_radians(), values.number("strength"));
+        let turn = DMat3::from_rotation_z(rotate);
         let (elevation, azimuth) = (values.number("sun_elevation").to_radians(), values.number("sun_azimuth").to_radians());
         let added = [values.number("sun_power"); 3];
         let added = (added[0] > 0.0).then(|| (Sky::clear(elevation, azimuth).sun(), added));
@@ -134,13 +129,15 @@ impl ViewedScene {
                 light
             }
             (None, Some(i)) => {
-                let map = &self.maps[i];
-                let own = map.sun.map(|(direction, irradiance)| (turn * direction, irradiance.map(|v| v * strength)));
-                ViewLight::new(m, map.light.rotated(turn).scaled(strength), added.or(own))
+                let mut light = self.maps[i].light.clone().turned(rotate, strength);
+                if let Some((direction, irradiance)) = added {
+                    light.sun = Some(Sun { direction, diameter: Sky::SUN_DIAMETER, irradiance });
+                }
+                ViewLight::of_daylight(m, &light, [1.0; 3])
             }
             (None, None) => {
-                let sky = Daylight::clear(&Sky::clear(elevation, azimuth), SKY_ROWS).turned(0.0, SKY_STRENGTH * strength);
-                ViewLight::new(m, ShLight::of(&sky.environment).rotated(turn), sky.sun.map(|s| (turn * s.direction, s.irradiance)))
+                let sky = Daylight::clear(&Sky::clear(elevation, azimuth), SKY_ROWS);
+                ViewLight::of_daylight(m, &sky.turned(rotate, SKY_STRENGTH * strength), [1.0; 3])
             }
         }
     }
