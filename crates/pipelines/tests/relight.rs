@@ -230,9 +230,9 @@ fn what_glass_mirrors_teaches_no_light() {
     glaze(&data);
     let mut config = config(&data, 12);
     // Opaque from the start, and hardly trained.
-    (config.field.first_density, config.optim.grid_rate) = (50.0, 1e-4);
+    (config.field.first_density, config.optim.grid_rate) = (1000.0, 1e-4);
     (config.light.from, config.light.model, config.light.sun_cells, config.loss.depth) = (0.25, "sun".into(), 16, 0.0);
-    (config.run.log_every, config.sampling.max_samples, config.sampling.rays) = (1, 256, 128);
+    (config.run.log_every, config.sampling.max_samples, config.sampling.rays) = (1, 64, 128);
     // Stopped as soon as surfaces are learned, then gone on with after columns of the photographs were repainted.
     let train = |name: &str, columns: Range<usize>| {
         let at = dir.path().join(name);
