@@ -191,7 +191,7 @@ fn a_mask_that_cannot_be_read() {
     std::fs::write(dir.path().join("masks/view_03.jpg"), b"no picture").unwrap();
     refused(dir.path(), &[], &["masks/view_03.jpg", "decoded"]);
     refused(copy().path(), &["--mask", "perhaps"], &["mask", "use, invert or ignore"]);
-    refused(copy().path(), &["--mask-meaning", "thing"], &["auto, object or unknown"]);
+    refused(copy().path(), &["--mask-meaning", "thing"], &["auto, object, unknown or classes"]);
 }
 
 #[test]

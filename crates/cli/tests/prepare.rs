@@ -398,7 +398,7 @@ fn photographs_in_several_lights_become_a_data_set_for_relighting() {
         (o.status.code(), text, serde_json::from_slice::<serde_json::Value>(&o.stdout).unwrap_or_default())
     };
     let (masks_flag, list_flag) = (masks.display().to_string(), list.display().to_string());
-    let (code, text, made) = prepare(&out, &["--masks", &masks_flag, "--sessions", &list_flag]);
+    let (code, text, made) = prepare(&out, &["--masks", &masks_flag, "--sessions", &list_flag, "--sky", "none"]);
     assert_eq!(code, Some(0), "{text}");
     assert_eq!((&made["photographs"], &made["sessions"]), (&(VIEWS as u64).into(), &2.into()));
     assert!((made["static_share"].as_f64().unwrap() - 0.9).abs() < 1e-6);

@@ -110,10 +110,10 @@ fn a_killed_run_of_the_scene_model_ends_with_the_same_bits() {
     let dir = folder();
     let at = dir.path();
     street(at);
-    let train = |run| settings(&["train", "street", "--preset", "ci", "--steps", "24", "--threads", "2", "-o", run], &SMALL_SCENE);
+    let train = |run| settings(&["train", "street", "--preset", "ci", "--steps", "200", "--threads", "2", "-o", run], &SMALL_SCENE);
     done(at, &train("whole"));
     // While surfaces are learned, and when light is told apart.
-    killed_at(at, &train("killed"), &["train", "--resume", "-o", "killed"], [&at.join("killed"), &at.join("whole")], &[4, 16]);
+    killed_at(at, &train("killed"), &["train", "--resume", "-o", "killed"], [&at.join("killed"), &at.join("whole")], &[4, 160]);
 }
 
 #[test]
@@ -206,10 +206,7 @@ fn runs_and_meshes_that_were_interrupted_are_whole_or_not_there() {
     interrupted(at, &train, || at.join("run/metrics.jsonl").exists(), "run/curves.png.partial");
     checkpoint::load(&at.join("run/checkpoints")).unwrap();
     // A short run to its end.
-    // It is dense from the beginning.
-    let dense = ["train", "street", "--preset", "ci", "--steps", "4", "--set", "field.first_density=30", "-o", "short"];
-    let train = settings(&dense, &SMALL_SCENE);
-    done(at, &train);
+    done(at, &settings(&["train", "street", "--preset", "ci", "--steps", "200", "-o", "short"], &SMALL_SCENE));
     let mesh = ["mesh", "short", "-o", "site.glb", "--resolution", "320", "--level", "0.01"];
     let is_sampling = || std::fs::read_to_string(at.join("said")).is_ok_and(|t| t.contains("density"));
     interrupted(at, &mesh, is_sampling, "site.glb");
