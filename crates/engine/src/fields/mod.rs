@@ -2,6 +2,7 @@
 
 mod encoder;
 mod injected;
+mod inverted_sphere;
 mod normals;
 mod presets;
 mod ray_codes;
@@ -9,8 +10,9 @@ mod visible;
 
 pub use diorama_kernels::ops::prune::Pruning;
 pub use encoder::{Encoded, Encoder, VoxelGrid};
+pub use inverted_sphere::{InvertedSphere, OuterSamples, Sphere};
 pub use normals::{DensitySlope, NORMAL, Normals, NormalsError};
-pub use presets::{baseline, mlp, nerf, ngp};
+pub use presets::{baseline, mlp, nerf, ngp, trunk};
 pub use ray_codes::{Appearance, DirectionCode, RayCodes};
 pub use visible::{VisibleBuffers, VisibleSamples};
 

@@ -69,21 +69,28 @@ pub fn ngp(grid: HashGridConfig, space: Space, rate: f32, images: usize, dims: u
     }
 }
 
+/// The first eight layers of NeRF's network, of which the sixth reads the position again (Mildenhall et al. 2020, figure 7).
+pub fn trunk(width: usize) -> Vec<Layer> {
+    use Source::{Input, Layer as L};
+    let inputs = |j: usize| match j {
+        0 => vec![Input(0)],
+        5 => vec![Input(0), L(4)],
+        _ => vec![L(j - 1)],
+    };
+    (0..8).map(|j| layer(inputs(j), width, true, true)).collect()
+}
+
 /// γ with 10 and 4 bands, 8 × 256 with a skip to the fifth layer, 128-wide view branch
 /// (Mildenhall et al. 2020, figure 7). `stream` tells the coarse from the fine network.
 pub fn nerf(space: Space, rate: f32, images: usize, dims: usize, seed: u64, stream: u64) -> Field {
-    use Source::{Input, Layer as L};
+    use Source::Layer as L;
     let encoding = Frequency { dims: 3, bands: 10, include_input: true, pi: true, window: None };
     let view = Frequency { bands: 4, pi: false, ..encoding };
     let appearance = appearance(images, dims, seed);
     let codes = 1 + appearance.is_some() as usize;
     let mut widths = vec![encoding.output_dims(), view.output_dims()];
     widths.extend(appearance.as_ref().map(|a| a.dims));
-    let mut layers = vec![layer(vec![Input(0)], 256, true, true)];
-    for j in 1..8 {
-        let inputs = if j == 5 { vec![Input(0), L(4)] } else { vec![L(j - 1)] };
-        layers.push(layer(inputs, 256, true, true));
-    }
+    let mut layers = trunk(256);
     layers.push(layer(vec![L(7)], PADDED, false, true));
     layers.push(layer(vec![L(7)], 256, false, true));
     layers.push(layer([L(9)].into_iter().chain(ray_inputs(1, codes)).collect(), 128, true, true));

@@ -81,7 +81,7 @@ impl FieldNet {
 pub enum Positions<'a> {
     /// Level-major features `[L, S, F]` of a hash grid; in a backward pass they are replaced by their gradients if those are `wanted`.
     Features { data: &'a mut [f32], levels: usize, width: usize, wanted: bool },
-    /// Positions `[S, 3]`, encoded in the block. Gradients `[S, 3]` are written where asked for.
+    /// Positions `[S, D]`, encoded in the block; in space, `D` is 3. Gradients `[S, D]` are written where asked for.
     Encoded { encoding: BlockEncoding, points: &'a [f32], d_points: Option<&'a mut [f32]> },
 }
 
@@ -93,6 +93,14 @@ pub enum BlockEncoding {
 }
 
 impl BlockEncoding {
+    /// Coordinates of a position.
+    pub fn dims(&self) -> usize {
+        match self {
+            BlockEncoding::Frequency(f) => f.dims,
+            BlockEncoding::TriangleWave { .. } => 3,
+        }
+    }
+
     /// Numbers per position.
     pub fn output_dims(&self) -> usize {
         match self {
@@ -101,7 +109,7 @@ impl BlockEncoding {
         }
     }
 
-    /// Points `[N, 3]` to rows `[N, output_dims]`.
+    /// Points `[N, D]` to rows `[N, output_dims]`.
     pub fn forward(&self, points: &[f32], out: &mut [f32]) {
         match self {
             BlockEncoding::Frequency(f) => frequency::cpu::forward(f, points, out),
@@ -109,7 +117,7 @@ impl BlockEncoding {
         }
     }
 
-    /// Derivatives `[N, output_dims]` along `v` `[N, 3]`, overwritten.
+    /// Derivatives `[N, output_dims]` along `v` `[N, D]`, overwritten.
     pub fn tangent(&self, points: &[f32], v: &[f32], out: &mut [f32]) {
         match self {
             BlockEncoding::Frequency(f) => frequency::cpu::tangent(f, points, v, out),

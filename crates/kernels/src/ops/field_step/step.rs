@@ -155,7 +155,7 @@ pub fn run(
             Shared { features: Some((Disjoint::new(data), levels, width, wanted)), ..shared }
         }
         Positions::Encoded { encoding, points, d_points } => {
-            assert_eq!(points.len(), s * 3, "field: points");
+            assert_eq!(points.len(), s * encoding.dims(), "field: points");
             Shared { encoded: Some((encoding, points, d_points.map(Disjoint::new))), ..shared }
         }
     };
@@ -353,7 +353,8 @@ fn gather_inputs(input: &StepInput, shared: &Shared, rays: std::ops::Range<usize
         }
     }
     if let Some((encoding, points, _)) = &shared.encoded {
-        encoding.forward(&points[s0 * 3..(s0 + n) * 3], &mut group.inputs[0]);
+        let d = encoding.dims();
+        encoding.forward(&points[s0 * d..(s0 + n) * d], &mut group.inputs[0]);
     }
     for (c, (values, width, _)) in shared.codes.iter().enumerate() {
         let mut rows = group.inputs[1 + c].chunks_exact_mut(*width);
@@ -434,8 +435,9 @@ fn backward(input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::
     }
     if let Some((encoding, points, Some(d_points))) = &shared.encoded {
         // SAFETY: this block's samples.
-        let d = unsafe { d_points.part(s0 * 3..(s0 + n) * 3) };
-        encoding.backward(&points[s0 * 3..(s0 + n) * 3], &group.d_inputs[0], d);
+        let dims = encoding.dims();
+        let d = unsafe { d_points.part(s0 * dims..(s0 + n) * dims) };
+        encoding.backward(&points[s0 * dims..(s0 + n) * dims], &group.d_inputs[0], d);
     }
     for (c, (_, width, gradient)) in shared.codes.iter().enumerate() {
         let Some(gradient) = gradient else { continue };
