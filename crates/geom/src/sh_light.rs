@@ -31,6 +31,24 @@ pub fn basis(n: DVec3) -> [f64; 9] {
     std::array::from_fn(|i| FACTORS[i] * monomials[i])
 }
 
+/// Derivatives of [`basis`] with respect to the direction, as if its polynomials went on beyond the unit sphere.
+pub fn basis_gradient(n: DVec3) -> [DVec3; 9] {
+    let DVec3 { x, y, z } = n;
+    let v = DVec3::new;
+    let monomials = [
+        v(0.0, 0.0, 0.0),
+        v(0.0, 1.0, 0.0),
+        v(0.0, 0.0, 1.0),
+        v(1.0, 0.0, 0.0),
+        v(y, x, 0.0),
+        v(0.0, z, y),
+        v(0.0, 0.0, 6.0 * z),
+        v(z, 0.0, x),
+        v(2.0 * x, -2.0 * y, 0.0),
+    ];
+    std::array::from_fn(|i| FACTORS[i] * monomials[i])
+}
+
 /// Light that reaches all points alike: coefficients `[9, RGB]` whose product with [`basis`] of a normal is the linear radiance that a white
 /// diffuse surface reflects (its irradiance divided by π).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -126,6 +144,18 @@ impl ShLight {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn gradients_of_the_basis_equal_differences() {
+        let (n, step) = (DVec3::new(0.3, -0.7, 0.5), 1e-5);
+        let got = basis_gradient(n);
+        for (axis, along) in [DVec3::X, DVec3::Y, DVec3::Z].into_iter().enumerate() {
+            let (up, down) = (basis(n + step * along), basis(n - step * along));
+            for i in 0..9 {
+                assert!((got[i][axis] - (up[i] - down[i]) / (2.0 * step)).abs() < 1e-9, "{i} {axis}");
+            }
+        }
+    }
 
     #[test]
     fn light_s_environment_shades_as_the_light() {

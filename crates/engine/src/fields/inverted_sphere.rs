@@ -3,6 +3,7 @@
 
 use super::presets::trunk;
 use crate::params::ParamGroup;
+use crate::samplers::RayBatch;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::composite::Packed;
@@ -37,6 +38,14 @@ impl Sphere {
         let dot = |a: &[f32], b: &[f32]| -> f32 { (0..3).map(|k| a[k] * b[k]).sum() };
         let (along, reach) = (dot(&o, dir), self.radius * times);
         (along * along - dot(&o, &o) + reach * reach).max(0.0).sqrt() - along
+    }
+
+    /// Shortens rays that begin inside to what they have there.
+    pub fn cut(&self, batch: &mut RayBatch) {
+        let rays = batch.origins.chunks_exact(3).zip(batch.dirs.chunks_exact(3));
+        for ((origin, dir), near_far) in rays.zip(batch.near_far.chunks_exact_mut(2)) {
+            near_far[1] = near_far[1].min(self.exit(origin, dir, 1.0)).max(near_far[0]);
+        }
     }
 }
 

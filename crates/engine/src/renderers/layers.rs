@@ -57,10 +57,10 @@ impl Tracer<'_> {
     pub fn trace_layers(&self, batch: &mut RayBatch, codes: &[&[f32]], buf: &mut FieldBuffers) -> Traced {
         assert!(codes.iter().map(|c| c.len()).eq(self.field.codes.given.iter().copied()), "the field reads other codes");
         self.cut(batch);
-        let mut on = self.place(batch, buf);
         let n = batch.len();
         let given: Vec<Vec<f32>> = codes.iter().map(|c| c.repeat(n)).collect();
         let given: Vec<&[f32]> = given.iter().map(|c| &c[..]).collect();
+        let mut on = self.place(batch, &given, buf);
         let (images, background) = (self.appearance.map(|i| vec![i; n]), vec![0.0; n * self.field.net.channels()]);
         let samples = Packed { offsets: &on.samples.offsets, t: &on.samples.t, dt: &on.samples.dt };
         let b = Batch {

@@ -9,7 +9,7 @@ use super::accelerator::Unserved;
 use super::blocks::{self, Blocks};
 use super::view::{interpolate_between, sort_by_tiles};
 use crate::background::LearnedBackground;
-use crate::fields::{Batch, Field, FieldBuffers, Pruning, VisibleSamples};
+use crate::fields::{Batch, Field, FieldBuffers, Pruning, Sphere, VisibleSamples};
 use crate::samplers::occupancy::Occupancy;
 use crate::samplers::placement::{self, PlaceOn, PlacedSamples, Placement};
 use crate::samplers::{RayBatch, pixels};
@@ -44,6 +44,8 @@ pub struct Tracer<'a> {
     pub clip: Option<([f32; 3], [f32; 3])>,
     /// Only what also lies in this box, which may be rotated, is shown (model space).
     pub crop: Option<OrientedBox>,
+    /// Rays end where they leave this sphere, in which they begin.
+    pub within: Option<Sphere>,
     /// Training image whose appearance code is used; none: the mean code.
     pub appearance: Option<u32>,
     /// Whether colors are linear light, which [`Tracer::view`] encodes to sRGB; values above 1 go on along the curve.
@@ -86,6 +88,7 @@ impl<'a> Tracer<'a> {
             cube,
             clip: None,
             crop: None,
+            within: None,
             appearance: None,
             is_linear: false,
             shared_weight: Quality::Full.shared_weight(),
@@ -182,8 +185,8 @@ impl Tracer<'_> {
         if let Some(out) = self.trace_blocks(batch) {
             return self.before_backdrop(batch, out);
         }
-        let mut samples = self.place(batch, buf);
-        self.composite(self.field, batch, &mut samples, buf);
+        let mut samples = self.place(batch, &[], buf);
+        self.composite(self.field, batch, &[], &mut samples, buf);
         let out = self.restored(take_traced(buf), batch, buf);
         self.before_backdrop(batch, out)
     }
@@ -196,16 +199,19 @@ impl Tracer<'_> {
         if let Some(crop) = &self.crop {
             cut_to(crop, batch);
         }
+        if let Some(sphere) = &self.within {
+            sphere.cut(batch);
+        }
     }
 
-    /// Samples of the main field, encoded.
-    pub(super) fn place(&self, batch: &RayBatch, buf: &mut FieldBuffers) -> VisibleSamples {
+    /// Samples of the main field, encoded; `given` are the codes that fields read, `[R, width]` each.
+    pub(super) fn place(&self, batch: &RayBatch, given: &[&[f32]], buf: &mut FieldBuffers) -> VisibleSamples {
         let mut samples = PlacedSamples::default();
         let on = PlaceOn { field: self.field, occupancy: self.occupancy.map(Occupancy::bits), batch, first: 0 };
         self.placement.place(&on, &mut samples, buf, &mut |samples, buf| {
             let coarse = self.coarse.expect("a coarse field");
             placement::encode(coarse, batch, samples);
-            self.composite(coarse, batch, samples, buf);
+            self.composite(coarse, batch, given, samples, buf);
         });
         samples.main
     }
@@ -247,12 +253,12 @@ impl Tracer<'_> {
     }
 
     /// Evaluates and composites encoded samples before black.
-    fn composite(&self, field: &Field, batch: &RayBatch, on: &mut VisibleSamples, buf: &mut FieldBuffers) {
+    fn composite(&self, field: &Field, batch: &RayBatch, given: &[&[f32]], on: &mut VisibleSamples, buf: &mut FieldBuffers) {
         let background = vec![0.0; batch.len() * field.net.channels()];
         let images = self.appearance.map(|i| vec![i; batch.len()]);
         let samples = Packed { offsets: &on.samples.offsets, t: &on.samples.t, dt: &on.samples.dt };
         let (dirs, images, background) = (&batch.dirs[..], images.as_deref(), &background[..]);
-        let b = Batch { samples, positions: &on.positions, dirs, images, given: &[], background, near_scaling: 0.0 };
+        let b = Batch { samples, positions: &on.positions, dirs, images, given, background, near_scaling: 0.0 };
         field.render_outputs(&b, &mut on.encoded, buf);
     }
 }
@@ -311,7 +317,7 @@ mod tests {
         march::cpu::march(occupancy.bits(), &rays, &occupancy.march_config(4096), &mut Default::default(), &mut long.samples);
         let mut buf = FieldBuffers::default();
         placement::encode(&field, &batch, &mut long);
-        tracer.composite(&field, &batch, &mut long, &mut buf);
+        tracer.composite(&field, &batch, &[], &mut long, &mut buf);
         for r in 0..120 {
             for k in 0..3 {
                 let want = buf.out.values[r * 3 + k] + (1.0 - buf.out.opacity[r]) * [0.2, 0.5, 0.9][k];

@@ -265,6 +265,7 @@ impl ObjectModel {
             near: s.near,
             cube: self.cube(),
             clip: None,
+            within: None,
             crop: None,
             is_linear: self.is_linear(),
             shared_weight: quality.shared_weight(),

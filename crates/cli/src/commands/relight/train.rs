@@ -24,7 +24,7 @@ use std::sync::Arc;
 pub struct Train {
     /// Folder of the capture
     data: Option<PathBuf>,
-    /// ci or fast
+    /// ci, fast, or paper: the network as printed, for comparisons
     #[arg(long, default_value = "fast")]
     preset: String,
     /// sh: harmonics and a learned shadow; sun: a sun apart, whose shadows are those of the learned surfaces
@@ -81,7 +81,8 @@ impl Verb for Train {
                 let preset = match self.preset.as_str() {
                     "ci" => Preset::Ci,
                     "fast" => Preset::Fast,
-                    other => return Err(PipelineError::Usage(format!("--preset {other:?}: expected ci or fast"))),
+                    "paper" => Preset::Paper,
+                    other => return Err(PipelineError::Usage(format!("--preset {other:?}: expected ci, fast or paper"))),
                 };
                 (None, Config::new(preset, data.clone()))
             }

@@ -12,6 +12,8 @@ pub enum Preset {
     /// Small: for tests and small photographs.
     Ci,
     Fast,
+    /// The network as printed, all at once (Rudnev et al. 2022): hours on a GPU, for comparisons.
+    Paper,
 }
 
 /// What a run learns at a time.
@@ -38,13 +40,21 @@ pub struct DataConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FieldConfig {
+    /// `grid`: a hash grid, in two stages; `mlp`: the network as printed, all at once ([`super::joint`]).
+    #[serde(default = "grid")]
+    pub kind: String,
+    /// Bands of the encoding of `mlp`, and whether a network besides learns what lies around its sphere.
+    #[serde(default = "twelve")]
+    pub bands: usize,
+    #[serde(default = "yes")]
+    pub background: bool,
     pub levels: usize,
     /// `log2` of the most rows per level.
     pub log2_size: u32,
     pub base: u32,
     /// Cells per axis at the finest level, over the inner cube.
     pub finest: u32,
-    /// Width of the hidden layers of albedo, shadow and normal.
+    /// Width of the hidden layers: of albedo, shadow and normal, or of all that `mlp` has.
     pub width: usize,
     /// Numbers of the code of a light.
     pub appearance: usize,
@@ -96,6 +106,26 @@ pub struct LossConfig {
     pub near_scaling: f32,
 }
 
+fn grid() -> String {
+    "grid".into()
+}
+
+fn twelve() -> usize {
+    12
+}
+
+fn yes() -> bool {
+    true
+}
+
+fn first_samples() -> usize {
+    64
+}
+
+fn more_samples() -> usize {
+    128
+}
+
 fn one_cube() -> f32 {
     1.0
 }
@@ -122,6 +152,11 @@ pub struct SamplingConfig {
     pub rays: usize,
     pub batch_samples: usize,
     pub max_samples: usize,
+    /// Samples per ray of the coarse network of `mlp`, and those that the fine one has besides.
+    #[serde(default = "first_samples")]
+    pub coarse: usize,
+    #[serde(default = "more_samples")]
+    pub fine: usize,
     /// Nearest distance at which matter may be, in inner cubes; 0: told by comparing photographs.
     pub near: f32,
     pub occupancy_resolution: usize,
@@ -169,15 +204,28 @@ impl LightConfig {
     }
 }
 
+impl FieldConfig {
+    /// Whether everything is learned at once, by the network as printed.
+    pub fn is_joint(&self) -> bool {
+        self.kind == "mlp"
+    }
+}
+
 impl Config {
     /// The values of a preset.
     pub fn new(preset: Preset, path: PathBuf) -> Config {
+        if preset == Preset::Paper {
+            return Config::printed(path);
+        }
         let ci = preset == Preset::Ci;
         let pick = |small: usize, large: usize| if ci { small } else { large };
         Config {
             seed: 0,
             data: DataConfig { path, downscale: 1, split: "file".into(), memory_budget: 4 << 30 },
             field: FieldConfig {
+                kind: grid(),
+                bands: twelve(),
+                background: true,
                 levels: 16,
                 log2_size: pick(16, 19) as u32,
                 base: 16,
@@ -205,6 +253,8 @@ impl Config {
                 rays: 0,
                 batch_samples: pick(1 << 15, 1 << 16),
                 max_samples: 1024,
+                coarse: first_samples(),
+                fine: more_samples(),
                 near: 0.0,
                 occupancy_resolution: 128,
                 occupancy_points: 1 << 16,
@@ -212,6 +262,17 @@ impl Config {
             },
             run: RunConfig { steps: pick(3000, 20_000) as u64, seconds: 0.0, log_every: 50, save_every_seconds: 60.0 },
         }
+    }
+
+    /// The values of Rudnev et al. 2022.
+    fn printed(path: PathBuf) -> Config {
+        let mut c = Config::new(Preset::Fast, path);
+        (c.field.kind, c.field.width) = ("mlp".into(), 256);
+        (c.loss.shadow, c.loss.depth) = (1e-2, 0.0);
+        (c.optim.net_rate, c.optim.light_rate, c.optim.final_scale) = (5e-4, 5e-4, 1.0);
+        c.sampling.rays = 1024;
+        c.run.steps = 500_000;
+        c
     }
 
     /// Overrides one value by its path.
@@ -238,6 +299,18 @@ impl Configuration for Config {
         let fault = |text: &str| Err(PipelineError::Usage(text.into()));
         if !["box", "unbounded"].contains(&&self.field.space[..]) {
             return fault("field.space: expected box or unbounded");
+        }
+        if !["grid", "mlp"].contains(&&self.field.kind[..]) {
+            return fault("field.kind: expected grid or mlp");
+        }
+        if self.field.is_joint() {
+            if self.light.has_sun() || self.light.gain {
+                return fault("field.kind=mlp learns harmonics alone: leave out --light sun and light.gain");
+            }
+            let samples = [self.sampling.rays, self.sampling.coarse, self.sampling.fine];
+            if samples.contains(&0) || !(1..=20).contains(&self.field.bands) {
+                return fault("field.kind=mlp: sampling.rays, coarse and fine must be at least 1, field.bands from 1 to 20");
+            }
         }
         if !["session", "image"].contains(&&self.light.of[..]) {
             return fault("light.of: expected session or image");
@@ -298,7 +371,7 @@ mod tests {
 
     #[test]
     fn presets_are_sound_and_wrong_values_are_refused() {
-        for preset in [Preset::Ci, Preset::Fast] {
+        for preset in [Preset::Ci, Preset::Fast, Preset::Paper] {
             Config::new(preset, "d".into()).check().unwrap();
         }
         let mut c = Config::template();
@@ -308,6 +381,12 @@ mod tests {
             let e = c.clone().set(key, value).unwrap_err();
             assert!(e.is_input() && e.to_string().contains(key.split('.').next().unwrap()), "{e}");
         }
+        let mut printed = Config::new(Preset::Paper, "d".into());
+        for (key, value) in [("light.model", "sun"), ("sampling.fine", "0"), ("field.kind", "tree")] {
+            let e = printed.clone().set(key, value).unwrap_err();
+            assert!(e.is_input() && e.to_string().contains("field.kind"), "{e}");
+        }
+        printed.set("field.background", "false").unwrap();
         assert!(c.set("loss.robst", "1").unwrap_err().to_string().contains("loss.robust"));
     }
 }

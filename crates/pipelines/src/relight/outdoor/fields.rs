@@ -1,14 +1,16 @@
-//! The two fields of a scene: of surfaces and how they look in each light, then, on the same surfaces, of albedo, shadow and normal.
+//! The fields of a scene: of surfaces and how they look in each light, then, on the same surfaces, of albedo, shadow and normal; or, as
+//! printed, of all at once.
 
 use super::config::Config;
 use crate::error::{PipelineError, Result};
-use diorama_engine::fields::{self, DirectionCode, Field, RayCodes};
+use diorama_engine::fields::{self, DirectionCode, Encoder, Field, Normals, RayCodes};
 use diorama_engine::params::{ParamGroup, Schedule};
 use diorama_geom::contraction::Space;
 use diorama_geom::rng::Rng;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::field_step::{FieldNet, Output};
+use diorama_kernels::ops::frequency::Frequency;
 use diorama_kernels::ops::fused_mlp::{Head, Layer, Mlp, Source};
 use diorama_kernels::ops::hash_grid::HashGridConfig;
 use diorama_kernels::ops::linear::Activation;
@@ -95,4 +97,44 @@ pub fn of_materials(config: &Config, surfaces: Field) -> Result<Field> {
     field.freeze_layers(|j| j < DENSITY);
     field.encoder.table_mut().into_iter().for_each(|t| t.frozen = true);
     Ok(field)
+}
+
+/// Density, albedo in sRGB, shadow and normals in one network of eight layers and two heads; the shadow's reads the gray light (Rudnev et al.
+/// 2022, section 4). `stream` tells the coarse from the fine network.
+pub fn of_all(config: &Config, edge: f32, stream: u64) -> Field {
+    use Source::{Input, Layer as L};
+    let (f, o) = (&config.field, &config.optim);
+    let encoding = Frequency { dims: 3, bands: f.bands, include_input: true, pi: false, window: None };
+    let mut layers = fields::trunk(f.width);
+    let trunk = layers.len();
+    layers.push(layer(vec![L(trunk - 1)], PADDED, Activation::None));
+    layers.push(layer(vec![L(trunk - 1)], f.width, Activation::None));
+    let features = trunk + 1;
+    for given in [&[][..], &[Input(1)]] {
+        let first = layers.len();
+        layers.push(layer([L(features)].iter().chain(given).copied().collect(), f.width / 2, Activation::Relu));
+        layers.push(layer(vec![L(first)], PADDED, Activation::None));
+    }
+    let net = FieldNet {
+        density: head(trunk, Activation::Relu, 0.0),
+        outputs: vec![
+            Output { head: head(trunk + 3, Activation::Sigmoid, 0.0), channels: 3 },
+            Output { head: head(trunk + 5, Activation::Sigmoid, 0.0), channels: 1 },
+        ],
+        mlp: Mlp::new(vec![encoding.output_dims(), 9], layers),
+    };
+    let adam = Adam { rate: o.net_rate, beta2: 0.999, epsilon: 1e-8, ..Adam::default() };
+    let weights = net.mlp.init(&Rng::new(config.seed, stream));
+    let mut field = Field {
+        weights: ParamGroup::dense("weights", weights, adam),
+        encoder: Encoder::Frequency(encoding),
+        codes: RayCodes { direction: DirectionCode::None, appearance: None, given: vec![9] },
+        space: Space::Cube(edge),
+        net,
+        normals: None,
+    };
+    // All samples, however thin: normals are those of the whole ray.
+    let all = Normals { min_weight: 0.0, ..Normals::default() };
+    field.set_normals(Some(all)).expect("rectified layers that read the position alone");
+    field
 }

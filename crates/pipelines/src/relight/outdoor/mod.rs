@@ -7,6 +7,7 @@
 
 pub mod config;
 mod fields;
+pub mod joint;
 pub mod model;
 mod normal_maps;
 pub mod pictures;

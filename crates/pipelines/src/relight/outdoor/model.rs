@@ -2,6 +2,7 @@
 
 use super::config::{Config, Stage};
 use super::fields;
+use super::joint::{self, Joint};
 use super::shading::{LIGHT, SKY};
 use super::sun::{SUN, Surfaces};
 use super::visibility::{self, Ambient, Visibility};
@@ -15,7 +16,7 @@ use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::placement::Placement;
 use diorama_engine::step::Scene;
 use diorama_engine::train::Origin;
-use diorama_geom::capture::Split;
+use diorama_geom::capture::{Frame, Split};
 use diorama_geom::contraction::Space;
 use diorama_geom::sh_light::ShLight;
 use diorama_geom::{Capture, Similarity};
@@ -44,6 +45,8 @@ pub struct SceneModel {
     pub capture: Capture,
     pub model_from_world: Similarity,
     pub field: Field,
+    /// What a model has besides that learns all at once.
+    pub joint: Option<Joint>,
     pub occupancy: Occupancy,
     /// `[lights, 9, 3]`
     pub lights: ParamGroup,
@@ -85,14 +88,18 @@ impl SceneModel {
             return Err(PipelineError::Usage(format!("{}: no photographs to train on", config.data.path.display())));
         }
         let (light_of, sessions) = lights_of(&config, &capture, &train);
+        let model_from_world = capture.scene.model_from_world();
+        let posed = |i: &usize| posed(&config, &model_from_world, &capture.frames[*i]);
+        let sphere = config.field.is_joint().then(|| joint::sphere(&(0..capture.frames.len()).map(|i| posed(&i)).collect::<Vec<_>>()));
         let space = match config.field.space == "unbounded" {
+            _ if sphere.is_some() => Space::Cube(2.0 * sphere.map_or(0.5, |s| s.radius)),
             // What lies around the cameras keeps its shape.
             true => Space::Contracted((2.0 * capture.viewing_distance()).clamp(1.0, 8.0) as f32),
             false => Space::Cube(capture.scene.aabb_scale.max(1) as f32),
         };
         let (edge, unbounded) = match space {
             Space::Contracted(_) => (1, true),
-            Space::Cube(e) => (e as u32, false),
+            Space::Cube(e) => ((e.ceil() as u32).next_power_of_two(), false),
         };
         let cascades = if unbounded { 8 } else { edge.ilog2() as usize + 1 };
         let schedule = fields::schedule(&config);
@@ -101,12 +108,17 @@ impl SceneModel {
         let n = sessions.len().max(light_of.iter().map(|l| *l as usize + 1).max().unwrap_or(0));
         let rate = config.optim.light_rate;
         let gains = if config.light.gain { vec![0.0; 3 * train.len()] } else { Vec::new() };
-        let field = fields::of_surfaces(&config, space, train.len());
+        let field = match &sphere {
+            Some(sphere) => joint::fine(&config, sphere),
+            None => fields::of_surfaces(&config, space, train.len()),
+        };
+        let joint = sphere.map(|sphere| Joint::new(&config, sphere, n));
         let mut model = SceneModel {
-            stage: Stage::Surfaces,
+            stage: if joint.is_some() { Stage::Light } else { Stage::Surfaces },
             began: 0,
-            model_from_world: capture.scene.model_from_world(),
+            model_from_world,
             field,
+            joint,
             occupancy: Occupancy::new(config.sampling.occupancy_resolution, cascades, unbounded),
             lights: group("lights", first_lights(n), rate),
             skies: group("skies", first_skies(n), rate),
@@ -133,8 +145,7 @@ impl SceneModel {
 
     /// A frame's camera at the run's resolution, in model space.
     pub fn posed(&self, frame: usize) -> PosedCamera {
-        let f = &self.capture.frames[frame];
-        PosedCamera { camera: f.camera.downscaled(self.config.data.downscale), pose: self.model_from_world.pose(&f.world_from_camera) }
+        posed(&self.config, &self.model_from_world, &self.capture.frames[frame])
     }
 
     /// The training cameras.
@@ -170,9 +181,12 @@ impl SceneModel {
     pub fn tracer(&self, quality: Quality) -> Tracer<'_> {
         Tracer {
             field: &self.field,
-            coarse: None,
+            coarse: self.joint.as_ref().map(|j| &j.coarse),
             occupancy: Some(&self.occupancy),
-            placement: Placement::occupied(&self.occupancy, self.config.sampling.max_samples, quality.pruning()),
+            placement: match &self.joint {
+                Some(_) => Joint::placement(&self.config),
+                None => Placement::occupied(&self.occupancy, self.config.sampling.max_samples, quality.pruning()),
+            },
             backdrop: Backdrop::Color([0.0; 3]),
             near: self.config.sampling.near,
             cube: self.cube(),
@@ -182,6 +196,7 @@ impl SceneModel {
             shared_weight: 0.0,
             appearance: None,
             tolerance: 0.0,
+            within: self.joint.as_ref().filter(|j| !j.backgrounds.is_empty()).map(|j| j.sphere),
             accelerator: None,
         }
     }
@@ -228,6 +243,7 @@ impl SceneModel {
             capture: self.capture.clone(),
             model_from_world: self.model_from_world,
             field: self.field.for_rendering(),
+            joint: self.joint.as_ref().map(Joint::for_rendering),
             occupancy: self.occupancy.clone(),
             lights: self.lights.values_only(),
             skies: self.skies.values_only(),
@@ -254,10 +270,8 @@ impl SceneModel {
 
     /// Everything that is trained by gradients.
     pub fn params(&mut self) -> ParamSet<'_> {
-        let mut params = ParamSet::default();
-        params.add("field", self.field.groups_mut());
-        params.add("", [&mut self.lights, &mut self.skies, &mut self.gains, &mut self.suns]);
-        params
+        let tables = [&mut self.lights, &mut self.skies, &mut self.gains, &mut self.suns];
+        params(&mut self.field, &mut self.joint, tables)
     }
 
     /// Lowest corner and edge of the cube in which surfaces hide light: all of a bounded space, else some of what is around the inner cube.
@@ -329,10 +343,8 @@ impl SceneModel {
             ("median_bits".into(), self.median.to_bits().to_string()),
             ("rate_scale_bits".into(), self.rate_scale.to_bits().to_string()),
         ]);
-        let mut params = ParamSet::default();
-        params.add("field", self.field.groups_mut());
-        params.add("", [&mut self.lights, &mut self.skies, &mut self.gains, &mut self.suns]);
-        let mut entries = param_state::entries(params);
+        let tables = [&mut self.lights, &mut self.skies, &mut self.gains, &mut self.suns];
+        let mut entries = param_state::entries(params(&mut self.field, &mut self.joint, tables));
         entries.extend([entry("occupancy", &self.occupancy.grid.density), entry("occupancy.fresh", &self.occupancy.grid.fresh)]);
         entries.push(entry("flat", &self.flat));
         entries.extend(around.iter().flat_map(|a| ["solid", "surfaces"].into_iter().zip(a)).map(|(name, v)| entry(name, v)));
@@ -351,7 +363,7 @@ impl SceneModel {
         fn tensor(c: &mut Checkpoint, name: &str, file: &Path) -> Result<Vec<f32>> {
             c.take(name).ok_or_else(|| PipelineError::Usage(format!("{}: {name} is missing", file.display())))
         }
-        let is_light = c.metadata.get("stage").is_some_and(|s| s == "light");
+        let is_light = self.joint.is_none() && c.metadata.get("stage").is_some_and(|s| s == "light");
         if is_light && self.stage == Stage::Surfaces {
             self.begin_light()?;
         }
@@ -367,6 +379,9 @@ impl SceneModel {
         param_state::take(&mut self.occupancy.grid.density, "occupancy", &mut c, file)?;
         param_state::take(&mut self.occupancy.grid.fresh, "occupancy.fresh", &mut c, file)?;
         self.occupancy.grid.refresh();
+        if let Some(joint) = &mut self.joint {
+            joint.anneal(&mut self.field, self.origin.step);
+        }
         if is_light {
             let solid = tensor(&mut c, "solid", file)?;
             let cells = self.config.light.sun_cells;
@@ -381,6 +396,11 @@ impl SceneModel {
     }
 }
 
+/// A frame's camera at a run's resolution, in model space.
+fn posed(config: &Config, model_from_world: &Similarity, frame: &Frame) -> PosedCamera {
+    PosedCamera { camera: frame.camera.downscaled(config.data.downscale), pose: model_from_world.pose(&frame.world_from_camera) }
+}
+
 /// The light of each training frame, and the sessions in order.
 fn lights_of(config: &Config, capture: &Capture, train: &[usize]) -> (Vec<u32>, Vec<u32>) {
     if config.light.of == "image" {
@@ -393,8 +413,21 @@ fn lights_of(config: &Config, capture: &Capture, train: &[usize]) -> (Vec<u32>, 
     (train.iter().map(|i| sessions.binary_search(&session(i)).expect("listed") as u32).collect(), sessions)
 }
 
+/// Everything that is trained by gradients, by the names that checkpoints have.
+fn params<'a>(field: &'a mut Field, joint: &'a mut Option<Joint>, tables: [&'a mut ParamGroup; 4]) -> ParamSet<'a> {
+    let mut params = ParamSet::default();
+    params.add("field", field.groups_mut());
+    params.add("", tables);
+    if let Some(joint) = joint {
+        params.add("coarse", joint.coarse.groups_mut().into_iter().chain([&mut joint.coarse_lights]));
+        let names = ["background.coarse", "background.fine"];
+        joint.backgrounds.iter_mut().zip(names).for_each(|(b, name)| params.add(name, [&mut b.weights]));
+    }
+    params
+}
+
 /// Even light with a little more from above.
-fn first_lights(n: usize) -> Vec<f32> {
+pub(super) fn first_lights(n: usize) -> Vec<f32> {
     let mut light = ShLight::uniform([0.9; 3]);
     light.0[2] = [0.3; 3];
     (0..n).flat_map(|_| light.0.into_iter().flatten().map(|v| v as f32)).collect()

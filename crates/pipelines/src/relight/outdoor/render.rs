@@ -1,6 +1,7 @@
 //! Views of the scene model under any light, and its layers.
 
 use super::config::Stage;
+use super::joint;
 use super::model::SceneModel;
 use super::shading::{self, CHANNELS, NORMAL, RayColor, gray};
 use super::sun::SUN;
@@ -8,7 +9,7 @@ use super::visibility::Ambient;
 use diorama_engine::renderers::layers::Layers;
 use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_geom::Image;
-use diorama_geom::color::linear_from_srgb;
+use diorama_geom::color::{linear_from_srgb, srgb_from_linear};
 use diorama_geom::daylight::Daylight;
 use diorama_geom::environment::Environment;
 use diorama_geom::glam::{DVec3, Vec3};
@@ -113,6 +114,11 @@ pub struct SceneView {
 }
 
 impl SceneModel {
+    /// Linear albedo of what the field says: as printed, that is sRGB.
+    pub(super) fn linear_albedo(&self, v: f32) -> f32 {
+        if self.joint.is_some() { linear_from_srgb(v) } else { v }
+    }
+
     /// Renders a camera that stands in model space under a light; `progress` receives rows.
     pub fn view(&self, camera: &PosedCamera, light: &ViewLight, progress: &mut dyn FnMut(usize)) -> SceneView {
         self.view_with(self.tracer(Quality::Full), camera, light, progress)
@@ -133,6 +139,7 @@ impl SceneModel {
         let image = |channels| Image::zeros(w, h, channels);
         let mut out =
             SceneView { color: image(3), albedo: image(3), normal: image(3), shadow: image(1), irradiance: image(3), depth, opacity };
+        let behind = self.joint.as_ref().and_then(|j| j.behind(&self.config, &origins, &dirs));
         let suns = light.suns();
         let sunlight = suns.as_ref().map(|suns| {
             let around = self.surroundings.as_deref().expect("a model with suns apart knows what stands around");
@@ -146,7 +153,19 @@ impl SceneModel {
             v[3] += 1.0 - o;
             let at = 3 * i..3 * i + 3;
             let hit = (o, out.depth.data[i] * o);
-            let ray = (&origins[at.clone()], &dirs[at]);
+            let ray = (&origins[at.clone()], &dirs[at.clone()]);
+            if self.joint.is_some() {
+                let mut color = joint::color(&v, &numbers);
+                if let Some(behind) = &behind {
+                    // The background is of photographs, in whose values it is added.
+                    let sum = |k: usize| srgb_from_linear(color.rgb[k]) + (1.0 - o) * behind[at.start + k];
+                    color.rgb = [0, 1, 2].map(|k| linear_from_srgb(sum(k)));
+                } else {
+                    let sky = shading::sky_toward(&light.sky, ray.1);
+                    (0..3).for_each(|k| color.rgb[k] += (1.0 - o) * sky[k].max(0.0));
+                }
+                return (v, color);
+            }
             let sunlit = sunlight
                 .map(|(suns, visibility, ambient)| shading::sunlit((visibility, ambient), (suns, &numbers), &v[NORMAL..], hit, ray));
             let mut color = shading::color(&v, o, ray.1, &numbers, &light.sky, sunlit);
@@ -162,7 +181,7 @@ impl SceneModel {
             let length = v[NORMAL..NORMAL + 3].iter().map(|n| n * n).sum::<f32>().sqrt().max(1e-20);
             for k in 0..3 {
                 out.color.data[3 * i + k] = color.rgb[k];
-                out.albedo.data[3 * i + k] = if o > 1e-3 { v[k] / o } else { 0.0 };
+                out.albedo.data[3 * i + k] = if o > 1e-3 { self.linear_albedo(v[k] / o) } else { 0.0 };
                 out.normal.data[3 * i + k] = v[NORMAL + k] / length;
                 out.irradiance.data[3 * i + k] = color.irradiance[k];
             }

@@ -189,6 +189,11 @@ fn sky_at(sky: &[f32], dir: &[f32]) -> ([f32; 3], [f32; 16]) {
     (std::array::from_fn(|k| (0..16).map(|i| sky[3 * i + k] * basis[i]).sum()), basis)
 }
 
+/// Radiance of a sky `[16, 3]` in a direction.
+pub fn sky_toward(sky: &[f32], dir: &[f32]) -> [f32; 3] {
+    sky_at(sky, dir).0
+}
+
 /// Irradiance over π of a white surface with a normal, by channel.
 fn irradiance(light: &[f32], basis: &[f64; 9]) -> [f32; 3] {
     std::array::from_fn(|k| (0..9).map(|i| light[3 * i + k] * basis[i] as f32).sum())

@@ -38,6 +38,10 @@ impl<'a> SurfaceField<'a> {
         Tracer { field: &self.field, ..self.model.tracer(Quality::Full) }
     }
 
+    fn srgb_albedo(&self, v: f32) -> f32 {
+        srgb_from_linear(self.model.linear_albedo(v).clamp(0.0, 1.0))
+    }
+
     fn to_model(&self, p_in_world: [f32; 3]) -> [f32; 3] {
         self.model.model_from_world.point(DVec3::from(p_in_world.map(f64::from))).as_vec3().to_array()
     }
@@ -104,7 +108,7 @@ impl<'a> SurfaceField<'a> {
             let traced = tracer.trace_layers(&mut batch, &[&DARK], &mut buf);
             let channels = self.field.channels();
             out.extend(traced.rgb.chunks_exact(channels).zip(&traced.opacity).map(|(v, o)| match *o > MATTER {
-                true => std::array::from_fn(|k| srgb_from_linear((v[k] / o).clamp(0.0, 1.0))),
+                true => std::array::from_fn(|k| self.srgb_albedo(v[k] / o)),
                 false => [-1.0; 3],
             }));
             progress(out.len(), positions.len());
@@ -163,7 +167,7 @@ impl FieldQuery for SurfaceField<'_> {
             };
             self.field.render(&batch, &mut encoded, &mut buf);
             let linear = buf.out.values.chunks_exact(channels);
-            out.iter_mut().zip(linear).for_each(|(o, v)| *o = std::array::from_fn(|k| srgb_from_linear(v[k].clamp(0.0, 1.0))));
+            out.iter_mut().zip(linear).for_each(|(o, v)| *o = std::array::from_fn(|k| self.srgb_albedo(v[k])));
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Training of the scene model: draws pixels, describes each step, and updates the lights.
 
 use super::config::Stage;
+use super::joint::Stepper;
 use super::model::SceneModel;
 use super::normal_maps::NormalMaps;
 use super::shading::SKY;
@@ -45,6 +46,7 @@ const FLAT_PIXELS: usize = 100_000;
 /// Steps before robust weights begin.
 const SETTLED: u64 = 200;
 
+mod at_once;
 mod light;
 
 /// A model in training.
@@ -64,6 +66,8 @@ pub(super) struct Trainer<'a> {
     normals: Option<NormalMaps>,
     /// Of the lights, where suns are apart.
     ambients: Vec<Ambient>,
+    /// Where all is learned at once.
+    stepper: Stepper,
 }
 
 /// Rays of a step as the losses read them.
@@ -86,7 +90,7 @@ impl<'a> Trainer<'a> {
         if model.origin.step == 0 {
             first_skies(&mut model, &photographs, &cameras);
         }
-        let normals = (model.stage == Stage::Light).then(|| NormalMaps::of(&model, &cameras));
+        let normals = surface_normals(&model, &cameras);
         let ambients = if model.stage == Stage::Light { model.ambients() } else { Vec::new() };
         let mut device = Device::cpu(None);
         let occupancy = Some(&mut model.occupancy);
@@ -105,6 +109,7 @@ impl<'a> Trainer<'a> {
             recovered: false,
             normals,
             ambients,
+            stepper: Stepper::default(),
         };
         trainer.observe_flat();
         Ok(trainer)
@@ -236,6 +241,11 @@ impl Trainer<'_> {
     }
 }
 
+/// Normals of surfaces that stay; none before that, and where all is learned at once.
+fn surface_normals(model: &SceneModel, cameras: &[PosedCamera]) -> Option<NormalMaps> {
+    (model.stage == Stage::Light && model.joint.is_none()).then(|| NormalMaps::of(model, cameras))
+}
+
 /// Pixels that do not show glass: what glass mirrors tells nothing about its albedo, shadow and light.
 struct WithoutGlass<'a>(&'a StoredPhotographs);
 
@@ -288,6 +298,9 @@ impl Trainee for Trainer<'_> {
     type Error = crate::error::PipelineError;
 
     fn prepare(&mut self, step: u64, progress: f64, interrupt: &AtomicBool, events: &mut dyn FnMut(&Event)) -> Result<()> {
+        if self.model.joint.is_some() {
+            return Ok(());
+        }
         match self.model.config.light.stage(progress as f32) {
             (Stage::Surfaces, share) => self.flatten(share, events),
             (Stage::Light, _) if self.model.stage == Stage::Surfaces => self.begin_light(step, interrupt, events)?,
@@ -299,6 +312,9 @@ impl Trainee for Trainer<'_> {
     fn step(&mut self, step: u64, progress: f64) -> Result<StepReport> {
         if self.view.is_some_and(RunView::wants_update) {
             self.show();
+        }
+        if self.model.joint.is_some() {
+            return Ok(self.learn_at_once(step, progress as f32));
         }
         match self.model.config.light.stage(progress as f32) {
             (Stage::Surfaces, share) => self.look(step, share),
@@ -331,7 +347,7 @@ impl Trainee for Trainer<'_> {
         self.model = fresh;
         self.observe_flat();
         self.ambients = self.model.ambients();
-        self.normals = (self.model.stage == Stage::Light).then(|| NormalMaps::of(&self.model, &self.cameras));
+        self.normals = surface_normals(&self.model, &self.cameras);
         Ok(Some((self.model.origin.step, "the loss was not finite; the rate is lowered".into())))
     }
 }
