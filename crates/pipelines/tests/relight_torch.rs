@@ -16,7 +16,7 @@ use std::process::Command;
 
 const RAYS: usize = 48;
 /// Of networks and lights.
-const RATES: [f32; 2] = [1.5e-4, 1e-3];
+const RATES: [f32; 2] = [5e-5, 1e-3];
 const VIEWS: usize = 6;
 const SIZE: u32 = 24;
 

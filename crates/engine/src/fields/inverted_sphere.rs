@@ -132,8 +132,7 @@ impl InvertedSphere {
             background: &background,
             near_scaling: 0.0,
         };
-        let positions =
-            Positions::Encoded { encoding: BlockEncoding::Frequency(self.encoding), points: &on.points, d_points: None };
+        let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(self.encoding), points: &on.points, d_points: None };
         let gradients = d_rgb.map(|values| RayGradients { values, opacity: vec![0.0; rays], depth: vec![0.0; rays] });
         let injected = gradients.as_ref().map(InjectedGradients);
         let loss = injected.as_ref().map(|i| i as &dyn field_step::RayLoss);

@@ -127,7 +127,8 @@ mod tests {
         let mut values: Vec<f32> = random(rays * CHANNELS, 1).iter().map(|v| 0.5 + 0.4 * v).collect();
         let mut opacity: Vec<f32> = random(rays, 2).iter().map(|v| 0.6 + 0.3 * v).collect();
         // Light from all around and a little more from some sides, so that nothing is black.
-        let mut lights: Vec<f32> = random(2 * LIGHT, 3).iter().enumerate().map(|(i, v)| 0.2 * v + if i % LIGHT < 3 { 3.0 } else { 0.0 }).collect();
+        let mut lights: Vec<f32> =
+            random(2 * LIGHT, 3).iter().enumerate().map(|(i, v)| 0.2 * v + if i % LIGHT < 3 { 3.0 } else { 0.0 }).collect();
         let mut behind: Vec<f32> = random(3 * rays, 4).iter().map(|v| 0.5 + 0.4 * v).collect();
         let target: Vec<f32> = random(3 * rays, 5).iter().map(|v| 0.5 + 0.4 * v).collect();
         let (counts, light, depth) = ([true, true, false, true, true], [0, 1, 0, 1, 0], vec![0.0; rays]);

@@ -68,8 +68,9 @@ impl Joint {
     /// Untrained networks of `lights` lights.
     pub fn new(config: &Config, sphere: Sphere, lights: usize) -> Joint {
         let adam = |rate: f32| Adam { rate, beta2: 0.999, epsilon: 1e-8, ..Adam::default() };
-        let background =
-            |i: u64| InvertedSphere::new(sphere, config.field.bands, config.field.width, adam(config.optim.net_rate), config.seed, OUTER + i);
+        let background = |i: u64| {
+            InvertedSphere::new(sphere, config.field.bands, config.field.width, adam(config.optim.net_rate), config.seed, OUTER + i)
+        };
         Joint {
             coarse: fields::of_all(config, 2.0 * sphere.radius, COARSE),
             coarse_lights: ParamGroup::dense("lights", first_lights(lights), adam(config.optim.light_rate)),

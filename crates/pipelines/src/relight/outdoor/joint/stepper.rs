@@ -142,8 +142,7 @@ impl Stepper {
             None => vec![0.0; 3 * n],
         };
         let table = lights.values.clone();
-        let loss =
-            JointLoss { target, counts: &batch.counts, light, lights: &table, behind: &behind, shadow, out: Mutex::default() };
+        let loss = JointLoss { target, counts: &batch.counts, light, lights: &table, behind: &behind, shadow, out: Mutex::default() };
         let (given, empty) = ([&codes[..]], [0.0, 0.0, 0.0, 1.0].repeat(n));
         let b = Batch {
             samples: Packed { offsets: &inner.samples.offsets, t: &inner.samples.t, dt: &inner.samples.dt },
