@@ -139,6 +139,9 @@ impl Export {
 
     /// Trains the object model from the run, in a run of its own inside of the run's folder.
     fn materials(&self) -> Result<Outcome> {
+        if self.out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("glb")) {
+            return Err(usage(format!("materials: {} is no .glb, which alone holds them; choose another --out", self.out.display())));
+        }
         self.check_out()?;
         let run = self.run.join(MATERIALS);
         if RunDescription::read(&run).is_ok() && !self.force {

@@ -58,7 +58,7 @@ pub struct Object {
     /// Cells along that box's longest side [default: 320]
     #[arg(long, requires = "from_run")]
     resolution: Option<usize>,
-    /// Largest number of faces of that run's mesh [default: 24 for each squared cell of the grid, 16224 for --grid 64]
+    /// Largest number of faces of that run's mesh; 0 keeps all [default: 24 for each squared cell of the grid, 16224 for --grid 64]
     #[arg(long, requires = "from_run")]
     faces: Option<usize>,
     /// Device that samples that run: auto, cpu, cuda, vulkan, metal or webgpu

@@ -13,7 +13,7 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 /// Longest side in pixels of the views that tell what hides the mesh.
-const VIEW_PX: f64 = 96.0;
+const VIEW_PX: f64 = 48.0;
 /// Samples per pixel and axis of the opacity, and those of large photographs.
 const SAMPLES: (u32, u32) = (4, 2);
 const LARGE: u32 = 1 << 20;
@@ -136,16 +136,14 @@ impl<'a> Cutter<'a> {
     /// In a small view: the sum of the field's opacity where the mesh is, the number of those pixels, and whether something hides too many of
     /// them.
     fn around(&self, camera: &Camera, pose: &Pose) -> (f64, usize, bool) {
-        let shrink = (VIEW_PX / camera.width.max(camera.height) as f64).min(1.0);
-        let side = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
-        let small = camera.resized(side(camera.width), side(camera.height));
+        let small = small(camera, VIEW_PX);
         let depth = DepthMap::new(self.mesh, small, pose);
         let is_covered: Vec<bool> = depth.depth().iter().map(|d| d.is_finite()).collect();
         let posed = self.model.to_model(small, pose);
         let (lo, hi) = self.bounds;
         let mut tracer = self.model.tracer(Quality::Fast);
         tracer.backdrop = Backdrop::Color([0.0; 3]);
-        tracer.clip = Some((self.in_model(lo), self.in_model(hi)));
+        tracer.clip = Some((in_model(self.model, lo.as_vec3().to_array()), in_model(self.model, hi.as_vec3().to_array())));
         let inside = tracer.view(&posed, &mut |_| {});
         // Everything before the nearest point of the mesh.
         let corner = |c: usize| DVec3::new([lo.x, hi.x][c & 1], [lo.y, hi.y][c >> 1 & 1], [lo.z, hi.z][c >> 2]);
@@ -163,10 +161,6 @@ impl<'a> Cutter<'a> {
         let opacity = of_mesh().map(|i| inside.opacity.data[i] as f64).sum();
         let behind = hidden.map_or(0, |v| of_mesh().filter(|i| v.opacity.data[*i] > 0.5).count());
         (opacity, n, behind as f64 > MAY_BE_HIDDEN * n as f64)
-    }
-
-    fn in_model(&self, p: DVec3) -> [f32; 3] {
-        self.model.model_from_world.point(p).as_vec3().to_array()
     }
 
     /// The photograph of a flat lens, with its own opacity, else the mesh's; none where its mask leaves open too much of the mesh.
@@ -193,8 +187,20 @@ impl<'a> Cutter<'a> {
     }
 }
 
-/// A pinhole camera in place of one whose lens bends lines.
-fn flat(camera: &Camera) -> Option<Camera> {
+/// A point of the world in model space.
+pub fn in_model(model: &ObjectModel, p: [f32; 3]) -> [f32; 3] {
+    model.model_from_world.point(DVec3::from(p.map(f64::from))).as_vec3().to_array()
+}
+
+/// A camera with at most `longest` pixels along the longest side.
+pub fn small(camera: &Camera, longest: f64) -> Camera {
+    let shrink = (longest / camera.width.max(camera.height) as f64).min(1.0);
+    let side = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
+    camera.resized(side(camera.width), side(camera.height))
+}
+
+/// A pinhole camera in place of one whose lens bends lines; none where no pinhole camera can replace it.
+pub fn flat(camera: &Camera) -> Option<Camera> {
     match camera.lens {
         Lens::Pinhole => Some(*camera),
         _ => undistort::pinhole(camera),
