@@ -294,9 +294,7 @@ fn reduce(mesh: &mut Mesh, faces: usize, o: &ExportOptions, notes: &mut Vec<Stri
     Ok(mesh.is_watertight())
 }
 
-/// # Errors
-/// When options are invalid.
-pub(super) fn check(o: &ExportOptions) -> Result<()> {
+fn check(o: &ExportOptions) -> Result<()> {
     if !(16..=2048).contains(&o.resolution) {
         return Err(PipelineError::Usage(format!("--resolution {}: must be 16 to 2048", o.resolution)));
     }

@@ -1,11 +1,9 @@
 //! Cuts the object of a run out of its photographs: the mesh of the trained field, and the photographs with opacity where the mesh covers
 //! them, as a capture of its own. What needs masks begins from it.
 
-mod level;
 mod view;
 
 use super::export::{self, ExportOptions, Format, Size, Surface};
-use super::extent;
 use super::model::ObjectModel;
 use crate::error::{PipelineError, Result};
 use crate::run::viewer_files::Crop;
@@ -70,11 +68,7 @@ pub fn write(
 ) -> Result<Option<CutOut>> {
     let mut notes = Vec::new();
     let density = Stoppable { model, interrupt };
-    let clip = o.clip.unwrap_or_else(|| extent::of(model));
-    let mut options = ExportOptions { clip: Some(clip), ..export_options(o) };
-    export::check(&options)?;
-    options.level = Some(level::choose(model, &density, clip, o.resolution, &mut |i, n| progress("level of density", i, n)));
-    let extracted = export::surface(model, &density, &options, &mut |n| notes.push(n.into()), progress);
+    let extracted = export::surface(model, &density, &export_options(o), &mut |n| notes.push(n.into()), progress);
     if interrupt.load(Ordering::Relaxed) {
         return Ok(None);
     }
@@ -138,7 +132,7 @@ fn export_options(o: &CutOptions) -> ExportOptions {
         watertight: false,
         size: Size::Unknown,
         unit_m: 1.0,
-        clip: None,
+        clip: o.clip,
         floaters: FLOATERS,
         keep_unseen: false,
     }

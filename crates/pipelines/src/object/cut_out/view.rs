@@ -188,19 +188,19 @@ impl<'a> Cutter<'a> {
 }
 
 /// A point of the world in model space.
-pub fn in_model(model: &ObjectModel, p: [f32; 3]) -> [f32; 3] {
+fn in_model(model: &ObjectModel, p: [f32; 3]) -> [f32; 3] {
     model.model_from_world.point(DVec3::from(p.map(f64::from))).as_vec3().to_array()
 }
 
 /// A camera with at most `longest` pixels along the longest side.
-pub fn small(camera: &Camera, longest: f64) -> Camera {
+fn small(camera: &Camera, longest: f64) -> Camera {
     let shrink = (longest / camera.width.max(camera.height) as f64).min(1.0);
     let side = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
     camera.resized(side(camera.width), side(camera.height))
 }
 
 /// A pinhole camera in place of one whose lens bends lines; none where no pinhole camera can replace it.
-pub fn flat(camera: &Camera) -> Option<Camera> {
+fn flat(camera: &Camera) -> Option<Camera> {
     match camera.lens {
         Lens::Pinhole => Some(*camera),
         _ => undistort::pinhole(camera),
