@@ -3,6 +3,7 @@
 mod program;
 
 use diorama_data::{checkpoint, model_file, photo};
+use diorama_geom::ImageU8;
 use program::{copy_all, fails, s, works};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -79,15 +80,30 @@ fn an_object_is_cut_out_of_opaque_photographs_and_goes_on_without_them() {
     copy_all(&good().run, &run);
     let config = std::fs::read_to_string(run.join("config.toml")).unwrap();
     std::fs::write(run.join("config.toml"), config.replace(s(&good().data), s(&data))).unwrap();
-    let kept = std::fs::read_to_string(run.join("capture.json")).unwrap();
-    std::fs::write(run.join("capture.json"), kept.replace(s(&good().data), s(&data))).unwrap();
+    let kept = std::fs::read_to_string(run.join("capture.json")).unwrap().replace(s(&good().data), s(&data));
+    let mut kept: serde_json::Value = serde_json::from_str(&kept).unwrap();
+    // The mask of one photograph leaves open all that it shows; another one is cut out already.
+    photo::save_png(&data.join("open.png"), &ImageU8 { width: 64, height: 64, channels: 1, data: vec![0; 64 * 64] }).unwrap();
+    kept["frames"][0]["mask"] = "open.png".into();
+    let image = data.join("images/001.png");
+    let opaque = photo::load(&image).unwrap();
+    let own = opaque.data.as_chunks::<3>().0.iter().flat_map(|p| [p[0], p[1], p[2], if *p == [255; 3] { 0 } else { 200 }]).collect();
+    photo::save_png(&image, &ImageU8 { channels: 4, data: own, ..opaque }).unwrap();
+    std::fs::write(run.join("capture.json"), kept.to_string()).unwrap();
     let call = format!(
         "relight object --from-run source --clip {CLIP} --preset ci --resolution 64 --steps 200 --texture 256 --run new -o box.glb --set run.log_every=1"
     );
     let said = interrupted(at, &call.split(' ').collect::<Vec<_>>(), || at.join("new/metrics.jsonl").exists());
-    assert!(said.contains("32 photographs, 28 of them to train on") && said.contains("--resume --run new"), "{said}");
+    assert!(
+        said.contains("of 32 photographs 1 show something in front")
+            && said.contains("31 photographs, 27 of them to train on")
+            && said.contains("--resume --run new"),
+        "{said}"
+    );
     // The background is transparent, the object is not.
     let cut = photo::load(&at.join("new/start/images/003.png")).unwrap();
+    let own = photo::load(&at.join("new/start/images/001.png")).unwrap();
+    assert!(own.channels == 4 && own.pixel(32, 32)[3] == 200, "its own opacity is kept");
     let alpha = |x: usize, y: usize| cut.pixel(x, y)[3];
     assert!(cut.channels == 4 && [(0, 0), (63, 0), (0, 63), (63, 63)].iter().all(|(x, y)| alpha(*x, *y) == 0) && alpha(32, 32) == 255);
     copy_all(&data.join("truth"), &at.join("new/start/truth"));

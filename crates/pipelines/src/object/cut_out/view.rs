@@ -256,3 +256,27 @@ fn names(frames: &[Frame]) -> Vec<String> {
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn photographs_of_one_name_in_two_folders_do_not_replace_each_other() {
+        let frame = |image: &str| Frame::new("", image, Camera::pinhole(4, 4, 1.0), Pose::IDENTITY);
+        let frames = ["left/a.jpg", "right/A.jpg", "b.png", "b.jpg"].map(frame);
+        assert_eq!(names(&frames), ["a", "00001_A", "b", "00003_b"]);
+    }
+
+    #[test]
+    fn opacity_replaces_that_of_pictures_of_any_channels() {
+        for channels in [1, 3, 4] {
+            let data = (0..2 * channels).map(|i| 10 * i as u8).collect();
+            let Photo::Eight(out) = with_opacity(&Photo::Eight(ImageU8 { width: 2, height: 1, channels, data }), &[1.0, 0.5]) else {
+                panic!("the depth stays")
+            };
+            let step = if channels == 1 { 0 } else { 10 };
+            assert!(out.channels == 4 && out.data[..4] == [0, step, 2 * step, 255] && out.data[7] == 128, "{:?}", out.data);
+        }
+    }
+}
