@@ -61,6 +61,7 @@ fn photographs() -> &'static Path {
             samples: 16,
             light: sky(40.0, 100.0),
             unseen: sky(20.0, 250.0),
+            shows_light: false,
             seed: 0,
         };
         let made = synth::generate(&data, &options, false, &AtomicBool::new(false), &mut |_| {}).unwrap();

@@ -2,23 +2,30 @@
 
 use super::clip::clip_or_crop;
 use super::process::{note, usage, use_threads};
+use super::relight::from_run::Source;
+use super::relight::object::Object;
 use super::{Outcome, Verb};
 use clap::Args;
 use diorama_data::{DataError, mesh_text};
+use diorama_pipelines::object::cut_out::RESOLUTION;
 use diorama_pipelines::object::export::{self, ExportOptions, Exported, Size};
 use diorama_pipelines::object::model::ObjectModel;
 use diorama_pipelines::object::points::{self, PointFormat, PointOptions, Region};
 use diorama_pipelines::object::viewing;
 use diorama_pipelines::object::{device, run_folder};
+use diorama_pipelines::run::RunDescription;
 use diorama_pipelines::run::viewer_files::Crop;
 use diorama_pipelines::{Application, PipelineError, Result};
 use std::path::PathBuf;
 use std::time::Instant;
 
+/// Folder of the run that finds materials, in the run's folder.
+const MATERIALS: &str = "materials";
+
 /// Extract a mesh or a point cloud
 #[derive(Args, Clone, Debug)]
 #[command(
-    after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export runs/chair --scale-to 80cm -o chair.usdz\n  diorama export runs/chair --resolution 384 --faces 100000 --watertight --units mm -o chair.stl\n  diorama export runs/chair --format points --points 2000000 -o chair.ply\n  diorama export runs/chair -o chair.e57"
+    after_help = "Examples:\n  diorama export runs/chair -o chair.glb\n  diorama export --materials runs/chair -o chair.glb\n  diorama export runs/chair --scale-to 80cm -o chair.usdz\n  diorama export runs/chair --resolution 384 --faces 100000 --watertight --units mm -o chair.stl\n  diorama export runs/chair --format points --points 2000000 -o chair.ply\n  diorama export runs/chair -o chair.e57"
 )]
 pub struct Export {
     /// Folder of the run
@@ -39,7 +46,7 @@ pub struct Export {
     #[arg(long, default_value = "mc")]
     extract: String,
     /// Cells along the longest side
-    #[arg(long, default_value_t = 320)]
+    #[arg(long, default_value_t = RESOLUTION)]
     resolution: usize,
     /// auto, or the density of the surface in inverse units of the input
     #[arg(long, default_value = "auto")]
@@ -50,6 +57,9 @@ pub struct Export {
     /// Edge of the texture in texels; 0 colors the vertices instead [default: 2048 if the format has textures]
     #[arg(long)]
     texture: Option<usize>,
+    /// Write base color, roughness and metalness, and the light as NAME.probe.hdr, as `diorama relight object --from-run` finds them; glb
+    #[arg(long, conflicts_with_all = ["format", "points", "extract", "level", "normal_map", "watertight", "scale", "scale_to", "measured", "units", "floaters", "keep_unseen"])]
+    materials: bool,
     /// Also bake the field's normals and make the material lit; glb and obj
     #[arg(long)]
     normal_map: bool,
@@ -96,6 +106,7 @@ impl Verb for Export {
     fn run(&self) -> Result<Outcome> {
         use_threads(self.threads)?;
         match Application::of_run(&self.run)? {
+            Application::Object if self.materials => self.materials(),
             Application::Object => self.object(),
             of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight render")),
             of @ Application::RelightObject => Err(of.refuse(&self.run, "diorama relight object --resume, which writes the GLB again")),
@@ -124,6 +135,28 @@ impl Export {
                 export_points(self, &model, &PointOptions { format, out: self.out.clone(), points, region, size, unit_m })
             }
         }
+    }
+
+    /// Trains the object model from the run, in a run of its own inside of the run's folder.
+    fn materials(&self) -> Result<Outcome> {
+        if self.out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("glb")) {
+            return Err(usage(format!("materials: {} is no .glb, which alone holds them; choose another --out", self.out.display())));
+        }
+        self.check_out()?;
+        let run = self.run.join(MATERIALS);
+        if RunDescription::read(&run).is_ok() && !self.force {
+            let text = format!(
+                "holds an earlier export with materials; go on with diorama relight object --resume --run {} -o {}, or give --force to replace it",
+                run.display(),
+                self.out.display()
+            );
+            return Err(DataError::input(run, text).into());
+        }
+        let resolution = (self.resolution != RESOLUTION).then_some(self.resolution);
+        let source = Source { run: &self.run, clip: self.clip.as_deref(), resolution, faces: self.faces, device: &self.device };
+        let mut object = Object::of_run(&source, run, self.out.clone());
+        (object.texture, object.force, object.json) = (self.texture, self.force, self.json);
+        object.run()
     }
 
     /// # Errors

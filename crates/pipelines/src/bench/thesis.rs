@@ -191,6 +191,7 @@ fn chair(o: &ThesisOptions, stop: &AtomicBool, events: &mut dyn FnMut(&str, &Eve
         samples: 32,
         light: sky(35.0, 140.0),
         unseen: sky(15.0, 300.0),
+        shows_light: false,
         seed: 0,
     };
     let made = synth::generate(&data, &options, false, stop, &mut |_| {})?;

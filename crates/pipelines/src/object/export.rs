@@ -87,6 +87,13 @@ pub struct ExportOptions {
     pub keep_unseen: bool,
 }
 
+impl ExportOptions {
+    /// Edge of the texture in texels, 0 without.
+    fn texels(&self) -> usize {
+        self.texture.unwrap_or(if self.format.has_texture() { TEXELS } else { 0 })
+    }
+}
+
 /// Most training cameras that visibility is tested with.
 const CAMERAS: usize = 240;
 /// Most attempts to meet the face limit with a closed surface.
@@ -156,22 +163,8 @@ pub fn export(
     progress: &mut dyn FnMut(&str, usize, usize),
 ) -> Result<Exported> {
     let start = Instant::now();
-    check(o)?;
-    let (min, max) = o.clip.unwrap_or_else(|| extent::of(model));
-    if (0..3).any(|k| max[k] <= min[k] || max[k].is_nan() || min[k].is_nan()) {
-        return Err(PipelineError::Usage("--clip: each highest coordinate must exceed the lowest".into()));
-    }
-    let grid = Grid { min, max, resolution: o.resolution };
-    let texels = o.texture.unwrap_or(if o.format.has_texture() { TEXELS } else { 0 });
-    memory::check_export(model, &grid, texels, o.normal_map)?.iter().for_each(|n| note(n));
-    let level = o.level.unwrap_or_else(|| automatic_level(model, &grid));
-    let mut mesh = extract::extract(model, &grid, level, o.method, &mut |i, n| progress("density", i, n));
-    model.check_device()?;
-    repair::weld(&mut mesh);
-    let removed = clean(model, &mut mesh, o, grid.cell());
-    let faces = o.faces.unwrap_or(if texels > 0 { FACES } else { COLORED_FACES });
-    let mut notes = Vec::new();
-    let watertight = reduce(&mut mesh, faces, o, &mut notes)?;
+    let texels = o.texels();
+    let Surface { mut mesh, grid, level, removed, notes, watertight } = surface(model, model, o, note, progress)?;
     if o.watertight && !watertight && !mesh.faces.is_empty() {
         return Err(DataError::failed(
             &o.out,
@@ -214,6 +207,47 @@ pub fn export(
         removed,
         notes,
     })
+}
+
+/// The surface of a model in the world, without colors.
+pub(super) struct Surface {
+    pub mesh: Mesh,
+    pub grid: Grid,
+    pub level: f32,
+    pub removed: Removed,
+    /// Deviations from the options, one line each.
+    pub notes: Vec<String>,
+    pub watertight: bool,
+}
+
+/// Extracts a surface of `density`, which is the model's, then cleans and reduces it; `note` and `progress` as in [`export`].
+///
+/// # Errors
+/// When options are invalid, memory does not suffice, the device fails, or the surface cannot be simplified as asked.
+pub(super) fn surface(
+    model: &ObjectModel,
+    density: &dyn FieldQuery,
+    o: &ExportOptions,
+    note: &mut dyn FnMut(&str),
+    progress: &mut dyn FnMut(&str, usize, usize),
+) -> Result<Surface> {
+    check(o)?;
+    let (min, max) = o.clip.unwrap_or_else(|| extent::of(model));
+    if (0..3).any(|k| max[k] <= min[k] || max[k].is_nan() || min[k].is_nan()) {
+        return Err(PipelineError::Usage("--clip: each highest coordinate must exceed the lowest".into()));
+    }
+    let grid = Grid { min, max, resolution: o.resolution };
+    let texels = o.texels();
+    memory::check_export(model, &grid, texels, o.normal_map)?.iter().for_each(|n| note(n));
+    let level = o.level.unwrap_or_else(|| automatic_level(model, &grid));
+    let mut mesh = extract::extract(density, &grid, level, o.method, &mut |i, n| progress("density", i, n));
+    model.check_device()?;
+    repair::weld(&mut mesh);
+    let removed = clean(model, &mut mesh, o, grid.cell());
+    let faces = o.faces.unwrap_or(if texels > 0 { FACES } else { COLORED_FACES });
+    let mut notes = Vec::new();
+    let watertight = reduce(&mut mesh, faces, o, &mut notes)?;
+    Ok(Surface { mesh, grid, level, removed, notes, watertight })
 }
 
 /// Removes components that do not belong to the object; `cell` is the edge of a grid cell, the scale of the surface's error.

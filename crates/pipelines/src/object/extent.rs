@@ -19,8 +19,8 @@ const MIDDLE: f64 = 0.4;
 const STRAYS: f64 = 0.01;
 const MARGIN: f64 = 0.05;
 
-/// Lowest and highest corner in the world: the inner cube where it is all there is, else the box around the surfaces that
-/// many of the cameras see.
+/// Lowest and highest corner in the world: the inner cube where the field ends there, else the box around the surfaces that many of the
+/// cameras see.
 pub fn of(model: &ObjectModel) -> ([f32; 3], [f32; 3]) {
     let s = &model.capture.scene;
     let cube = |half: f64| {
@@ -28,7 +28,7 @@ pub fn of(model: &ObjectModel) -> ([f32; 3], [f32; 3]) {
         (corner(-1.0), corner(1.0))
     };
     let narrow = |(lo, hi): (DVec3, DVec3)| (lo.as_vec3().to_array(), hi.as_vec3().to_array());
-    if s.aabb_scale <= 1 {
+    if s.aabb_scale <= 1 && !model.field.is_unbounded() {
         return narrow(cube(s.half));
     }
     let (lowest, highest) = cube(s.half * s.aabb_scale as f64);

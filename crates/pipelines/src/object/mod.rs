@@ -2,6 +2,7 @@
 
 pub mod compare;
 pub mod config;
+pub mod cut_out;
 pub mod depth_error;
 pub mod device;
 pub mod diagnose;

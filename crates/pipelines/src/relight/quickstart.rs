@@ -194,6 +194,7 @@ impl Quickstart<'_> {
             samples: 48,
             light: LightOptions::of(Source::Sky { elevation: 35.0, rotation: 140.0 }),
             unseen: LightOptions::of(Source::File(self.unseen_light())),
+            shows_light: false,
             seed: 0,
         };
         Ok(!object::synth::generate(&out, &options, false, self.stop, self.share)?.interrupted)

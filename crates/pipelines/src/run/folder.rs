@@ -18,6 +18,8 @@ use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+/// Folder of what a run keeps of another run that it began from.
+pub const START: &str = "start";
 /// Metrics for TensorBoard.
 const EVENTS: &str = "events.tfevents";
 

@@ -15,6 +15,7 @@ pub mod prepare;
 pub mod profile;
 pub mod sparse_points;
 pub mod summary;
+pub mod undistort;
 pub mod viewer_files;
 pub mod viewing;
 pub mod viewing_points;

@@ -3,9 +3,10 @@
 mod compose;
 mod eval;
 mod fit_light;
+pub(super) mod from_run;
 mod light_flags;
 mod mesh;
-mod object;
+pub(super) mod object;
 mod prepare;
 mod quickstart;
 mod render;

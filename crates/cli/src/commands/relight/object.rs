@@ -1,5 +1,6 @@
 //! `diorama relight object`
 
+use super::from_run::Source;
 use crate::commands::process::{INTERRUPT, note, usage, use_threads, watch_interrupts};
 use crate::commands::{Outcome, Verb};
 use crate::terminal::Progress;
@@ -16,7 +17,7 @@ use std::path::PathBuf;
 /// Turn photographs of an object with opacity into a mesh with materials, and the light it stood in
 #[derive(Args, Clone, Debug)]
 #[command(
-    after_help = "Examples:\n  diorama relight object data/chair -o chair.glb\n  diorama relight object --resume --run runs/chair -o chair.glb"
+    after_help = "Examples:\n  diorama relight object data/chair -o chair.glb\n  diorama relight object --from-run runs/chair -o chair.glb\n  diorama relight object --resume --run runs/chair -o chair.glb"
 )]
 pub struct Object {
     /// Folder of the capture: RGBA photographs or masks, and poses
@@ -35,7 +36,7 @@ pub struct Object {
     grid: Option<u32>,
     /// Edge of the textures in texels [default: by preset]
     #[arg(long)]
-    texture: Option<usize>,
+    pub texture: Option<usize>,
     /// Steps of each stage [default: by preset]
     #[arg(long)]
     steps: Option<u64>,
@@ -48,6 +49,21 @@ pub struct Object {
     /// Mesh to begin with, in the capture's coordinates; its triangles are kept
     #[arg(long, value_name = "FILE")]
     base: Option<PathBuf>,
+    /// Begin from a run of `diorama train`: its poses, its mesh, and photographs without masks, cut out where its mesh covers them
+    #[arg(long, value_name = "RUN")]
+    from_run: Option<PathBuf>,
+    /// Box of the object in that run, x0,y0,z0,x1,y1,z1 (the input's frame), or auto [default: the crop box saved in the viewer, else auto: what most cameras look at]
+    #[arg(long, allow_hyphen_values = true, requires = "from_run")]
+    clip: Option<String>,
+    /// Cells along that box's longest side [default: 320]
+    #[arg(long, requires = "from_run")]
+    resolution: Option<usize>,
+    /// Largest number of faces of that run's mesh; 0 keeps all [default: 24 for each squared cell of the grid, 16224 for --grid 64]
+    #[arg(long, requires = "from_run")]
+    faces: Option<usize>,
+    /// Device that samples that run: auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto", requires = "from_run")]
+    device: String,
     #[arg(long)]
     seed: Option<u64>,
     /// KEY=VALUE of the configuration; may be repeated
@@ -58,7 +74,7 @@ pub struct Object {
     resume: bool,
     /// Replace an earlier run
     #[arg(long)]
-    force: bool,
+    pub force: bool,
     /// Samples per pixel of path-traced scores; 0: no scores
     #[arg(long, default_value_t = 32)]
     score_spp: u32,
@@ -67,7 +83,7 @@ pub struct Object {
     threads: Option<usize>,
     /// Print one JSON object on stdout
     #[arg(long)]
-    json: bool,
+    pub json: bool,
 }
 
 /// Cubes of the lattice that has about as many tetrahedra as a grid of the usual names.
@@ -81,10 +97,28 @@ fn cells(grid: u32) -> Result<usize> {
 }
 
 impl Object {
+    /// # Errors
+    /// When options exclude each other.
+    fn check(&self) -> Result<()> {
+        if self.out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("glb")) {
+            return Err(usage(format!("out {}: objects are written as .glb", self.out.display())));
+        }
+        let excluded = [
+            (self.data.is_some(), "the run knows its photographs; leave out the folder"),
+            (self.resume, "a run that is resumed has kept what it began from; leave out one of --from-run and --resume"),
+            (self.base.is_some(), "the run gives the mesh; leave out one of --from-run and --base"),
+        ];
+        if let Some((_, why)) = excluded.iter().find(|(is_given, _)| self.from_run.is_some() && *is_given) {
+            return Err(usage(format!("from-run: {why}")));
+        }
+        Ok(())
+    }
+
     fn config(&self, begun: Option<Config>) -> Result<Config> {
         let mut config = match (begun, &self.data) {
             (Some(_), Some(_)) => return Err(PipelineError::Usage("--resume: the run knows its capture; leave out the folder".into())),
-            (None, None) => return Err(PipelineError::Usage("give the folder of a capture, or --resume".into())),
+            (None, None) if self.from_run.is_some() => Config::new(self.preset, PathBuf::new()),
+            (None, None) => return Err(PipelineError::Usage("give the folder of a capture, --from-run or --resume".into())),
             (Some(config), None) => {
                 let fixed =
                     [self.grid.is_some(), self.texture.is_some(), self.steps.is_some(), self.base.is_some(), self.fixed_light.is_some()];
@@ -126,28 +160,33 @@ impl Verb for Object {
 
     fn run(&self) -> Result<Outcome> {
         use_threads(self.threads)?;
-        if self.out.extension().is_none_or(|e| !e.eq_ignore_ascii_case("glb")) {
-            return Err(usage(format!("out {}: objects are written as .glb", self.out.display())));
-        }
+        self.check()?;
         let opened = if self.resume { Some(RunFolder::open(&self.run)?) } else { None };
         let (folder, begun) = match opened {
             Some((folder, description)) => (Some(folder), Some(description.config::<Config>()?)),
             None => (None, None),
         };
-        let config = self.config(begun)?;
+        let mut config = self.config(begun)?;
+        watch_interrupts();
         // Nothing is written before the request is known to be sound.
-        let (mut folder, imported) = match folder {
-            Some(folder) => {
+        let (mut folder, imported) = match (folder, self.source()) {
+            (Some(folder), _) => {
                 let capture = folder.capture()?;
                 (folder, capture)
             }
-            None => {
+            (None, Some(source)) => match source.begin(&mut config, &self.run, self.force)? {
+                Some(begun) => begun,
+                None => {
+                    note("stopped before training began; nothing is kept");
+                    return Ok(Outcome::Interrupted);
+                }
+            },
+            (None, None) => {
                 let imported = capture::import(&config)?;
                 capture::load(&config, &imported)?;
                 (RunFolder::create(&self.run, self.force)?, imported)
             }
         };
-        watch_interrupts();
         let mut progress = Progress::new();
         let trained = recipe::train(&config, &imported, &mut folder, self.resume, &INTERRUPT, &mut |e| progress.event(e))?;
         if trained.summary.interrupted {
@@ -173,6 +212,40 @@ impl Verb for Object {
 }
 
 impl Object {
+    /// The materials of a run of the object application, as `diorama export --materials` asks for them.
+    pub fn of_run(source: &Source, run: PathBuf, out: PathBuf) -> Object {
+        Object {
+            data: None,
+            preset: Preset::Fast,
+            out,
+            run,
+            grid: None,
+            texture: None,
+            steps: None,
+            mc: false,
+            fixed_light: None,
+            base: None,
+            from_run: Some(source.run.to_path_buf()),
+            clip: source.clip.map(str::to_string),
+            resolution: source.resolution,
+            faces: source.faces,
+            device: source.device.to_string(),
+            seed: None,
+            set: Vec::new(),
+            resume: false,
+            force: false,
+            score_spp: 0,
+            threads: None,
+            json: false,
+        }
+    }
+
+    /// The run to begin from.
+    fn source(&self) -> Option<Source<'_>> {
+        let run = self.from_run.as_deref()?;
+        Some(Source { run, clip: self.clip.as_deref(), resolution: self.resolution, faces: self.faces, device: &self.device })
+    }
+
     /// Scores on what was held out, with pictures in the run's folder.
     fn scores(&self, trained: &Trained) -> Result<Option<ObjectScores>> {
         use diorama_geom::capture::Split;

@@ -30,6 +30,9 @@ pub struct Synth {
     /// Light of an object's held-out views besides their own, as --light
     #[arg(long, default_value = "sky:15,300")]
     unseen_light: String,
+    /// Photographs of an object show the light behind it and are opaque, as photographs without masks are
+    #[arg(long, requires = "object")]
+    show_light: bool,
     /// Views [default: by size; of objects 60]
     #[arg(long)]
     views: Option<usize>,
@@ -109,6 +112,7 @@ impl Synth {
             samples: self.spp.unwrap_or(64),
             light: self.light.options()?,
             unseen: LightOptions::of(unseen),
+            shows_light: self.show_light,
             seed: self.seed,
         };
         watch_interrupts();

@@ -35,6 +35,7 @@ pub fn train(
     events: &mut dyn FnMut(&Event),
 ) -> Result<Trained> {
     imported.notes.iter().for_each(|n| events(&Event::Note(n.clone())));
+    let config = &if resume { with_kept_start(config.clone(), folder.path()) } else { config.clone() };
     let photographs = capture::load(config, imported)?;
     let mut model = ObjectModel::new(config.clone(), &photographs)?;
     std::mem::take(&mut model.notes).into_iter().for_each(|n| events(&Event::Note(n)));
@@ -100,13 +101,24 @@ pub fn export(model: &ObjectModel, out: &Path) -> Result<PathBuf> {
 /// # Errors
 /// When the folder holds no run of this application, or its checkpoint is damaged.
 pub fn load(run: &Path) -> Result<(ObjectModel, ObjectCapture, Vec<String>)> {
-    let config: Config = RunDescription::read(run)?.config()?;
+    let config = with_kept_start(RunDescription::read(run)?.config()?, run);
     let imported = kept_capture::read(run, None, &config.data.path)?;
     let (checkpoint, file, note) = folder::last_checkpoint(run)?;
     let photographs = capture::load(&config, &imported)?;
     let mut model = ObjectModel::new(config, &photographs)?;
     model.restore(checkpoint, &file)?;
     Ok((model, photographs, note.into_iter().collect()))
+}
+
+/// A configuration whose mesh and photographs, if the run keeps them itself, are where the run's folder is now.
+fn with_kept_start(mut config: Config, run: &Path) -> Config {
+    let kept = run.join(folder::START);
+    let is_kept = |p: &Path| p.file_name().is_some_and(|n| n == folder::START) && !p.exists() && kept.is_dir();
+    if is_kept(&config.data.path) {
+        config.base_mesh = config.base_mesh.file_name().map_or(PathBuf::new(), |name| kept.join(name));
+        config.data.path = kept;
+    }
+    config
 }
 
 /// Description of a run for `diorama info`.

@@ -39,6 +39,8 @@ pub struct ObjectSynth {
     pub samples: u32,
     pub light: LightOptions,
     pub unseen: LightOptions,
+    /// The photographs are opaque and show the light behind the object.
+    pub shows_light: bool,
     pub seed: u64,
 }
 
@@ -114,14 +116,14 @@ pub fn generate(
         let (name, is_held_out) = (format!("{v:03}"), v % HOLD_OUT == HOLD_OUT - 1);
         let view = View { camera: *camera, world_from_camera: *pose, lens: None };
         scene.set_light(&lights[0]);
-        let film = traced(&scene, &view, options, v as u64);
-        save(&out.join("images").join(format!("{name}.png")), &film)?;
+        let film = traced(&scene, &view, options, (v as u64, options.shows_light));
+        save(&out.join("images").join(format!("{name}.png")), &film, options.shows_light)?;
         if is_held_out {
             let truth =
                 ViewTruth { photograph: name.clone(), unseen: format!("unseen_{name}.png"), base_color: format!("base_color_{name}.exr") };
             photo::save_exr(&ObjectTruth::file(out, &truth.base_color), &film.image(|p| p.albedo))?;
             scene.set_light(&lights[1]);
-            save(&ObjectTruth::file(out, &truth.unseen), &traced(&scene, &view, options, (options.views + v) as u64))?;
+            save(&ObjectTruth::file(out, &truth.unseen), &traced(&scene, &view, options, ((options.views + v) as u64, false)), false)?;
             views.push(truth);
         }
         frames[is_held_out as usize].push(frame(&name, camera, pose));
@@ -178,18 +180,20 @@ fn exposed(scene: &mut Scene, light: Daylight, (camera, pose): &(Camera, Pose)) 
     light.turned(0.0, stops.exp2())
 }
 
-fn traced(scene: &Scene, view: &View, options: &ObjectSynth, number: u64) -> Film {
+/// A view by its number, with the light behind the object where it is shown.
+fn traced(scene: &Scene, view: &View, options: &ObjectSynth, (number, shows_light): (u64, bool)) -> Film {
     let mut film = Film::new(&view.camera);
     let seed = options.seed.wrapping_mul(100_003).wrapping_add(number);
-    let settings = Settings { seed, bounces: BOUNCES, shows_light: false, ..Settings::default() };
+    let settings = Settings { seed, bounces: BOUNCES, shows_light, ..Settings::default() };
     cpu::render(scene, view, &settings, options.samples, &mut film);
     denoise::cpu::run(&mut film);
     film
 }
 
-/// RGBA of a film, straight, in sRGB.
-fn save(path: &Path, film: &Film) -> Result<()> {
-    Ok(photo::save_png(path, &picture::develop(&film.image(|p| [p.color[0], p.color[1], p.color[2], p.opacity]), 0.0))?)
+/// RGBA of a film, straight, in sRGB; RGB where the film is opaque.
+fn save(path: &Path, film: &Film, is_opaque: bool) -> Result<()> {
+    let opacity = |own: f32| if is_opaque { 1.0 } else { own };
+    Ok(photo::save_png(path, &picture::develop(&film.image(|p| [p.color[0], p.color[1], p.color[2], opacity(p.opacity)]), 0.0))?)
 }
 
 /// A frame of `transforms_*.json`: poses look along −z there.

@@ -3,11 +3,11 @@
 
 mod masks;
 mod sky;
-mod undistort;
 mod world;
 
 use crate::error::{PipelineError, Result};
 use crate::run::prepare::{self as poses, Finish, Matcher, Sfm};
+use crate::run::undistort;
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::masks::{MaskOptions, SKY_CLASS, STATIC_CLASS};
 use diorama_data::sessions::{self, SessionRule};
