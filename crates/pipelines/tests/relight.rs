@@ -152,6 +152,51 @@ fn a_trained_place_is_scored_and_its_layers_are_rendered() {
 }
 
 /// Light changes what is lit and nothing else; the lists make sense; a place that is looked at has a position.
+/// The printed model, so small that it learns in seconds.
+fn printed(data: &Path, steps: u64) -> Config {
+    let mut c = Config::new(Preset::Paper, data.into());
+    (c.run.steps, c.run.log_every, c.field.width) = (steps, 1, 48);
+    (c.sampling.rays, c.sampling.coarse, c.sampling.fine) = (128, 24, 24);
+    (c.optim.net_rate, c.optim.light_rate, c.sampling.occupancy_points) = (2e-3, 5e-3, 1 << 12);
+    c
+}
+
+#[test]
+fn the_printed_model_learns_photographs_is_resumed_and_scored() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("data");
+    generate(&data, 10, (32, 24));
+    let train = |name: &str, steps: u64, stop_at: Option<usize>, resume: bool| {
+        let at = dir.path().join(name);
+        let mut folder = if resume { RunFolder::open(&at).unwrap().0 } else { RunFolder::create(&at, false).unwrap() };
+        let (stop, mut losses) = (AtomicBool::new(false), Vec::new());
+        let trained = recipe::train(&printed(&data, steps), &mut folder, resume, None, &stop, &mut |e| {
+            if let Event::Progress { loss, .. } = e {
+                losses.push(*loss);
+                stop.store(stop_at.is_some_and(|at| losses.len() >= at), Ordering::Relaxed);
+            }
+        });
+        (trained.unwrap().summary.interrupted, losses)
+    };
+    assert!(!train("short", 8, None, false).0);
+    assert!(train("parts", 8, Some(4), false).0 && !train("parts", 8, None, true).0);
+    let losses = train("whole", 160, None, false).1;
+    let mean = |l: &[f64]| l.iter().sum::<f64>() / l.len() as f64;
+    let (first, last) = (mean(&losses[..10]), mean(&losses[140..]));
+    println!("{first} {last}");
+    assert!(last < 0.5 * first, "{first} {last}");
+    let load = |name: &str| recipe::load(&dir.path().join(name)).unwrap().0;
+    let (mut short, mut parts) = (load("short"), load("parts"));
+    let arrays = |m: &mut diorama_pipelines::relight::outdoor::model::SceneModel| -> Vec<(String, Vec<f32>)> {
+        m.params().into_arrays().into_iter().map(|(name, values)| (name, values.to_vec())).collect()
+    };
+    assert!(arrays(&mut short) == arrays(&mut parts));
+    let s = scores::judge(&load("whole"), &data, &mut |_, _| Ok(())).unwrap();
+    println!("{s:?}");
+    // Shape and albedo are rough after so few steps; a picture that is upside down or unlit would be far below.
+    assert!(s.seen_light_psnr > 14.0 && s.albedo_psnr > 12.0, "{s:?}");
+}
+
 fn the_viewer_shows_layers_in_any_light(run: &Path, truth: &Path) {
     let (maps, _) = viewing::read_maps(&[truth.join("noon.hdr")]).unwrap();
     let view = viewing::open(run, recipe::load(run).unwrap().0, maps, false).unwrap();

@@ -9,8 +9,8 @@ use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, Capture, Pose, SceneBox};
 use diorama_pipelines::relight::outdoor::config::{Config, Preset};
-use diorama_pipelines::relight::outdoor::joint::{Stepper, sphere_rays};
 use diorama_pipelines::relight::outdoor::model::SceneModel;
+use diorama_pipelines::relight::outdoor::stepper::{Stepper, sphere_rays};
 use std::path::Path;
 use std::process::Command;
 

@@ -3,7 +3,6 @@
 
 use super::presets::trunk;
 use crate::params::ParamGroup;
-use crate::samplers::RayBatch;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::composite::Packed;
@@ -41,9 +40,11 @@ impl Sphere {
     }
 
     /// Shortens rays that begin inside to what they have there.
-    pub fn cut(&self, batch: &mut RayBatch) {
-        let rays = batch.origins.chunks_exact(3).zip(batch.dirs.chunks_exact(3));
-        for ((origin, dir), near_far) in rays.zip(batch.near_far.chunks_exact_mut(2)) {
+    ///
+    /// # Shapes
+    /// origins, dirs: `[R, 3]`; near_far: `[R, 2]`.
+    pub fn cut(&self, origins: &[f32], dirs: &[f32], near_far: &mut [f32]) {
+        for ((origin, dir), near_far) in origins.chunks_exact(3).zip(dirs.chunks_exact(3)).zip(near_far.chunks_exact_mut(2)) {
             near_far[1] = near_far[1].min(self.exit(origin, dir, 1.0)).max(near_far[0]);
         }
     }

@@ -200,7 +200,7 @@ impl Tracer<'_> {
             cut_to(crop, batch);
         }
         if let Some(sphere) = &self.within {
-            sphere.cut(batch);
+            sphere.cut(&batch.origins, &batch.dirs, &mut batch.near_far);
         }
     }
 

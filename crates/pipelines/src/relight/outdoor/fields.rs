@@ -7,6 +7,7 @@ use diorama_engine::fields::{self, DirectionCode, Encoder, Field, Normals, RayCo
 use diorama_engine::params::{ParamGroup, Schedule};
 use diorama_geom::contraction::Space;
 use diorama_geom::rng::Rng;
+use diorama_geom::sh_light::ShLight;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::field_step::{FieldNet, Output};
@@ -30,6 +31,13 @@ fn layer(inputs: Vec<Source>, width: usize, activation: Activation) -> Layer {
 
 fn head(layer: usize, activation: Activation, shift: f32) -> Head {
     Head { layer, channel: 0, activation, shift }
+}
+
+/// Even light with a little more from above.
+pub fn first_lights(n: usize) -> Vec<f32> {
+    let mut light = ShLight::uniform([0.9; 3]);
+    light.0[2] = [0.3; 3];
+    (0..n).flat_map(|_| light.0.into_iter().flatten().map(|v| v as f32)).collect()
 }
 
 /// Course of the rates over each stage.

@@ -17,6 +17,7 @@ pub mod scores;
 pub mod shading;
 #[cfg(test)]
 mod shading_tests;
+pub mod stepper;
 pub mod sun;
 pub mod surface_field;
 mod trainer;

@@ -120,7 +120,7 @@ impl SceneModel {
             field,
             joint,
             occupancy: Occupancy::new(config.sampling.occupancy_resolution, cascades, unbounded),
-            lights: group("lights", first_lights(n), rate),
+            lights: group("lights", fields::first_lights(n), rate),
             skies: group("skies", first_skies(n), rate),
             gains: group("gains", gains, rate),
             suns: group("suns", vec![0.0; SUN * n], rate),
@@ -424,13 +424,6 @@ fn params<'a>(field: &'a mut Field, joint: &'a mut Option<Joint>, tables: [&'a m
         joint.backgrounds.iter_mut().zip(names).for_each(|(b, name)| params.add(name, [&mut b.weights]));
     }
     params
-}
-
-/// Even light with a little more from above.
-pub(super) fn first_lights(n: usize) -> Vec<f32> {
-    let mut light = ShLight::uniform([0.9; 3]);
-    light.0[2] = [0.3; 3];
-    (0..n).flat_map(|_| light.0.into_iter().flatten().map(|v| v as f32)).collect()
 }
 
 /// Even, bright skies.

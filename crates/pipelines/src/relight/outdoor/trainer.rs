@@ -1,10 +1,11 @@
 //! Training of the scene model: draws pixels, describes each step, and updates the lights.
 
 use super::config::Stage;
-use super::joint::Stepper;
+
 use super::model::SceneModel;
 use super::normal_maps::NormalMaps;
 use super::shading::SKY;
+use super::stepper::Stepper;
 use super::viewing::RunView;
 use super::visibility::Ambient;
 use crate::error::Result;

@@ -145,7 +145,7 @@ mod tests {
         let mut check = |which: usize, grads: &[f32]| {
             for (i, g) in grads.iter().enumerate() {
                 let mut at = |by: f32| {
-                    let mut all = [&mut values, &mut opacity, &mut lights, &mut behind];
+                    let all = [&mut values, &mut opacity, &mut lights, &mut behind];
                     let before = all[which][i];
                     all[which][i] = before + by;
                     let value = evaluate(&values, &opacity, &lights, &behind).0;

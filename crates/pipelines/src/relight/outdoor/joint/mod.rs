@@ -4,19 +4,15 @@
 
 mod loss;
 mod pictures;
-mod stepper;
 
 pub use loss::{JointGradients, JointLoss};
 pub use pictures::color;
-pub use stepper::{JointFigures, Level, Stepper};
 
 use super::config::Config;
-use super::fields;
-use super::model::{SceneModel, first_lights};
+use super::fields::{self, first_lights};
 use diorama_engine::fields::{Encoder, Field, InvertedSphere, Sphere};
 use diorama_engine::params::ParamGroup;
 use diorama_engine::samplers::placement::Placement;
-use diorama_engine::samplers::{RayBatch, pixels};
 use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::frequency::Frequency;
 use diorama_kernels::ops::ray_generation::PosedCamera;
@@ -50,18 +46,6 @@ pub fn sphere(cameras: &[PosedCamera]) -> Sphere {
 /// The fine network of a sphere.
 pub fn fine(config: &Config, sphere: &Sphere) -> Field {
     fields::of_all(config, 2.0 * sphere.radius, FINE)
-}
-
-/// Sets origins, directions and extents of the images and pixels in `batch`: where there is a background, rays end at its sphere.
-///
-/// # Panics
-/// When the model is none that is learned at once.
-pub fn sphere_rays(model: &SceneModel, cameras: &[PosedCamera], batch: &mut RayBatch) {
-    let joint = model.joint.as_ref().expect("a model that is learned at once");
-    pixels::rays(cameras, model.config.sampling.near, model.cube(), batch);
-    if !joint.backgrounds.is_empty() {
-        joint.sphere.cut(batch);
-    }
 }
 
 impl Joint {

@@ -1,7 +1,7 @@
 //! Steps of the model as printed, which learns all at once.
 
 use super::{PIXELS, Trainer, WithoutGlass};
-use crate::relight::outdoor::joint::sphere_rays;
+use crate::relight::outdoor::stepper::sphere_rays;
 use diorama_engine::samplers::pixels::PixelSource;
 use diorama_engine::train::StepReport;
 use diorama_geom::rng::Rng;

@@ -1,17 +1,17 @@
 //! A step of the model as printed.
 
-use super::Joint;
-use super::loss::{JointGradients, JointLoss};
-use crate::relight::outdoor::config::Config;
-use crate::relight::outdoor::model::SceneModel;
-use crate::relight::outdoor::shading::{LIGHT, gray};
+use super::config::Config;
+use super::joint::{Joint, JointGradients, JointLoss};
+use super::model::SceneModel;
+use super::shading::{LIGHT, gray};
 use diorama_engine::fields::{Batch, Field, FieldBuffers, InvertedSphere, Loss, OuterSamples, VisibleSamples};
 use diorama_engine::params::ParamGroup;
 use diorama_engine::samplers::RayBatch;
-use diorama_engine::samplers::placement;
+use diorama_engine::samplers::{pixels, placement};
 use diorama_geom::color::LUMINANCE;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::composite::Packed;
+use diorama_kernels::ops::ray_generation::PosedCamera;
 use diorama_kernels::ops::strata::cpu as strata;
 use std::sync::Mutex;
 
@@ -65,6 +65,18 @@ pub struct JointFigures {
 /// Weight of the shadows in a step.
 fn shadow_weight(weight: f32, step: u64) -> f32 {
     weight * ((step as f32 - SHADOW_FROM) / SHADOW_RAMP).clamp(0.0, 1.0)
+}
+
+/// Sets origins, directions and extents of the images and pixels in `batch`: where there is a background, rays end at its sphere.
+///
+/// # Panics
+/// When the model is none that is learned at once.
+pub fn sphere_rays(model: &SceneModel, cameras: &[PosedCamera], batch: &mut RayBatch) {
+    let joint = model.joint.as_ref().expect("a model that is learned at once");
+    pixels::rays(cameras, model.config.sampling.near, model.cube(), batch);
+    if !joint.backgrounds.is_empty() {
+        joint.sphere.cut(&batch.origins, &batch.dirs, &mut batch.near_far);
+    }
 }
 
 impl Stepper {
