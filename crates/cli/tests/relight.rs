@@ -87,6 +87,32 @@ fn what_passes_through_an_object_is_refused() {
 }
 
 #[test]
+fn an_object_inside_of_a_wall_is_refused() {
+    let dir = folder();
+    let first = FLOOR.lines().filter(|l| l.starts_with("v ")).count();
+    let wall = |least: f64| {
+        let scaled = |line: &str| {
+            let numbers: Vec<f64> = line.split(' ').skip(1).map(|n| n.parse().unwrap()).collect();
+            match &line[..1] {
+                "v" => format!("v {} {} {}\n", 4.0 * numbers[0] + least, 3.0 * numbers[1], 4.0 * numbers[2]),
+                _ => numbers.iter().fold("f".to_string(), |text, n| format!("{text} {}", n + first as f64)) + "\n",
+            }
+        };
+        FLOOR.to_string() + &CUBE.lines().map(scaled).collect::<String>()
+    };
+    let text = SCENE.replace("snap = \"ground\"", "");
+    std::fs::write(dir.path().join("scene.toml"), &text).unwrap();
+    std::fs::write(dir.path().join("floor.obj"), wall(0.0)).unwrap();
+    refused(dir.path(), &["compose", "scene.toml", "-o", "b.exr"], &["object 0", "inside of the closed surface", "overlap"]);
+    // Beside it, nothing is wrong; nor where the user says so.
+    std::fs::write(dir.path().join("floor.obj"), wall(8.0)).unwrap();
+    assert!(run(dir.path(), &["compose", "scene.toml", "-o", "b.png"]).status.success());
+    std::fs::write(dir.path().join("floor.obj"), wall(0.0)).unwrap();
+    std::fs::write(dir.path().join("scene.toml"), text.replace("scale = 0.5", "scale = 0.5\noverlap = true")).unwrap();
+    assert!(run(dir.path(), &["compose", "scene.toml", "-o", "c.png"]).status.success());
+}
+
+#[test]
 fn what_does_not_fit_into_memory_is_refused_before_anything_is_written() {
     let dir = folder();
     let text = SCENE.replace("size = [96, 64]", "size = [4096, 4096]");

@@ -144,8 +144,8 @@ fn face_centers(mesh: &Mesh, faces: &[u32]) -> Vec<[f32; 3]> {
     (0..n).map(|i| center(faces[i * faces.len() / n])).collect()
 }
 
-/// Groups faces by connected component.
-fn components(mesh: &Mesh) -> Vec<Vec<u32>> {
+/// Groups faces by connected component: those that share vertices.
+pub fn components(mesh: &Mesh) -> Vec<Vec<u32>> {
     let mut parent: Vec<u32> = (0..mesh.positions.len() as u32).collect();
     fn root(parent: &mut [u32], mut i: u32) -> u32 {
         while parent[i as usize] != i {

@@ -8,9 +8,11 @@ use crate::run::{RunDescription, kept_capture};
 use diorama_data::{DataError, model_file, photo};
 use diorama_geom::daylight::Daylight;
 use diorama_geom::glam::{DAffine3, DMat3, DVec3};
-use diorama_geom::{Camera, Image, Model, Pose};
+use diorama_geom::model::Instance;
+use diorama_geom::{Camera, Image, Mesh, Model, Pose};
 use diorama_kernels::ops::denoise;
 use diorama_kernels::ops::path_trace::{Film, Scene, Settings, ThinLens, View, cpu};
+use diorama_mesh::{clean, repair};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
@@ -20,6 +22,8 @@ const FOOT: f64 = 0.02;
 const PIERCED: f64 = 0.02;
 /// Edges of the scene, once for each of their triangles, that may cross an object: specks of photographed scenes do.
 const PIERCING: usize = 4;
+/// Winding number of a closed surface around what is inside of it, with room for holes.
+const ENCLOSED: f64 = 0.75;
 /// Edges that are tested.
 const EDGES: usize = 4000;
 /// Largest change of a photograph by light that objects throw onto it.
@@ -92,6 +96,9 @@ pub fn load(file: &SceneFile) -> Result<Composition> {
             let through = piercing(&model, place, &placed)?;
             if through > PIERCING {
                 return refused(format!("{through} edges of the scene cross its surfaces"));
+            }
+            if let Some(part) = enclosing(&model, place, &placed) {
+                return refused(format!("it is inside of the closed surface {part}"));
             }
         }
         objects.push(placed.bounds());
@@ -181,6 +188,29 @@ fn piercing(model: &Model, place: usize, object: &Model) -> Result<usize> {
         }
     }
     Ok(crossing)
+}
+
+/// Name of a part of the scene, which is the first `place` instances of a model, that an object's middle is inside of: a connected surface of it
+/// closes around that, seen from behind (winding number, Jacobson et al. 2013).
+fn enclosing(model: &Model, place: usize, object: &Model) -> Option<String> {
+    let (low, high) = object.bounds()?;
+    let middle = 0.5 * (DVec3::from(low) + DVec3::from(high));
+    let encloses = |instance: &&Instance| {
+        let mesh = &model.parts[instance.part].mesh;
+        let mut welded = Mesh { positions: mesh.positions.clone(), faces: mesh.faces.clone(), ..Mesh::default() };
+        repair::weld(&mut welded);
+        let at = |i: u32| instance.world_from_part.transform_point3(DVec3::from(welded.positions[i as usize].map(f64::from))) - middle;
+        // The tangent of half the solid angle of a triangle (van Oosterom and Strackee 1983).
+        let half_angle = |[a, b, c]: [DVec3; 3]| {
+            let (x, y, z) = (a.length(), b.length(), c.length());
+            a.dot(b.cross(c)).atan2(x * y * z + a.dot(b) * z + b.dot(c) * x + c.dot(a) * y)
+        };
+        let winding =
+            |faces: &Vec<u32>| faces.iter().map(|f| half_angle(welded.faces[*f as usize].map(at))).sum::<f64>() / std::f64::consts::TAU;
+        clean::components(&welded).iter().any(|faces| winding(faces) > ENCLOSED)
+    };
+    let found = model.instances[..place].iter().find(encloses)?;
+    Some(model.parts[found.part].name.clone())
 }
 
 /// The part of an edge above a floor, its lower end first.

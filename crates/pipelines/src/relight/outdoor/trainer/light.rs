@@ -11,7 +11,7 @@ use diorama_engine::fields::FieldBuffers;
 use diorama_engine::renderers::traced::Traced;
 use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_engine::samplers::RayBatch;
-use diorama_engine::samplers::pixels::{self, DrawOptions};
+use diorama_engine::samplers::pixels::{self, DrawOptions, PixelSource};
 use diorama_engine::step::{GivenRays, Loss, Trainees};
 use diorama_engine::train::{Event, StepReport};
 use diorama_geom::color::linear_from_srgb;
@@ -24,8 +24,10 @@ use std::sync::{Arc, Mutex};
 const NOISE: u64 = 12;
 const SUNS: u64 = 13;
 const TAUGHT: u64 = 14;
-/// Pixels from which the light of all lights together is told apart: most in all, least and most for each light.
+/// Pixels from which the light of all lights together is told apart: most in all, least and most for each light, and one in how many of the
+/// photographs' at most.
 const TELLING: (usize, usize, usize) = (40_000, 1000, 6000);
+const TELLS: usize = 4;
 /// Opacity from which a pixel shows a surface.
 const SURFACE: f32 = 0.9;
 /// Standard deviation of noise on the light that the shadow sees.
@@ -81,7 +83,8 @@ impl Trainer<'_> {
         let m = &self.model;
         let (field, lights) = (m.with_shared_codes(), m.light_count());
         let (all, least, most) = TELLING;
-        let mut batch = self.pixels((all / lights.max(1)).clamp(least, most));
+        let pixels: usize = (0..self.photographs.images()).map(|i| self.photographs.size(i)).map(|(w, h)| (w * h) as usize).sum();
+        let mut batch = self.pixels((all / lights.max(1)).min(pixels / TELLS).clamp(least, most));
         let mut out: Vec<Seen> = Vec::new();
         for l in 0..lights {
             let tracer = Tracer { field: &field, appearance: Some(l as u32), ..m.tracer(Quality::Full) };
