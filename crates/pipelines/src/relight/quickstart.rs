@@ -31,6 +31,8 @@ const SCORED_SAMPLES: u32 = 16;
 const COMPOSED_SIZE: (u32, u32) = (480, 270);
 /// Cells along the street's mesh, its most faces, and the edge of its texture.
 const MESH: (usize, usize, usize) = (192, 60_000, 1024);
+/// Share of the scene's steps in which surfaces are learned.
+const SURFACES: f32 = 0.85;
 /// How much is generated and trained.
 #[derive(Clone, Debug)]
 pub struct QuickstartOptions {
@@ -44,11 +46,11 @@ pub struct QuickstartOptions {
 }
 
 impl Default for QuickstartOptions {
-    /// About seven minutes on two cores.
+    /// About eight minutes on two cores.
     fn default() -> Self {
         QuickstartOptions {
             street: SynthOptions { views: 20, lights: 4, size: (96, 54), samples: 48, seed: 0 },
-            scene_steps: 1500,
+            scene_steps: 4000,
             chair_views: 32,
             chair_size: (128, 128),
             object: object::config::Preset::Fast,
@@ -162,6 +164,7 @@ impl Quickstart<'_> {
     fn scene(&mut self) -> Result<Option<SceneModel>> {
         let mut config = outdoor::config::Config::new(outdoor::config::Preset::Ci, self.at("street"));
         config.run.steps = self.o.scene_steps;
+        (config.light.model, config.light.from) = ("sun".into(), SURFACES);
         config.check()?;
         let (mut folder, resume) = self.run("scene")?;
         let trained = outdoor::recipe::train(&config, &mut folder, resume, None, self.stop, self.events)?;
