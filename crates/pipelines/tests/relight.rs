@@ -151,7 +151,6 @@ fn a_trained_place_is_scored_and_its_layers_are_rendered() {
     assert!(e.is_input() && e.to_string().contains("--frame nothing"), "{e}");
 }
 
-/// Light changes what is lit and nothing else; the lists make sense; a place that is looked at has a position.
 /// The printed model, so small that it learns in seconds.
 fn printed(data: &Path, steps: u64) -> Config {
     let mut c = Config::new(Preset::Paper, data.into());
@@ -197,6 +196,7 @@ fn the_printed_model_learns_photographs_is_resumed_and_scored() {
     assert!(s.seen_light_psnr > 14.0 && s.albedo_psnr > 12.0, "{s:?}");
 }
 
+/// Light changes what is lit and nothing else; the lists make sense; a place that is looked at has a position.
 fn the_viewer_shows_layers_in_any_light(run: &Path, truth: &Path) {
     let (maps, _) = viewing::read_maps(&[truth.join("noon.hdr")]).unwrap();
     let view = viewing::open(run, recipe::load(run).unwrap().0, maps, false).unwrap();

@@ -1,7 +1,6 @@
 //! The scene model as printed learns as it does in PyTorch, where normals are differentiated twice: same weights, rays and samples, a hundred
 //! steps. Runs where `DIORAMA_TORCH_PYTHON` names a Python that has torch and numpy.
 
-use diorama_engine::fields::{Field, InvertedSphere};
 use diorama_engine::samplers::RayBatch;
 use diorama_geom::capture::Frame;
 use diorama_geom::color::LUMINANCE;
@@ -75,10 +74,15 @@ impl Record<'_> {
         values.iter().for_each(|v| file.write_all(&v.to_le_bytes()).unwrap());
     }
 
-    fn start(&self, name: &str, field: &Field, lights: &[f32], background: &InvertedSphere) {
-        self.add(&format!("{name}.weights"), &field.weights.values);
-        self.add(&format!("{name}.lights"), lights);
-        self.add(&format!("{name}.background"), &background.weights.values);
+    /// All parameters, at the start and at the `end`.
+    fn parameters(&self, model: &SceneModel, end: &str) {
+        let joint = model.joint.as_ref().unwrap();
+        let levels = [("coarse", &joint.coarse, &joint.coarse_lights), ("fine", &model.field, &model.lights)];
+        for ((name, field, lights), background) in levels.into_iter().zip(&joint.backgrounds) {
+            self.add(&format!("{name}.weights{end}"), &field.weights.values);
+            self.add(&format!("{name}.lights{end}"), &lights.values);
+            self.add(&format!("{name}.background{end}"), &background.weights.values);
+        }
     }
 }
 
@@ -86,10 +90,8 @@ impl Record<'_> {
 fn course(first: u64, steps: u64) -> Vec<f32> {
     let (mut model, mut stepper, dir) = (model(), Stepper::default(), tempfile::tempdir().unwrap());
     let record = Record(dir.path());
-    let joint = model.joint.as_ref().unwrap();
-    record.start("coarse", &joint.coarse, &joint.coarse_lights.values, &joint.backgrounds[0]);
-    record.start("fine", &model.field, &model.lights.values, &joint.backgrounds[1]);
-    record.add("radius", &[joint.sphere.radius]);
+    record.parameters(&model, "");
+    record.add("radius", &[model.joint.as_ref().unwrap().sphere.radius]);
     record.add("rates", &[first as f32, RATES[0], RATES[1]]);
     let mut losses = Vec::new();
     for step in 0..steps {
@@ -114,6 +116,7 @@ fn course(first: u64, steps: u64) -> Vec<f32> {
         }
     }
     record.add("losses", &losses);
+    record.parameters(&model, ".end");
     match std::env::var("DIORAMA_TORCH_PYTHON") {
         Err(_) => println!("skipped: DIORAMA_TORCH_PYTHON is not set"),
         Ok(python) => {

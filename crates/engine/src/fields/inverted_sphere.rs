@@ -1,4 +1,4 @@
-//! What lies outside of a sphere, read by inverse distance (Zhang et al. 2020, "NeRF++", section 4): a point at `r ≥ 1` radii from the center in
+//! Background: density and color outside of a sphere, by inverse distance (Zhang et al. 2020, "NeRF++", section 4): a point at `r ≥ 1` radii from the center in
 //! the direction `(x, y, z)` is `(x, y, z, 1/r)`, so that all of space is in the unit cube.
 
 use super::presets::trunk;
@@ -31,21 +31,22 @@ pub struct Sphere {
 }
 
 impl Sphere {
-    /// Distance at which a ray that begins inside leaves the sphere of `times` its radius.
-    pub fn exit(&self, origin: &[f32], dir: &[f32], times: f32) -> f32 {
+    /// Distance at which a ray leaves the sphere of `times` its radius; none where it does not enter it.
+    pub fn exit(&self, origin: &[f32], dir: &[f32], times: f32) -> Option<f32> {
         let o = [0, 1, 2].map(|k| origin[k] - self.center[k]);
         let dot = |a: &[f32], b: &[f32]| -> f32 { (0..3).map(|k| a[k] * b[k]).sum() };
-        let (along, reach) = (dot(&o, dir), self.radius * times);
-        (along * along - dot(&o, &o) + reach * reach).max(0.0).sqrt() - along
+        let (closest, reach) = (-dot(&o, dir), self.radius * times);
+        let square = closest * closest - dot(&o, &o) + reach * reach;
+        (square >= 0.0).then(|| closest + square.sqrt()).filter(|t| *t > 0.0)
     }
 
-    /// Shortens rays that begin inside to what they have there.
+    /// Ends rays where they leave the sphere; those that never enter it become empty.
     ///
     /// # Shapes
     /// origins, dirs: `[R, 3]`; near_far: `[R, 2]`.
     pub fn cut(&self, origins: &[f32], dirs: &[f32], near_far: &mut [f32]) {
         for ((origin, dir), near_far) in origins.chunks_exact(3).zip(dirs.chunks_exact(3)).zip(near_far.chunks_exact_mut(2)) {
-            near_far[1] = near_far[1].min(self.exit(origin, dir, 1.0)).max(near_far[0]);
+            near_far[1] = near_far[1].min(self.exit(origin, dir, 1.0).unwrap_or(0.0)).max(near_far[0]);
         }
     }
 }
@@ -91,7 +92,7 @@ impl InvertedSphere {
         InvertedSphere { sphere, encoding, net, weights }
     }
 
-    /// Finds the points of `on.samples` on rays `[R, 3]` that begin inside.
+    /// Finds the points of `on.samples` on rays `[R, 3]`; where a ray that begins outside misses a sphere, samples have no length.
     pub fn locate(&self, origins: &[f32], dirs: &[f32], on: &mut OuterSamples) {
         on.points.clear();
         on.dt.clone_from(&on.samples.dt);
@@ -100,11 +101,16 @@ impl InvertedSphere {
             let of = on.samples.offsets[r] as usize..on.samples.offsets[r + 1] as usize;
             for i in of.clone() {
                 let inverse = (1.0 - on.samples.t[i] - 0.5 * on.samples.dt[i]).max(1e-6);
-                let t = self.sphere.exit(origin, dir, 1.0 / inverse);
+                let Some(t) = self.sphere.exit(origin, dir, 1.0 / inverse) else {
+                    // A camera outside sees nothing of this sphere.
+                    on.points.extend([0.0, 0.0, 0.0, inverse]);
+                    on.dt[i] = 0.0;
+                    continue;
+                };
                 let at = |k: usize| (origin[k] + t * dir[k] - self.sphere.center[k]) * inverse / self.sphere.radius;
                 on.points.extend([at(0), at(1), at(2), inverse]);
             }
-            if let Some(last) = of.last() {
+            if let Some(last) = of.last().filter(|i| on.dt[*i] > 0.0) {
                 on.dt[last] = ENDLESS;
             }
         }
@@ -180,6 +186,21 @@ mod tests {
         assert!(on.points[..64].chunks_exact(4).all(|p| (p[0] - 1.0).abs() < 1e-5));
         // The second sees ever more of its own direction.
         assert!((on.points[125] - 0.6).abs() < 0.02 && (on.points[126] - 0.8).abs() < 0.02, "{:?}", &on.points[124..]);
+    }
+
+    #[test]
+    fn rays_end_at_the_sphere_and_cameras_outside_may_miss_it() {
+        let s = Sphere { center: [0.5; 3], radius: 2.0 };
+        let (origins, dirs) = ([0.5, 0.5, 0.5, 4.0, 0.5, 0.5, 4.0, 0.5, 0.5], [1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
+        let mut near_far = [0.1, 9.0].repeat(3);
+        s.cut(&origins, &dirs, &mut near_far);
+        assert_eq!(near_far, [0.1, 2.0, 0.1, 5.5, 0.1, 0.1]);
+        let (inverted, mut on) = (small(), OuterSamples::default());
+        strata::stratified(&[0.0, 1.0], 16, None, &mut on.samples);
+        inverted.locate(&origins[6..], &dirs[6..], &mut on);
+        // At right angles, it meets those spheres alone that hold it.
+        let is_met: Vec<bool> = on.dt.iter().map(|d| *d > 0.0).collect();
+        assert!(!is_met[0] && is_met[15] && is_met.windows(2).all(|w| w[0] <= w[1]), "{is_met:?}");
     }
 
     #[test]

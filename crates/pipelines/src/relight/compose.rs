@@ -205,9 +205,14 @@ fn enclosing(model: &Model, place: usize, object: &Model) -> Option<String> {
             let (x, y, z) = (a.length(), b.length(), c.length());
             a.dot(b.cross(c)).atan2(x * y * z + a.dot(b) * z + b.dot(c) * x + c.dot(a) * y)
         };
-        let winding =
-            |faces: &Vec<u32>| faces.iter().map(|f| half_angle(welded.faces[*f as usize].map(at))).sum::<f64>() / std::f64::consts::TAU;
-        clean::components(&welded).iter().any(|faces| winding(faces) > ENCLOSED)
+        // A mirrored part is inside out.
+        let way = instance.world_from_part.matrix3.determinant().signum() / std::f64::consts::TAU;
+        let winding = |faces: &Vec<u32>| way * faces.iter().map(|f| half_angle(welded.faces[*f as usize].map(at))).sum::<f64>();
+        let reach = |faces: &Vec<u32>| faces.iter().map(|f| at(welded.faces[*f as usize][0]).length()).fold(0.0, f64::max);
+        // The innermost surface decides: in a room of thick walls, that is seen from the front.
+        let parts = clean::components(&welded);
+        let around = parts.iter().map(|f| (winding(f), reach(f))).filter(|(w, _)| w.abs() > ENCLOSED);
+        around.min_by(|a, b| a.1.total_cmp(&b.1)).is_some_and(|(w, _)| w > 0.0)
     };
     let found = model.instances[..place].iter().find(encloses)?;
     Some(model.parts[found.part].name.clone())

@@ -173,6 +173,9 @@ fn judge(model: &ObjectModel, shown: &[Shown]) -> Result<Option<String>> {
     let training = shown.iter().filter(|s| s.frame.as_ref().is_ok_and(|f| f.split == Split::Train)).count();
     if training < FEWEST {
         let of = model.train.len();
+        if of < FEWEST {
+            return Err(PipelineError::Usage(format!("the run has {of} training photographs, {FEWEST} are needed")));
+        }
         return Err(PipelineError::Usage(format!(
             "only {training} of {of} training photographs show what is in the box ({} of all photographs), {FEWEST} are needed; \
              give another box with --clip x0,y0,z0,x1,y1,z1",

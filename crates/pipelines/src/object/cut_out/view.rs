@@ -5,6 +5,7 @@ use crate::error::Result;
 use crate::run::undistort;
 use diorama_data::{DataError, masks, photo, photo::Photo};
 use diorama_engine::renderers::volume::{Backdrop, Quality};
+use diorama_geom::capture::MaskMeaning;
 use diorama_geom::capture::{ColorSpace, Frame};
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Camera, ImageU8, Lens, Mesh, OrientedBox, Pose};
@@ -166,8 +167,10 @@ impl<'a> Cutter<'a> {
     /// The photograph of a flat lens, with its own opacity, else the mesh's; none where its mask leaves open too much of the mesh.
     fn picture(&self, frame: &Frame, from: &Camera, to: &Camera, coverage: &[f32]) -> Result<Option<Photo>> {
         let (w, h) = (to.width as usize, to.height as usize);
-        let (decoded, open) = masks::apply(frame, &self.model.capture.masks, photo::load_full(&frame.image)?)?;
-        let is_cut_out = has_opacity(&decoded);
+        let (rule, photo) = (&self.model.capture.masks, photo::load_full(&frame.image)?);
+        // Of its own, or by masks of objects: a sky that masks mark as transparent leaves much besides the object.
+        let is_cut_out = has_opacity(&photo) || (rule.meaning == MaskMeaning::Object && frame.mask.is_some());
+        let (decoded, open) = masks::apply(frame, rule, photo)?;
         let mut picture = decoded.downsampled(w, h);
         let mut open = open.map(|m| m.downsampled(w, h));
         if from.lens != to.lens {

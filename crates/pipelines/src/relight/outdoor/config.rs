@@ -12,7 +12,7 @@ pub enum Preset {
     /// Small: for tests and small photographs.
     Ci,
     Fast,
-    /// The network as printed, all at once (Rudnev et al. 2022): hours on a GPU, for comparisons.
+    /// The network as printed, all at once (Rudnev et al. 2022), for comparisons: days on a CPU.
     Paper,
 }
 

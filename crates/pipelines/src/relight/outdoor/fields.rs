@@ -45,6 +45,21 @@ pub fn schedule(config: &Config) -> Schedule {
     Schedule { warmup: 0.01, final_scale: config.optim.final_scale, decay_from: 0.3 }
 }
 
+/// Course of the rates where all is learned at once: none, unless `optim.final_scale` asks for a fall.
+pub fn joint_schedule(config: &Config) -> Schedule {
+    Schedule { warmup: 0.0, final_scale: config.optim.final_scale, decay_from: 0.0 }
+}
+
+/// A group of the model that learns all at once.
+pub fn joint_group(config: &Config, name: &'static str, values: Vec<f32>, rate: f32) -> ParamGroup {
+    ParamGroup { schedule: joint_schedule(config), ..ParamGroup::dense(name, values, joint_adam(rate)) }
+}
+
+/// Its optimizer.
+pub fn joint_adam(rate: f32) -> Adam {
+    Adam { rate, beta2: 0.999, epsilon: 1e-8, ..Adam::default() }
+}
+
 /// Surfaces, and their colors in sRGB as seen from a direction in each of `lights` lights, which have codes: instant-ngp's field with an
 /// appearance code (Müller et al. 2022; Martin-Brualla et al. 2021).
 pub fn of_surfaces(config: &Config, space: Space, lights: usize) -> Field {
@@ -131,10 +146,9 @@ pub fn of_all(config: &Config, edge: f32, stream: u64) -> Field {
         ],
         mlp: Mlp::new(vec![encoding.output_dims(), 9], layers),
     };
-    let adam = Adam { rate: o.net_rate, beta2: 0.999, epsilon: 1e-8, ..Adam::default() };
     let weights = net.mlp.init(&Rng::new(config.seed, stream));
     let mut field = Field {
-        weights: ParamGroup::dense("weights", weights, adam),
+        weights: joint_group(config, "weights", weights, o.net_rate),
         encoder: Encoder::Frequency(encoding),
         codes: RayCodes { direction: DirectionCode::None, appearance: None, given: vec![9] },
         space: Space::Cube(edge),

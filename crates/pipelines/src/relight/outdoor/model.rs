@@ -45,7 +45,7 @@ pub struct SceneModel {
     pub capture: Capture,
     pub model_from_world: Similarity,
     pub field: Field,
-    /// What a model has besides that learns all at once.
+    /// Coarse network, its lights and the backgrounds; only where `field.kind` is `mlp`.
     pub joint: Option<Joint>,
     pub occupancy: Occupancy,
     /// `[lights, 9, 3]`
@@ -89,13 +89,13 @@ impl SceneModel {
         }
         let (light_of, sessions) = lights_of(&config, &capture, &train);
         let model_from_world = capture.scene.model_from_world();
-        let posed = |i: &usize| posed(&config, &model_from_world, &capture.frames[*i]);
-        let sphere = config.field.is_joint().then(|| joint::sphere(&(0..capture.frames.len()).map(|i| posed(&i)).collect::<Vec<_>>()));
-        let space = match config.field.space == "unbounded" {
-            _ if sphere.is_some() => Space::Cube(2.0 * sphere.map_or(0.5, |s| s.radius)),
+        let all_cameras = || capture.frames.iter().map(|f| posed(&config, &model_from_world, f)).collect::<Vec<_>>();
+        let sphere = config.field.is_joint().then(|| joint::sphere(&all_cameras()));
+        let space = match (&sphere, config.field.space == "unbounded") {
+            (Some(sphere), _) => Space::Cube(2.0 * sphere.radius),
             // What lies around the cameras keeps its shape.
-            true => Space::Contracted((2.0 * capture.viewing_distance()).clamp(1.0, 8.0) as f32),
-            false => Space::Cube(capture.scene.aabb_scale.max(1) as f32),
+            (None, true) => Space::Contracted((2.0 * capture.viewing_distance()).clamp(1.0, 8.0) as f32),
+            (None, false) => Space::Cube(capture.scene.aabb_scale.max(1) as f32),
         };
         let (edge, unbounded) = match space {
             Space::Contracted(_) => (1, true),
@@ -120,7 +120,10 @@ impl SceneModel {
             field,
             joint,
             occupancy: Occupancy::new(config.sampling.occupancy_resolution, cascades, unbounded),
-            lights: group("lights", fields::first_lights(n), rate),
+            lights: match &sphere {
+                Some(_) => joint::joint_lights(&config, n),
+                None => group("lights", fields::first_lights(n), rate),
+            },
             skies: group("skies", first_skies(n), rate),
             gains: group("gains", gains, rate),
             suns: group("suns", vec![0.0; SUN * n], rate),

@@ -100,6 +100,9 @@ fn check_memory(config: &Config, capture: &Capture) -> Result<()> {
     let photographs = (5 * pixels).min(config.data.memory_budget);
     memory::require("the photographs", photographs, "use --set data.memory_budget=BYTES, or --set data.downscale=2")?;
     let f = &config.field;
+    if f.is_joint() {
+        return Ok(());
+    }
     // Two features a row; value, gradient and two moments of each.
     let table = (f.levels as u64) << f.log2_size;
     memory::require("the field", photographs + 2 * 16 * table, &format!("use --set field.log2_size={}", f.log2_size.saturating_sub(1)))?;

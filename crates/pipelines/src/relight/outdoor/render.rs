@@ -93,6 +93,12 @@ impl ViewLight {
         }
     }
 
+    /// Radiance of the map behind in a direction; black without one.
+    fn map_toward(&self, dir: &[f32]) -> [f32; 3] {
+        let radiance = |map: &Environment| map.radiance(Vec3::from_slice(dir).as_dvec3()).map(|v| v as f32);
+        self.behind.as_ref().map_or([0.0; 3], radiance)
+    }
+
     fn numbers(&self) -> Vec<f32> {
         self.light.0.iter().flatten().map(|v| *v as f32).collect()
     }
@@ -160,18 +166,18 @@ impl SceneModel {
                     // The background is of photographs, in whose values it is added.
                     let sum = |k: usize| srgb_from_linear(color.rgb[k]) + (1.0 - o) * behind[at.start + k];
                     color.rgb = [0, 1, 2].map(|k| linear_from_srgb(sum(k)));
-                } else {
-                    let sky = shading::sky_toward(&light.sky, ray.1);
-                    (0..3).for_each(|k| color.rgb[k] += (1.0 - o) * sky[k].max(0.0));
+                    return (v, color);
                 }
+                let sky = shading::sky_toward(&light.sky, ray.1);
+                (0..3).for_each(|k| color.rgb[k] += (1.0 - o) * (sky[k].max(0.0) + light.map_toward(ray.1)[k]));
                 return (v, color);
             }
             let sunlit = sunlight
                 .map(|(suns, visibility, ambient)| shading::sunlit((visibility, ambient), (suns, &numbers), &v[NORMAL..], hit, ray));
             let mut color = shading::color(&v, o, ray.1, &numbers, &light.sky, sunlit);
-            if let Some(map) = light.behind.as_ref().filter(|_| o < 1.0) {
-                let radiance = map.radiance(Vec3::from_slice(ray.1).as_dvec3());
-                (0..3).for_each(|k| color.rgb[k] += (1.0 - o) * radiance[k] as f32);
+            if o < 1.0 {
+                let radiance = light.map_toward(ray.1);
+                (0..3).for_each(|k| color.rgb[k] += (1.0 - o) * radiance[k]);
             }
             (v, color)
         };

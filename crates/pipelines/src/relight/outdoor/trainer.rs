@@ -1,7 +1,6 @@
 //! Training of the scene model: draws pixels, describes each step, and updates the lights.
 
 use super::config::Stage;
-
 use super::model::SceneModel;
 use super::normal_maps::NormalMaps;
 use super::shading::SKY;

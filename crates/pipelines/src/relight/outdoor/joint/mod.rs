@@ -1,5 +1,5 @@
 //! The scene model as printed (Rudnev et al. 2022): `C = S · A ⊙ max(0, Lᵀ b(N))^(1/2.2)` with sRGB albedo `A`, learned at once with the density
-//! from whose gradient the normal `N` comes, by a coarse and a fine network with a table of light each. What lies around the sphere of the
+//! from whose gradient the normal `N = v / √(|v|² + ε²)`, `v = −Σ w ∇σ`, comes (printed without `ε`: there, empty space has normals of noise), by a coarse and a fine network with a table of light each. What lies around the sphere of the
 //! cameras is a color of an inverted sphere (Zhang et al. 2020), which no light changes.
 
 mod loss;
@@ -13,7 +13,6 @@ use super::fields::{self, first_lights};
 use diorama_engine::fields::{Encoder, Field, InvertedSphere, Sphere};
 use diorama_engine::params::ParamGroup;
 use diorama_engine::samplers::placement::Placement;
-use diorama_kernels::ops::adam::Adam;
 use diorama_kernels::ops::frequency::Frequency;
 use diorama_kernels::ops::ray_generation::PosedCamera;
 
@@ -43,6 +42,11 @@ pub fn sphere(cameras: &[PosedCamera]) -> Sphere {
     Sphere { center: [0.5; 3], radius: (MARGIN * farthest).max(0.5) as f32 }
 }
 
+/// Table of as many lights, `[lights, 9, 3]`.
+pub fn joint_lights(config: &Config, lights: usize) -> ParamGroup {
+    fields::joint_group(config, "lights", first_lights(lights), config.optim.light_rate)
+}
+
 /// The fine network of a sphere.
 pub fn fine(config: &Config, sphere: &Sphere) -> Field {
     fields::of_all(config, 2.0 * sphere.radius, FINE)
@@ -51,13 +55,15 @@ pub fn fine(config: &Config, sphere: &Sphere) -> Field {
 impl Joint {
     /// Untrained networks of `lights` lights.
     pub fn new(config: &Config, sphere: Sphere, lights: usize) -> Joint {
-        let adam = |rate: f32| Adam { rate, beta2: 0.999, epsilon: 1e-8, ..Adam::default() };
+        let (f, adam) = (&config.field, fields::joint_adam(config.optim.net_rate));
         let background = |i: u64| {
-            InvertedSphere::new(sphere, config.field.bands, config.field.width, adam(config.optim.net_rate), config.seed, OUTER + i)
+            let mut b = InvertedSphere::new(sphere, f.bands, f.width, adam, config.seed, OUTER + i);
+            b.weights.schedule = fields::joint_schedule(config);
+            b
         };
         Joint {
             coarse: fields::of_all(config, 2.0 * sphere.radius, COARSE),
-            coarse_lights: ParamGroup::dense("lights", first_lights(lights), adam(config.optim.light_rate)),
+            coarse_lights: joint_lights(config, lights),
             backgrounds: if config.field.background { (0..2).map(background).collect() } else { Vec::new() },
             sphere,
         }
