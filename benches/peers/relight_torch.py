@@ -15,7 +15,8 @@ from torch import nn
 BANDS, WIDTH = 12, 256
 GRAY = torch.tensor([0.2126, 0.7152, 0.0722])
 FACTORS = [0.282095, 0.488603, 0.488603, 0.488603, 1.092548, 1.092548, 0.315392, 1.092548, 0.546274]
-MOST, APART, SHORT = 0.01, 0.1, 0.05
+# Rounding grows from step to step; another formula ends a whole way apart.
+MOST, APART, SHORT = 0.01, 0.25, 0.05
 
 
 def encode(x, step):

@@ -52,6 +52,9 @@ fn fuzz(runs: &str) -> bool {
     built && Command::new("target/release/diorama-fuzz").arg(runs).status().is_ok_and(|s| s.success())
 }
 
+/// Builds the program as the tests of the whole workspace build it: packages on their own have other features of dependencies.
+const PROGRAM: [&str; 5] = ["build", "--release", "--workspace", "--bin", "diorama"];
+
 /// Builds once for devices, separated by commas, and compares every op on each with its reference. Builds other than the default one
 /// contain burn's GPU backend; there, ops in burn's graph are compared too.
 fn gpu_check(devices: &str) -> bool {
@@ -59,11 +62,12 @@ fn gpu_check(devices: &str) -> bool {
     let features: Vec<&str> = devices.split(',').map(|d| if ["vulkan", "metal"].contains(&d) { "native" } else { d }).collect();
     let features = features.join(",");
     let with_graph = features != "native";
-    let mut build = vec!["build", "--release", "--package", "diorama", "--bin", "diorama"];
-    if with_graph {
-        build.extend(["--package", "diorama-nets", "--example", "graph-check", "--no-default-features", "--features", &features]);
-    }
-    if !step("build", cargo(&build)) {
+    let other = ["build", "--release", "--package", "diorama", "--bin", "diorama", "--package", "diorama-nets", "--example", "graph-check"];
+    let built = match with_graph {
+        true => cargo(&[&other[..], &["--no-default-features", "--features", &features]].concat()),
+        false => cargo(&PROGRAM),
+    };
+    if !step("build", built) {
         return false;
     }
     // Training is compared on a real capture if there is one.
@@ -183,8 +187,8 @@ fn viewer_check() -> bool {
     let run = std::env::temp_dir().join(format!("diorama-viewer-check-{}", std::process::id()));
     let diorama = "target/release/diorama";
     // The page is also tested with a source whose layers and controls no run has.
-    let made = cargo(&["build", "--release"])
-        && cargo(&["build", "--release", "-p", "diorama-viewer", "--example", "own_picture"])
+    let made = cargo(&PROGRAM)
+        && cargo(&["build", "--release", "--workspace", "--example", "own_picture"])
         && Command::new(diorama)
             .args(["quickstart", "--seconds", "6", "--out"])
             .arg(&run)

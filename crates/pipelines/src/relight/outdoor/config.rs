@@ -5,6 +5,35 @@ use crate::run::config::{self, Configuration};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
+/// What only the hash grid and its stages read.
+const GRID_KEYS: [&str; 25] = [
+    "field.levels",
+    "field.log2_size",
+    "field.base",
+    "field.finest",
+    "field.appearance",
+    "field.space",
+    "field.first_density",
+    "light.from",
+    "light.sun_cells",
+    "loss.huber",
+    "loss.robust",
+    "loss.traced",
+    "loss.normal",
+    "loss.negative",
+    "loss.distortion",
+    "loss.depth",
+    "loss.gauge",
+    "loss.near_scaling",
+    "optim.grid_rate",
+    "optim.table_decay",
+    "sampling.batch_samples",
+    "sampling.max_samples",
+    "sampling.occupancy_resolution",
+    "sampling.occupancy_points",
+    "sampling.occupancy_every",
+];
+
 /// Size of the model and length of its training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -264,6 +293,14 @@ impl Config {
         }
     }
 
+    /// A key of the hash grid alone that has another value than presets give it.
+    fn unread_by_mlp(&self) -> Option<&'static str> {
+        let value =
+            |c: &Config, key: &str| serde_json::to_value(c).expect("plain values").pointer(&format!("/{}", key.replace('.', "/"))).cloned();
+        let presets = [Preset::Ci, Preset::Fast, Preset::Paper].map(|p| Config::new(p, PathBuf::new()));
+        GRID_KEYS.into_iter().find(|key| presets.iter().all(|p| value(p, key) != value(self, key)))
+    }
+
     /// The values of Rudnev et al. 2022.
     fn printed(path: PathBuf) -> Config {
         let mut c = Config::new(Preset::Fast, path);
@@ -310,6 +347,9 @@ impl Configuration for Config {
             let samples = [self.sampling.rays, self.sampling.coarse, self.sampling.fine];
             if samples.contains(&0) || !(1..=20).contains(&self.field.bands) {
                 return fault("field.kind=mlp: sampling.rays, coarse and fine must be at least 1, field.bands from 1 to 20");
+            }
+            if let Some(key) = self.unread_by_mlp() {
+                return fault(&format!("{key}: field.kind=mlp does not use it; leave it out"));
             }
         }
         if !["session", "image"].contains(&&self.light.of[..]) {
@@ -382,9 +422,12 @@ mod tests {
             assert!(e.is_input() && e.to_string().contains(key.split('.').next().unwrap()), "{e}");
         }
         let mut printed = Config::new(Preset::Paper, "d".into());
-        for (key, value) in [("light.model", "sun"), ("sampling.fine", "0"), ("field.kind", "tree")] {
+        for (key, value) in [("light.model", "sun"), ("sampling.fine", "0"), ("field.kind", "tree"), ("loss.normal", "2")] {
             let e = printed.clone().set(key, value).unwrap_err();
             assert!(e.is_input() && e.to_string().contains("field.kind"), "{e}");
+        }
+        for key in GRID_KEYS {
+            config::set(&mut printed.clone(), key, "7").unwrap_err();
         }
         printed.set("field.background", "false").unwrap();
         assert!(c.set("loss.robst", "1").unwrap_err().to_string().contains("loss.robust"));
