@@ -126,7 +126,7 @@ fn a_trained_place_is_scored_and_its_layers_are_rendered() {
     drop(folder);
     let (model, _) = recipe::load(&run).unwrap();
     let mut looked = 0;
-    let s = scores::judge(&model, &data, &mut |_, sheet| {
+    let s = scores::judge(&model, &data, 1, &mut |_, sheet| {
         looked += 1;
         assert!(sheet.ours.iter().zip(&sheet.exact).all(|(a, b)| (a.width, a.height) == (b.width, b.height)));
         Ok(())
@@ -140,6 +140,7 @@ fn a_trained_place_is_scored_and_its_layers_are_rendered() {
         light: None,
         frames: vec!["0".into(), "v001_noon".into()],
         layers: vec![Layer::Rgb, Layer::Albedo, Layer::Normal, Layer::Shadow],
+        samples: 2,
         is_linear: false,
         out: dir.path().join("pictures"),
     };
@@ -190,7 +191,7 @@ fn the_printed_model_learns_photographs_is_resumed_and_scored() {
         m.params().into_arrays().into_iter().map(|(name, values)| (name, values.to_vec())).collect()
     };
     assert!(arrays(&mut short) == arrays(&mut parts));
-    let s = scores::judge(&load("whole"), &data, &mut |_, _| Ok(())).unwrap();
+    let s = scores::judge(&load("whole"), &data, 1, &mut |_, _| Ok(())).unwrap();
     println!("{s:?}");
     // Shape and albedo are rough after so few steps; a picture that is upside down or unlit would be far below.
     assert!(s.seen_light_psnr > 14.0 && s.albedo_psnr > 12.0, "{s:?}");

@@ -27,6 +27,8 @@ use std::sync::atomic::AtomicBool;
 /// Samples per pixel of the composition, and of pictures of the object that are path-traced for its scores.
 const COMPOSED_SAMPLES: u32 = 64;
 const SCORED_SAMPLES: u32 = 16;
+/// Rays per pixel and axis of pictures of the scene.
+const RAYS: u32 = 2;
 /// Size of the composition.
 const COMPOSED_SIZE: (u32, u32) = (480, 270);
 /// Cells along the street's mesh, its most faces, and the edge of its texture.
@@ -176,7 +178,7 @@ impl Quickstart<'_> {
         let pictures = self.at("pictures");
         std::fs::create_dir_all(&pictures).map_err(DataError::io(&pictures, "create"))?;
         let mut rows = Vec::new();
-        let scores = outdoor::scores::judge(model, &self.at("street"), &mut |_, sheet| {
+        let scores = outdoor::scores::judge(model, &self.at("street"), RAYS, &mut |_, sheet| {
             rows.extend([&sheet.ours, &sheet.exact].map(|row| row.iter().map(three_channels).collect()));
             Ok(())
         })?;

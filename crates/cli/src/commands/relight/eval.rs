@@ -10,8 +10,9 @@ use diorama_pipelines::relight::outdoor::{recipe, scores};
 use diorama_pipelines::{Application, Result};
 use std::path::PathBuf;
 
-/// Samples per pixel of path-traced scores.
+/// Samples per pixel of path-traced scores of objects, and rays per pixel and axis of pictures of scenes.
 const SAMPLES: u32 = 32;
+const RAYS: u32 = 2;
 
 /// Score a run of the scene model or of the object model on a generated benchmark
 #[derive(Args, Clone, Debug)]
@@ -43,7 +44,7 @@ impl Verb for Eval {
         notes.iter().for_each(|n| note(n));
         let out = self.out.clone().unwrap_or_else(|| self.run.join("eval"));
         std::fs::create_dir_all(&out).map_err(DataError::io(&out, "create"))?;
-        let s = scores::judge(&model, &model.config.data.path, &mut |name, sheet| {
+        let s = scores::judge(&model, &model.config.data.path, RAYS, &mut |name, sheet| {
             Ok(photo::save_png(&out.join(format!("{name}.png")), &rows(&[&sheet.ours, &sheet.exact]))?)
         })?;
         if self.json {

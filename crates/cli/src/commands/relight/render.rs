@@ -29,6 +29,9 @@ pub struct Render {
     /// rgb, albedo, normal, shadow, irradiance, depth
     #[arg(long, default_value = "rgb", value_delimiter = ',')]
     layers: Vec<String>,
+    /// Rays per pixel and axis, from 1 to 16
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u32).range(1..=16))]
+    samples: u32,
     /// exr (linear) or png
     #[arg(long, default_value = "png")]
     format: String,
@@ -58,7 +61,14 @@ impl Verb for Render {
         let (model, notes) = recipe::load(&self.run)?;
         notes.iter().for_each(|n| note(n));
         let light = if self.own_light { None } else { Some(self.light.options()?) };
-        let options = PicturesOptions { light, frames: self.frame.clone(), layers, is_linear: self.format == "exr", out: self.out.clone() };
+        let options = PicturesOptions {
+            light,
+            frames: self.frame.clone(),
+            layers,
+            samples: self.samples,
+            is_linear: self.format == "exr",
+            out: self.out.clone(),
+        };
         watch_interrupts();
         let mut shown = ShareShown::new();
         let made = pictures::render(&model, &options, &INTERRUPT, &mut |s| shown.show(s, "views"))?;

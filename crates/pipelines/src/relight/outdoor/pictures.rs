@@ -57,6 +57,8 @@ pub struct PicturesOptions {
     /// Numbers or names of frames; none: all that were held out.
     pub frames: Vec<String>,
     pub layers: Vec<Layer>,
+    /// Rays per pixel and axis.
+    pub samples: u32,
     /// Whether pictures are EXR in linear light, or PNG.
     pub is_linear: bool,
     pub out: PathBuf,
@@ -91,7 +93,7 @@ pub fn render(model: &SceneModel, options: &PicturesOptions, stop: &AtomicBool, 
     let lights = frames.iter().map(|f| light_of(model, *f, given.as_ref())).collect::<Result<Vec<_>>>()?;
     std::fs::create_dir_all(&options.out).map_err(DataError::io(&options.out, "create"))?;
     for (i, (frame, light)) in frames.iter().zip(&lights).enumerate() {
-        let view = model.view(&model.posed(*frame), light, &mut |_| {});
+        let view = model.fine_view(&model.posed(*frame), light, options.samples);
         let title = model.capture.frames[*frame].name.replace(['/', '\\'], "_");
         for layer in &options.layers {
             let extension = if options.is_linear { "exr" } else { "png" };

@@ -130,7 +130,28 @@ impl SceneModel {
         self.view_with(self.tracer(Quality::Full), camera, light, progress)
     }
 
-    /// The same by a tracer of this model, such as one that shows only what lies in a box.
+    /// The same with `samples`² rays per pixel, whose layers are averaged.
+    pub fn fine_view(&self, camera: &PosedCamera, light: &ViewLight, samples: u32) -> SceneView {
+        let (w, h) = (camera.camera.width, camera.camera.height);
+        let fine = PosedCamera { camera: camera.camera.resized(samples * w, samples * h), pose: camera.pose };
+        let view = self.view(&fine, light, &mut |_| {});
+        let mean = |image: Image| image.downsampled(w as usize, h as usize);
+        let mut normal = mean(view.normal);
+        for n in normal.data.as_chunks_mut::<3>().0 {
+            *n = Vec3::from_array(*n).normalize_or_zero().to_array();
+        }
+        SceneView {
+            color: mean(view.color),
+            albedo: mean(view.albedo),
+            normal,
+            shadow: mean(view.shadow),
+            irradiance: mean(view.irradiance),
+            depth: mean(view.depth),
+            opacity: mean(view.opacity),
+        }
+    }
+
+    /// The same as [`SceneModel::view`] by a tracer of this model, such as one that shows only what lies in a box.
     pub fn view_with(&self, tracer: Tracer, camera: &PosedCamera, light: &ViewLight, progress: &mut dyn FnMut(usize)) -> SceneView {
         if self.stage == Stage::Surfaces {
             return unlit_view(&tracer.layers(camera, &[], progress), camera);

@@ -77,11 +77,11 @@ impl Errors {
     }
 }
 
-/// Judges a model; `look` receives the name of each held-out photograph in a light that training never saw, and its layers.
+/// Judges a model by pictures with `samples`² rays per pixel; `look` receives the name of each held-out photograph in a light that training never saw, and its layers.
 ///
 /// # Errors
 /// When the data set has no truth, or files are missing.
-pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &Sheet) -> Result<()>) -> Result<SceneScores> {
+pub fn judge(model: &SceneModel, data: &Path, samples: u32, look: &mut dyn FnMut(&str, &Sheet) -> Result<()>) -> Result<SceneScores> {
     if !Truth::exists(data) {
         return Err(PipelineError::Usage(format!("{}: has no truth; only generated benchmarks do", data.display())));
     }
@@ -102,7 +102,7 @@ pub fn judge(model: &SceneModel, data: &Path, look: &mut dyn FnMut(&str, &Sheet)
             Some(l) => ViewLight::learned(model, l),
             None => given(model, data, light, gauge)?,
         };
-        let view = model.view(&model.posed(frame), &view_light, &mut |_| {});
+        let view = model.fine_view(&model.posed(frame), &view_light, samples);
         let shadow = truth::read_shadow(data, &of.photograph)?;
         let others = if is_seen { None } else { mean_picture(data, &truth, &of.view)? };
         let of_light = if is_unseen { &mut unseen } else { &mut veiled };
