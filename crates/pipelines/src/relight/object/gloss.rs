@@ -38,13 +38,14 @@ pub struct Gloss {
     pub mirrored: Vec<[f32; 3]>,
 }
 
-/// Sightings of one vertex, in a row.
-struct Rows {
-    vertex: Vec<u32>,
-    ranges: Vec<std::ops::Range<usize>>,
-    normal: Vec<f32>,
-    view: Vec<f32>,
-    color: Vec<[f32; 3]>,
+/// Sightings, those of one vertex in a row.
+pub struct Rows {
+    pub vertex: Vec<u32>,
+    /// Sightings of each vertex.
+    pub ranges: Vec<std::ops::Range<usize>>,
+    pub normal: Vec<f32>,
+    pub view: Vec<f32>,
+    pub color: Vec<[f32; 3]>,
 }
 
 /// Fits the factor; none where nothing glossy is seen.
@@ -54,7 +55,7 @@ pub fn fit(
     sightings: &[Vec<Sighting>],
     (positions, normals): (&[[f32; 3]], &[[f32; 3]]),
 ) -> Option<Gloss> {
-    let rows = rows(transport, sightings, (positions, normals), VERTICES);
+    let rows = rows(transport, sightings, (positions, normals));
     if rows.ranges.len() < 50 {
         return None;
     }
@@ -81,11 +82,11 @@ pub fn fit(
     Some(Gloss { scale, roughness, mirrored: mean })
 }
 
-/// Sightings in which no other surface is mirrored, of about `most` vertices.
-fn rows(transport: &Transport, sightings: &[Vec<Sighting>], (positions, normals): (&[[f32; 3]], &[[f32; 3]]), most: usize) -> Rows {
+/// Sightings in which no other surface is mirrored, of some of the vertices.
+pub fn rows(transport: &Transport, sightings: &[Vec<Sighting>], (positions, normals): (&[[f32; 3]], &[[f32; 3]])) -> Rows {
     let mut rows = Rows { vertex: Vec::new(), ranges: Vec::new(), normal: Vec::new(), view: Vec::new(), color: Vec::new() };
-    let step = sightings.len().div_ceil(most.max(1)).max(1);
-    for v in (0..sightings.len()).step_by(step) {
+    let seen: Vec<usize> = (0..sightings.len()).filter(|v| sightings[*v].len() >= LEAST).collect();
+    for v in seen.iter().step_by(seen.len().div_ceil(VERTICES).max(1)).copied() {
         let (p, n) = (positions[v], unit(normals[v]));
         let views: Vec<[f32; 3]> = sightings[v].iter().map(|s| unit(sub(s.eye, p))).collect();
         let rays: Vec<Ray> = views

@@ -17,6 +17,7 @@ pub mod hull;
 pub mod loss;
 pub mod material;
 mod memory;
+mod metal;
 pub mod model;
 mod pixel_means;
 pub mod placement;

@@ -201,12 +201,16 @@ impl Textured {
         self.texels.moment2.fill(0.0);
     }
 
-    /// Diffuse base color of the vertices.
-    pub fn vertex_colors(&self, drawn: &Drawn) -> Vec<[f32; 3]> {
+    /// Values of texels at the vertices, `[V, 9]`.
+    pub fn at_vertices(&self, drawn: &Drawn) -> Vec<f32> {
         let mut uv = vec![[0.5f32; 2]; self.layout.initial.len()];
         self.layout.source.iter().zip(&self.layout.uvs).for_each(|(v, at)| uv[*v as usize] = *at);
-        let values = self.lookup(drawn, uv.as_flattened(), &vec![VERTEX_LEVEL; uv.len()]);
-        values.as_chunks::<CHANNELS>().0.iter().map(|t| [t[0], t[1], t[2]].map(|c| c * (1.0 - t[5]))).collect()
+        self.lookup(drawn, uv.as_flattened(), &vec![VERTEX_LEVEL; uv.len()])
+    }
+
+    /// Diffuse base color of the vertices.
+    pub fn vertex_colors(&self, drawn: &Drawn) -> Vec<[f32; 3]> {
+        self.at_vertices(drawn).as_chunks::<CHANNELS>().0.iter().map(|t| [t[0], t[1], t[2]].map(|c| c * (1.0 - t[5]))).collect()
     }
 
     /// Light at the vertices, in the third stage.

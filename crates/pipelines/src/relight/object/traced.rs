@@ -1,10 +1,11 @@
 //! Third stage: how it begins. The mesh is kept; shadows and light between its surfaces are traced; the light is found anew, and what it was
 //! mistaken for is taken out of the base color.
 
-use super::albedo_entropy;
+use super::albedo_entropy::{self, Sighting};
 use super::capture::ObjectCapture;
 use super::config::{CHANNELS, Config};
 use super::gloss::{self, Gloss};
+use super::metal::{METAL, Metal};
 use super::probe::{self, Probe};
 use super::surroundings::Surroundings;
 use super::textured::Textured;
@@ -40,9 +41,11 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
     let size = config.material.texture;
     let texels = bake::texels(&flat, size);
     let before = probe.diffuse(texels.normals.as_flattened());
-    let gloss = find_light(m, config, capture, (&around, probe));
+    let metal = metal_of(m);
+    let (gloss, of_metal) = find_light(m, config, capture, (&around, probe, &metal));
     let roughness = gloss.as_ref().map_or(ROUGHNESS, |g| g.roughness);
     let mirrored = gloss.map_or_else(|| vec![[0.0; 3]; m.places().len()], |g| g.mirrored);
+    let kept: Vec<([f32; CHANNELS], bool)> = m.texels.values.as_chunks().0.iter().map(|t: &[f32; CHANNELS]| (*t, t[5] > METAL)).collect();
     // Two rounds: light between surfaces depends on their colors.
     let sent: Vec<[f32; 3]> = texels
         .index
@@ -68,28 +71,50 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
             })
             .collect();
         let spread = bake::spread(&texels, &colors, size);
-        for (t, c) in m.texels.values.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&spread) {
-            t[..3].copy_from_slice(c);
-            t[3..6].copy_from_slice(&[0.0, roughness, 0.0]);
+        for ((t, c), (before, is_metal)) in m.texels.values.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&spread).zip(&kept) {
+            let color = if *is_metal { std::array::from_fn(|k| (of_metal[k] * before[k]).min(BRIGHTEST)) } else { *c };
+            t[..3].copy_from_slice(&color);
+            t[3..6].copy_from_slice(&if *is_metal { [0.0, before[4], before[5]] } else { [0.0, roughness, 0.0] });
         }
     }
     m.forget_steps();
     m.surroundings = Some(Box::new(around));
 }
 
-/// Finds the light, beginning with that of the second stage, and what gloss tells of its brightness.
-fn find_light(m: &Textured, config: &Config, capture: &ObjectCapture, (around, probe): (&Surroundings, &mut Probe)) -> Option<Gloss> {
+/// What the second stage holds for metal.
+fn metal_of(m: &Textured) -> Metal {
+    let values = m.at_vertices(&m.drawn());
+    let texels = || values.as_chunks::<CHANNELS>().0.iter();
+    Metal {
+        is_metal: texels().map(|t| t[5] > METAL).collect(),
+        colors: texels().map(|t| [t[0], t[1], t[2]]).collect(),
+        roughness: texels().map(|t| t[4]).collect(),
+    }
+}
+
+/// Finds the light, beginning with that of the second stage; what gloss tells of its brightness, and the factor of the metals' base colors.
+fn find_light(
+    m: &Textured,
+    config: &Config,
+    capture: &ObjectCapture,
+    (around, probe, metal): (&Surroundings, &mut Probe, &Metal),
+) -> (Option<Gloss>, [f32; 3]) {
     let normals: Vec<[f32; 3]> = vertex_normals::cpu::forward(&m.layout.faces, m.places()).into_iter().map(unit).collect();
     let photos: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.photos[i]).collect();
     let at = (m.places(), &normals[..]);
-    let sightings = albedo_entropy::sightings(&photos, at, &around.transport);
+    let all = albedo_entropy::sightings(&photos, at, &around.transport);
+    // Metal has neither diffuse colors nor the gloss of what is no metal.
+    let (metals, sightings): (Vec<Vec<Sighting>>, Vec<Vec<Sighting>>) =
+        all.into_iter().zip(&metal.is_metal).map(|(s, m)| if *m { (s, Vec::new()) } else { (Vec::new(), s) }).unzip();
+    let of_metals = metal.is_present().then(|| gloss::rows(&around.transport, &metals, at));
+    let factor = |probe: &Probe| of_metals.as_ref().and_then(|rows| metal.factor(probe, rows)).unwrap_or([1.0; 3]);
     if probe.group.frozen {
         let mut gloss = gloss::fit(probe, &around.transport, &sightings, at);
         // The light is as bright as it is.
         if let Some(g) = &mut gloss {
             g.mirrored.iter_mut().for_each(|m| (0..3).for_each(|k| m[k] /= g.scale[k]));
         }
-        return gloss;
+        return (gloss, factor(probe));
     }
     // About 1, and nowhere so dark that it could not be brightened.
     let mean = probe.group.values.iter().sum::<f32>() / probe.group.values.len() as f32;
@@ -109,7 +134,14 @@ fn find_light(m: &Textured, config: &Config, capture: &ObjectCapture, (around, p
             *o = o.map(|c| std::array::from_fn(|k| (c[k] - mirrored[k]).max(LEFT * c[k])));
         }
     }
-    gloss
+    // No metal mirrors more than it receives.
+    let of_metal = factor(probe);
+    let by = (metal.brightest() * of_metal[0].max(of_metal[1]).max(of_metal[2]) / BRIGHTEST).max(1.0);
+    if of_metals.is_some() && by > 1.0 {
+        probe.scale([by; 3]);
+        gloss.iter_mut().for_each(|g| g.mirrored.as_flattened_mut().iter_mut().for_each(|m| *m *= by));
+    }
+    (gloss, of_metal.map(|f| f / by))
 }
 
 /// Weights of a triangle's corners at a point of it.
