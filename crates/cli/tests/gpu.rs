@@ -1,7 +1,9 @@
-//! A run that starts on a GPU and ends on the CPU. Without a device these tests are skipped, or fail if `DIORAMA_REQUIRE_GPU` is set.
+//! Runs that start on a GPU and end on the CPU, and pictures whose paths a GPU traces. Without a device these tests are skipped, or fail if `DIORAMA_REQUIRE_GPU` is set.
 #![cfg(feature = "gpu")]
 
+use diorama_data::photo;
 use diorama_pipelines::object::quickstart::write_capture;
+use std::path::Path;
 use std::process::{Command, Output};
 
 fn diorama(args: &[&str]) -> Output {
@@ -111,4 +113,87 @@ fn a_device_without_room_gets_half_the_batch_twice_and_then_the_bytes_are_said()
     assert_eq!(error["kind"], "memory", "{error}");
     let text = error["error"].as_str().unwrap();
     assert!(["GiB", "--downscale", "--device cpu"].iter().all(|p| text.contains(p)) && !run.exists(), "{text}");
+}
+
+const CUBE: &str = "v -1 0 -1\nv 1 0 -1\nv 1 0 1\nv -1 0 1\nv -1 2 -1\nv 1 2 -1\nv 1 2 1\nv -1 2 1\n\
+    f 1 2 3 4\nf 5 8 7 6\nf 1 5 6 2\nf 2 6 7 3\nf 3 7 8 4\nf 4 8 5 1\n";
+const SCENE: &str = r#"
+[[object]]
+mesh = "cube.obj"
+[light]
+sky = { elevation = 40, rotation = 60, intensity = 0.02 }
+[camera]
+eye = [0, 4, 6]
+target = [0, 1, 0]
+[render]
+size = [48, 32]
+spp = 64
+bounces = 4
+"#;
+
+/// A command of the group `relight` in a folder.
+fn relight(folder: &Path, arguments: &[&str]) -> Command {
+    let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
+    c.arg("relight").args(arguments).current_dir(folder);
+    c
+}
+
+fn folder() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("cube.obj"), CUBE).unwrap();
+    std::fs::write(dir.path().join("scene.toml"), SCENE).unwrap();
+    dir
+}
+
+/// Mean difference of the bytes of two pictures.
+fn difference(a: &Path, b: &Path) -> f64 {
+    let [a, b] = [a, b].map(|p| photo::load(p).unwrap().data);
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(&b).map(|(x, y)| x.abs_diff(*y) as f64).sum::<f64>() / a.len() as f64
+}
+
+#[test]
+fn pictures_and_turntables_are_traced_there_as_here() {
+    let Some(device) = device() else { return };
+    let dir = folder();
+    for name in [&device[..], "cpu"] {
+        let composed = relight(dir.path(), &["compose", "scene.toml", "--device", name, "--json", "-o", &format!("{name}.png")]).output();
+        let told = json(composed.unwrap());
+        let traced_by = told["device"].as_str().unwrap();
+        assert!(if name == "cpu" { traced_by == "cpu" } else { traced_by.ends_with(&format!("({name})")) }, "{name}: {traced_by}");
+        let turn = ["turntable", "cube.obj", "--frames", "3", "--turn-model", "--light", "sky:20,60", "--size", "24x16", "--spp", "32"];
+        let o = relight(dir.path(), &[&turn[..], &["--device", name, "-o", &format!("{name}.turn")]].concat()).output().unwrap();
+        assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+    }
+    for file in [".png", ".turn/0000.png", ".turn/0001.png"] {
+        let [there, here] = [&device[..], "cpu"].map(|name| dir.path().join(format!("{name}{file}")));
+        // The same random numbers: only rounding differs.
+        assert!(difference(&there, &here) < 0.5, "{file}: {}", difference(&there, &here));
+    }
+    let [first, second] = ["0000", "0001"].map(|i| dir.path().join(format!("{device}.turn/{i}.png")));
+    assert!(difference(&first, &second) > 2.0, "the model turns");
+}
+
+#[test]
+#[cfg(unix)]
+fn an_interrupted_picture_goes_on_to_the_same_bits_there() {
+    let Some(device) = device() else { return };
+    let dir = folder();
+    let long = ["compose", "scene.toml", "--spp", "1024", "--device", &device, "-o"];
+    assert!(relight(dir.path(), &[&long[..], &["whole.png"]].concat()).status().unwrap().success());
+    let parts = [&long[..], &["parts.png"]].concat();
+    for wait in 2.. {
+        let mut child = relight(dir.path(), &parts).spawn().unwrap();
+        std::thread::sleep(std::time::Duration::from_millis(100 * wait));
+        assert!(Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+        match child.wait().unwrap().code() {
+            Some(130) => break,
+            // Before the handler is there, the signal ends the program.
+            code => assert!(code.is_none(), "{code:?}"),
+        }
+    }
+    assert!(dir.path().join("parts.png.unfinished").exists() && !dir.path().join("parts.png").exists());
+    assert!(relight(dir.path(), &parts).status().unwrap().success());
+    let read = |name: &str| std::fs::read(dir.path().join(name)).unwrap();
+    assert_eq!(read("whole.png"), read("parts.png"));
 }

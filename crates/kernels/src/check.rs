@@ -3,8 +3,8 @@
 use crate::gpu::{Gpu, GpuError};
 use crate::ops::{
     adam, composite, depth_loss, distortion, error_map, field_step, frequency, fused_mlp, grid_sample, hash_grid, linear, march,
-    marching_cubes, marching_tetrahedra, occupancy_update, photometric_loss, pixel_draw, pixel_gather, pool, prune, ray_aabb,
-    ray_generation, resample, sample_pdf, scan, spherical_harmonics, ssim, strata, triangle_wave, trilinear_corner_grid,
+    marching_cubes, marching_tetrahedra, occupancy_update, path_trace, photometric_loss, pixel_draw, pixel_gather, pool, prune, ray_aabb,
+    ray_generation, ray_triangles, resample, sample_pdf, scan, spherical_harmonics, ssim, strata, triangle_wave, trilinear_corner_grid,
 };
 
 pub use crate::gpu::table::{Row, TOLERANCE, Table};
@@ -28,6 +28,7 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         photometric_loss::cases::check,
         scan::cases::check,
         ray_aabb::cases::check,
+        ray_triangles::cases::check,
         march::cases::check,
         occupancy_update::cases::check,
         sample_pdf::cases::check,
@@ -46,6 +47,7 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         resample::cases::check,
         pool::cases::check,
         grid_sample::cases::check,
+        path_trace::cases::check,
     ];
     for check in ops {
         check(gpu, &mut table)?;

@@ -6,6 +6,7 @@ mod buffer;
 pub(crate) mod launch;
 pub(crate) mod random;
 pub(crate) mod table;
+pub(crate) mod vector;
 
 use crate::api::Api;
 pub use atomics::{Accumulate, Native, Swap};

@@ -1,6 +1,7 @@
 //! Renders a composition: models in a scene under one light, or before a photograph that receives their shadows.
 
 use super::light::{LightOptions, Source};
+use super::path_tracer::PathTracer;
 use super::picture::{self, Job};
 use super::scene_file::{Backplate, Denoise, Focus, SceneFile, Snap, object_of};
 use crate::error::{PipelineError, Result};
@@ -123,8 +124,15 @@ pub fn load(file: &SceneFile) -> Result<Composition> {
 /// Renders a composition with `samples` per pixel. Unfinished pictures are in `kept`. `progress` gets the share that is done.
 ///
 /// # Errors
-/// When an unfinished picture cannot be written.
-pub fn render(c: &mut Composition, file: &SceneFile, kept: &Path, stop: &AtomicBool, progress: &mut dyn FnMut(f64)) -> Result<Composed> {
+/// When an unfinished picture cannot be written, or a device that was named failed.
+pub fn render(
+    c: &mut Composition,
+    file: &SceneFile,
+    tracer: &mut PathTracer,
+    kept: &Path,
+    stop: &AtomicBool,
+    progress: &mut dyn FnMut(f64),
+) -> Result<Composed> {
     let samples = file.render.spp;
     let passes = if c.photograph.is_some() { 2.0 } else { 1.0 };
     let job = |scene, part: &str| Job {
@@ -135,7 +143,8 @@ pub fn render(c: &mut Composition, file: &SceneFile, kept: &Path, stop: &AtomicB
         kept: Some(kept.join(part)),
         key: format!("{} {part}", c.key),
     };
-    let (mut film, interrupted) = picture::render(&job(&c.scene, "with"), stop, &mut |s| progress(s / passes))?;
+    tracer.load(&c.scene)?;
+    let (mut film, interrupted) = picture::render(&job(&c.scene, "with"), tracer, stop, &mut |s| progress(s / passes))?;
     if file.render.denoise == Denoise::Atrous && !interrupted {
         denoise::cpu::run(&mut film);
     }
@@ -145,8 +154,9 @@ pub fn render(c: &mut Composition, file: &SceneFile, kept: &Path, stop: &AtomicB
     };
     let mut empty = c.model.clone();
     empty.instances.truncate(c.place);
-    let (mut without, interrupted) =
-        picture::render(&job(&Scene::new(&empty, &c.light), "without"), stop, &mut |s| progress(0.5 + s / passes))?;
+    let empty = Scene::new(&empty, &c.light);
+    tracer.load(&empty)?;
+    let (mut without, interrupted) = picture::render(&job(&empty, "without"), tracer, stop, &mut |s| progress(0.5 + s / passes))?;
     if file.render.denoise == Denoise::Atrous && !interrupted {
         denoise::cpu::run(&mut without);
     }

@@ -1,12 +1,13 @@
 //! Pictures that are refined in passes, kept when they are interrupted, and written as EXR or PNG.
 
+use super::path_tracer::PathTracer;
 use crate::error::{PipelineError, Result};
 use crate::run::memory;
 use diorama_data::checkpoint::{self, Entry};
 use diorama_data::{DataError, photo};
 use diorama_geom::color::{srgb_from_linear, u8_from_unit};
 use diorama_geom::{Image, ImageU8};
-use diorama_kernels::ops::path_trace::{Film, Pixel, Scene, Settings, View, cpu};
+use diorama_kernels::ops::path_trace::{Film, Pixel, Scene, Settings, View};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -36,11 +37,12 @@ pub struct Job<'a> {
     pub key: String,
 }
 
-/// Renders a picture, continuing an unfinished one, and whether it was interrupted. `progress` gets the share that is done.
+/// Renders a picture of the scene that `tracer` has loaded, continuing an unfinished one, and whether it was interrupted. `progress` gets the
+/// share that is done.
 ///
 /// # Errors
-/// When the unfinished picture cannot be written.
-pub fn render(job: &Job, stop: &AtomicBool, progress: &mut dyn FnMut(f64)) -> Result<(Film, bool)> {
+/// When the unfinished picture cannot be written, or a device that was named failed.
+pub fn render(job: &Job, tracer: &mut PathTracer, stop: &AtomicBool, progress: &mut dyn FnMut(f64)) -> Result<(Film, bool)> {
     let pixels = job.view.camera.width as u64 * job.view.camera.height as u64;
     memory::require("the picture", pixels * PIXEL, "render a smaller size")?;
     let mut film = job.continued().unwrap_or_else(|| Film::new(&job.view.camera));
@@ -48,7 +50,7 @@ pub fn render(job: &Job, stop: &AtomicBool, progress: &mut dyn FnMut(f64)) -> Re
     while film.samples < job.samples {
         progress(film.samples as f64 / job.samples as f64);
         let pass = PASS.min(job.samples - film.samples);
-        cpu::render(job.scene, &job.view, &job.settings, pass, &mut film);
+        tracer.add(job.scene, &job.view, &job.settings, pass, &mut film)?;
         let interrupted = stop.load(Ordering::Relaxed) && film.samples < job.samples;
         if interrupted || last.elapsed() > KEEP {
             job.keep(&film)?;

@@ -9,6 +9,7 @@ use super::meshing::{self, MeshOptions};
 use super::object::{self, scores::ObjectScores, synth::ObjectSynth};
 use super::outdoor::scores::SceneScores;
 use super::outdoor::{self, model::SceneModel};
+use super::path_tracer::PathTracer;
 use super::scenario::{self, Scenario, ScenarioOptions};
 use super::synth::{self, Place, SynthOptions};
 use super::{picture, scene_file};
@@ -253,7 +254,7 @@ impl Quickstart<'_> {
         self.notes.append(&mut composition.notes);
         let out = self.at("composed.png");
         let kept = picture::kept_beside(&out);
-        let composed = compose::render(&mut composition, &file, &kept, self.stop, self.share)?;
+        let composed = compose::render(&mut composition, &file, &mut PathTracer::cpu(), &kept, self.stop, self.share)?;
         if composed.interrupted {
             return Ok(None);
         }

@@ -4,6 +4,7 @@
 
 use super::compose::Z_UP;
 use super::light::{LightOptions, Source, require_file};
+use super::path_tracer::PathTracer;
 use super::picture::{self, Job};
 use super::synth::{Place, SynthOptions};
 use super::{compose, turntable};
@@ -268,7 +269,7 @@ fn photograph(out: &Path, mut scene: Scene, view: &View, o: &ScenarioOptions, st
     scene.set_light(&LightOptions { rotate_deg: o.rotate_deg, ..source }.read()?.0);
     let settings = Settings { bounces: 8, seed: 1, ..Settings::default() };
     let job = Job { scene: &scene, view: *view, settings, samples: o.samples, kept: None, key: String::new() };
-    let (mut film, interrupted) = picture::render(&job, stop, &mut |_| {})?;
+    let (mut film, interrupted) = picture::render(&job, &mut PathTracer::cpu(), stop, &mut |_| {})?;
     if interrupted {
         return Ok(true);
     }

@@ -1,6 +1,7 @@
 //! A model from all sides under one light.
 
 use super::light::{LightOptions, require_file};
+use super::path_tracer::PathTracer;
 use super::picture::{self, Job};
 use crate::error::{PipelineError, Result};
 use diorama_data::film::Film as Video;
@@ -49,6 +50,8 @@ pub struct Turntable {
     pub frames: usize,
     pub triangles: usize,
     pub exposure: f64,
+    /// What traced the paths.
+    pub device: String,
     pub interrupted: bool,
     #[serde(skip)]
     pub notes: Vec<String>,
@@ -57,10 +60,11 @@ pub struct Turntable {
 /// Renders a turn; `progress` gets the share that is done. Frames that are in the folder already are kept unless `force`.
 ///
 /// # Errors
-/// When the model or the light cannot be read, the model is empty, or a frame cannot be written.
+/// When the model or the light cannot be read, the model is empty, a frame cannot be written, or a device that was named failed.
 pub fn render(
     model: &Path,
     options: &TurntableOptions,
+    tracer: &mut PathTracer,
     force: bool,
     stop: &AtomicBool,
     progress: &mut dyn FnMut(f64),
@@ -72,15 +76,17 @@ pub fn render(
     let Some((low, high)) = geometry.bounds().map(|(l, h)| (DVec3::from(l), DVec3::from(h))) else {
         return Err(DataError::input(model, "holds no triangles").into());
     };
-    let mut output = Output::open(&options.out, options.size, force)?;
     let camera = Camera::pinhole(options.size.0, options.size.1, options.fov);
     let mut scene = Scene::new(&geometry, &light);
+    tracer.load(&scene)?;
+    let mut output = Output::open(&options.out, options.size, force)?;
     let settings = Settings { shows_light: options.background, ..Settings::default() };
     let mut made = Turntable {
         out: options.out.clone(),
         frames: 0,
         triangles: geometry.face_count(),
         exposure: options.exposure.unwrap_or(0.0),
+        device: String::new(),
         interrupted: false,
         notes,
     };
@@ -89,13 +95,14 @@ pub fn render(
         if options.turn_model {
             // Seen from a camera that moves, a light that moves along stands still.
             scene.set_light(&light.clone().turned(turn, 1.0));
+            tracer.set_light(&scene)?;
         }
         let rgba = if output.has(i) {
             None
         } else {
             let view = View { camera, world_from_camera: orbit(&camera, [low, high], options.elevation, turn), lens: None };
             let job = Job { scene: &scene, view, settings, samples: options.samples, kept: None, key: String::new() };
-            let (mut film, interrupted) = picture::render(&job, stop, &mut |s| progress((i as f64 + s) / options.frames as f64))?;
+            let (mut film, interrupted) = picture::render(&job, tracer, stop, &mut |s| progress((i as f64 + s) / options.frames as f64))?;
             if interrupted {
                 made.interrupted = true;
                 break;
@@ -118,6 +125,7 @@ pub fn render(
         }
     }
     output.finish(made.frames)?;
+    made.device = tracer.name().into();
     progress(1.0);
     Ok(made)
 }

@@ -10,6 +10,8 @@ use diorama_kernels::device::Api;
 use diorama_kernels::gpu::{Gpu, GpuError};
 #[cfg(feature = "gpu")]
 use running::Running;
+#[cfg(feature = "gpu")]
+pub(crate) use running::to_pipeline_error;
 
 /// The device of a run.
 pub struct Device {
@@ -405,7 +407,7 @@ mod running {
         }
     }
 
-    fn to_pipeline_error(e: GpuError) -> PipelineError {
+    pub fn to_pipeline_error(e: GpuError) -> PipelineError {
         match e {
             GpuError::Memory(..) => PipelineError::Memory(e.to_string()),
             e => PipelineError::Device(e.to_string()),

@@ -5,7 +5,7 @@ use crate::commands::{Outcome, Verb};
 use crate::terminal::ShareShown;
 use clap::Args;
 use diorama_pipelines::relight::scene_file::Denoise;
-use diorama_pipelines::relight::{compose, export_blender, picture, scene_file};
+use diorama_pipelines::relight::{compose, export_blender, path_tracer::PathTracer, picture, scene_file};
 use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -27,6 +27,9 @@ pub struct Compose {
     /// WIDTHxHEIGHT [default: that of the description]
     #[arg(long)]
     size: Option<String>,
+    /// auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto")]
+    device: String,
     /// off or atrous [default: that of the description]
     #[arg(long)]
     denoise: Option<String>,
@@ -57,6 +60,7 @@ impl Verb for Compose {
             return Err(PipelineError::Usage(format!("{}: exists; give --force to replace it", self.out.display())));
         }
         watch_interrupts();
+        let mut tracer = PathTracer::open(&self.device, Box::new(note))?;
         let mut composition = compose::load(&file)?;
         composition.notes.iter().for_each(|n| note(n));
         if let Some(folder) = &self.export_blender {
@@ -66,7 +70,7 @@ impl Verb for Compose {
         let (start, kept) = (Instant::now(), picture::kept_beside(&self.out));
         let mut shown = ShareShown::new();
         let text = format!("{} triangles, {} samples per pixel", composition.scene.triangles(), file.render.spp);
-        let composed = compose::render(&mut composition, &file, &kept, &INTERRUPT, &mut |s| shown.show(s, &text))?;
+        let composed = compose::render(&mut composition, &file, &mut tracer, &kept, &INTERRUPT, &mut |s| shown.show(s, &text))?;
         shown.finish();
         if composed.interrupted {
             eprintln!("interrupted: the unfinished picture is in {}; the same command goes on", kept.display());
@@ -79,10 +83,10 @@ impl Verb for Compose {
         if self.json {
             println!(
                 "{}",
-                serde_json::json!({ "picture": self.out, "size": size, "spp": file.render.spp, "triangles": composition.scene.triangles(), "seconds": seconds, "exposure": stops })
+                serde_json::json!({ "picture": self.out, "size": size, "spp": file.render.spp, "triangles": composition.scene.triangles(), "device": tracer.name(), "seconds": seconds, "exposure": stops })
             );
         } else {
-            println!("{} × {} pixels, {} samples each, in {seconds:.1} s", size[0], size[1], file.render.spp);
+            println!("{} × {} pixels, {} samples each, in {seconds:.1} s ({})", size[0], size[1], file.render.spp, tracer.name());
             stops.iter().for_each(|s| println!("exposure   {s:+.2} stops"));
             println!("{}", self.out.display());
         }

@@ -5,7 +5,7 @@ use crate::commands::{Outcome, Verb};
 use crate::terminal::ShareShown;
 use clap::Args;
 use diorama_pipelines::relight::scenario::{self, Scenario as Kind, ScenarioOptions};
-use diorama_pipelines::relight::{compose, picture, scene_file};
+use diorama_pipelines::relight::{compose, path_tracer::PathTracer, picture, scene_file};
 use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -87,7 +87,8 @@ impl Verb for Scenario {
         let (picture, mut composition) = (self.out.join("composed.png"), compose::load(&file)?);
         composition.notes.iter().for_each(|n| note(n));
         let (kept, mut shown) = (picture::kept_beside(&picture), ShareShown::new());
-        let composed = compose::render(&mut composition, &file, &kept, &INTERRUPT, &mut |s| shown.show(s, &self.name))?;
+        let composed =
+            compose::render(&mut composition, &file, &mut PathTracer::cpu(), &kept, &INTERRUPT, &mut |s| shown.show(s, &self.name))?;
         shown.finish();
         if composed.interrupted {
             eprintln!("interrupted: the unfinished picture is in {}; the same command without --force goes on", kept.display());

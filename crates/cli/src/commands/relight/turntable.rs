@@ -5,6 +5,7 @@ use crate::commands::process::{INTERRUPT, note, use_threads, watch_interrupts};
 use crate::commands::{Outcome, Verb};
 use crate::terminal::ShareShown;
 use clap::Args;
+use diorama_pipelines::relight::path_tracer::PathTracer;
 use diorama_pipelines::relight::turntable::{self, TurntableOptions};
 use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
@@ -28,6 +29,9 @@ pub struct Turntable {
     /// Samples per pixel
     #[arg(long, default_value_t = 64)]
     spp: u32,
+    /// auto, cpu, cuda, vulkan, metal or webgpu
+    #[arg(long, default_value = "auto")]
+    device: String,
     /// Height of the camera above the model's center in degrees
     #[arg(long, default_value_t = 20.0, allow_hyphen_values = true)]
     elevation: f64,
@@ -69,8 +73,9 @@ impl Verb for Turntable {
         use_threads(self.threads)?;
         let options = self.options()?;
         watch_interrupts();
+        let mut tracer = PathTracer::open(&self.device, Box::new(note))?;
         let (start, mut shown) = (Instant::now(), ShareShown::new());
-        let made = turntable::render(&self.model, &options, self.force, &INTERRUPT, &mut |s| shown.show(s, "turntable"))?;
+        let made = turntable::render(&self.model, &options, &mut tracer, self.force, &INTERRUPT, &mut |s| shown.show(s, "turntable"))?;
         shown.finish();
         made.notes.iter().for_each(|n| note(n));
         if made.interrupted {
@@ -79,7 +84,7 @@ impl Verb for Turntable {
         if self.json {
             println!("{}", serde_json::to_string(&made).expect("plain values"));
         } else {
-            println!("{} frames of {} triangles in {:.1} s", made.frames, made.triangles, start.elapsed().as_secs_f64());
+            println!("{} frames of {} triangles in {:.1} s ({})", made.frames, made.triangles, start.elapsed().as_secs_f64(), made.device);
             println!("exposure   {:+.2} stops", made.exposure);
             println!("{}", made.out.display());
         }

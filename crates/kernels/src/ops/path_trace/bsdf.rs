@@ -9,11 +9,11 @@ use super::vector::{dot, luminance, sin_cos_turns, unit};
 use std::sync::OnceLock;
 
 /// Reflectance of dielectrics at normal incidence (index of refraction 1.5).
-const DIELECTRIC: f32 = 0.04;
+pub(super) const DIELECTRIC: f32 = 0.04;
 /// Smallest slope parameter α; below it, single-precision numbers do not resolve the lobe.
-const SHARPEST: f32 = 1e-3;
+pub(super) const SHARPEST: f32 = 1e-3;
 /// Entries per axis of the table of reflected shares.
-const SIZE: usize = 32;
+pub(super) const SIZE: usize = 32;
 /// Directions per entry and axis from which the table is computed.
 const DRAWS: usize = 64;
 
@@ -157,8 +157,8 @@ impl Bsdf {
 }
 
 /// Shares of light that microfacets reflect after one bounce: `straight · scale + grazing · offset`, by the cosine of the outgoing direction and √α.
-struct Shares {
-    table: Vec<[f32; 2]>,
+pub(super) struct Shares {
+    pub(super) table: Vec<[f32; 2]>,
 }
 
 impl Shares {
@@ -180,7 +180,7 @@ impl Shares {
 }
 
 /// The table, computed when it is first used, in some milliseconds.
-fn shares() -> &'static Shares {
+pub(super) fn shares() -> &'static Shares {
     static SHARES: OnceLock<Shares> = OnceLock::new();
     SHARES.get_or_init(|| {
         // No light at all leaves along the surface, so the first cosine is a small one.

@@ -8,51 +8,51 @@ use diorama_geom::glam::DAffine3;
 use diorama_geom::model::{Model, Opacity};
 
 /// Affine transform, rows `[axis][x, y, z, 1]`.
-type Affine = [[f32; 4]; 3];
+pub type Affine = [[f32; 4]; 3];
 
 const IDENTITY: Affine = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
 
 /// Triangles with one hierarchy.
 #[derive(Clone, Debug)]
-struct Mesh {
-    bvh: Bvh,
-    vertices: Vec<Vertex>,
-    faces: Vec<Face>,
+pub struct Mesh {
+    pub bvh: Bvh,
+    pub vertices: Vec<Vertex>,
+    pub faces: Vec<Face>,
 }
 
 /// What is interpolated between the corners of a triangle; together, because a hit reads all of it.
 #[derive(Clone, Copy, Debug)]
 #[repr(align(64))]
-struct Vertex {
-    position: V3,
-    normal: V3,
+pub struct Vertex {
+    pub position: V3,
+    pub normal: V3,
     /// Along u, with the sign of the direction against v; zero where there is none.
-    tangent: [f32; 4],
-    uv: [f32; 2],
+    pub tangent: [f32; 4],
+    pub uv: [f32; 2],
     /// Linear factor of the base color.
-    color: V3,
+    pub color: V3,
 }
 
 /// A triangle.
 #[derive(Clone, Copy, Debug)]
-struct Face {
-    corners: [u32; 3],
-    material: u32,
+pub struct Face {
+    pub corners: [u32; 3],
+    pub material: u32,
     /// The instance that it belongs to, in meshes that stand once.
-    instance: u32,
+    pub instance: u32,
 }
 
 /// A mesh where it stands.
 #[derive(Clone, Debug)]
-struct Placed {
-    mesh: usize,
+pub struct Placed {
+    pub mesh: usize,
     /// Index of the instance, for meshes that stand several times.
-    instance: u32,
-    is_moved: bool,
-    world_from_mesh: Affine,
-    mesh_from_world: Affine,
-    low: V3,
-    high: V3,
+    pub instance: u32,
+    pub is_moved: bool,
+    pub world_from_mesh: Affine,
+    pub mesh_from_world: Affine,
+    pub low: V3,
+    pub high: V3,
 }
 
 /// A node of the tree of placed meshes: `low`, `high`, and either two children or one mesh.
@@ -69,17 +69,17 @@ const LEAF: u32 = 1 << 31;
 /// All triangles of a scene.
 #[derive(Clone, Debug)]
 pub struct Geometry {
-    meshes: Vec<Mesh>,
+    pub meshes: Vec<Mesh>,
     /// Those that light cannot pass, and those that it can pass in places.
-    solid: Tree,
-    porous: Tree,
+    pub solid: Tree,
+    pub porous: Tree,
     pub triangles: usize,
 }
 
 /// Placed meshes and the tree over them.
 #[derive(Clone, Debug, Default)]
-struct Tree {
-    placed: Vec<Placed>,
+pub struct Tree {
+    pub placed: Vec<Placed>,
     nodes: Vec<Node>,
 }
 

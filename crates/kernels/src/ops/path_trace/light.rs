@@ -12,30 +12,30 @@ const LEAST: f32 = 0.1;
 /// Light from all directions, and how it is drawn.
 #[derive(Clone, Debug)]
 pub struct DistantLight {
-    width: usize,
-    height: usize,
+    pub width: usize,
+    pub height: usize,
     /// Linear radiance, scaled by the strength, and density per steradian of drawing from the map, `[H, W]`.
-    texels: Vec<[f32; 4]>,
+    pub texels: Vec<[f32; 4]>,
     /// Angle by which sources are turned, in turns.
-    turn: f32,
+    pub turn: f32,
     /// One distribution, and one for each row.
-    rows: Steps,
-    columns: Steps,
+    pub rows: Steps,
+    pub columns: Steps,
     /// Cosine of the polar angle at the upper edge of each row, and at the lower one of the last, `[H + 1]`.
-    edges: Vec<f32>,
-    sun: Option<Disc>,
+    pub edges: Vec<f32>,
+    pub sun: Option<Disc>,
     /// Probability of drawing from the sun.
-    sun_share: f32,
+    pub sun_share: f32,
 }
 
 /// The sun's disc.
 #[derive(Clone, Copy, Debug)]
-struct Disc {
-    direction: V3,
+pub struct Disc {
+    pub direction: V3,
     /// `1 − cos` of its angular radius.
-    cap: f32,
-    radiance: V3,
-    density: f32,
+    pub cap: f32,
+    pub radiance: V3,
+    pub density: f32,
 }
 
 impl Disc {
@@ -70,13 +70,13 @@ type Indices = [u32; LANES];
 
 /// Distributions that are constant within equal intervals, and for equal shares of each the interval to search from.
 #[derive(Clone, Debug)]
-struct Steps {
+pub struct Steps {
     /// Intervals of each.
     n: usize,
     /// Sums before each interval, from 0 to 1, `[rows, n + 1]`.
-    sums: Vec<f32>,
+    pub sums: Vec<f32>,
     /// `[rows, n]`
-    guide: Vec<u32>,
+    pub guide: Vec<u32>,
 }
 
 impl Steps {

@@ -5,8 +5,12 @@
 //! refined in passes and continued after an interruption.
 
 pub mod bsdf;
+#[cfg(any(test, feature = "gpu"))]
+pub(crate) mod cases;
 pub mod cpu;
 mod geometry;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 mod light;
 pub mod reference;
 mod sampler;
@@ -162,6 +166,16 @@ impl Pixel {
         v[14..18].copy_from_slice(&self.backdrop);
         v[18] = self.square;
         v
+    }
+
+    /// Means with the sums of `added` samples, after which there are `samples`.
+    #[inline(always)]
+    fn add(&mut self, sums: &[f32; Pixel::LEN], added: f32, samples: f32) {
+        let (mut mean, share) = (self.values(), added / samples);
+        for (mean, sum) in mean.iter_mut().zip(sums) {
+            *mean += share * (sum / added - *mean);
+        }
+        *self = Pixel::of(mean);
     }
 
     #[inline(always)]

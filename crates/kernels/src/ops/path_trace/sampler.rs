@@ -43,11 +43,16 @@ fn unit(bits: u32) -> f32 {
     (bits >> 8) as f32 * (1.0 / (1 << 24) as f32)
 }
 
+/// The part of a pixel's seed that all pixels share.
+#[inline(always)]
+pub fn seed_of(seed: u64) -> u32 {
+    hash(seed as u32 ^ hash((seed >> 32) as u32 ^ 0x9e37_79b9))
+}
+
 impl Sampler {
     #[inline(always)]
     pub fn new(seed: u64, pixel: u32, sample: u32) -> Sampler {
-        let seed = hash(seed as u32 ^ hash((seed >> 32) as u32 ^ 0x9e37_79b9));
-        Sampler { seed: hash(pixel ^ seed), index: sample, dimension: 0 }
+        Sampler { seed: hash(pixel ^ seed_of(seed)), index: sample, dimension: 0 }
     }
 
     /// The next two numbers in `[0, 1)`; over the samples of a pixel they fill the square evenly.

@@ -9,10 +9,10 @@ use diorama_geom::model::{Material, Model, Opacity, Texture, Wrap};
 /// Materials of a scene.
 #[derive(Clone, Debug)]
 pub struct Surfaces {
-    materials: Vec<Material>,
-    textures: Vec<Texture>,
+    pub materials: Vec<Material>,
+    pub textures: Vec<Texture>,
     /// Linear light of sRGB values.
-    linear: [f32; 256],
+    pub linear: [f32; 256],
 }
 
 /// A surface at a point, as light meets it.

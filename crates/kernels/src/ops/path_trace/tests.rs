@@ -1,63 +1,11 @@
+use super::cases::*;
 use super::*;
 use crate::simd::{Level, with_level};
 use diorama_geom::daylight::Sun;
 use diorama_geom::environment::Environment;
 use diorama_geom::glam::{DAffine3, DQuat};
-use diorama_geom::model::{Instance, Material, Opacity, Part, Texture, Wrap};
+use diorama_geom::model::{Instance, Material, Opacity, Texture, Wrap};
 use diorama_geom::{ImageU8, Mesh};
-
-/// A unit sphere with smooth normals.
-fn sphere(n: usize) -> Mesh {
-    let mut mesh = Mesh::default();
-    for r in 0..=n {
-        for c in 0..=2 * n {
-            let (polar, azimuth) = (std::f64::consts::PI * r as f64 / n as f64, std::f64::consts::PI * c as f64 / n as f64);
-            mesh.positions.push([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()].map(|v| v as f32));
-            mesh.uvs.push([c as f32 / (2 * n) as f32, r as f32 / n as f32]);
-        }
-    }
-    mesh.normals = mesh.positions.clone();
-    for r in 0..n as u32 {
-        for c in 0..2 * n as u32 {
-            let at = |r: u32, c: u32| r * (2 * n as u32 + 1) + c;
-            mesh.faces.extend([[at(r, c), at(r + 1, c), at(r + 1, c + 1)], [at(r, c), at(r + 1, c + 1), at(r, c + 1)]]);
-        }
-    }
-    mesh
-}
-
-/// A square of edge 2 `half` at height `z`, facing up; texture coordinates grow with x and fall with y.
-fn square(half: f32, z: f32) -> Mesh {
-    Mesh {
-        positions: vec![[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]],
-        normals: vec![[0.0, 0.0, 1.0]; 4],
-        uvs: vec![[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]],
-        faces: vec![[0, 1, 2], [0, 2, 3]],
-        ..Mesh::default()
-    }
-}
-
-fn model(parts: Vec<(Mesh, Material)>) -> Model {
-    let mut model = Model::default();
-    for (i, (mesh, material)) in parts.into_iter().enumerate() {
-        model.materials.push(material);
-        model.parts.push(Part { name: String::new(), mesh, material: i });
-        model.instances.push(Instance { part: i, world_from_part: DAffine3::IDENTITY });
-    }
-    model
-}
-
-fn matte(color: [f32; 3]) -> Material {
-    Material { base_color: [color[0], color[1], color[2], 1.0], ..Material::default() }
-}
-
-fn glossy(color: [f32; 3], roughness: f32, metallic: f32) -> Material {
-    Material { roughness, metallic, ..matte(color) }
-}
-
-fn view(size: u32, eye: DVec3, target: DVec3, up: DVec3) -> View {
-    View { camera: Camera::pinhole(size, size, 0.6), world_from_camera: Pose::look_at(eye, target, up), lens: None }
-}
 
 fn render(scene: &Scene, view: &View, settings: &Settings, samples: u32) -> Film {
     let mut film = Film::new(&view.camera);
@@ -67,29 +15,6 @@ fn render(scene: &Scene, view: &View, settings: &Settings, samples: u32) -> Film
 
 fn furnace() -> Daylight {
     Daylight::of(Environment::uniform([1.0; 3], 8))
-}
-
-/// Dim sky, a bright patch and a sun.
-fn day() -> Daylight {
-    let lamp = DVec3::new(0.5, -0.5, 0.7).normalize();
-    let map =
-        Environment::from_fn(32, |d| if d.dot(lamp) > 0.95 { [9.0, 8.0, 6.0] } else { [0.3, 0.4, 0.6].map(|v| v * (0.6 + 0.4 * d.z)) });
-    let sun = Sun { direction: DVec3::new(-0.48, -0.36, 0.8), diameter: 0.08, irradiance: [3.0, 2.5, 2.0] };
-    Daylight { environment: map, sun: Some(sun) }
-}
-
-/// A glossy ball beside a matte one on a floor, seen from above.
-fn balls() -> Model {
-    let mut scene = model(vec![(square(4.0, 0.0), glossy([0.7, 0.6, 0.5], 0.6, 0.0)), (sphere(12), glossy([0.9, 0.6, 0.3], 0.3, 1.0))]);
-    scene.materials.push(matte([0.2, 0.5, 0.8]));
-    scene.parts.push(Part { name: String::new(), mesh: sphere(12), material: 2 });
-    scene.instances[1].world_from_part = DAffine3::from_translation(DVec3::new(-1.1, 0.0, 1.0));
-    scene.instances.push(Instance { part: 2, world_from_part: DAffine3::from_translation(DVec3::new(1.1, 0.2, 1.0)) });
-    scene
-}
-
-fn balls_view(size: u32) -> View {
-    view(size, DVec3::new(0.5, -8.0, 5.0), DVec3::new(0.0, 0.0, 0.6), DVec3::Z)
 }
 
 #[test]

@@ -12,9 +12,9 @@ use std::cell::Cell;
 use std::f32::consts::PI;
 
 /// Surfaces that one ray passes through at most.
-const PASSED: usize = 64;
+pub(super) const PASSED: usize = 64;
 /// Reflectance of a pane at normal incidence (index of refraction 1.5).
-const PANE: f32 = 0.04;
+pub(super) const PANE: f32 = 0.04;
 
 #[inline(always)]
 pub fn narrow(v: DVec3) -> V3 {

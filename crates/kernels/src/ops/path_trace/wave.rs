@@ -17,7 +17,7 @@ use std::ops::Range;
 /// Paths that take their steps together at most.
 const WAVE: usize = 512;
 /// Surfaces after which a path may end by chance.
-const SURE: u32 = 3;
+pub(super) const SURE: u32 = 3;
 
 /// Paths between one that is computed and one whose surface is fetched.
 const AHEAD: usize = 8;
@@ -76,14 +76,8 @@ multiversion! {
                 }
             }
         }
-        let added = spp as f32;
-        let share = added / samples.end as f32;
         for (pixel, sums) in pixels.iter_mut().zip(&sums) {
-            let mut mean = pixel.values();
-            for (mean, sum) in mean.iter_mut().zip(sums) {
-                *mean += share * (sum / added - *mean);
-            }
-            *pixel = Pixel::of(mean);
+            pixel.add(sums, spp as f32, samples.end as f32);
         }
     }
 }

@@ -7,8 +7,8 @@ use diorama_geom::Lens;
 use std::f32::consts::{PI, TAU};
 
 /// Numbers per camera: rotation and translation `[3, 4]`, fx, fy, cx, cy, width, height, lens, its ten numbers.
-const CAMERA: usize = 29;
-const INTRINSICS: usize = 12;
+pub(crate) const CAMERA: usize = 29;
+pub(crate) const INTRINSICS: usize = 12;
 const LENS: usize = 18;
 
 const PINHOLE: u32 = 0;
@@ -23,7 +23,7 @@ pub struct GpuCameras {
     /// Cameras without corrections.
     base: Buffer,
     /// Cameras with their corrections.
-    numbers: Buffer,
+    pub(crate) numbers: Buffer,
 }
 
 impl GpuCameras {
@@ -159,10 +159,10 @@ struct Point {
 }
 
 #[derive(CubeType)]
-struct Direction {
-    x: f32,
-    y: f32,
-    z: f32,
+pub(crate) struct Direction {
+    pub x: f32,
+    pub y: f32,
+    pub z: f32,
 }
 
 /// Ideal to distorted coordinates of the lens whose numbers begin at `at`.
@@ -217,7 +217,7 @@ fn undistort(c: &[f32], at: usize, x: f32, y: f32) -> Point {
 
 /// Unit direction in the camera of the ray through a pixel, with focal lengths scaled.
 #[cube]
-fn direction(c: &[f32], camera: usize, px: f32, py: f32, zoom: f32) -> Direction {
+pub(crate) fn direction(c: &[f32], camera: usize, px: f32, py: f32, zoom: f32) -> Direction {
     let k = camera * CAMERA + INTRINSICS;
     let at = camera * CAMERA + LENS;
     let lens = u32::cast_from(c[at]);
@@ -259,7 +259,7 @@ fn direction(c: &[f32], camera: usize, px: f32, py: f32, zoom: f32) -> Direction
 
 /// Rotates a direction from the camera into the world.
 #[cube]
-fn rotate_to_world(c: &[f32], camera: usize, d: &Direction) -> Direction {
+pub(crate) fn rotate_to_world(c: &[f32], camera: usize, d: &Direction) -> Direction {
     let r = camera * CAMERA;
     Direction {
         x: c[r] * d.x + c[r + 1] * d.y + c[r + 2] * d.z,

@@ -9,7 +9,7 @@ use std::mem::MaybeUninit;
 /// Rays per task.
 const BLOCK: usize = 256;
 /// Rounding of the distances of boxes, upwards (Ize 2013).
-pub(super) const WIDER: f32 = 1.000_000_4;
+pub(in crate::ops) const WIDER: f32 = 1.000_000_4;
 /// Smallest component of a direction that divides.
 const TINY: f32 = 1e-30;
 

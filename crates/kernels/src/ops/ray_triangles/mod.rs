@@ -2,9 +2,15 @@
 //!
 //! Triangles have two sides. Between the triangles of a closed surface no ray passes (Woop, Benthin and Wald 2013).
 
+#[cfg(feature = "gpu")]
+pub(crate) mod binary;
 mod build;
 mod bundle;
+#[cfg(any(feature = "gpu", test))]
+pub(crate) mod cases;
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 mod octet;
 pub mod reference;
 #[cfg(test)]

@@ -1,56 +1,11 @@
 use super::*;
 use crate::simd::{Level, with_level};
-use diorama_testkit::random;
-
-/// Triangles of edges of about `size`, in the cube `[−1, 1]³`.
-fn soup(n: usize, size: f32, seed: u64) -> (Vec<[f32; 3]>, Vec<[u32; 3]>) {
-    let (centers, edges) = (random(3 * n, seed), random(9 * n, seed + 1));
-    let vertices = (0..3 * n).map(|i| std::array::from_fn(|k| centers[i / 3 * 3 + k] + size * edges[3 * i + k])).collect();
-    (vertices, (0..n as u32).map(|i| [3 * i, 3 * i + 1, 3 * i + 2]).collect())
-}
-
-fn rays(n: usize, seed: u64) -> Vec<Ray> {
-    let (from, to) = (random(3 * n, seed), random(3 * n, seed + 1));
-    (0..n)
-        .map(|i| {
-            let origin = std::array::from_fn(|k| 2.0 * from[3 * i + k]);
-            let mut direction: [f32; 3] = std::array::from_fn(|k| to[3 * i + k] - origin[k]);
-            // Some are parallel to one axis plane or two.
-            (0..i % 8 % 3).for_each(|k| direction[(i + k) % 3] = 0.0);
-            Ray { origin, direction, range: [0.0, f32::INFINITY] }
-        })
-        .collect()
-}
+use cases::{rays, soup, sphere, through_edges};
 
 fn nearest(bvh: &Bvh, rays: &[Ray]) -> Vec<Hit> {
     let mut hits = vec![Hit::NONE; rays.len()];
     cpu::nearest(bvh, rays, &mut hits);
     hits
-}
-
-/// A sphere of `4 n²` vertices around the origin, closed.
-fn sphere(n: usize) -> (Vec<[f32; 3]>, Vec<[u32; 3]>) {
-    let (rows, columns) = (n, 2 * n);
-    let mut vertices = vec![[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]];
-    for r in 1..rows {
-        for c in 0..columns {
-            let (polar, azimuth) = (std::f64::consts::PI * r as f64 / rows as f64, std::f64::consts::TAU * c as f64 / columns as f64);
-            vertices.push([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos()].map(|v| v as f32));
-        }
-    }
-    let at = |r: usize, c: usize| match r {
-        0 => 0,
-        r if r == rows => 1,
-        r => (2 + (r - 1) * columns + c % columns) as u32,
-    };
-    let mut triangles = Vec::new();
-    for r in 0..rows {
-        for c in 0..columns {
-            let [a, b, d, e] = [at(r, c), at(r + 1, c), at(r + 1, c + 1), at(r, c + 1)];
-            triangles.extend([[a, b, d], [a, d, e]].into_iter().filter(|t| t[0] != t[1] && t[1] != t[2] && t[2] != t[0]));
-        }
-    }
-    (vertices, triangles)
 }
 
 #[test]
@@ -102,17 +57,8 @@ fn nearest_hits_match_the_reference_on_every_level() {
 
 #[test]
 fn no_ray_passes_between_the_triangles_of_a_closed_surface() {
-    let (vertices, triangles) = sphere(24);
-    let bvh = Bvh::build(&vertices, &triangles);
-    let mut through = Vec::new();
-    // Rays from inside through corners and through points of edges.
-    for t in &triangles {
-        let [a, b, _] = t.map(|v| vertices[v as usize]);
-        for s in [0.0, 0.25, 0.5, 0.7] {
-            let direction = std::array::from_fn(|k| (1.0 - s) * a[k] + s * b[k] - [0.1, -0.2, 0.05][k]);
-            through.push(Ray { origin: [0.1, -0.2, 0.05], direction, range: [0.0, f32::INFINITY] });
-        }
-    }
+    let mesh = sphere(24);
+    let (bvh, through) = (Bvh::build(&mesh.0, &mesh.1), through_edges(&mesh));
     for level in Level::available() {
         let hits = with_level(level, || nearest(&bvh, &through));
         let missed = hits.iter().filter(|h| !h.is_some()).count();
