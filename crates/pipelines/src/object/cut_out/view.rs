@@ -173,10 +173,16 @@ impl<'a> Cutter<'a> {
         let (decoded, open) = masks::apply(frame, rule, photo)?;
         let mut picture = decoded.downsampled(w, h);
         let mut open = open.map(|m| m.downsampled(w, h));
+        let is_linear = matches!(&picture, Photo::Linear(_)) && frame.color_space == ColorSpace::Linear;
+        if from.lens != to.lens && is_linear {
+            let what =
+                "holds linear light seen by a lens that bends lines, which cannot be made flat here; undistort the photographs first";
+            return Err(DataError::input(&frame.image, what).into());
+        }
         if from.lens != to.lens {
             picture = Photo::Eight(undistort::undistorted(&picture.into_8_bits(), from, to));
             open = open.map(|m| undistort::undistorted(&m, from, to));
-        } else if !(matches!(&picture, Photo::Linear(_)) && frame.color_space == ColorSpace::Linear) {
+        } else if !is_linear {
             picture = Photo::Eight(picture.into_8_bits());
         }
         if let Some(open) = open {

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
 /// What only the hash grid and its stages read.
-const GRID_KEYS: [&str; 25] = [
+const GRID_KEYS: [&str; 22] = [
     "field.levels",
     "field.log2_size",
     "field.base",
@@ -29,9 +29,6 @@ const GRID_KEYS: [&str; 25] = [
     "optim.table_decay",
     "sampling.batch_samples",
     "sampling.max_samples",
-    "sampling.occupancy_resolution",
-    "sampling.occupancy_points",
-    "sampling.occupancy_every",
 ];
 
 /// Size of the model and length of its training.

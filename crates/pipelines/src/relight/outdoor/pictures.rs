@@ -1,14 +1,13 @@
 //! Pictures of a run: views in their own light or a new one, and their layers.
 
 use super::model::SceneModel;
-use super::render::{SceneView, ViewLight};
+use super::render::{FineViews, SceneView, ViewLight};
 use crate::error::Result;
 use crate::relight::light::LightOptions;
 use diorama_data::{DataError, photo};
 use diorama_geom::Image;
 use diorama_geom::capture::Split;
 use diorama_geom::color::srgb_from_linear;
-use diorama_geom::daylight::Daylight;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -83,17 +82,22 @@ pub fn render(model: &SceneModel, options: &PicturesOptions, stop: &AtomicBool, 
         Some(light) => {
             let (daylight, notes) = light.read()?;
             made.notes = notes;
-            Some(daylight.sun_apart())
+            Some(ViewLight::of_daylight(model, &daylight.sun_apart(), [1.0; 3]))
         }
     };
     let frames = if options.frames.is_empty() { model.capture.indices(Split::Test) } else { named(model, &options.frames)? };
     if frames.is_empty() {
         return Err(DataError::input(&model.config.data.path, "no photographs were held out; name some with --frame").into());
     }
-    let lights = frames.iter().map(|f| light_of(model, *f, given.as_ref())).collect::<Result<Vec<_>>>()?;
+    let own = match &given {
+        Some(_) => Vec::new(),
+        None => frames.iter().map(|f| own_light(model, *f)).collect::<Result<Vec<_>>>()?,
+    };
     std::fs::create_dir_all(&options.out).map_err(DataError::io(&options.out, "create"))?;
-    for (i, (frame, light)) in frames.iter().zip(&lights).enumerate() {
-        let view = model.fine_view(&model.posed(*frame), light, options.samples);
+    let mut fine = FineViews::new(model, options.samples);
+    for (i, frame) in frames.iter().enumerate() {
+        let light = given.as_ref().unwrap_or_else(|| &own[i]);
+        let view = fine.view(&model.posed(*frame), light);
         let title = model.capture.frames[*frame].name.replace(['/', '\\'], "_");
         for layer in &options.layers {
             let extension = if options.is_linear { "exr" } else { "png" };
@@ -127,10 +131,7 @@ fn named(model: &SceneModel, names: &[String]) -> Result<Vec<usize>> {
     names.iter().map(find).collect()
 }
 
-fn light_of(model: &SceneModel, frame: usize, given: Option<&Daylight>) -> Result<ViewLight> {
-    if let Some(light) = given {
-        return Ok(ViewLight::of_daylight(model, light, [1.0; 3]));
-    }
+fn own_light(model: &SceneModel, frame: usize) -> Result<ViewLight> {
     let own = model.light_of_frame(frame).ok_or_else(|| {
         let name = &model.capture.frames[frame].name;
         DataError::input(&model.config.data.path, format!("{name}: its light was not trained on; give --light"))

@@ -130,35 +130,24 @@ impl SceneModel {
         self.view_with(self.tracer(Quality::Full), camera, light, progress)
     }
 
-    /// The same with `samples`² rays per pixel, whose layers are averaged.
-    pub fn fine_view(&self, camera: &PosedCamera, light: &ViewLight, samples: u32) -> SceneView {
-        let (w, h) = (camera.camera.width, camera.camera.height);
-        let fine = PosedCamera { camera: camera.camera.resized(samples * w, samples * h), pose: camera.pose };
-        let view = self.view(&fine, light, &mut |_| {});
-        let mean = |image: Image| image.downsampled(w as usize, h as usize);
-        let mut normal = mean(view.normal);
-        for n in normal.data.as_chunks_mut::<3>().0 {
-            *n = Vec3::from_array(*n).normalize_or_zero().to_array();
-        }
-        SceneView {
-            color: mean(view.color),
-            albedo: mean(view.albedo),
-            normal,
-            shadow: mean(view.shadow),
-            irradiance: mean(view.irradiance),
-            depth: mean(view.depth),
-            opacity: mean(view.opacity),
-        }
-    }
-
-    /// The same as [`SceneModel::view`] by a tracer of this model, such as one that shows only what lies in a box.
+    /// The same by a tracer of this model, such as one that shows only what lies in a box.
     pub fn view_with(&self, tracer: Tracer, camera: &PosedCamera, light: &ViewLight, progress: &mut dyn FnMut(usize)) -> SceneView {
         if self.stage == Stage::Surfaces {
             return unlit_view(&tracer.layers(camera, &[], progress), camera);
         }
+        self.lit(&self.layers(&tracer, camera, light, progress), camera, light)
+    }
+
+    /// What the field says of each pixel; where suns are apart, the same in all lights.
+    fn layers(&self, tracer: &Tracer, camera: &PosedCamera, light: &ViewLight, progress: &mut dyn FnMut(usize)) -> Layers {
+        let code: Vec<f32> = light.numbers().chunks_exact(3).map(gray).collect();
+        tracer.layers(camera, &[&code], progress)
+    }
+
+    /// A view under a light, of what the field says of it.
+    fn lit(&self, Layers { values, opacity, depth }: &Layers, camera: &PosedCamera, light: &ViewLight) -> SceneView {
         let numbers = light.numbers();
-        let code: Vec<f32> = numbers.chunks_exact(3).map(gray).collect();
-        let Layers { values, opacity, depth } = tracer.layers(camera, &[&code], progress);
+        let (depth, opacity) = (depth.clone(), opacity.clone());
         let (w, h) = (values.width, values.height);
         let pixels: Vec<f32> = (0..w * h).flat_map(|i| [(i % w) as f32 + 0.5, (i / w) as f32 + 0.5]).collect();
         let (mut origins, mut dirs) = (vec![0.0; 3 * w * h], vec![0.0; 3 * w * h]);
@@ -215,6 +204,45 @@ impl SceneModel {
             out.shadow.data[i] = color.shadow;
         }
         out
+    }
+}
+
+/// Views with several rays per pixel, whose layers are averaged. Views of one camera in several lights are traced once where they can be.
+pub struct FineViews<'a> {
+    model: &'a SceneModel,
+    /// Rays per pixel and axis.
+    samples: u32,
+    last: Option<(PosedCamera, Layers)>,
+}
+
+impl FineViews<'_> {
+    pub fn new(model: &SceneModel, samples: u32) -> FineViews<'_> {
+        FineViews { model, samples, last: None }
+    }
+
+    /// A camera's view under a light.
+    pub fn view(&mut self, camera: &PosedCamera, light: &ViewLight) -> SceneView {
+        let (model, (w, h)) = (self.model, (camera.camera.width, camera.camera.height));
+        let fine = PosedCamera { camera: camera.camera.resized(self.samples * w, self.samples * h), pose: camera.pose };
+        let is_traced = self.last.as_ref().is_some_and(|l| model.has_suns() && l.0.camera == fine.camera && l.0.pose == fine.pose);
+        if !is_traced {
+            self.last = Some((fine, model.layers(&model.tracer(Quality::Full), &fine, light, &mut |_| {})));
+        }
+        let view = model.lit(&self.last.as_ref().expect("traced").1, &fine, light);
+        let mean = |image: Image| image.downsampled(w as usize, h as usize);
+        let mut normal = mean(view.normal);
+        for n in normal.data.as_chunks_mut::<3>().0 {
+            *n = Vec3::from_array(*n).normalize_or_zero().to_array();
+        }
+        SceneView {
+            color: mean(view.color),
+            albedo: mean(view.albedo),
+            normal,
+            shadow: mean(view.shadow),
+            irradiance: mean(view.irradiance),
+            depth: mean(view.depth),
+            opacity: mean(view.opacity),
+        }
     }
 }
 

@@ -1,7 +1,7 @@
 //! Scores of the scene model against a generated benchmark.
 
 use super::model::SceneModel;
-use super::render::{SceneView, ViewLight};
+use super::render::{FineViews, SceneView, ViewLight};
 use crate::error::{PipelineError, Result};
 use crate::relight::light::{LightOptions, Source};
 use crate::relight::truth::{self, LightTruth, Truth, ViewLayers};
@@ -11,6 +11,8 @@ use diorama_geom::color::{linear_from_srgb, srgb_from_linear};
 use diorama_geom::glam::DVec3;
 use diorama_geom::{Image, ImageU8};
 use serde::Serialize;
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::path::Path;
 
 /// Scores over the pixels of held-out views that show opaque surfaces.
@@ -91,6 +93,7 @@ pub fn judge(model: &SceneModel, data: &Path, samples: u32, look: &mut dyn FnMut
     let (mut albedos, mut angles, mut shadows, mut depths) = <(Vec<_>, Vec<_>, Vec<_>, Vec<_>)>::default();
     let per_meter = model.model_from_world.scale as f32;
     let mut views = 0;
+    let (mut fine, mut lights) = (FineViews::new(model, samples), HashMap::new());
     for frame in model.capture.indices(Split::Test) {
         let name = &model.capture.frames[frame].name;
         let Some(of) = truth.views.iter().find(|v| name.ends_with(&v.photograph)) else { continue };
@@ -98,11 +101,14 @@ pub fn judge(model: &SceneModel, data: &Path, samples: u32, look: &mut dyn FnMut
         let layers = truth::read_view(data, &of.view)?;
         let (light, is_unseen) = (&truth.lights[of.light], of.light == truth.unseen);
         let is_seen = truth.is_seen(of.light);
-        let view_light = match model.light_of_frame(frame).filter(|_| is_seen) {
-            Some(l) => ViewLight::learned(model, l),
-            None => given(model, data, light, gauge)?,
+        let view_light = match lights.entry(of.light) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(new) => new.insert(match model.light_of_frame(frame).filter(|_| is_seen) {
+                Some(l) => ViewLight::learned(model, l),
+                None => given(model, data, light, gauge)?,
+            }),
         };
-        let view = model.fine_view(&model.posed(frame), &view_light, samples);
+        let view = fine.view(&model.posed(frame), view_light);
         let shadow = truth::read_shadow(data, &of.photograph)?;
         let others = if is_seen { None } else { mean_picture(data, &truth, &of.view)? };
         let of_light = if is_unseen { &mut unseen } else { &mut veiled };
