@@ -19,7 +19,7 @@ const LONGEST: u32 = 320;
 const REACH: i32 = 8;
 const STRIDE: usize = 2;
 /// Relative difference of inverse depths beyond which a pixel is of something else, and rounds of the robust fit.
-const APART: f64 = 0.01;
+const APART: f64 = 0.005;
 const ROUNDS: usize = 4;
 /// Opacity from which there is a surface, and the mean weight in a window from which it is plane enough.
 const SURFACE: f32 = 0.5;
@@ -28,7 +28,7 @@ const PLANE: f64 = 0.15;
 const SUPPORTED: f64 = 0.55;
 /// Mean weight in a window from which its plane tells distances, and by how much at most it moves them.
 const FLAT: f64 = 0.4;
-const FLATTENED: f64 = 0.02;
+const FLATTENED: f64 = 0.005;
 /// Normals of which the main directions are found, directions that are tried, and most that are kept.
 const SAMPLED: usize = 50_000;
 const TRIED: usize = 3000;
