@@ -46,10 +46,12 @@ pub struct QuickstartOptions {
     pub object: object::config::Preset,
     /// Steps of each of the object's stages; none: those of its preset.
     pub object_steps: Option<u64>,
+    /// Steps of its stage in which light is traced.
+    pub traced_steps: u64,
 }
 
 impl Default for QuickstartOptions {
-    /// About eight minutes on two cores.
+    /// About ten minutes on two cores.
     fn default() -> Self {
         QuickstartOptions {
             street: SynthOptions { views: 20, lights: 4, size: (96, 54), samples: 48, seed: 0 },
@@ -58,6 +60,7 @@ impl Default for QuickstartOptions {
             chair_size: (128, 128),
             object: object::config::Preset::Fast,
             object_steps: Some(250),
+            traced_steps: 60,
         }
     }
 }
@@ -209,6 +212,7 @@ impl Quickstart<'_> {
     fn object(&mut self) -> Result<Option<(PathBuf, ObjectScores)>> {
         let mut config = object::config::Config::new(self.o.object, self.at("chair"));
         self.o.object_steps.iter().for_each(|s| (config.run.topology_steps, config.run.texture_steps) = (*s, *s));
+        config.run.traced_steps = self.o.traced_steps;
         config.check()?;
         let imported = object::capture::import(&config)?;
         let (mut folder, resume) = self.run("object")?;
