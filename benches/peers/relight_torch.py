@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from torch import nn
 
-# Threads that wait for each other take minutes where other programs run.
+# On a busy machine, several threads wait for each other for minutes.
 torch.set_num_threads(1)
 
 BANDS, WIDTH = 12, 256
 GRAY = torch.tensor([0.2126, 0.7152, 0.0722])
 FACTORS = [0.282095, 0.488603, 0.488603, 0.488603, 1.092548, 1.092548, 0.315392, 1.092548, 0.546274]
-# Rounding grows from step to step; another formula ends a whole way apart.
+# Rounding errors grow with each step; a wrong formula moves the parameters by about 100 %.
 MOST, APART, SHORT = 0.01, 0.25, 0.05
 
 

@@ -39,7 +39,7 @@ fn installed(tool: &str) -> bool {
     Command::new("cargo").args([tool, "--version"]).stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok_and(|s| s.success())
 }
 
-/// Crates with code of their own for each instruction set.
+/// Crates whose results depend on the instruction set.
 const SIMD_CRATES: [&str; 3] = ["kernels", "engine", "nets"];
 
 /// Runs the library tests of these crates with a lower instruction set than this machine's best, as they were built with the whole workspace.
@@ -49,13 +49,20 @@ fn libraries_at(level: &str) -> bool {
     let Ok(out) = Command::new("cargo").args(args).output() else { return false };
     let said = String::from_utf8_lossy(&out.stderr).into_owned();
     let run = |name: &&str| {
-        let program = said.split(['(', ')']).find(|part| part.contains(&format!("diorama_{name}-")));
-        let Some(Ok(program)) = program.map(std::path::absolute) else { return false };
+        let Some(Ok(program)) = tests_of(&said, name).map(std::path::absolute) else {
+            println!("{said}\ncargo named no tests of {name}");
+            return false;
+        };
         let mut tests = Command::new(program);
         tests.arg("--quiet").env("DIORAMA_SIMD", level).current_dir(format!("crates/{name}"));
         tests.status().is_ok_and(|s| s.success())
     };
     out.status.success() && SIMD_CRATES.iter().all(run)
+}
+
+/// The test program of a crate's library in what cargo said of a build.
+fn tests_of<'a>(said: &'a str, name: &str) -> Option<&'a str> {
+    said.split(['(', ')']).find(|part| part.contains(&format!("/diorama_{name}-")))
 }
 
 /// Runs every parser with mutated inputs. Built with the whole workspace, so that the test build is reused.
@@ -64,7 +71,7 @@ fn fuzz(runs: &str) -> bool {
     built && Command::new("target/release/diorama-fuzz").arg(runs).status().is_ok_and(|s| s.success())
 }
 
-/// Builds the program as the tests of the whole workspace build it: packages on their own have other features of dependencies.
+/// Builds the program with the whole workspace, as its tests do: one package alone selects other features of dependencies and rebuilds them.
 const PROGRAM: [&str; 5] = ["build", "--release", "--workspace", "--bin", "diorama"];
 
 /// Builds once for devices, separated by commas, and compares every op on each with its reference. Builds other than the default one
@@ -211,4 +218,17 @@ fn viewer_check() -> bool {
     let seen = Command::new("node").arg("test/viewer.mjs").arg(absolute).arg(&run).current_dir(web).status().is_ok_and(|s| s.success());
     let _ = std::fs::remove_dir_all(&run);
     ok & step("viewer", made && seen)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn test_programs_are_found_in_what_cargo_says() {
+        let said = "    Finished `release` profile [optimized] target(s) in 1s\n  Executable unittests src/lib.rs (target/release/deps/diorama_nets-0a)\n  \
+            Executable unittests src/lib.rs (target/release/deps/diorama_kernels-1b)\n";
+        assert_eq!(tests_of(said, "kernels"), Some("target/release/deps/diorama_kernels-1b"));
+        assert_eq!(tests_of(said, "engine"), None);
+    }
 }

@@ -1,4 +1,4 @@
-//! Metal when the third stage begins: which vertices the second stage holds for metal, and their base color in a light that was found anew.
+//! Metal when the third stage begins: which vertices the second stage classifies as metal, and their base color in a light that was found anew.
 //!
 //! A metal sends `c = a S + B` with the mirrored light `S` and `B` of the split sum, so that a factor `f` from base colors in the light before
 //! to those in this one follows from `c − B = f a S` by least absolute differences over all sightings.
@@ -7,7 +7,7 @@ use super::gloss::Rows;
 use super::probe::Probe;
 use diorama_kernels::ops::split_sum::Points;
 
-/// Metalness from which the second stage is believed: what is not metal stays far below.
+/// Metalness above which a surface counts as metal: what is not metal stays far below.
 pub const METAL: f32 = 0.6;
 /// Sightings that are needed.
 const LEAST: usize = 100;

@@ -45,7 +45,9 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
     let (gloss, of_metal) = find_light(m, config, capture, (&around, probe, &metal));
     let roughness = gloss.as_ref().map_or(ROUGHNESS, |g| g.roughness);
     let mirrored = gloss.map_or_else(|| vec![[0.0; 3]; m.places().len()], |g| g.mirrored);
-    let kept: Vec<([f32; CHANNELS], bool)> = m.texels.values.as_chunks().0.iter().map(|t: &[f32; CHANNELS]| (*t, t[5] > METAL)).collect();
+    let kept: Vec<([f32; CHANNELS], bool)> =
+        m.texels.values.as_chunks().0.iter().map(|t: &[f32; CHANNELS]| (*t, of_metal.is_some() && t[5] > METAL)).collect();
+    let of_metal = of_metal.unwrap_or([1.0; 3]);
     // Two rounds: light between surfaces depends on their colors.
     let sent: Vec<[f32; 3]> = texels
         .index
@@ -81,7 +83,7 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
     m.surroundings = Some(Box::new(around));
 }
 
-/// What the second stage holds for metal.
+/// What the second stage classifies as metal.
 fn metal_of(m: &Textured) -> Metal {
     let values = m.at_vertices(&m.drawn());
     let texels = || values.as_chunks::<CHANNELS>().0.iter();
@@ -92,13 +94,14 @@ fn metal_of(m: &Textured) -> Metal {
     }
 }
 
-/// Finds the light, beginning with that of the second stage; what gloss tells of its brightness, and the factor of the metals' base colors.
+/// Finds the light, beginning with that of the second stage; what gloss tells of its brightness, and the factor of the metals' base
+/// colors, where enough of them is seen.
 fn find_light(
     m: &Textured,
     config: &Config,
     capture: &ObjectCapture,
     (around, probe, metal): (&Surroundings, &mut Probe, &Metal),
-) -> (Option<Gloss>, [f32; 3]) {
+) -> (Option<Gloss>, Option<[f32; 3]>) {
     let normals: Vec<[f32; 3]> = vertex_normals::cpu::forward(&m.layout.faces, m.places()).into_iter().map(unit).collect();
     let photos: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.photos[i]).collect();
     let at = (m.places(), &normals[..]);
@@ -107,7 +110,7 @@ fn find_light(
     let (metals, sightings): (Vec<Vec<Sighting>>, Vec<Vec<Sighting>>) =
         all.into_iter().zip(&metal.is_metal).map(|(s, m)| if *m { (s, Vec::new()) } else { (Vec::new(), s) }).unzip();
     let of_metals = metal.is_present().then(|| gloss::rows(&around.transport, &metals, at));
-    let factor = |probe: &Probe| of_metals.as_ref().and_then(|rows| metal.factor(probe, rows)).unwrap_or([1.0; 3]);
+    let factor = |probe: &Probe| of_metals.as_ref().and_then(|rows| metal.factor(probe, rows));
     if probe.group.frozen {
         let mut gloss = gloss::fit(probe, &around.transport, &sightings, at);
         // The light is as bright as it is.
@@ -135,13 +138,13 @@ fn find_light(
         }
     }
     // No metal mirrors more than it receives.
-    let of_metal = factor(probe);
+    let Some(of_metal) = factor(probe) else { return (gloss, None) };
     let by = (metal.brightest() * of_metal[0].max(of_metal[1]).max(of_metal[2]) / BRIGHTEST).max(1.0);
-    if of_metals.is_some() && by > 1.0 {
+    if by > 1.0 {
         probe.scale([by; 3]);
         gloss.iter_mut().for_each(|g| g.mirrored.as_flattened_mut().iter_mut().for_each(|m| *m *= by));
     }
-    (gloss, of_metal.map(|f| f / by))
+    (gloss, Some(of_metal.map(|f| f / by)))
 }
 
 /// Weights of a triangle's corners at a point of it.

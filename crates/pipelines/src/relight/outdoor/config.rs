@@ -424,7 +424,13 @@ mod tests {
             assert!(e.is_input() && e.to_string().contains("field.kind"), "{e}");
         }
         for key in GRID_KEYS {
-            config::set(&mut printed.clone(), key, "7").unwrap_err();
+            let value = match key {
+                "field.space" => "box",
+                "light.from" => "0.123",
+                _ => "77",
+            };
+            let e = config::set(&mut printed.clone(), key, value).unwrap_err().to_string();
+            assert!(e.starts_with(&format!("{key}: field.kind=mlp does not use it")), "{e}");
         }
         printed.set("field.background", "false").unwrap();
         assert!(c.set("loss.robst", "1").unwrap_err().to_string().contains("loss.robust"));

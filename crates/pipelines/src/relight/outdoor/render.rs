@@ -6,6 +6,8 @@ use super::model::SceneModel;
 use super::shading::{self, CHANNELS, NORMAL, RayColor, gray};
 use super::sun::SUN;
 use super::visibility::Ambient;
+use crate::error::Result;
+use crate::run::memory;
 use diorama_engine::renderers::layers::Layers;
 use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_geom::Image;
@@ -21,6 +23,9 @@ use std::sync::OnceLock;
 /// Radiance over the mean of a map from which on it casts shadows, and lamps at most by which it does.
 const GLARING: f64 = 20.0;
 const LAMPS: usize = 32;
+
+/// Bytes of a ray of a view, while it is lit.
+const RAY: u64 = 200;
 
 /// Light in which views are shown: spherical harmonics, and the sky behind.
 pub struct ViewLight {
@@ -216,8 +221,13 @@ pub struct FineViews<'a> {
 }
 
 impl FineViews<'_> {
-    pub fn new(model: &SceneModel, samples: u32) -> FineViews<'_> {
-        FineViews { model, samples, last: None }
+    /// # Errors
+    /// When the largest view does not fit into memory.
+    pub fn new(model: &SceneModel, samples: u32) -> Result<FineViews<'_>> {
+        let pixels = |i: usize| (model.posed(i).camera.width as u64) * model.posed(i).camera.height as u64;
+        let most = (0..model.capture.frames.len()).map(pixels).max().unwrap_or(0);
+        memory::require("a view", most * (samples * samples) as u64 * RAY, "use fewer --samples")?;
+        Ok(FineViews { model, samples, last: None })
     }
 
     /// A camera's view under a light.
@@ -229,21 +239,36 @@ impl FineViews<'_> {
             self.last = Some((fine, model.layers(&model.tracer(Quality::Full), &fine, light, &mut |_| {})));
         }
         let view = model.lit(&self.last.as_ref().expect("traced").1, &fine, light);
+        if !model.has_suns() {
+            self.last = None;
+        }
         let mean = |image: Image| image.downsampled(w as usize, h as usize);
-        let mut normal = mean(view.normal);
+        let opacity = mean(view.opacity.clone());
+        // What is not multiplied by the opacity is the mean of what is opaque.
+        let of_matter = |image: Image| of_matter(image, &view.opacity, &opacity);
+        let mut normal = of_matter(view.normal);
         for n in normal.data.as_chunks_mut::<3>().0 {
             *n = Vec3::from_array(*n).normalize_or_zero().to_array();
         }
         SceneView {
             color: mean(view.color),
-            albedo: mean(view.albedo),
+            albedo: of_matter(view.albedo),
             normal,
             shadow: mean(view.shadow),
             irradiance: mean(view.irradiance),
-            depth: mean(view.depth),
-            opacity: mean(view.opacity),
+            depth: of_matter(view.depth),
+            opacity,
         }
     }
+}
+
+/// A smaller image whose pixels are means weighted by the opacity of theirs.
+fn of_matter(mut image: Image, opacity: &Image, mean: &Image) -> Image {
+    let channels = image.channels;
+    image.data.chunks_exact_mut(channels).zip(&opacity.data).for_each(|(p, o)| p.iter_mut().for_each(|v| *v *= o));
+    let mut small = image.downsampled(mean.width, mean.height);
+    small.data.chunks_exact_mut(channels).zip(&mean.data).for_each(|(p, o)| p.iter_mut().for_each(|v| *v /= o.max(1e-6)));
+    small
 }
 
 /// Surfaces as they look in the mean of all lights, from which nothing is told apart yet: in place of color and albedo alike. Normals face the
@@ -260,5 +285,21 @@ fn unlit_view(layers: &Layers, camera: &PosedCamera) -> SceneView {
         color: linear,
         depth: layers.depth.clone(),
         opacity: layers.opacity.clone(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn half_covered_pixels_have_the_albedo_of_what_covers_them() {
+        let image = |data: Vec<f32>, channels| Image { width: 2, height: 2, channels, data };
+        let (opacity, albedo) = (image(vec![1.0, 0.0, 1.0, 0.0], 1), image([[0.6; 3], [0.0; 3]].repeat(2).concat(), 3));
+        let mean = opacity.downsampled(1, 1);
+        let small = of_matter(albedo, &opacity, &mean);
+        assert!(mean.data[0] == 0.5 && small.data.iter().all(|v| (v - 0.6).abs() < 1e-6), "{:?}", small.data);
+        let nothing = image(vec![0.0; 4], 1);
+        assert_eq!(of_matter(image(vec![7.0; 4], 1), &nothing, &nothing.downsampled(1, 1)).data, [0.0]);
     }
 }

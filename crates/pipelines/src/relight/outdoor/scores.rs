@@ -93,7 +93,7 @@ pub fn judge(model: &SceneModel, data: &Path, samples: u32, look: &mut dyn FnMut
     let (mut albedos, mut angles, mut shadows, mut depths) = <(Vec<_>, Vec<_>, Vec<_>, Vec<_>)>::default();
     let per_meter = model.model_from_world.scale as f32;
     let mut views = 0;
-    let (mut fine, mut lights) = (FineViews::new(model, samples), HashMap::new());
+    let (mut fine, mut lights) = (FineViews::new(model, samples)?, HashMap::new());
     for frame in model.capture.indices(Split::Test) {
         let name = &model.capture.frames[frame].name;
         let Some(of) = truth.views.iter().find(|v| name.ends_with(&v.photograph)) else { continue };
