@@ -29,7 +29,8 @@ pub trait PathDevice {
     fn add(&mut self, view: &View, settings: &Settings, samples: u32, film: &mut Film) -> Result<()>;
 }
 
-/// The device that traces the paths of pictures. The failure of one that the user named is the result; else it is said once and the CPU goes on.
+/// The device that traces the paths of pictures. If a named device fails, the call returns the error; with `auto`, the failure is reported once
+/// and the CPU continues.
 pub struct PathTracer {
     device: Option<Box<dyn PathDevice>>,
     name: String,

@@ -10,8 +10,9 @@ use diorama_pipelines::relight::outdoor::{recipe, scores};
 use diorama_pipelines::{Application, Result};
 use std::path::PathBuf;
 
-/// Samples per pixel of path-traced scores of objects, and rays per pixel and axis of pictures of scenes.
+/// Samples per pixel of path-traced scores of objects.
 const SAMPLES: u32 = 32;
+/// Rays per pixel and axis of pictures of scenes.
 const RAYS: u32 = 2;
 
 /// Score a run of the scene model or of the object model on a generated benchmark

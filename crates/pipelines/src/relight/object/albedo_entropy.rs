@@ -35,7 +35,7 @@ const TINT: f32 = 0.02;
 const LOCAL: f32 = 0.5;
 /// Least cosine between normal and view at which a photograph counts, and value from which on it is clipped.
 const SEEN: f32 = 0.3;
-const CLIPPED: f32 = 0.97;
+pub const CLIPPED: f32 = 0.97;
 
 /// A vertex in a photograph.
 #[derive(Clone, Copy, Debug)]

@@ -4,7 +4,7 @@
 //! With the mirrored light `S` of a view (split sum, base color 0), a point sends `c = d + s S`: the factor `s` of each channel minimizes the
 //! squares of `c − mean c − s (S − mean S)`, reweighted against outliers.
 
-use super::albedo_entropy::Sighting;
+use super::albedo_entropy::{CLIPPED, Sighting};
 use super::probe::Probe;
 use super::transport::{Transport, dot, unit};
 use diorama_geom::mesh::sub;
@@ -23,8 +23,6 @@ const EXPLAINED: f64 = 0.08;
 /// Bounds of the factor. The light before it is one under which the brightest colors are nearly white: much less light is impossible, and a
 /// smaller factor tells of an object whose gloss differs from place to place.
 const BOUNDS: [f64; 2] = [0.6, 8.0];
-/// Value from which on photographs are clipped: such places hardly change, however glossy they are.
-const CLIPPED: f32 = 0.97;
 /// Distance from the surface at which rays begin, in object space.
 const OFFSET: f32 = 1e-3;
 

@@ -3,6 +3,7 @@
 //! A metal sends `c = a S + B` with the mirrored light `S` and `B` of the split sum, so that a factor `f` from base colors in the light before
 //! to those in this one follows from `c − B = f a S` by least absolute differences over all sightings.
 
+use super::albedo_entropy::CLIPPED;
 use super::gloss::Rows;
 use super::probe::Probe;
 use diorama_kernels::ops::split_sum::Points;
@@ -11,8 +12,6 @@ use diorama_kernels::ops::split_sum::Points;
 pub const METAL: f32 = 0.6;
 /// Sightings that are needed.
 const LEAST: usize = 100;
-/// Value from which on photographs are clipped.
-const CLIPPED: f32 = 0.97;
 /// Share of the brightest base colors that may exceed those of any metal, as they are wrong.
 const WRONG: f32 = 0.1;
 
@@ -24,10 +23,6 @@ pub struct Metal {
 }
 
 impl Metal {
-    pub fn is_present(&self) -> bool {
-        self.is_metal.contains(&true)
-    }
-
     /// Base color, by channel, that all but a few vertices stay below.
     pub fn brightest(&self) -> f32 {
         let colors = self.colors.iter().zip(&self.is_metal).filter(|(_, m)| **m);

@@ -109,8 +109,8 @@ fn find_light(
     // Metal has neither diffuse colors nor the gloss of what is no metal.
     let (metals, sightings): (Vec<Vec<Sighting>>, Vec<Vec<Sighting>>) =
         all.into_iter().zip(&metal.is_metal).map(|(s, m)| if *m { (s, Vec::new()) } else { (Vec::new(), s) }).unzip();
-    let of_metals = metal.is_present().then(|| gloss::rows(&around.transport, &metals, at));
-    let factor = |probe: &Probe| of_metals.as_ref().and_then(|rows| metal.factor(probe, rows));
+    let of_metals = gloss::rows(&around.transport, &metals, at);
+    let factor = |probe: &Probe| metal.factor(probe, &of_metals);
     if probe.group.frozen {
         let mut gloss = gloss::fit(probe, &around.transport, &sightings, at);
         // The light is as bright as it is.

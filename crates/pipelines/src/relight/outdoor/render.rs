@@ -224,7 +224,10 @@ impl FineViews<'_> {
     /// # Errors
     /// When the largest view does not fit into memory.
     pub fn new(model: &SceneModel, samples: u32) -> Result<FineViews<'_>> {
-        let pixels = |i: usize| (model.posed(i).camera.width as u64) * model.posed(i).camera.height as u64;
+        let pixels = |i: usize| {
+            let c = model.posed(i).camera;
+            c.width as u64 * c.height as u64
+        };
         let most = (0..model.capture.frames.len()).map(pixels).max().unwrap_or(0);
         memory::require("a view", most * (samples * samples) as u64 * RAY, "use fewer --samples")?;
         Ok(FineViews { model, samples, last: None })

@@ -210,12 +210,12 @@ pub fn encoded(linear: &Image) -> ImageU8 {
 /// Factor by channel from exact light to the model's: that by which the model's albedo is too dark in the median, as brightness is shared between
 /// albedo and light by chance.
 fn gauge(model: &SceneModel, data: &Path, truth: &Truth) -> Result<[f64; 3]> {
-    let mut pairs = Vec::new();
+    let (mut pairs, light) = (Vec::new(), ViewLight::learned(model, 0));
     for frame in model.capture.indices(Split::Test) {
         let name = &model.capture.frames[frame].name;
         let Some(of) = truth.views.iter().find(|v| v.light == truth.unseen && name.ends_with(&v.photograph)) else { continue };
         let layers = truth::read_view(data, &of.view)?;
-        let view = model.view(&model.posed(frame), &ViewLight::learned(model, 0), &mut |_| {});
+        let view = model.view(&model.posed(frame), &light, &mut |_| {});
         let rgb = |image: &Image, i: usize| -> [f32; 3] { std::array::from_fn(|k| image.data[3 * i + k]) };
         pairs.extend(valid(&layers).map(|i| (rgb(&view.albedo, i), rgb(&layers.albedo, i))));
     }

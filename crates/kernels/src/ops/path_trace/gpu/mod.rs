@@ -24,7 +24,7 @@ use eye::start;
 use state::{BatchLaunch, PATH, accumulate};
 use steps::{arrive, ask_layers, follow, scatter};
 
-/// Paths on their way at once: on hardware, and on a CPU that plays it.
+/// Paths in flight: on a hardware GPU, and on a software device.
 const PATHS: [usize; 2] = [1 << 19, 1 << 15];
 
 /// A scene on a device.
@@ -207,7 +207,7 @@ impl<'a> Wave<'a> {
         &self.queues[bounce as usize % 2]
     }
 
-    fn follow(&self, n: usize, batch: Batch, bounce: u32) {
+    fn follow(&self, n: usize, batch: BatchLaunch, bounce: u32) {
         let s = self.scene;
         launch!(
             self.gpu,
@@ -230,7 +230,7 @@ impl<'a> Wave<'a> {
         );
     }
 
-    fn ask_layers<const SUN: bool>(&self, n: usize, batch: Batch) {
+    fn ask_layers<const SUN: bool>(&self, n: usize, batch: BatchLaunch) {
         let s = self.scene;
         launch!(
             self.gpu,
@@ -250,7 +250,7 @@ impl<'a> Wave<'a> {
         );
     }
 
-    fn scatter(&self, n: usize, batch: Batch, bounce: u32) {
+    fn scatter(&self, n: usize, batch: BatchLaunch, bounce: u32) {
         let (s, settings) = (self.scene, self.settings);
         let strategy = match settings.strategy {
             Strategy::Both => steps::BOTH,
@@ -282,7 +282,7 @@ impl<'a> Wave<'a> {
         );
     }
 
-    fn arrive(&self, n: usize, batch: Batch, bounce: u32, field: u32) {
+    fn arrive(&self, n: usize, batch: BatchLaunch, bounce: u32, field: u32) {
         let s = self.scene;
         launch!(
             self.gpu,
@@ -308,5 +308,3 @@ impl<'a> Wave<'a> {
         );
     }
 }
-
-type Batch = BatchLaunch;

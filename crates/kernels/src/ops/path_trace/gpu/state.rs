@@ -117,6 +117,17 @@ pub fn hit(paths: &mut [u32], path: usize, b: &Batch) -> Found {
     }
 }
 
+/// Writes what a path's ray met.
+#[cube]
+pub fn put_hit(paths: &mut [u32], path: usize, b: &Batch, found: &Found) {
+    let n = b.paths as usize;
+    paths[TRIANGLE * n + path] = found.triangle;
+    paths[PLACED * n + path] = found.placed;
+    put_number(paths, DISTANCE, path, b, found.t);
+    put_number(paths, WEIGHTS, path, b, found.u);
+    put_number(paths, WEIGHTS + 1, path, b, found.v);
+}
+
 /// Adds the samples of each pixel to its sums `[19, pixels]`, one after the other.
 #[cube(launch_unchecked)]
 pub fn accumulate(samples: &[f32], sums: &mut [f32], b: Batch) {

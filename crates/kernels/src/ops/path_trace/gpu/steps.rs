@@ -4,8 +4,8 @@ use super::bsdf;
 use super::light;
 use super::sampler::{Pair, one, pair};
 use super::state::{
-    ALBEDO, ARRIVAL, BACKDROP, Batch, COLOR, DENSITY, DEPTH, DIMENSION, DIRECTION, DISTANCE, NORMAL, OPACITY, ORIGIN, PLACED, THROUGHPUT,
-    TOWARD, TRIANGLE, UNSHADOWED, WEIGHTS, add, hit, note, number, put, put_number, sample, seed, vector,
+    ALBEDO, ARRIVAL, BACKDROP, Batch, COLOR, DENSITY, DEPTH, DIMENSION, DIRECTION, NORMAL, OPACITY, ORIGIN, THROUGHPUT, TOWARD, TRIANGLE,
+    UNSHADOWED, add, hit, note, number, put, put_hit, put_number, sample, seed, vector,
 };
 use super::surface::{Surface, Vertex, chance_through, local, surface, through, vertex, world};
 use crate::gpu::vector::{V3, dot, luminance, scale, times, unit};
@@ -67,11 +67,7 @@ pub fn follow(
         let mut goes = true.runtime();
         while goes {
             let found = nearest(tree, root, origin, d, near, FAR, 0u32, stack);
-            paths[TRIANGLE * n + path] = found.triangle;
-            paths[PLACED * n + path] = found.placed;
-            put_number(paths, DISTANCE, path, &b, found.t);
-            put_number(paths, WEIGHTS, path, &b, found.u);
-            put_number(paths, WEIGHTS + 1, path, &b, found.v);
+            put_hit(paths, path, &b, &found);
             goes = false.runtime();
             if found.triangle != NOTHING {
                 let s = surface(tree, surfaces, texels, &found, textured);
@@ -103,11 +99,7 @@ pub fn follow(
         paths[DIMENSION * n + path] = dimension;
     } else {
         let found = nearest(tree, root, origin, d, 0.0f32, FAR, 0u32, stack);
-        paths[TRIANGLE * n + path] = found.triangle;
-        paths[PLACED * n + path] = found.placed;
-        put_number(paths, DISTANCE, path, &b, found.t);
-        put_number(paths, WEIGHTS, path, &b, found.u);
-        put_number(paths, WEIGHTS + 1, path, &b, found.v);
+        put_hit(paths, path, &b, &found);
     }
 }
 
