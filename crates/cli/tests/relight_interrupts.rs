@@ -66,7 +66,7 @@ fn street(folder: &Path) {
         let turn = i as f64 * 1.2;
         Pose::look_at(DVec3::new(6.0 * turn.cos(), 6.0 * turn.sin(), 3.0), DVec3::new(0.0, 0.0, 1.0), DVec3::Z)
     };
-    let place = Place { model, cameras: (0..5).map(|i| (Camera::pinhole(24, 16, 0.8), pose(i))).collect() };
+    let place = Place::around(model, (0..5).map(|i| (Camera::pinhole(24, 16, 0.8), pose(i))).collect());
     let options = SynthOptions { views: 5, lights: 2, size: (24, 16), samples: 4, seed: 0 };
     synth::generate(&folder.join("street"), &place, &options, false, &AtomicBool::new(false), &mut |_| {}).unwrap();
 }

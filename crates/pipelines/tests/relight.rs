@@ -56,7 +56,7 @@ fn place(views: usize, (width, height): (u32, u32)) -> Place {
         let (turn, height) = (i as f64 / views as f64 * std::f64::consts::TAU, 2.2 + 1.3 * (i % 3) as f64);
         Pose::look_at(DVec3::new(4.5 * turn.cos(), 4.5 * turn.sin(), 1.0 + height), DVec3::new(0.0, 0.0, 0.4), DVec3::Z)
     };
-    Place { model, cameras: (0..views).map(|i| (camera, pose(i))).collect() }
+    Place::around(model, (0..views).map(|i| (camera, pose(i))).collect())
 }
 
 fn generate(out: &Path, views: usize, size: (u32, u32)) {

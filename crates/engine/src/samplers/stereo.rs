@@ -244,8 +244,9 @@ fn offset(k: usize) -> (i32, i32) {
     ((k % side) as i32 - RADIUS, (k / side) as i32 - RADIUS)
 }
 
-/// The neighbors of photograph `i`: those closest to the preferred angles, by ascending angle.
-fn neighbors(views: &[Gray], i: usize, viewing_distance: f64) -> Vec<&Gray> {
+/// The neighbors of photograph `i`: those closest to the preferred angles, by ascending angle; of the same light where enough of them are, as
+/// shadows differ otherwise. `lights` is empty where all photographs have one.
+fn neighbors<'a>(views: &'a [Gray], lights: &[u32], i: usize, viewing_distance: f64) -> Vec<&'a Gray> {
     let own = &views[i];
     let target = own.posed.pose.point(DVec3::Z * viewing_distance);
     let to_own = own.posed.pose.translation - target;
@@ -255,6 +256,12 @@ fn neighbors(views: &[Gray], i: usize, viewing_distance: f64) -> Vec<&Gray> {
         .map(|j| (to_own.angle_between(views[j].posed.pose.translation - target).to_degrees(), j))
         .filter(|(angle, _)| (ANGLE_RANGE.0..ANGLE_RANGE.1).contains(angle))
         .collect();
+    if !lights.is_empty() {
+        let alike: Vec<(f64, usize)> = all.iter().copied().filter(|(_, j)| lights[*j] == lights[i]).collect();
+        if alike.len() >= FEWEST {
+            all = alike;
+        }
+    }
     let mut chosen = Vec::new();
     for wanted in ANGLES {
         let closest = (0..all.len()).min_by(|a, b| (all[*a].0 / wanted).ln().abs().total_cmp(&(all[*b].0 / wanted).ln().abs()));
@@ -270,14 +277,21 @@ pub fn bytes(sizes: impl Iterator<Item = (u32, u32)>) -> u64 {
 }
 
 /// Observes the distances of corner pixels that neighboring photographs agree on; returns nothing if `interrupt` is set. `cameras` are in the
-/// order of the photographs; `viewing_distance` is the distance from the cameras to what they view, in model space.
-pub fn observe(source: &dyn PixelSource, cameras: &[PosedCamera], viewing_distance: f64, interrupt: &AtomicBool) -> Vec<Observation> {
-    observe_at(source, cameras, viewing_distance, interrupt, LONGEST)
+/// order of the photographs, as is `lights`, the light of each, which is empty where all have one; `viewing_distance` is the distance from the
+/// cameras to what they view, in model space.
+pub fn observe(
+    source: &dyn PixelSource,
+    cameras: &[PosedCamera],
+    lights: &[u32],
+    viewing_distance: f64,
+    interrupt: &AtomicBool,
+) -> Vec<Observation> {
+    observe_at(source, (cameras, lights), viewing_distance, interrupt, LONGEST)
 }
 
 fn observe_at(
     source: &dyn PixelSource,
-    cameras: &[PosedCamera],
+    (cameras, lights): (&[PosedCamera], &[u32]),
     viewing_distance: f64,
     interrupt: &AtomicBool,
     longest: u32,
@@ -287,7 +301,7 @@ fn observe_at(
     let Some(views) = cameras.par_iter().enumerate().map(gray).collect::<Option<Vec<Gray>>>() else { return Vec::new() };
     let count = (CORNERS / views.len().max(1)).clamp(CORNERS_OF_ONE.0, CORNERS_OF_ONE.1);
     let of_view = |i: usize| -> Vec<Observation> {
-        let (own, others) = (&views[i], neighbors(&views, i, viewing_distance));
+        let (own, others) = (&views[i], neighbors(&views, lights, i, viewing_distance));
         if others.len() < 2 || is_over() {
             return Vec::new();
         }
@@ -344,7 +358,7 @@ mod tests {
 
         /// Number of observations, and how many of them are wrong by more than 2 %.
         fn observed(&self, longest: u32) -> (usize, usize) {
-            let all = observe_at(self, &self.cameras, 3.0, &AtomicBool::new(false), longest);
+            let all = observe_at(self, (&self.cameras, &[]), 3.0, &AtomicBool::new(false), longest);
             let is_wrong = |o: &&Observation| {
                 let (_, t) = self.distance(o.image as usize, o.x as f64 + 0.5, o.y as f64 + 0.5);
                 (o.distance as f64 / t - 1.0).abs() > 0.02
@@ -396,11 +410,11 @@ mod tests {
             let (found, wrong) = wall.observed(longest);
             println!("{size:?} stride {stride}: {wrong} of {found} are wrong");
             assert!(found > 300 && wrong * 30 < found, "{size:?}: {wrong} of {found} are wrong");
-            let all = observe_at(&wall, &wall.cameras, 3.0, &AtomicBool::new(false), longest);
+            let all = observe_at(&wall, (&wall.cameras, &[]), 3.0, &AtomicBool::new(false), longest);
             assert!(all.iter().all(|o| o.x < size.0 / 2));
         }
         let wall = Wall::new(irregular);
-        assert_eq!(observe(&wall, &wall.cameras, 3.0, &AtomicBool::new(true)), [], "interrupted");
+        assert_eq!(observe(&wall, &wall.cameras, &[], 3.0, &AtomicBool::new(true)), [], "interrupted");
     }
 
     #[test]

@@ -97,7 +97,7 @@ fn sky() -> Result<diorama_geom::daylight::Daylight> {
 
 fn street(size: (u32, u32)) -> Result<Subject> {
     let place = Place::street(&SynthOptions { size, ..SynthOptions::named("ci")? });
-    let (camera, world_from_camera) = place.cameras[0];
+    let (camera, world_from_camera) = (place.viewpoints[0].camera, place.viewpoints[0].pose);
     let view = View { camera, world_from_camera, lens: None };
     Ok(Subject { name: "street".into(), scene: Scene::new(&place.model, &sky()?), view, settings: Settings::default() })
 }

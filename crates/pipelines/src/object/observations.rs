@@ -31,7 +31,7 @@ pub(super) fn find(
     let viewing_distance = model.viewing_distance();
     if is_wanted && source == Source::Stereo {
         note(format!("comparing {} photographs with their neighbors to find distances", photographs.images()));
-        found = stereo::observe(photographs, &model.base_cameras(), viewing_distance, interrupt);
+        found = stereo::observe(photographs, &model.base_cameras(), &[], viewing_distance, interrupt);
         found.retain(is_stored);
     }
     if is_wanted && from == "auto" && !interrupt.load(Ordering::Relaxed) {

@@ -129,7 +129,7 @@ pub fn prepare(out: &Path, scenario: &Scenario, o: &ScenarioOptions, force: bool
         }
         None => {
             let place = Place::street(&SynthOptions { size: o.size, ..SynthOptions::named("ci")? });
-            (place.model, Some(place.cameras))
+            (place.model, Some(place.viewpoints.iter().map(|p| (p.camera, p.pose)).collect::<Vec<_>>()))
         }
     };
     let scene = Scene::new(&site, &LightOptions::of(Source::Uniform(1.0)).read()?.0);

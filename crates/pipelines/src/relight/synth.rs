@@ -36,20 +36,49 @@ const BOUNCES: u32 = 6;
 /// Every so many views, one is held out.
 const HOLD_OUT: usize = 5;
 
-/// A place and the cameras that photograph it.
+/// A place and the viewpoints from which it is photographed.
 pub struct Place {
     pub model: Model,
-    pub cameras: Vec<(Camera, Pose)>,
+    pub viewpoints: Vec<Viewpoint>,
+}
+
+/// A camera that stands somewhere.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Viewpoint {
+    pub camera: Camera,
+    pub pose: Pose,
+    /// The light of training in which it photographs; none: all of them.
+    pub light: Option<usize>,
+    /// Whether it is for scores only, in lights that are held out as well.
+    pub is_held_out: bool,
 }
 
 impl Place {
-    /// The northern row of the procedural street, seen by a photographer who walks past it. What stands behind the photographer would cast
-    /// shadows that no photograph explains.
+    /// A place photographed in all lights from the same viewpoints, of which every fifth is held out.
+    pub fn around(model: Model, cameras: Vec<(Camera, Pose)>) -> Place {
+        let viewpoint =
+            |(v, (camera, pose)): (usize, (Camera, Pose))| Viewpoint { camera, pose, light: None, is_held_out: v % HOLD_OUT == HOLD_OUT - 1 };
+        Place { model, viewpoints: cameras.into_iter().enumerate().map(viewpoint).collect() }
+    }
+
+    /// The northern row of the procedural street. In each light, a photographer walks past it anew, so that no two photographs of training are
+    /// from one viewpoint; those held out are photographed in all lights. What stands behind the photographer would cast shadows that no
+    /// photograph explains.
     pub fn street(options: &SynthOptions) -> Place {
         let [w, h] = [options.size.0, options.size.1];
         let model = street::northern_row(options.seed);
-        let cameras = looking_at_one_place(&model, street::cameras(CANDIDATES * options.views, w, h, options.seed), options.views);
-        Place { model, cameras }
+        let held_out = options.views / HOLD_OUT;
+        let count = held_out + options.lights * (options.views - held_out);
+        let mut cameras = looking_at_one_place(&model, street::cameras(CANDIDATES * count, w, h, options.seed), count);
+        // Along the street: one that is held out after the same number of others.
+        let every = count.checked_div(held_out).unwrap_or(usize::MAX);
+        let mut walked = 0;
+        let viewpoint = |(v, (camera, pose)): (usize, (Camera, Pose))| {
+            let is_held_out = v % every == every / 2 && v / every < held_out;
+            walked += !is_held_out as usize;
+            Viewpoint { camera, pose, light: (!is_held_out).then(|| walked % options.lights.max(1)), is_held_out }
+        };
+        Place { model, viewpoints: cameras.drain(..).enumerate().map(viewpoint).collect() }
     }
 }
 
@@ -79,6 +108,7 @@ fn looking_at_one_place(model: &Model, candidates: Vec<(Camera, Pose)>, n: usize
 /// Size of the benchmark.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SynthOptions {
+    /// Photographs in each light.
     pub views: usize,
     /// Lights of training, 1 to 4; a sun and a veiled sun are held out besides.
     pub lights: usize,
@@ -194,30 +224,27 @@ pub fn generate(
         return Err(PipelineError::Usage(format!("{}: holds a capture; give --force to replace it", out.display())));
     }
     let most = LIGHTS.len() - HELD_OUT_LIGHTS;
-    if !(1..=most).contains(&options.lights) || place.cameras.len() < HOLD_OUT {
+    if !(1..=most).contains(&options.lights) || place.viewpoints.len() < HOLD_OUT {
         return Err(PipelineError::Usage(format!("a benchmark has 1 to {most} lights and at least {HOLD_OUT} views")));
     }
     for folder in ["images", "masks", "truth"] {
         let folder = out.join(folder);
         std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     }
-    let (model, cameras) = (&place.model, &place.cameras);
+    let (model, viewpoints) = (&place.model, &place.viewpoints);
     let lights: Vec<usize> = (0..options.lights).chain(most..LIGHTS.len()).collect();
     let daylights: Vec<Daylight> = lights.iter().map(|l| light(*l)).collect();
     let mut scene = Scene::new(model, &daylights[0]);
     let mut made = Synthesized { photographs: 0, held_out: 0, triangles: model.face_count(), interrupted: false };
     let (mut frames, mut views) = ([Vec::new(), Vec::new()], Vec::new());
-    let total = (cameras.len() * lights.len()) as f64;
-    for (v, (camera, pose)) in cameras.iter().enumerate() {
+    let is_in = |p: &Viewpoint, l: usize| p.light.is_none_or(|of| of == l) && (l < options.lights || p.is_held_out);
+    let total = viewpoints.iter().map(|p| (0..lights.len()).filter(|l| is_in(p, *l)).count()).sum::<usize>() as f64;
+    for (v, viewpoint) in viewpoints.iter().enumerate() {
+        let Viewpoint { camera, pose, is_held_out, .. } = viewpoint;
         let view = View { camera: *camera, world_from_camera: *pose, lens: None };
-        for (l, daylight) in daylights.iter().enumerate() {
+        let mut is_first = true;
+        for (l, daylight) in daylights.iter().enumerate().filter(|(l, _)| is_in(viewpoint, *l)) {
             scene.set_light(daylight);
-            let is_unseen = l >= options.lights;
-            let is_held_out = v % HOLD_OUT == HOLD_OUT - 1;
-            // Of lights that are held out, only the views that are held out.
-            if is_unseen && !is_held_out {
-                continue;
-            }
             let mut film = Film::new(camera);
             let settings = Settings {
                 seed: options.seed + (v * lights.len() + l) as u64,
@@ -231,16 +258,16 @@ pub fn generate(
             save_photograph(&out.join("images").join(format!("{name}.png")), &film)?;
             truth::save_shadow(out, &name, &film)?;
             let mask = format!("masks/v{v:03}.png");
-            if l == 0 {
+            if std::mem::take(&mut is_first) {
                 let classes = classes(&scene, &view, model);
                 let is_valid = valid_pixels(&classes, &film);
                 truth::save_view(out, &format!("v{v:03}"), &film, &is_valid)?;
                 photo::save_png(&out.join(&mask), &classes)?;
             }
-            frames[is_held_out as usize].push(frame(&name, &mask, camera, pose, l));
-            views.push(ViewTruth { photograph: name, view: format!("v{v:03}"), light: l, held_out: is_held_out });
-            *(if is_held_out { &mut made.held_out } else { &mut made.photographs }) += 1;
-            progress((v * lights.len() + l + 1) as f64 / total);
+            frames[*is_held_out as usize].push(frame(&name, &mask, camera, pose, l));
+            views.push(ViewTruth { photograph: name, view: format!("v{v:03}"), light: l, held_out: *is_held_out });
+            *(if *is_held_out { &mut made.held_out } else { &mut made.photographs }) += 1;
+            progress((made.photographs + made.held_out) as f64 / total);
             if stop.load(Ordering::Relaxed) {
                 made.interrupted = true;
                 return Ok(made);
@@ -255,7 +282,7 @@ pub fn generate(
     }
     truth.save(out)?;
     for (name, frames) in ["transforms_train.json", "transforms_test.json"].into_iter().zip(frames) {
-        atomic::write(&out.join(name), &serde_json::to_vec_pretty(&capture(frames, &scene, cameras)).expect("plain values"))?;
+        atomic::write(&out.join(name), &serde_json::to_vec_pretty(&capture(frames, &scene, viewpoints)).expect("plain values"))?;
     }
     Ok(made)
 }
@@ -298,13 +325,13 @@ fn frame(name: &str, mask: &str, camera: &Camera, pose: &Pose, session: usize) -
 }
 
 /// `transforms.json` whose inner cube holds the cameras and most of what they see, and whose outer cube all of it.
-fn capture(frames: Vec<serde_json::Value>, scene: &Scene, cameras: &[(Camera, Pose)]) -> serde_json::Value {
+fn capture(frames: Vec<serde_json::Value>, scene: &Scene, viewpoints: &[Viewpoint]) -> serde_json::Value {
     let mut seen: Vec<DVec3> = Vec::new();
-    for (camera, pose) in cameras {
+    for Viewpoint { camera, pose, .. } in viewpoints {
         let view = View { camera: camera.resized(PROBED.0, PROBED.1), world_from_camera: *pose, lens: None };
         seen.extend(cpu::first_hits(scene, &view, true).into_iter().flatten().map(|h| h.position));
     }
-    let standing = || cameras.iter().map(|(_, pose)| pose.translation);
+    let standing = || viewpoints.iter().map(|p| p.pose.translation);
     let range = |axis: usize| -> (f64, f64) {
         let mut along: Vec<f64> = seen.iter().map(|p| p[axis]).collect();
         along.sort_by(f64::total_cmp);

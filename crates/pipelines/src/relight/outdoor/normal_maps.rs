@@ -13,8 +13,9 @@ use diorama_geom::glam::{DMat3, DVec3, Vec3};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use rayon::prelude::*;
 
-/// Pixels along the longer side at most.
+/// Pixels along the longer side at most, and pixels of all maps together.
 const LONGEST: u32 = 320;
+const PIXELS: f64 = 3e6;
 /// Reach of a window to each side and distance of the pixels in it that are used: a plane must be larger than the noise of its distances.
 const REACH: i32 = 8;
 const STRIDE: usize = 2;
@@ -41,8 +42,8 @@ const SHARE: f32 = 0.02;
 /// Maps of the training cameras.
 pub struct NormalMaps {
     maps: Vec<Map>,
-    /// Map of each camera, and its width and height.
-    of: Vec<(usize, [f32; 2])>,
+    /// Map of each camera that has one, and its width and height.
+    of: Vec<Option<(usize, [f32; 2])>>,
 }
 
 struct Map {
@@ -73,18 +74,31 @@ struct Plane {
 }
 
 impl NormalMaps {
-    /// Of a model's surfaces. Cameras that stand alike share a map.
+    /// Of a model's surfaces. Cameras that stand alike share a map; so many that their maps would be large together get smaller ones.
     pub fn of(model: &SceneModel, cameras: &[PosedCamera]) -> NormalMaps {
-        let mut shown: Vec<PosedCamera> = Vec::new();
-        let is_same = |a: &PosedCamera, b: &PosedCamera| a.pose == b.pose && a.camera == b.camera;
-        let of = cameras.iter().map(|c| {
-            let at = shown.iter().position(|s| is_same(s, c)).unwrap_or_else(|| {
-                shown.push(*c);
-                shown.len() - 1
-            });
-            (at, [c.camera.width as f32, c.camera.height as f32])
-        });
-        let of = of.collect();
+        let (shown, of) = apart(cameras);
+        let pixels: f64 = shown.iter().map(|c| shrunk(c, 1.0)).map(|c| c.camera.width as f64 * c.camera.height as f64).sum();
+        let by = (PIXELS / pixels).sqrt().min(1.0);
+        let size = |c: &PosedCamera| [c.camera.width as f32, c.camera.height as f32];
+        let of = of.iter().zip(cameras).map(|(map, c)| Some((*map, size(c)))).collect();
+        NormalMaps::shown(model, shown.iter().map(|c| shrunk(c, by)).collect(), of)
+    }
+
+    /// Of some of the cameras, as many as have large maps; `turn` says which of them, so that each has its turn.
+    pub fn of_some(model: &SceneModel, cameras: &[PosedCamera], turn: usize) -> NormalMaps {
+        let (shown, of) = apart(cameras);
+        let of_one = |c: &PosedCamera| shrunk(c, 1.0).camera;
+        let pixels: f64 = shown.iter().map(of_one).map(|c| c.width as f64 * c.height as f64).sum();
+        let every = ((pixels / PIXELS).ceil() as usize).max(1);
+        let is_used = |map: usize| map % every == turn % every;
+        let size = |c: &PosedCamera| [c.camera.width as f32, c.camera.height as f32];
+        let place = |map: usize| is_used(map).then(|| map / every);
+        let of = of.iter().zip(cameras).map(|(map, c)| Some((place(*map)?, size(c)))).collect();
+        let used = shown.iter().enumerate().filter(|(map, _)| is_used(*map)).map(|(_, c)| shrunk(c, 1.0));
+        NormalMaps::shown(model, used.collect(), of)
+    }
+
+    fn shown(model: &SceneModel, shown: Vec<PosedCamera>, of: Vec<Option<(usize, [f32; 2])>>) -> NormalMaps {
         let seen: Vec<Seen> = shown.iter().map(|c| Seen::of(model, c)).collect();
         let free: Vec<Vec<Option<Plane>>> = seen.iter().map(Seen::free_planes).collect();
         let main = main_directions(&seen, &free);
@@ -94,7 +108,7 @@ impl NormalMaps {
 
     /// Normal at a pixel of a training camera; 0 where it is not known.
     pub fn at(&self, image: usize, x: f32, y: f32) -> Vec3 {
-        let (map, [w, h]) = self.of[image];
+        let Some((map, [w, h])) = self.of[image] else { return Vec3::ZERO };
         let map = &self.maps[map];
         let at = |v: f32, of: f32, n: usize| ((v / of * n as f32) as usize).min(n - 1);
         map.normals[at(y, h, map.height) * map.width + at(x, w, map.width)]
@@ -103,7 +117,7 @@ impl NormalMaps {
     /// Distances to the planes, of about `count` pixels of the cameras' photographs.
     pub fn observations(&self, count: usize) -> Vec<Observation> {
         let known = |m: &Map| m.distances.iter().filter(|d| **d > 0.0).count();
-        let all: usize = self.of.iter().map(|(map, _)| known(&self.maps[*map])).sum();
+        let all: usize = self.of.iter().flatten().map(|(map, _)| known(&self.maps[*map])).sum();
         let every = all.div_ceil(count).max(1);
         let of_one = |(image, (map, size)): (usize, &(usize, [f32; 2]))| {
             let map = &self.maps[*map];
@@ -115,20 +129,16 @@ impl NormalMaps {
                 Observation { image: image as u32, x, y, distance: *distance }
             })
         };
-        self.of.iter().enumerate().flat_map(of_one).collect()
+        self.of.iter().enumerate().filter_map(|(i, of)| Some((i, of.as_ref()?))).flat_map(of_one).collect()
     }
 }
 
 impl Seen {
-    fn of(model: &SceneModel, camera: &PosedCamera) -> Seen {
-        let c = &camera.camera;
-        let shrink = (LONGEST as f64 / c.width.max(c.height) as f64).min(1.0);
-        let size = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
-        let small = PosedCamera { camera: c.resized(size(c.width), size(c.height)), pose: camera.pose };
+    fn of(model: &SceneModel, small: &PosedCamera) -> Seen {
         // The same surfaces whether light is about to be told apart or has been.
         let tracer = Tracer { cube: model.cube_in(Stage::Light), ..model.tracer(Quality::Full) };
         let codes: &[&[f32]] = if model.stage == Stage::Light { &[&[0.0; 9]] } else { &[] };
-        let view = tracer.layers(&small, codes, &mut |_| {});
+        let view = tracer.layers(small, codes, &mut |_| {});
         let (w, h) = (view.depth.width, view.depth.height);
         let rays: Vec<DVec3> = (0..w * h).map(|i| small.camera.direction((i % w) as f64 + 0.5, (i / w) as f64 + 0.5)).collect();
         let inverse = |i: usize| {
@@ -236,6 +246,28 @@ impl Seen {
         let sign = if plane.of.dot(self.rays[i]) > 0.0 { -1.0 } else { 1.0 };
         (sign * (self.to_model * plane.of).normalize_or_zero()).as_vec3()
     }
+}
+
+/// The cameras that stand apart, and which of them each camera stands like.
+fn apart(cameras: &[PosedCamera]) -> (Vec<PosedCamera>, Vec<usize>) {
+    let mut shown: Vec<PosedCamera> = Vec::new();
+    let is_same = |a: &PosedCamera, b: &PosedCamera| a.pose == b.pose && a.camera == b.camera;
+    let of = cameras.iter().map(|c| {
+        shown.iter().position(|s| is_same(s, c)).unwrap_or_else(|| {
+            shown.push(*c);
+            shown.len() - 1
+        })
+    });
+    let of = of.collect();
+    (shown, of)
+}
+
+/// A camera of at most [`LONGEST`] pixels along its longer side, times a factor.
+fn shrunk(camera: &PosedCamera, by: f64) -> PosedCamera {
+    let c = &camera.camera;
+    let shrink = by * (LONGEST as f64 / c.width.max(c.height) as f64).min(1.0);
+    let size = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
+    PosedCamera { camera: c.resized(size(c.width), size(c.height)), pose: camera.pose }
 }
 
 /// How much a relative difference counts (Geman–McClure).

@@ -123,7 +123,7 @@ fn observations(
         found = sparse_points::observe(&model.capture, &model.train, reduction, model.model_from_world.scale);
         let from = if found.len() < sparse_points::ENOUGH {
             events(&Event::Note(format!("comparing {} photographs with their neighbors to find distances", model.train.len())));
-            found = stereo::observe(photographs, &model.cameras(), distance, interrupt);
+            found = stereo::observe(photographs, &model.cameras(), &model.light_of, distance, interrupt);
             "by comparing photographs"
         } else {
             "by sparse points"

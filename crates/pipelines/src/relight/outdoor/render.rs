@@ -104,6 +104,14 @@ impl ViewLight {
         self.behind.as_ref().map_or([0.0; 3], radiance)
     }
 
+    /// What shadows read of it.
+    fn code(&self) -> [f32; 9] {
+        match self.sun {
+            Some(sun) => shading::sun_code(&sun),
+            None => std::array::from_fn(|i| gray(&self.light.0[i].map(|v| v as f32))),
+        }
+    }
+
     fn numbers(&self) -> Vec<f32> {
         self.light.0.iter().flatten().map(|v| *v as f32).collect()
     }
@@ -143,9 +151,9 @@ impl SceneModel {
         self.lit(&self.layers(&tracer, camera, light, progress), camera, light)
     }
 
-    /// What the field says of each pixel; where suns are apart, the same in all lights.
+    /// What the field says of each pixel.
     fn layers(&self, tracer: &Tracer, camera: &PosedCamera, light: &ViewLight, progress: &mut dyn FnMut(usize)) -> Layers {
-        let code: Vec<f32> = light.numbers().chunks_exact(3).map(gray).collect();
+        let code = light.code();
         tracer.layers(camera, &[&code], progress)
     }
 
@@ -217,7 +225,7 @@ pub struct FineViews<'a> {
     model: &'a SceneModel,
     /// Rays per pixel and axis.
     samples: u32,
-    last: Option<(PosedCamera, Layers)>,
+    last: Option<(PosedCamera, [f32; 9], Layers)>,
 }
 
 impl FineViews<'_> {
@@ -237,14 +245,12 @@ impl FineViews<'_> {
     pub fn view(&mut self, camera: &PosedCamera, light: &ViewLight) -> SceneView {
         let (model, (w, h)) = (self.model, (camera.camera.width, camera.camera.height));
         let fine = PosedCamera { camera: camera.camera.resized(self.samples * w, self.samples * h), pose: camera.pose };
-        let is_traced = self.last.as_ref().is_some_and(|l| model.has_suns() && l.0.camera == fine.camera && l.0.pose == fine.pose);
+        let code = light.code();
+        let is_traced = self.last.as_ref().is_some_and(|l| l.0.camera == fine.camera && l.0.pose == fine.pose && l.1 == code);
         if !is_traced {
-            self.last = Some((fine, model.layers(&model.tracer(Quality::Full), &fine, light, &mut |_| {})));
+            self.last = Some((fine, code, model.layers(&model.tracer(Quality::Full), &fine, light, &mut |_| {})));
         }
-        let view = model.lit(&self.last.as_ref().expect("traced").1, &fine, light);
-        if !model.has_suns() {
-            self.last = None;
-        }
+        let view = model.lit(&self.last.as_ref().expect("traced").2, &fine, light);
         let mean = |image: Image| image.downsampled(w as usize, h as usize);
         let opacity = mean(view.opacity.clone());
         // What is not multiplied by the opacity is the mean of what is opaque.

@@ -106,6 +106,8 @@ pub struct Sunlit<'a> {
     pub sun: &'a [f32],
     pub reach: [f32; 2],
     pub ambient: Vec3,
+    /// Light of lamps that arrives.
+    pub of_lamps: Vec3,
 }
 
 /// What a ray shows: a point and its normal; none where it meets nothing. `depth` is `Σ w t`.
@@ -131,7 +133,7 @@ pub fn sunlit<'a>(
 ) -> Sunlit<'a> {
     let (sun, lamps) = suns.split_at(SUN);
     match surface(normal, hit, origin, dir) {
-        None => Sunlit { sun, reach: [1.0; 2], ambient: Vec3::ONE },
+        None => Sunlit { sun, reach: [1.0; 2], ambient: Vec3::ONE, of_lamps: Vec3::ZERO },
         Some(at) => {
             let corners = visibility.corners(at.0, at.1);
             let from_lamp = |lamp: &[f32]| {
@@ -140,7 +142,7 @@ pub fn sunlit<'a>(
                 arrives * Vec3::from_slice(&lamp[3..])
             };
             let lamps: Vec3 = lamps.chunks_exact(SUN).map(from_lamp).sum();
-            Sunlit { sun, reach: reach(visibility, sun, at), ambient: ambient.at(&corners, at.1, sky) + lamps }
+            Sunlit { sun, reach: reach(visibility, sun, at), ambient: ambient.at(&corners, at.1, sky), of_lamps: lamps }
         }
     }
 }
@@ -233,7 +235,7 @@ fn shade(normal: &[f32], dir: &[f32], light: &[f32], sky: &[f32]) -> Shaded {
 
 /// Light that a white surface sends, with its shadow.
 fn received(values: &[f32], s: &Shaded, sunlit: Option<Sunlit>, k: usize) -> f32 {
-    sunlit.map_or(values[3] * s.lit[k].max(0.0), |l| l.received(&s.normal)[k])
+    sunlit.map_or(values[3] * s.lit[k].max(0.0), |l| l.received(&s.normal, values[3])[k])
 }
 
 /// Light of a sun that reaches a surface without shadows.
@@ -242,9 +244,9 @@ fn unhidden(sun: &[f32], normal: &[f32; 3]) -> Vec3 {
 }
 
 impl Sunlit<'_> {
-    /// Light that a white surface sends.
-    fn received(&self, normal: &[f32; 3]) -> Vec3 {
-        self.reach[0] * unhidden(self.sun, normal) + self.ambient
+    /// Light that a white surface sends of which a share of the suns is not hidden by what is too small to be traced.
+    fn received(&self, normal: &[f32; 3], share: f32) -> Vec3 {
+        share * (self.reach[0] * unhidden(self.sun, normal) + self.of_lamps) + self.ambient
     }
 }
 
@@ -272,10 +274,16 @@ pub fn color(values: &[f32], opacity: f32, dir: &[f32], light: &[f32], sky: &[f3
     let rgb = std::array::from_fn(|k| values[k] * irradiance[k] + (1.0 - opacity) * s.sky[k].max(0.0));
     let shadow = match sunlit {
         Some(_) if opacity < FAINT => 1.0,
-        Some(l) => arriving(l.sun, l.reach, &s.normal, s.lit, Vec3::ZERO),
+        Some(l) => arriving(l.sun, [values[3] * l.reach[0], l.reach[1]], &s.normal, s.lit, Vec3::ZERO),
         None => values[3],
     };
     RayColor { rgb, irradiance, shadow }
+}
+
+/// What the shadow's head reads of a sun apart: its direction; zeros where there is none.
+pub fn sun_code(sun: &[f32]) -> [f32; 9] {
+    let is_there = sun[3..SUN].iter().any(|v| *v > 0.0);
+    std::array::from_fn(|i| if is_there && i < 3 { sun[i] } else { 0.0 })
 }
 
 /// Luminance of a color or coefficient.
@@ -351,6 +359,9 @@ impl SceneLoss<'_> {
                 tables.gains[3 * image + k] += dc * plain[k];
             }
             d_values[k] += dc * white[k];
+            if let Some(l) = sunlit {
+                d_values[3] += dc * values[k] * l.reach[0] * unhidden(l.sun, &s.normal)[k];
+            }
             if sunlit.is_none() && s.lit[k] > 0.0 {
                 d_values[3] += dc * values[k] * s.lit[k];
                 let d_lit = dc * shadow * values[k];
@@ -366,12 +377,10 @@ impl SceneLoss<'_> {
     fn teach(&self, r: usize, ray: &RayIn, d: &mut RayGradients, share: f32) -> f64 {
         let (w, values, mut loss) = (self.weights, ray.values, 0.0);
         let d_values = &mut d.values[r * CHANNELS..][..CHANNELS];
-        if self.suns.is_none() {
-            let (want, weight) = ray.traced.map_or((1.0, w.shadow), |t| (t, w.traced));
-            let off = values[3] - want;
-            loss += (share * weight * off * off) as f64;
-            d_values[3] += 2.0 * share * weight * off;
-        }
+        let (want, weight) = ray.traced.map_or((1.0, w.shadow), |t| (t, w.traced));
+        let off = values[3] - want;
+        loss += (share * weight * off * off) as f64;
+        d_values[3] += 2.0 * share * weight * off;
         let said = unit(&values[NORMAL..]);
         if said.1 > SHORTEST && self.normals[3 * r..3 * r + 3].iter().any(|v| *v != 0.0) {
             loss += (share * w.tie * (1.0 - (0..3).map(|a| said.0[a] * ray.normal[a]).sum::<f32>())) as f64;

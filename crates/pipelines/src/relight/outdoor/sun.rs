@@ -2,7 +2,7 @@
 //! visibility `V`, the sky's harmonics `L` as what stands around lets them through, `T`, and light `B` from surfaces around. Directions are
 //! searched, the rest then is linear; `B` follows from light and albedo, again and again.
 
-use super::visibility::{Ambient, Corners, Visibility, spread};
+use super::visibility::{Ambient, Corners, OPEN_CELLS, Visibility, spread};
 use diorama_geom::color::{LUMINANCE, srgb_from_linear};
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
@@ -48,6 +48,8 @@ const SENT_AGAIN: usize = 3;
 /// worse without it.
 const WEAK: f32 = 0.5;
 const NO_WORSE: f64 = 1.01;
+/// Share of the points, the lowest, that the ground outside looks like.
+const LOWEST: f32 = 0.1;
 /// Bounces of light between surfaces, where a light is given.
 const BOUNCES: usize = 4;
 /// Difference in sRGB beyond which points count less and less.
@@ -124,15 +126,31 @@ impl Surfaces {
 
     /// Light of the sky and of surfaces, of which each receives `irradiance`.
     fn ambient(&self, visibility: &Visibility, sky: &[f32], irradiance: &[Vec3]) -> Ambient {
-        let mut sent: Vec<(Vec3, f32)> = vec![(Vec3::ZERO, 0.0); super::visibility::OPEN_CELLS.pow(3)];
-        let mut mean = Vec3::ZERO;
+        let mut sent: Vec<(Vec3, f32)> = vec![(Vec3::ZERO, 0.0); OPEN_CELLS.pow(3)];
+        let mut by_height = [(Vec3::ZERO, 0.0); OPEN_CELLS];
         for ((p, a), e) in self.points.iter().zip(&self.albedos).zip(irradiance) {
-            let of = &mut sent[p.cell as usize];
-            *of = (of.0 + *a * *e, of.1 + 1.0);
-            mean += *a * *e / self.points.len() as f32;
+            for of in [&mut sent[p.cell as usize], &mut by_height[p.cell as usize / OPEN_CELLS.pow(2)]] {
+                *of = (of.0 + *a * *e, of.1 + 1.0);
+            }
         }
-        let radiosity: Vec<Option<Vec3>> = sent.into_iter().map(|(sum, n)| (n > 0.0).then(|| sum / n)).collect();
-        visibility.ambient(sky, &radiosity, mean)
+        // What no photograph shows looks like the rest at its height; the ground outside, like the lowest tenth.
+        let (mut ground, mut count) = (Vec3::ZERO, 0.0);
+        for (sum, n) in by_height {
+            if count < LOWEST * self.points.len() as f32 {
+                (ground, count) = (ground + sum, count + n);
+            }
+        }
+        let ground = ground / count.max(1.0);
+        let mut last = ground;
+        let by_height = by_height.map(|(sum, n)| {
+            if n > 0.0 {
+                last = sum / n;
+            }
+            last
+        });
+        let of_cell = |(i, (sum, n)): (usize, (Vec3, f32))| if n > 0.0 { sum / n } else { by_height[i / OPEN_CELLS.pow(2)] };
+        let radiosity: Vec<Vec3> = sent.into_iter().enumerate().map(of_cell).collect();
+        visibility.ambient(sky, &radiosity, ground)
     }
 
     /// What of the sky, and of surfaces that it and suns `[N, 6]` light, reaches any place.

@@ -123,7 +123,7 @@ impl<'a> Trainer<'a> {
         }
         self.model.flattened = due;
         events(&Event::Preparing { what: "flattening surfaces", share: due as f64 / FLATTENED as f64 });
-        let flat = NormalMaps::of(&self.model, &self.cameras).observations(FLAT_PIXELS);
+        let flat = NormalMaps::of_some(&self.model, &self.cameras, due as usize).observations(FLAT_PIXELS);
         self.model.flat = flat.iter().flat_map(|o| [o.image as f32, o.x as f32, o.y as f32, o.distance]).collect();
         self.observe_flat();
     }

@@ -19,8 +19,9 @@ const SOLID: f32 = 0.5;
 /// Optical depth of a solid cell, and beyond which nothing passes.
 const DEPTH: f32 = 2.0;
 const OPAQUE: f32 = 6.0;
-/// Cells that a ray starts off its surface, along the normal and along its own direction.
-const LIFT: (f32, f32) = (1.5, 1.0);
+/// Cells above its surface at which what a ray meets begins to count, and farthest along the ray that this is.
+const LIFT: f32 = 1.5;
+const FARTHEST: f32 = 8.0;
 /// Length of a step in cells.
 const STEP: f32 = 0.7;
 /// Bits in a number of a checkpoint.
@@ -187,8 +188,11 @@ impl Visibility {
 
     /// Share of the light from a direction that reaches a surface.
     pub fn from_sun(&self, point: Vec3, normal: Vec3, direction: Vec3) -> f32 {
-        let at = (point - self.low) / self.cell();
-        self.pass(at + LIFT.0 * normal + LIFT.1 * direction, direction).0
+        // On the ray, not beside it: off to the side, shadows would be shifted.
+        let facing = normal.dot(direction).max(0.0);
+        let along = (LIFT / facing.max(1e-3)).min(FARTHEST);
+        let beside = (LIFT - along * facing) * normal;
+        self.pass((point - self.low) / self.cell() + along * direction + beside, direction).0
     }
 
     /// Whether a block with something solid touches a cell of `[OPEN_CELLS³]` or one next to it.
@@ -295,13 +299,13 @@ impl Visibility {
         row
     }
 
-    /// Light of a sky `[9, 3]` and of surfaces of which `radiosity` over π is given by cell, and where that is not known, on the mean.
-    pub fn ambient(&self, sky: &[f32], radiosity: &[Option<Vec3>], mean: Vec3) -> Ambient {
+    /// Light of a sky `[9, 3]` and of surfaces of which `radiosity` over π is given by cell, and of the ground outside.
+    pub fn ambient(&self, sky: &[f32], radiosity: &[Vec3], ground: Vec3) -> Ambient {
         let weights: Vec<[f32; 9]> = (0..DIRECTIONS).map(|i| looks(i).1).collect();
         let of = |s: &Surroundings| {
             let mut out: [Vec3; 9] = std::array::from_fn(|j| (0..9).map(|i| s.sky[j][i] * Vec3::from_slice(&sky[3 * i..])).sum());
             for seen in &s.seen {
-                let sent = seen.share * if seen.cell == GROUND { mean } else { radiosity[seen.cell as usize].unwrap_or(mean) };
+                let sent = seen.share * if seen.cell == GROUND { ground } else { radiosity[seen.cell as usize] };
                 (0..9).for_each(|j| out[j] += weights[seen.direction as usize][j] * sent);
             }
             out

@@ -2,7 +2,7 @@
 
 use super::super::model::Around;
 use super::super::normal_maps::NormalMaps;
-use super::super::shading::{LIGHT, SceneGradients, SceneLoss, Suns, TracedLight, Weights, gray};
+use super::super::shading::{LIGHT, SceneGradients, SceneLoss, Suns, TracedLight, Weights, gray, sun_code};
 use super::super::sun::{self, SUN, Seen};
 use super::super::visibility::Visibility;
 use super::{SETTLED, Trainer, WithoutGlass};
@@ -32,6 +32,9 @@ const TELLS: usize = 4;
 const SURFACE: f32 = 0.9;
 /// Standard deviation of noise on the light that the shadow sees.
 const LIGHT_NOISE: f32 = 0.01;
+/// The same on the direction of a sun apart, and share of the rays whose shadow reads none.
+const SUN_NOISE: f32 = 0.1;
+const UNREAD: f32 = 0.25;
 /// Every so many rays, one teaches the shadow of a sun that no photograph has.
 const TAUGHT_RAYS: usize = 3;
 
@@ -143,6 +146,18 @@ impl Trainer<'_> {
         out
     }
 
+    /// What shadows read of the rays' suns, with noise; of some rays, nothing, as where there is no sun.
+    fn sun_codes(&self, light: &[u32], step: u64) -> Vec<f32> {
+        let (noise, rng) = (self.rng(NOISE, step), self.rng(TAUGHT, step));
+        let of_ray = |(r, l): (usize, &u32)| {
+            let mut code = sun_code(&self.model.suns.values[SUN * *l as usize..][..SUN]);
+            let is_read = code != [0.0; 9] && rng.uniform(r as u64) > UNREAD;
+            (0..3).for_each(|i| code[i] = if is_read { code[i] + SUN_NOISE * noise.normal((3 * r + i) as u64) } else { 0.0 });
+            code
+        };
+        light.iter().enumerate().flat_map(of_ray).collect()
+    }
+
     /// One step of the light's stage.
     pub(super) fn relight(&mut self, step: u64, share: f32) -> Result<StepReport> {
         self.draw(step);
@@ -185,8 +200,8 @@ impl Trainer<'_> {
             traced: (!is_apart).then_some(TracedLight { suns: &taught.suns, skies: &taught.skies, visibility, origins }),
             out: Mutex::default(),
         };
-        let unread = vec![0.0; if is_apart { 9 * n } else { 0 }];
-        let codes = [if is_apart { &unread[..] } else { &taught.codes }];
+        let of_suns = if is_apart { self.sun_codes(&drawn.light, step) } else { Vec::new() };
+        let codes = [if is_apart { &of_suns[..] } else { &taught.codes }];
         let background = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0].repeat(n);
         let given = given(&self.batch, &drawn.light, &background, &codes);
         let described = self.described(step - self.model.began, share, given, Loss::Batch(&loss));
