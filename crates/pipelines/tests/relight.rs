@@ -10,7 +10,7 @@ use diorama_geom::{Camera, ImageU8, Mesh, Model, Pose};
 use diorama_pipelines::relight::outdoor::config::{Config, Preset};
 use diorama_pipelines::relight::outdoor::pictures::{self, Layer, PicturesOptions};
 use diorama_pipelines::relight::outdoor::{recipe, scores, viewing};
-use diorama_pipelines::relight::synth::{self, Place, SynthOptions};
+use diorama_pipelines::relight::synth::{self, Place, SynthOptions, Viewpoint};
 use diorama_pipelines::run::RunFolder;
 use std::ops::Range;
 use std::path::Path;
@@ -71,6 +71,19 @@ fn config(data: &Path, steps: u64) -> Config {
     let mut config = Config::new(Preset::Ci, data.into());
     (config.run.steps, config.sampling.rays) = (steps, 256);
     config
+}
+
+#[test]
+fn each_light_is_photographed_from_viewpoints_of_its_own() {
+    let options = SynthOptions { views: 10, lights: 3, size: (16, 12), samples: 1, seed: 0 };
+    let viewpoints = Place::street(&options).viewpoints;
+    let (held_out, walked): (Vec<Viewpoint>, Vec<Viewpoint>) = viewpoints.iter().partition(|v| v.is_held_out);
+    assert!(held_out.len() == 2 && held_out.iter().all(|v| v.light.is_none()));
+    for light in 0..3 {
+        assert_eq!(walked.iter().filter(|v| v.light == Some(light)).count(), 8);
+    }
+    let is_alone = |v: &Viewpoint| viewpoints.iter().filter(|w| w.pose == v.pose).count() == 1;
+    assert!(viewpoints.iter().all(is_alone));
 }
 
 #[test]

@@ -403,6 +403,20 @@ mod tests {
     }
 
     #[test]
+    fn photographs_of_one_light_are_compared() {
+        let wall = Wall::new(irregular);
+        let cameras: Vec<PosedCamera> = (0..2).flat_map(|_| wall.cameras.iter().copied()).collect();
+        let views: Vec<Gray> = cameras.iter().enumerate().map(|(i, c)| Gray::of(&wall, i % 7, c, 800)).collect();
+        let at = |v: &Gray| views.iter().position(|w| std::ptr::eq(w, v)).unwrap();
+        let chosen = |lights: &[u32]| neighbors(&views, lights, 3, 3.0).into_iter().map(at).collect::<Vec<usize>>();
+        let of_two: Vec<u32> = (0..14).map(|i| i / 7).collect();
+        assert!(chosen(&of_two).len() > 2 && chosen(&of_two).iter().all(|i| *i < 7));
+        // A light of two photographs has too few neighbors of its own.
+        let of_many: Vec<u32> = (0..14).map(|i| if i == 3 || i == 4 { 9 } else { 0 }).collect();
+        assert!(chosen(&of_many).iter().any(|i| *i != 4) && chosen(&of_many) == chosen(&[]));
+    }
+
+    #[test]
     fn distances_of_texture_are_right_and_only_where_pixels_count() {
         // Full size; reduced by two and by three, which do not divide the sides; and with one stored pixel in four.
         for (size, stride, longest) in [((96, 96), 1, 800), ((195, 193), 1, 98), ((290, 289), 1, 97), ((193, 195), 2, 98)] {
@@ -435,9 +449,9 @@ mod tests {
             PosedCamera { camera: c.camera, pose: Pose::look_at(c.pose.translation, target, DVec3::Y) }
         };
         let turned: Vec<PosedCamera> = mixed.cameras.iter().enumerate().map(turned).collect();
-        let wrong_poses = observe(&mixed, &turned, 3.0, &AtomicBool::new(false)).len();
+        let wrong_poses = observe(&mixed, &turned, &[], 3.0, &AtomicBool::new(false)).len();
         mixed.cameras.truncate(2);
-        let too_few = observe(&mixed, &mixed.cameras, 3.0, &AtomicBool::new(false)).len();
+        let too_few = observe(&mixed, &mixed.cameras, &[], 3.0, &AtomicBool::new(false)).len();
         println!("plain {plain}, pattern {wrong} wrong of {pattern}, turned {wrong_poses} of {right}, two views {too_few}");
         assert_eq!((plain, too_few), (0, 0));
         assert!(wrong * 20 < right && wrong_poses * 20 < right);

@@ -265,7 +265,7 @@ impl Config {
             loss: LossConfig {
                 huber: 0.1,
                 robust: 2.0,
-                shadow: 1e-2,
+                shadow: 1e-4,
                 traced: 0.1,
                 normal: 0.1,
                 negative: 0.1,

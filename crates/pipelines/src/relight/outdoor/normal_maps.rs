@@ -30,6 +30,12 @@ const SUPPORTED: f64 = 0.55;
 /// Mean weight in a window from which its plane tells distances, and by how much at most it moves them.
 const FLAT: f64 = 0.4;
 const FLATTENED: f64 = 0.005;
+/// Where ground may be uneven: sine of the angle below the horizon, relative difference of its distances, cosine between up and upright
+/// planes, and share of the support that these may have.
+const DOWN: f64 = 0.04;
+const UNEVEN: f64 = 0.06;
+const UPRIGHT: f64 = 0.5;
+const LESS: f64 = 0.9;
 /// Normals of which the main directions are found, directions that are tried, and most that are kept.
 const SAMPLED: usize = 50_000;
 const TRIED: usize = 3000;
@@ -202,7 +208,7 @@ impl Seen {
     }
 
     /// The plane of a given normal, in the camera's space, that most distances around a pixel agree on; none where it faces away.
-    fn plane_along(&self, i: usize, near: &[(DVec3, f64)], normal: DVec3) -> Option<Plane> {
+    fn plane_along(&self, i: usize, near: &[(DVec3, f64)], normal: DVec3, apart: f64) -> Option<Plane> {
         let offset = |ray: DVec3, inverse: f64| normal.dot(ray) / inverse;
         let mut at = offset(self.rays[i], self.inverse[i]);
         if at * self.inverse[i] > -0.05 * self.rays[i].length() {
@@ -213,7 +219,7 @@ impl Seen {
             let (mut sum, mut weights) = (0.0, 0.0);
             for (ray, inverse) in near {
                 let own = offset(*ray, *inverse);
-                let weight = if own < 0.0 { agreement((at / own - 1.0) / APART) } else { 0.0 };
+                let weight = if own < 0.0 { agreement((at / own - 1.0) / apart) } else { 0.0 };
                 (sum, weights) = (sum + weight * own, weights + weight);
             }
             if weights <= 0.0 {
@@ -224,17 +230,39 @@ impl Seen {
         Some(Plane { of: normal / at, support })
     }
 
+    /// The level plane through uneven distances below the camera; none where an upright one explains them as well. Ground is seen from close
+    /// above it and has little texture, so that its distances are those of lumps.
+    fn level(&self, i: usize, (near, all): (&[(DVec3, f64)], usize), (up, main): (DVec3, &[DVec3])) -> Option<Plane> {
+        if self.rays[i].dot(up) > -DOWN * self.rays[i].length() {
+            return None;
+        }
+        let level = self.plane_along(i, near, up, UNEVEN).filter(|p| p.support > FLAT * all as f64)?;
+        let upright = main.iter().filter(|m| m.dot(up).abs() < UPRIGHT).filter_map(|m| self.plane_along(i, near, *m, UNEVEN));
+        upright.into_iter().all(|p| p.support < LESS * level.support).then_some(level)
+    }
+
     /// The normals, each of the free plane or of one along a main direction.
     fn map(&self, free: &[Option<Plane>], main: &[Vec3]) -> Map {
         let main: Vec<DVec3> = main.iter().map(|m| self.to_model.transpose() * m.as_dvec3()).collect();
+        let up = self.to_model.transpose() * DVec3::Z;
         let of = |i: usize| {
-            let Some(own) = free[i] else { return (Vec3::ZERO, 0.0) };
+            if self.inverse[i] <= 0.0 {
+                return (Vec3::ZERO, 0.0);
+            }
             let (near, all) = self.window(i);
-            let along = main.iter().filter_map(|m| self.plane_along(i, &near, *m));
+            let along = main.iter().filter_map(|m| self.plane_along(i, &near, *m, APART));
             let best = along.max_by(|a, b| a.support.total_cmp(&b.support));
-            let plane = best.filter(|b| b.support >= SUPPORTED * own.support).unwrap_or(own);
+            let best = free[i].map(|own| best.filter(|b| b.support >= SUPPORTED * own.support).unwrap_or(own));
+            let (plane, flattened) = match best.filter(|p| p.support > FLAT * all as f64) {
+                Some(plane) => (plane, FLATTENED),
+                None => match (self.level(i, (&near, all), (up, &main)), best) {
+                    (Some(level), _) => (level, UNEVEN),
+                    (None, Some(plane)) => (plane, 0.0),
+                    (None, None) => return (Vec3::ZERO, 0.0),
+                },
+            };
             let inverse = plane.of.dot(self.rays[i]);
-            let is_on = plane.support > FLAT * all as f64 && (inverse / self.inverse[i] - 1.0).abs() < FLATTENED;
+            let is_on = (inverse / self.inverse[i] - 1.0).abs() < flattened;
             (self.normal(i, plane), if is_on { (self.rays[i].length() / inverse) as f32 } else { 0.0 })
         };
         let (normals, distances) = (0..free.len()).into_par_iter().map(of).unzip();

@@ -31,6 +31,8 @@ const FAINT: f32 = 0.05;
 const SOLID: f32 = 0.5;
 /// Length below which a vector has no direction.
 const SHORTEST: f32 = 1e-12;
+/// Value in sRGB from which a photograph may be clipped.
+pub const CLIPPED: f32 = 0.99;
 /// Directions in which irradiance must not be negative.
 const DIRECTIONS: usize = 64;
 
@@ -344,7 +346,9 @@ impl SceneLoss<'_> {
             plain[k] = values[k] * white[k] + (1.0 - opacity) * s.sky[k].max(0.0);
             let factor = gain.map_or(1.0, |g| g[k].exp());
             let (srgb, slope) = encode(factor * plain[k]);
-            errors[k] = srgb - self.target[3 * r + k];
+            let target = self.target[3 * r + k];
+            // How much brighter than white something is, no photograph tells.
+            errors[k] = if target >= CLIPPED && srgb > target { 0.0 } else { srgb - target };
             d_colors[k] = slope * factor;
         }
         let squared: f32 = errors.iter().map(|e| e * e).sum();

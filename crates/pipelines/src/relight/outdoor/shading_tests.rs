@@ -136,7 +136,23 @@ fn gradients_with_suns_apart_are_those_of_the_loss() {
     let (_, d, tables) = run(&sunlit_case());
     check("values", sunlit_case, |c| &mut c.values, &d.values, 3e-3);
     // Suns and skies are given.
-    assert!(tables.lights.iter().all(|d| *d == 0.0) && d.values.iter().skip(3).step_by(CHANNELS).all(|d| *d == 0.0));
+    assert!(tables.lights.iter().all(|d| *d == 0.0));
+}
+
+#[test]
+fn what_is_brighter_than_white_is_not_pulled_down() {
+    let mut c = case();
+    c.target.fill(1.0);
+    c.gains.fill(3.0);
+    c.values.chunks_exact_mut(CHANNELS).for_each(|v| v[..3].fill(0.9));
+    c.opacity.fill(1.0);
+    c.lights.fill(0.0);
+    c.lights.chunks_exact_mut(LIGHT).for_each(|l| l[..3].fill(4.0));
+    let of_color = |c: &Case| run(c).1.values.chunks_exact(CHANNELS).flat_map(|v| v[..3].to_vec()).collect::<Vec<f32>>();
+    assert_eq!(run(&c).2.mse, 0.0);
+    assert!(of_color(&c).iter().all(|d| *d == 0.0));
+    c.target.fill(0.98);
+    assert!(of_color(&c).iter().filter(|d| **d > 0.0).count() == 12, "of the four rays that count");
 }
 
 #[test]

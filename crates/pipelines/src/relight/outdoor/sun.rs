@@ -47,13 +47,16 @@ const SENT_AGAIN: usize = 3;
 /// Share of a level surface's light below which a sun may be one that is not there, and factor by which what is seen may then be explained
 /// worse without it.
 const WEAK: f32 = 0.5;
-const NO_WORSE: f64 = 1.01;
+const NO_WORSE: f64 = 1.05;
 /// Share of the points, the lowest, that the ground outside looks like.
 const LOWEST: f32 = 0.1;
 /// Bounces of light between surfaces, where a light is given.
 const BOUNCES: usize = 4;
 /// Difference in sRGB beyond which points count less and less.
 const TRUSTED: f32 = 0.15;
+/// Linear light from which a photograph may be clipped, and how much it then tells of the albedo.
+const CLIPPED: f32 = 0.93;
+const UNSURE: f32 = 0.02;
 /// Linear light below which errors do not count more.
 const DARK: f32 = 0.02;
 
@@ -368,7 +371,8 @@ fn explained(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess], left_out: Op
             }
             let white = g.irradiance(i, &surfaces.points[i]);
             // The derivative of sRGB at what is seen, squared.
-            let weight = Vec3::from(c.max(Vec3::splat(DARK)).to_array().map(|v| v.powf(-1.16))) * trust(before * white, *c);
+            let by_channel = c.max(Vec3::splat(DARK)).to_array().map(|v| v.powf(-1.16) * if v < CLIPPED { 1.0 } else { UNSURE });
+            let weight = Vec3::from(by_channel) * trust(before * white, *c);
             (a, b) = (a + weight * white * *c, b + weight * white * white);
         }
         (a / b).max(Vec3::ZERO)
@@ -459,7 +463,8 @@ fn solve(points: &[Lit], places: &[Place], sunlit: &[f32], direction: Vec3) -> F
         let row: [f64; UNKNOWNS] = std::array::from_fn(|i| if i == 0 { *sun } else { place.sky[i - 1] } as f64);
         for k in 0..3 {
             // The derivative of sRGB at what is seen.
-            let weight = p.trust.sqrt() * 0.44 * p.seen[k].max(DARK).powf(-0.58);
+            let sure = if p.seen[k] < CLIPPED { 1.0 } else { UNSURE };
+            let weight = sure * p.trust.sqrt() * 0.44 * p.seen[k].max(DARK).powf(-0.58);
             let (a, y) = ((weight * p.albedo[k]) as f64, (weight * (p.seen[k] - p.albedo[k] * p.sent[k])) as f64);
             for (i, line) in sums[k].iter_mut().enumerate() {
                 (i..UNKNOWNS).for_each(|j| line[j] += a * a * row[i] * row[j]);

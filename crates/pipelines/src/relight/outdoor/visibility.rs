@@ -400,6 +400,18 @@ mod tests {
         assert!(v.from_sun(Vec3::new(0.5, 0.5, 0.5), Vec3::NEG_X, other) > 0.95);
     }
 
+    /// Coarse cells and a low sun: the edge of the shadow lies where the ray from the edge of the wall meets the plate.
+    #[test]
+    fn shadows_are_not_shifted() {
+        let (v, up) = (Visibility::of(&Corner, &Occupancy::new(16, 1, false), (0.0, 1.0), 16), Vec3::Z);
+        // Half as high as the cube, the wall ends a shadow 0.4 before it.
+        let sun = Vec3::new(1.0, 0.0, 1.25).normalize();
+        for (x, is_lit) in [(0.07, true), (0.13, false), (0.2, false)] {
+            let got = v.from_sun(Vec3::new(x, 0.5, 0.25), up, sun);
+            assert!(if is_lit { got > 0.6 } else { got < 0.25 }, "{x}: {got}");
+        }
+    }
+
     #[test]
     fn corners_are_less_open_than_the_plain() {
         let v = corner();

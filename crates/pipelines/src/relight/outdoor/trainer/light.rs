@@ -33,7 +33,7 @@ const SURFACE: f32 = 0.9;
 /// Standard deviation of noise on the light that the shadow sees.
 const LIGHT_NOISE: f32 = 0.01;
 /// The same on the direction of a sun apart, and share of the rays whose shadow reads none.
-const SUN_NOISE: f32 = 0.1;
+const SUN_NOISE: f32 = 0.25;
 const UNREAD: f32 = 0.25;
 /// Every so many rays, one teaches the shadow of a sun that no photograph has.
 const TAUGHT_RAYS: usize = 3;
