@@ -138,13 +138,14 @@ fn a_trained_place_is_scored_and_its_layers_are_rendered() {
     assert!(losses.last().unwrap() < &(0.85 * losses[0]), "{losses:?}");
     drop(folder);
     let (model, _) = recipe::load(&run).unwrap();
-    let mut looked = 0;
-    let s = scores::judge(&model, &data, 1, &mut |_, sheet| {
+    let (mut looked, mut shares) = (0, Vec::new());
+    let look = &mut |_: &str, sheet: &scores::Sheet| {
         looked += 1;
         assert!(sheet.ours.iter().zip(&sheet.exact).all(|(a, b)| (a.width, a.height) == (b.width, b.height)));
         Ok(())
-    })
-    .unwrap();
+    };
+    let s = scores::judge(&model, &data, 1, look, &mut |s| shares.push(s)).unwrap();
+    assert!(shares.len() == 10 && shares.is_sorted(), "two views in five lights: {shares:?}");
     assert_eq!((s.views, looked), (2, 4));
     assert!(s.veiled_light_psnr.is_finite() && s.veiled_oracle_psnr > s.veiled_mean_psnr, "{s:?}");
     // Exact layers explain more than the mean of the other lights.
@@ -204,7 +205,7 @@ fn the_printed_model_learns_photographs_is_resumed_and_scored() {
         m.params().into_arrays().into_iter().map(|(name, values)| (name, values.to_vec())).collect()
     };
     assert!(arrays(&mut short) == arrays(&mut parts));
-    let s = scores::judge(&load("whole"), &data, 1, &mut |_, _| Ok(())).unwrap();
+    let s = scores::judge(&load("whole"), &data, 1, &mut |_, _| Ok(()), &mut |_| {}).unwrap();
     println!("{s:?}");
     // Shape and albedo are rough after so few steps; a picture that is upside down or unlit would be far below.
     assert!(s.seen_light_psnr > 14.0 && s.albedo_psnr > 12.0, "{s:?}");

@@ -148,10 +148,12 @@ mod on_gpu {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::relight::picture::{self, Job};
     use diorama_geom::daylight::Daylight;
     use diorama_geom::environment::Environment;
     use diorama_geom::glam::DVec3;
     use diorama_geom::{Camera, Model, Pose};
+    use std::sync::atomic::AtomicBool;
     use std::sync::{Arc, Mutex};
 
     /// Adds samples of a light that is not there, so many times, then fails.
@@ -193,6 +195,30 @@ mod tests {
         let (film, said) = picture(true, 3);
         assert!(matches!(film, Err(PipelineError::Device(e)) if e.contains("unplugged") && e.contains("--device cpu")));
         assert!(said.is_empty(), "the error itself says it");
+    }
+
+    #[test]
+    fn passes_before_a_failure_are_kept() {
+        let dir = tempfile::tempdir().unwrap();
+        let scene = Scene::new(&Model::default(), &Daylight::of(Environment::uniform([1.0; 3], 8)));
+        let job = Job {
+            scene: &scene,
+            view: View {
+                camera: Camera::pinhole(4, 4, 0.6),
+                world_from_camera: Pose::look_at(DVec3::X, DVec3::ZERO, DVec3::Z),
+                lens: None,
+            },
+            settings: Settings::default(),
+            samples: 64,
+            kept: Some(dir.path().join("a.png.unfinished")),
+            key: "a".into(),
+        };
+        let mut fails = PathTracer { device: Some(Box::new(Fails(2))), ..PathTracer::cpu() };
+        let draw = |tracer: &mut PathTracer| picture::render(&job, tracer, &AtomicBool::new(false), &mut |_| {});
+        assert!(draw(&mut fails).is_err());
+        let (film, _) = draw(&mut PathTracer::cpu()).unwrap();
+        // Two of four passes of 7, two of 1.
+        assert!(film.samples == 64 && film.pixels.iter().all(|p| (p.color[0] - 4.0).abs() < 1e-4), "{:?}", film.pixels[0]);
     }
 
     #[test]

@@ -50,7 +50,13 @@ pub fn render(job: &Job, tracer: &mut PathTracer, stop: &AtomicBool, progress: &
     while film.samples < job.samples {
         progress(film.samples as f64 / job.samples as f64);
         let pass = PASS.min(job.samples - film.samples);
-        tracer.add(job.scene, &job.view, &job.settings, pass, &mut film)?;
+        if let Err(e) = tracer.add(job.scene, &job.view, &job.settings, pass, &mut film) {
+            // The passes before it are not lost.
+            if film.samples > 0 {
+                job.keep(&film)?;
+            }
+            return Err(e);
+        }
         let interrupted = stop.load(Ordering::Relaxed) && film.samples < job.samples;
         if interrupted || last.elapsed() > KEEP {
             job.keep(&film)?;

@@ -182,10 +182,11 @@ impl Quickstart<'_> {
         let pictures = self.at("pictures");
         std::fs::create_dir_all(&pictures).map_err(DataError::io(&pictures, "create"))?;
         let mut rows = Vec::new();
-        let scores = outdoor::scores::judge(model, &self.at("street"), RAYS, &mut |_, sheet| {
+        let look = &mut |_: &str, sheet: &outdoor::scores::Sheet| {
             rows.extend([&sheet.ours, &sheet.exact].map(|row| row.iter().map(three_channels).collect()));
             Ok(())
-        })?;
+        };
+        let scores = outdoor::scores::judge(model, &self.at("street"), RAYS, look, self.share)?;
         photo::save_png(&pictures.join("layers.png"), &tiled(&rows))?;
         Ok(scores)
     }

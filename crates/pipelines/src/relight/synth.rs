@@ -56,8 +56,12 @@ pub struct Viewpoint {
 impl Place {
     /// A place photographed in all lights from the same viewpoints, of which every fifth is held out.
     pub fn around(model: Model, cameras: Vec<(Camera, Pose)>) -> Place {
-        let viewpoint =
-            |(v, (camera, pose)): (usize, (Camera, Pose))| Viewpoint { camera, pose, light: None, is_held_out: v % HOLD_OUT == HOLD_OUT - 1 };
+        let viewpoint = |(v, (camera, pose)): (usize, (Camera, Pose))| Viewpoint {
+            camera,
+            pose,
+            light: None,
+            is_held_out: v % HOLD_OUT == HOLD_OUT - 1,
+        };
         Place { model, viewpoints: cameras.into_iter().enumerate().map(viewpoint).collect() }
     }
 

@@ -2,6 +2,7 @@
 
 use crate::commands::process::{note, use_threads};
 use crate::commands::{Outcome, Verb};
+use crate::terminal::ShareShown;
 use clap::Args;
 use diorama_data::{DataError, photo};
 use diorama_geom::ImageU8;
@@ -45,9 +46,12 @@ impl Verb for Eval {
         notes.iter().for_each(|n| note(n));
         let out = self.out.clone().unwrap_or_else(|| self.run.join("eval"));
         std::fs::create_dir_all(&out).map_err(DataError::io(&out, "create"))?;
-        let s = scores::judge(&model, &model.config.data.path, RAYS, &mut |name, sheet| {
+        let mut shown = ShareShown::new();
+        let look = &mut |name: &str, sheet: &scores::Sheet| {
             Ok(photo::save_png(&out.join(format!("{name}.png")), &rows(&[&sheet.ours, &sheet.exact]))?)
-        })?;
+        };
+        let s = scores::judge(&model, &model.config.data.path, RAYS, look, &mut |s| shown.show(s, "held-out photographs"))?;
+        shown.finish();
         if self.json {
             println!("{}", serde_json::to_string(&s).expect("plain values"));
         } else {

@@ -2,7 +2,7 @@
 
 use super::View;
 #[cfg(feature = "gpu")]
-use super::{Film, Pixel, Scene, Settings, ThinLens, cpu, geometry::Geometry, gpu as on_gpu};
+use super::{Film, Pixel, Scene, Settings, Strategy, ThinLens, cpu, geometry::Geometry, gpu as on_gpu};
 #[cfg(feature = "gpu")]
 use crate::gpu::{Gpu, GpuError, table::Table};
 use diorama_geom::daylight::{Daylight, Sun};
@@ -178,8 +178,21 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     let plain = (Scene::new(&balls(), &day()), balls_view(16), Settings { bounces: 5, ..Settings::default() });
     let (scene, view) = garden();
     let full = (scene, view, Settings { seed: 7 << 33 | 5, light_layers: true, bounces: 4, ..Settings::default() });
-    for ((scene, view, settings), name) in [plain, full].iter().zip(["balls", "garden"]) {
-        let on_device = on_gpu::GpuScene::upload(gpu, scene)?;
+    // By one strategy alone, with the light hidden or shown, and in a light that takes the place of another.
+    let alone = |strategy: Strategy, shows_light: bool| {
+        let settings = Settings { bounces: 3, strategy, shows_light, ..Settings::default() };
+        (Scene::new(&balls(), &day()), balls_view(16), settings)
+    };
+    let evening = Daylight { environment: Environment::from_fn(16, |d| [0.8 - 0.3 * d.z, 0.5, 0.3 + 0.2 * d.x]), sun: None };
+    let mut relit = alone(Strategy::Both, true);
+    relit.0.set_light(&evening);
+    let cases = [plain, full, alone(Strategy::Light, false), alone(Strategy::Surface, true), relit];
+    let names = ["balls", "garden", "balls, light's rays", "balls, surface's rays", "balls, evening"];
+    for ((scene, view, settings), name) in cases.iter().zip(names) {
+        let mut on_device = on_gpu::GpuScene::upload(gpu, if name == names[4] { &cases[0].0 } else { scene })?;
+        if name == names[4] {
+            on_device.set_light(gpu, scene)?;
+        }
         let draw = |settings: &Settings, passes: &[u32], paths: usize| {
             let mut film = Film::new(&view.camera);
             let mut run = passes.iter().map(|n| on_gpu::render_batches(gpu, &on_device, view, settings, *n, &mut film, paths));

@@ -68,6 +68,47 @@ fn least_difference(pairs: &[(f64, f64)]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use diorama_geom::environment::Environment;
+    use diorama_geom::glam::Vec3;
+    use diorama_geom::rng::Rng;
+
+    /// Balls of gold and brass under an uneven light, with a few sightings that are clipped and a few of something else before them.
+    #[test]
+    fn base_colors_become_those_that_mirror_the_light_as_it_is_seen() {
+        let light = Environment::from_fn(16, |d| [0.4 + 0.3 * d.z, 0.3 + 0.2 * d.x, 0.2 + 0.1 * d.y].map(|v: f64| v.max(0.0)));
+        let (probe, rng) = (Probe::given(32, &light), Rng::new(5, 0));
+        let metal = Metal { is_metal: vec![true; 2], colors: vec![[0.5, 0.4, 0.15], [0.4, 0.35, 0.2]], roughness: vec![0.3, 0.5] };
+        let n = 200;
+        let unit = |of: [u64; 3]| Vec3::from(of.map(|k| rng.normal(k))).normalize();
+        let normals: Vec<Vec3> = (0..n as u64).map(|i| unit([6 * i, 6 * i + 1, 6 * i + 2])).collect();
+        let views = (0..n as u64).map(|i| (normals[i as usize] + 0.6 * unit([6 * i + 3, 6 * i + 4, 6 * i + 5])).normalize());
+        let mut rows = Rows {
+            vertex: vec![0, 1],
+            ranges: vec![0..n / 2, n / 2..n],
+            normal: normals.iter().flat_map(|v| v.to_array()).collect(),
+            view: views.flat_map(|v| v.to_array()).collect(),
+            color: Vec::new(),
+        };
+        let want = [1.6, 1.3, 2.0];
+        let of = |i: usize| if i < n / 2 { 0 } else { 1 };
+        let kd: Vec<f32> = (0..n).flat_map(|i| [0, 1, 2].map(|k| want[k] * metal.colors[of(i)][k])).collect();
+        let ks: Vec<f32> = (0..n).flat_map(|i| [0.0, metal.roughness[of(i)], 1.0]).collect();
+        let exact = probe.shade(&Points { normal: &rows.normal, view: &rows.view, kd: &kd, ks: &ks }, None).color;
+        rows.color = exact.as_chunks::<3>().0.to_vec();
+        rows.color.iter_mut().step_by(7).for_each(|c| *c = [1.0; 3]);
+        rows.color.iter_mut().skip(3).step_by(11).for_each(|c| *c = [0.05; 3]);
+        let found = metal.factor(&probe, &rows).unwrap();
+        assert!((0..3).all(|k| (found[k] / want[k] - 1.0).abs() < 0.03), "{found:?}");
+        (rows.ranges, rows.color) = (vec![0..10, 10..20], rows.color[..20].to_vec());
+        assert!(metal.factor(&probe, &rows).is_none(), "too little is seen");
+    }
+
+    #[test]
+    fn a_few_wrong_colors_are_not_the_brightest() {
+        let colors = (0..40).map(|i| [if i < 3 { 9.0 } else { 0.01 * i as f32 }, 0.1, 0.1]).collect();
+        let metal = Metal { is_metal: (0..40).map(|i| i != 39).collect(), colors, roughness: vec![0.5; 40] };
+        assert!((0.3..0.39).contains(&metal.brightest()), "{}", metal.brightest());
+    }
 
     #[test]
     fn outliers_hardly_change_the_factor() {

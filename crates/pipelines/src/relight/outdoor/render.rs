@@ -21,8 +21,8 @@ use rayon::prelude::*;
 use std::sync::OnceLock;
 
 /// Radiance over the mean of a map from which on it casts shadows, and lamps at most by which it does.
-const GLARING: f64 = 20.0;
-const LAMPS: usize = 32;
+const GLARING: f64 = 4.0;
+const LAMPS: usize = 64;
 
 /// Bytes of a ray of a view, while it is lit.
 const RAY: u64 = 200;
@@ -84,6 +84,18 @@ impl ViewLight {
     /// Sun and lamps, `[N, 6]`; none where suns are not apart.
     fn suns(&self) -> Option<Vec<f32>> {
         self.sun.map(|sun| sun.into_iter().chain(self.lamps.iter().copied()).collect())
+    }
+
+    /// The same for each of the `side`² rays of a pixel: of the lamps, a part that is as much brighter.
+    fn shares(&self, side: usize) -> Vec<Vec<f32>> {
+        let Some(sun) = self.sun else { return Vec::new() };
+        let parts = side * side;
+        let brighter = |(i, v): (usize, &f32)| if i < 3 { *v } else { *v * parts as f32 };
+        let of_ray = |own: usize| {
+            let lamps = self.lamps.chunks_exact(SUN).skip(own).step_by(parts);
+            sun.into_iter().chain(lamps.flat_map(|l| l.iter().enumerate().map(brighter))).collect()
+        };
+        (0..parts).map(of_ray).collect()
     }
 
     /// The light that a model learned.
@@ -148,7 +160,7 @@ impl SceneModel {
         if self.stage == Stage::Surfaces {
             return unlit_view(&tracer.layers(camera, &[], progress), camera);
         }
-        self.lit(&self.layers(&tracer, camera, light, progress), camera, light)
+        self.lit(&self.layers(&tracer, camera, light, progress), camera, light, 1)
     }
 
     /// What the field says of each pixel.
@@ -157,8 +169,8 @@ impl SceneModel {
         tracer.layers(camera, &[&code], progress)
     }
 
-    /// A view under a light, of what the field says of it.
-    fn lit(&self, Layers { values, opacity, depth }: &Layers, camera: &PosedCamera, light: &ViewLight) -> SceneView {
+    /// A view under a light, of what the field says of it. Lamps are shared among the `samples`² rays of a pixel.
+    fn lit(&self, Layers { values, opacity, depth }: &Layers, camera: &PosedCamera, light: &ViewLight, samples: u32) -> SceneView {
         let numbers = light.numbers();
         let (depth, opacity) = (depth.clone(), opacity.clone());
         let (w, h) = (values.width, values.height);
@@ -170,10 +182,11 @@ impl SceneModel {
             SceneView { color: image(3), albedo: image(3), normal: image(3), shadow: image(1), irradiance: image(3), depth, opacity };
         let behind = self.joint.as_ref().and_then(|j| j.behind(&self.config, &origins, &dirs));
         let suns = light.suns();
+        let (side, shares) = (samples as usize, light.shares(samples as usize));
         let sunlight = suns.as_ref().map(|suns| {
             let around = self.surroundings.as_deref().expect("a model with suns apart knows what stands around");
             let ambient = light.ambient.get_or_init(|| around.surfaces.light(&around.visibility, suns, &numbers));
-            (suns, &around.visibility, ambient)
+            (&around.visibility, ambient)
         });
         let shaded = |i: usize| {
             let mut v: [f32; CHANNELS] = std::array::from_fn(|k| values.data[CHANNELS * i + k]);
@@ -195,8 +208,8 @@ impl SceneModel {
                 (0..3).for_each(|k| color.rgb[k] += (1.0 - o) * (sky[k].max(0.0) + light.map_toward(ray.1)[k]));
                 return (v, color);
             }
-            let sunlit = sunlight
-                .map(|(suns, visibility, ambient)| shading::sunlit((visibility, ambient), (suns, &numbers), &v[NORMAL..], hit, ray));
+            let own = (i / w % side) * side + i % w % side;
+            let sunlit = sunlight.map(|around| shading::sunlit(around, (&shares[own], &numbers), &v[NORMAL..], hit, ray));
             let mut color = shading::color(&v, o, ray.1, &numbers, &light.sky, sunlit);
             if o < 1.0 {
                 let radiance = light.map_toward(ray.1);
@@ -250,7 +263,7 @@ impl FineViews<'_> {
         if !is_traced {
             self.last = Some((fine, code, model.layers(&model.tracer(Quality::Full), &fine, light, &mut |_| {})));
         }
-        let view = model.lit(&self.last.as_ref().expect("traced").2, &fine, light);
+        let view = model.lit(&self.last.as_ref().expect("traced").2, &fine, light, self.samples);
         let mean = |image: Image| image.downsampled(w as usize, h as usize);
         let opacity = mean(view.opacity.clone());
         // What is not multiplied by the opacity is the mean of what is opaque.
@@ -300,6 +313,18 @@ fn unlit_view(layers: &Layers, camera: &PosedCamera) -> SceneView {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn rays_of_a_pixel_share_all_lamps() {
+        let lamp = |i: usize| [0.0, 0.6, 0.8, i as f32, 2.0, 1.0];
+        let mut light = ViewLight::of(ShLight::DARK);
+        (light.sun, light.lamps) = (Some([1.0; SUN]), (0..10).flat_map(lamp).collect());
+        assert_eq!(light.shares(1), [light.suns().unwrap()]);
+        let shares = light.shares(2);
+        let power = |k: usize| shares.iter().flat_map(|s| s[SUN..].chunks_exact(SUN)).map(|l| l[k]).sum::<f32>() / 4.0;
+        assert!(shares.iter().all(|s| s[..SUN] == [1.0; SUN] && s.len() < 5 * SUN) && shares[1][SUN..SUN + 3] == [0.0, 0.6, 0.8]);
+        assert_eq!([power(3), power(4)], [45.0, 20.0]);
+    }
 
     #[test]
     fn half_covered_pixels_have_the_albedo_of_what_covers_them() {

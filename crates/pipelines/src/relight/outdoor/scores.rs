@@ -79,11 +79,18 @@ impl Errors {
     }
 }
 
-/// Judges a model by pictures with `samples`² rays per pixel; `look` receives the name of each held-out photograph in a light that training never saw, and its layers.
+/// Judges a model by pictures with `samples`² rays per pixel; `look` receives the name of each held-out photograph in a light that training never saw, and its layers,
+/// and `progress` the share that is done.
 ///
 /// # Errors
 /// When the data set has no truth, or files are missing.
-pub fn judge(model: &SceneModel, data: &Path, samples: u32, look: &mut dyn FnMut(&str, &Sheet) -> Result<()>) -> Result<SceneScores> {
+pub fn judge(
+    model: &SceneModel,
+    data: &Path,
+    samples: u32,
+    look: &mut dyn FnMut(&str, &Sheet) -> Result<()>,
+    progress: &mut dyn FnMut(f64),
+) -> Result<SceneScores> {
     if !Truth::exists(data) {
         return Err(PipelineError::Usage(format!("{}: has no truth; only generated benchmarks do", data.display())));
     }
@@ -94,7 +101,9 @@ pub fn judge(model: &SceneModel, data: &Path, samples: u32, look: &mut dyn FnMut
     let per_meter = model.model_from_world.scale as f32;
     let mut views = 0;
     let (mut fine, mut lights) = (FineViews::new(model, samples)?, HashMap::new());
-    for frame in model.capture.indices(Split::Test) {
+    let held_out = model.capture.indices(Split::Test);
+    for (done, frame) in held_out.iter().copied().enumerate() {
+        progress(done as f64 / held_out.len() as f64);
         let name = &model.capture.frames[frame].name;
         let Some(of) = truth.views.iter().find(|v| name.ends_with(&v.photograph)) else { continue };
         let photograph = photo::load(&model.capture.frames[frame].image)?;
