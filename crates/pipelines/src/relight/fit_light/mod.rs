@@ -303,6 +303,7 @@ fn shown(shot: &Shot, view: &SceneView, i: usize) -> Shown {
         point: known::point(&shot.camera, view, i).as_vec3(),
         normal: at(&view.normal),
         albedo: at(&view.albedo),
+        share: view.share.data[i],
         color: Vec3::from(shot.rgb(i).map(|v| linear_from_srgb(v as f32 / 255.0))),
     }
 }

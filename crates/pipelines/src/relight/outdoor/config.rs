@@ -261,7 +261,7 @@ impl Config {
                 space: "unbounded".into(),
                 first_density: 0.1,
             },
-            light: LightConfig { of: "session".into(), gain: false, model: "sh".into(), from: 0.6, sun_cells: pick(256, 512) },
+            light: LightConfig { of: "session".into(), gain: false, model: "sh".into(), from: 0.85, sun_cells: pick(256, 512) },
             loss: LossConfig {
                 huber: 0.1,
                 robust: 2.0,

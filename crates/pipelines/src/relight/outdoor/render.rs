@@ -138,6 +138,8 @@ pub struct SceneView {
     /// Of unit length.
     pub normal: Image,
     pub shadow: Image,
+    /// Share of a sun that is left by what is too small to be traced, where suns are apart.
+    pub share: Image,
     /// Light that a white surface would send, shadow included.
     pub irradiance: Image,
     pub depth: Image,
@@ -178,8 +180,16 @@ impl SceneModel {
         let (mut origins, mut dirs) = (vec![0.0; 3 * w * h], vec![0.0; 3 * w * h]);
         ray_generation::cpu::forward(std::slice::from_ref(camera), &vec![0; w * h], &pixels, &mut origins, &mut dirs);
         let image = |channels| Image::zeros(w, h, channels);
-        let mut out =
-            SceneView { color: image(3), albedo: image(3), normal: image(3), shadow: image(1), irradiance: image(3), depth, opacity };
+        let mut out = SceneView {
+            color: image(3),
+            albedo: image(3),
+            normal: image(3),
+            shadow: image(1),
+            share: image(1),
+            irradiance: image(3),
+            depth,
+            opacity,
+        };
         let behind = self.joint.as_ref().and_then(|j| j.behind(&self.config, &origins, &dirs));
         let suns = light.suns();
         let (side, shares) = (samples as usize, light.shares(samples as usize));
@@ -228,6 +238,7 @@ impl SceneModel {
                 out.irradiance.data[3 * i + k] = color.irradiance[k];
             }
             out.shadow.data[i] = color.shadow;
+            out.share.data[i] = v[3];
         }
         out
     }
@@ -277,6 +288,7 @@ impl FineViews<'_> {
             albedo: of_matter(view.albedo),
             normal,
             shadow: mean(view.shadow),
+            share: mean(view.share),
             irradiance: mean(view.irradiance),
             depth: of_matter(view.depth),
             opacity,
@@ -303,6 +315,7 @@ fn unlit_view(layers: &Layers, camera: &PosedCamera) -> SceneView {
         albedo: linear.clone(),
         normal: Image { data: back.to_array().repeat(w * h), ..Image::zeros(w, h, 3) },
         shadow: Image { data: vec![1.0; w * h], ..Image::zeros(w, h, 1) },
+        share: Image { data: vec![1.0; w * h], ..Image::zeros(w, h, 1) },
         irradiance: Image { data: vec![1.0; 3 * w * h], ..Image::zeros(w, h, 3) },
         color: linear,
         depth: layers.depth.clone(),

@@ -79,6 +79,86 @@ impl Errors {
     }
 }
 
+/// What was found in the pixels of held-out views.
+#[derive(Default)]
+struct Tally {
+    unseen: InLight,
+    veiled: InLight,
+    seen: Errors,
+    sunlit: Errors,
+    albedos: Vec<([f32; 3], [f32; 3])>,
+    angles: Vec<f64>,
+    shadows: Vec<(f64, f64)>,
+    depths: Vec<f64>,
+    views: usize,
+}
+
+/// A held-out view in a light, and what is exact of it.
+struct Judged<'a> {
+    view: &'a SceneView,
+    photograph: &'a ImageU8,
+    layers: &'a ViewLayers,
+    shadow: &'a Image,
+    light: &'a LightTruth,
+    is_seen: bool,
+    is_unseen: bool,
+    /// Mean of the view's pictures in the lights of training, in a light that is not one of them.
+    mean: Option<Image>,
+    /// Model space per meter.
+    per_meter: f32,
+}
+
+impl Tally {
+    fn add(&mut self, j: &Judged) {
+        let (exact, of_light) = (j.light.light(), if j.is_unseen { &mut self.unseen } else { &mut self.veiled });
+        for i in valid(j.layers) {
+            let rgb = |image: &Image| -> [f32; 3] { std::array::from_fn(|k| image.data[3 * i + k]) };
+            let photo: [f32; 3] = std::array::from_fn(|k| j.photograph.data[j.photograph.channels * i + k] as f32 / 255.0);
+            let (got, normal, albedo) = (rgb(&j.view.color), rgb(&j.view.normal), rgb(&j.layers.albedo));
+            let n = DVec3::from(rgb(&j.layers.normal).map(f64::from)).normalize_or_zero();
+            let shadow = j.shadow.data[3 * i];
+            self.shadows.push((j.view.shadow.data[i] as f64, shadow as f64));
+            if j.is_seen {
+                self.seen.add(got, photo);
+                if j.light.sun.is_some() {
+                    self.sunlit.add(got, photo);
+                }
+            } else {
+                let lit = exact.shade(n);
+                of_light.ours.add(got, photo);
+                of_light.oracle.add(std::array::from_fn(|k| albedo[k] * lit[k].max(0.0) as f32 * shadow), photo);
+                j.mean.iter().for_each(|m| of_light.mean.add(rgb(m), photo));
+            }
+            if j.is_unseen {
+                self.albedos.push((rgb(&j.view.albedo), albedo));
+                let depth = j.per_meter * j.layers.depth.data[i];
+                self.depths.push(((j.view.depth.data[i] - depth) / depth).abs() as f64);
+                self.angles.push(n.dot(DVec3::from(normal.map(f64::from))).clamp(-1.0, 1.0).acos().to_degrees());
+            }
+        }
+        self.views += j.is_unseen as usize;
+    }
+
+    fn scores(self, light: &str) -> SceneScores {
+        SceneScores {
+            unseen_light_psnr: self.unseen.ours.psnr(),
+            oracle_psnr: self.unseen.oracle.psnr(),
+            mean_light_psnr: self.unseen.mean.psnr(),
+            veiled_light_psnr: self.veiled.ours.psnr(),
+            veiled_oracle_psnr: self.veiled.oracle.psnr(),
+            veiled_mean_psnr: self.veiled.mean.psnr(),
+            seen_light_psnr: self.seen.psnr(),
+            sunlit_psnr: self.sunlit.psnr(),
+            light: light.into(),
+            albedo_psnr: scaled_psnr(&self.albedos),
+            normal_median_deg: median(self.angles),
+            depth_median: median(self.depths),
+            shadow_correlation: correlation(&self.shadows),
+            views: self.views,
+        }
+    }
+}
+
 /// Judges a model by pictures with `samples`² rays per pixel; `look` receives the name of each held-out photograph in a light that training never saw, and its layers,
 /// and `progress` the share that is done.
 ///
@@ -96,11 +176,8 @@ pub fn judge(
     }
     let truth = Truth::read(data)?;
     let gauge = gauge(model, data, &truth)?;
-    let (mut unseen, mut veiled, mut seen, mut sunlit) = <(InLight, InLight, Errors, Errors)>::default();
-    let (mut albedos, mut angles, mut shadows, mut depths) = <(Vec<_>, Vec<_>, Vec<_>, Vec<_>)>::default();
     let per_meter = model.model_from_world.scale as f32;
-    let mut views = 0;
-    let (mut fine, mut lights) = (FineViews::new(model, samples)?, HashMap::new());
+    let (mut tally, mut fine, mut lights) = (Tally::default(), FineViews::new(model, samples)?, HashMap::new());
     let held_out = model.capture.indices(Split::Test);
     for (done, frame) in held_out.iter().copied().enumerate() {
         progress(done as f64 / held_out.len() as f64);
@@ -108,8 +185,7 @@ pub fn judge(
         let Some(of) = truth.views.iter().find(|v| name.ends_with(&v.photograph)) else { continue };
         let photograph = photo::load(&model.capture.frames[frame].image)?;
         let layers = truth::read_view(data, &of.view)?;
-        let (light, is_unseen) = (&truth.lights[of.light], of.light == truth.unseen);
-        let is_seen = truth.is_seen(of.light);
+        let (light, is_unseen, is_seen) = (&truth.lights[of.light], of.light == truth.unseen, truth.is_seen(of.light));
         let view_light = match lights.entry(of.light) {
             Entry::Occupied(known) => known.into_mut(),
             Entry::Vacant(new) => new.insert(match model.light_of_frame(frame).filter(|_| is_seen) {
@@ -119,57 +195,14 @@ pub fn judge(
         };
         let view = fine.view(&model.posed(frame), view_light);
         let shadow = truth::read_shadow(data, &of.photograph)?;
-        let others = if is_seen { None } else { mean_picture(data, &truth, &of.view)? };
-        let of_light = if is_unseen { &mut unseen } else { &mut veiled };
-        let exact = light.light();
-        for i in valid(&layers) {
-            let rgb = |image: &Image| -> [f32; 3] { std::array::from_fn(|k| image.data[3 * i + k]) };
-            let photo: [f32; 3] = std::array::from_fn(|k| photograph.data[photograph.channels * i + k] as f32 / 255.0);
-            let (got, normal) = (rgb(&view.color), rgb(&view.normal));
-            let n = DVec3::from(rgb(&layers.normal).map(f64::from)).normalize_or_zero();
-            let albedo = rgb(&layers.albedo);
-            shadows.push((view.shadow.data[i] as f64, shadow.data[3 * i] as f64));
-            if is_seen {
-                seen.add(got, photo);
-                if light.sun.is_some() {
-                    sunlit.add(got, photo);
-                }
-            } else {
-                let lit = exact.shade(n);
-                of_light.ours.add(got, photo);
-                of_light.oracle.add(std::array::from_fn(|k| albedo[k] * lit[k].max(0.0) as f32 * shadow.data[3 * i]), photo);
-                others.iter().for_each(|o| of_light.mean.add(rgb(o), photo));
-            }
-            if is_unseen {
-                albedos.push((rgb(&view.albedo), albedo));
-                let depth = per_meter * layers.depth.data[i];
-                depths.push(((view.depth.data[i] - depth) / depth).abs() as f64);
-                angles.push(n.dot(DVec3::from(normal.map(f64::from))).clamp(-1.0, 1.0).acos().to_degrees());
-            }
-        }
-        if is_unseen {
-            views += 1;
-        }
+        let mean = if is_seen { None } else { mean_picture(data, &truth, &of.view)? };
+        let (view, photograph, layers, shadow) = (&view, &photograph, &layers, &shadow);
+        tally.add(&Judged { view, photograph, layers, shadow, light, is_seen, is_unseen, mean, per_meter });
         if !is_seen {
-            look(&of.photograph, &sheet(&view, &photograph, &layers, &shadow, per_meter))?;
+            look(&of.photograph, &sheet(view, photograph, layers, shadow, per_meter))?;
         }
     }
-    Ok(SceneScores {
-        unseen_light_psnr: unseen.ours.psnr(),
-        oracle_psnr: unseen.oracle.psnr(),
-        mean_light_psnr: unseen.mean.psnr(),
-        veiled_light_psnr: veiled.ours.psnr(),
-        veiled_oracle_psnr: veiled.oracle.psnr(),
-        veiled_mean_psnr: veiled.mean.psnr(),
-        seen_light_psnr: seen.psnr(),
-        sunlit_psnr: sunlit.psnr(),
-        light: if model.has_suns() { "sun" } else { "sh" }.into(),
-        albedo_psnr: scaled_psnr(&albedos),
-        normal_median_deg: median(angles),
-        depth_median: median(depths),
-        shadow_correlation: correlation(&shadows),
-        views,
-    })
+    Ok(tally.scores(if model.has_suns() { "sun" } else { "sh" }))
 }
 
 fn median(mut values: Vec<f64>) -> f64 {

@@ -9,8 +9,10 @@ use diorama_geom::sh_light;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+mod least_squares;
 mod photograph;
 
+use least_squares::solve;
 pub use photograph::{Shown, of_photograph};
 
 /// Numbers of a sun: direction and power.
@@ -24,13 +26,8 @@ const SEARCH_POINTS: usize = 1500;
 /// Radii in radians of the circles about the best direction that are tried afterwards, and directions on each.
 const CIRCLES: [f32; 5] = [0.1, 0.05, 0.025, 0.0125, 0.006];
 const AROUND: usize = 10;
-/// Unknowns: sun, nine of the sky.
-const UNKNOWNS: usize = 10;
 /// Light that surfaces send to each other over what a level white one receives, before it is known: about their albedo.
 pub const BOUNCED: f32 = 0.25;
-/// Pull of the unknowns toward 0, per point: of the sun and the even sky, and of the sky's first and second band, as normals of few directions
-/// tell little of them.
-const RIDGE: [f64; 3] = [1e-4, 2e-3, 5e-3];
 /// Albedo on the mean before anything is known, and luminance of the brightest twentieth.
 const FIRST_ALBEDO: f32 = 0.3;
 const BRIGHT: f32 = 0.7;
@@ -95,6 +92,8 @@ struct Place {
     corners: Corners,
     /// Light that arrives for each of the sky's coefficients.
     sky: [f32; 9],
+    /// Share of a sun that is left by what is too small to be traced.
+    share: f32,
 }
 
 impl Surfaces {
@@ -104,7 +103,7 @@ impl Surfaces {
         let place = |(point, normal): &(Vec3, Vec3)| {
             let corners = visibility.corners(*point, *normal);
             let sky = visibility.sky_row(&corners, *normal);
-            Place { point: *point, normal: *normal, cell: visibility.cell_of(*point), corners, sky }
+            Place { point: *point, normal: *normal, cell: visibility.cell_of(*point), corners, sky, share: 1.0 }
         };
         Surfaces { points: points.par_iter().map(place).collect(), albedos }
     }
@@ -176,7 +175,7 @@ impl Surfaces {
 impl Place {
     fn sunlit(&self, visibility: &Visibility, toward: Vec3) -> f32 {
         let facing = self.normal.dot(toward);
-        if facing > 0.0 { facing * visibility.from_sun(self.point, self.normal, toward) } else { 0.0 }
+        if facing > 0.0 { self.share * facing * visibility.from_sun(self.point, self.normal, toward) } else { 0.0 }
     }
 
     /// Light of a sky `[9, 3]`.
@@ -194,6 +193,8 @@ struct Lit {
     sent: Vec3,
     /// How much the point counts: shadows that are a little off must not blur what is told apart.
     trust: f32,
+    /// How much a channel counts that may be clipped.
+    clipped: f32,
 }
 
 /// State of one light while lights are told apart.
@@ -353,7 +354,7 @@ fn lit(seen: &[Seen], albedos: &[Vec3], light: usize, sent: &[Vec3], by: Option<
     let of = |(i, s): (usize, &Seen)| {
         let (albedo, color) = (albedos[i], s.colors[light]);
         let trust = by.map_or(1.0, |g| trust(albedo * g.irradiance(i, &places[i]), color));
-        Lit { albedo, seen: color, sent: sent[i], trust }
+        Lit { albedo, seen: color, sent: sent[i], trust, clipped: UNSURE }
     };
     seen.iter().enumerate().map(of).collect()
 }
@@ -453,67 +454,6 @@ fn trust(got: Vec3, seen: Vec3) -> f32 {
     let shown = |v: f32| srgb_from_linear(v.clamp(0.0, 1.0));
     let squared: f32 = (0..3).map(|k| (shown(got[k]) - shown(seen[k])).powi(2)).sum();
     (TRUSTED * TRUSTED / (TRUSTED * TRUSTED + squared)).powi(2)
-}
-
-/// Least squares for one direction, of which `sunlit` reaches each point.
-fn solve(points: &[Lit], places: &[Place], sunlit: &[f32], direction: Vec3) -> Fitted {
-    let mut sums = [[[0.0f64; UNKNOWNS + 1]; UNKNOWNS]; 3];
-    let mut squares = 0.0;
-    for ((p, place), sun) in points.iter().zip(places).zip(sunlit) {
-        let row: [f64; UNKNOWNS] = std::array::from_fn(|i| if i == 0 { *sun } else { place.sky[i - 1] } as f64);
-        for k in 0..3 {
-            // The derivative of sRGB at what is seen.
-            let sure = if p.seen[k] < CLIPPED { 1.0 } else { UNSURE };
-            let weight = sure * p.trust.sqrt() * 0.44 * p.seen[k].max(DARK).powf(-0.58);
-            let (a, y) = ((weight * p.albedo[k]) as f64, (weight * (p.seen[k] - p.albedo[k] * p.sent[k])) as f64);
-            for (i, line) in sums[k].iter_mut().enumerate() {
-                (i..UNKNOWNS).for_each(|j| line[j] += a * a * row[i] * row[j]);
-                line[UNKNOWNS] += a * row[i] * y;
-            }
-            squares += y * y;
-        }
-    }
-    let n = points.len().max(1) as f64;
-    let mut found = Fitted { sun: [0.0; SUN], sky: [0.0; 27], error: squares / (3.0 * n) };
-    found.sun[..3].copy_from_slice(&direction.to_array());
-    for (k, sums) in sums.iter_mut().enumerate() {
-        (0..UNKNOWNS).for_each(|i| {
-            sums[i][i] += n * RIDGE[[0, 0, 1, 1, 1, 2, 2, 2, 2, 2][i]];
-            (0..i).for_each(|j| sums[i][j] = sums[j][i]);
-        });
-        // A sun that would take light away is left out.
-        let all = without(sums, &[]);
-        let x = if all[0] < 0.0 { without(sums, &[0]) } else { all };
-        found.sun[3 + k] = x[0] as f32;
-        (0..9).for_each(|i| found.sky[3 * i + k] = x[1 + i] as f32);
-        // ‖y − Ax‖² = ‖y‖² − 2 xᵀAᵀy + xᵀAᵀA x.
-        let explained: f64 =
-            (0..UNKNOWNS).map(|i| x[i] * (2.0 * sums[i][UNKNOWNS] - (0..UNKNOWNS).map(|j| sums[i][j] * x[j]).sum::<f64>())).sum();
-        found.error -= explained / (3.0 * n);
-    }
-    found
-}
-
-/// Solution of symmetric equations in which some unknowns are 0, by elimination.
-fn without(equations: &[[f64; UNKNOWNS + 1]; UNKNOWNS], out: &[usize]) -> [f64; UNKNOWNS] {
-    let mut m = *equations;
-    for &i in out {
-        m[i] = [0.0; UNKNOWNS + 1];
-        m.iter_mut().for_each(|row| row[i] = 0.0);
-        m[i][i] = 1.0;
-    }
-    for i in 0..UNKNOWNS {
-        let pivot = m[i];
-        for row in &mut m[i + 1..] {
-            let factor = row[i] / pivot[i];
-            (i..=UNKNOWNS).for_each(|j| row[j] -= factor * pivot[j]);
-        }
-    }
-    let mut x = [0.0; UNKNOWNS];
-    for i in (0..UNKNOWNS).rev() {
-        x[i] = (m[i][UNKNOWNS] - (i + 1..UNKNOWNS).map(|j| m[i][j] * x[j]).sum::<f64>()) / m[i][i];
-    }
-    x
 }
 
 #[cfg(test)]

@@ -1,12 +1,14 @@
 //! The light of a photograph that shows surfaces of known albedo.
 
-use super::{BOUNCED, FIRST_ALBEDO, Fitted, Guess, NO_WORSE, Place, SEARCHED, Seen, Surfaces, fit, lit, misfit, solve};
+use super::{BOUNCED, FIRST_ALBEDO, Fitted, Guess, Place, SEARCHED, Seen, Surfaces, fit, lit, misfit, solve};
 use crate::relight::outdoor::visibility::Visibility;
 use diorama_geom::glam::Vec3;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Linear value of a channel from which on a photograph is overexposed.
 const OVEREXPOSED: f32 = 0.97;
+/// Factor by which a photograph may be explained worse without a sun for it to have none.
+const NO_WORSE: f64 = 1.01;
 /// Times that the light of a photograph and what surfaces send are found in turn.
 const PHOTOGRAPH_ROUNDS: usize = 5;
 
@@ -16,6 +18,8 @@ pub struct Shown {
     pub point: Vec3,
     pub normal: Vec3,
     pub albedo: Vec3,
+    /// Share of a sun that is left by what is too small to be traced.
+    pub share: f32,
     /// Linear.
     pub color: Vec3,
 }
@@ -24,7 +28,8 @@ pub struct Shown {
 /// hardly more. None after an interrupt.
 pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility, interrupt: &AtomicBool) -> Option<Fitted> {
     let albedos: Vec<Vec3> = shown.iter().map(|s| s.albedo).collect();
-    let places = Surfaces::new(shown.iter().map(|s| (s.point, s.normal)), albedos.clone(), visibility);
+    let mut places = Surfaces::new(shown.iter().map(|s| (s.point, s.normal)), albedos.clone(), visibility);
+    places.points.iter_mut().zip(shown).for_each(|(p, s)| p.share = s.share);
     let seen: Vec<Seen> = shown.iter().map(|s| Seen { point: s.point, normal: s.normal, colors: vec![s.color] }).collect();
     let mean = shown.iter().map(|s| s.color).sum::<Vec3>() / shown.len().max(1) as f32;
     let sent_first = |p: &Place| (1.0 - visibility.from_sky(&p.corners, p.normal)) * BOUNCED / FIRST_ALBEDO * mean;
@@ -32,6 +37,7 @@ pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility
     // What is overexposed says that there is at least so much light.
     let counting = |found: &Option<Guess>, sent: &[Vec3]| {
         let mut points = lit(&seen, &albedos, 0, sent, found.as_ref(), &places.points);
+        points.iter_mut().for_each(|p| p.clipped = 1.0);
         for (i, p) in points.iter_mut().enumerate().filter(|(_, p)| p.seen.max_element() > OVEREXPOSED) {
             let is_reached = |g: &Guess| (p.albedo * g.irradiance(i, &places.points[i])).max_element() >= p.seen.max_element();
             p.trust *= found.as_ref().is_some_and(|g| !is_reached(g)) as u8 as f32;
