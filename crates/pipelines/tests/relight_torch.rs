@@ -15,7 +15,7 @@ use std::process::Command;
 
 const RAYS: usize = 24;
 /// Of networks and lights.
-const RATES: [f32; 2] = [5e-5, 1e-3];
+const RATES: [f32; 2] = [4e-5, 1e-3];
 const VIEWS: usize = 6;
 const SIZE: u32 = 24;
 

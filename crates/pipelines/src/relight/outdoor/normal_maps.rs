@@ -36,6 +36,8 @@ const DOWN: f64 = 0.04;
 const UNEVEN: f64 = 0.06;
 const UPRIGHT: f64 = 0.5;
 const LESS: f64 = 0.9;
+/// Least cosine between up and a plane that is fitted to them freely.
+const LEVEL: f64 = 0.97;
 /// Normals of which the main directions are found, directions that are tried, and most that are kept.
 const SAMPLED: usize = 50_000;
 const TRIED: usize = 3000;
@@ -182,21 +184,26 @@ impl Seen {
     }
 
     fn free_plane(&self, i: usize) -> Option<Plane> {
-        let own = self.inverse[i];
-        if own <= 0.0 {
+        if self.inverse[i] <= 0.0 {
             return None;
         }
         let (near, all) = self.window(i);
+        self.plane_through(i, (&near, all), APART)
+    }
+
+    /// The plane through distances, of which those that differ more do not count.
+    fn plane_through(&self, i: usize, (near, all): (&[(DVec3, f64)], usize), apart: f64) -> Option<Plane> {
+        let own = self.inverse[i];
         let center = DVec3::new(self.rays[i].x, self.rays[i].y, 0.0);
         let (mut plane, mut support) = (DVec3::new(0.0, 0.0, own), 0.0);
         for round in 0..ROUNDS {
             let (mut m, mut v) = (DMat3::from_diagonal(DVec3::splat(1e-12)), DVec3::ZERO);
             support = 0.0;
-            for (ray, value) in &near {
+            for (ray, value) in near {
                 let row = *ray - center;
                 // At first, all that is as far away counts alike, whatever its slope.
                 let (off, wide) = if round == 0 { (value - own, 10.0) } else { (row.dot(plane) - value, 1.0) };
-                let weight = agreement(off / (wide * APART * own));
+                let weight = agreement(off / (wide * apart * own));
                 support += weight;
                 m += DMat3::from_cols(weight * row.x * row, weight * row.y * row, weight * row.z * row);
                 v += weight * value * row;
@@ -237,6 +244,11 @@ impl Seen {
             return None;
         }
         let level = self.plane_along(i, near, up, UNEVEN).filter(|p| p.support > FLAT * all as f64)?;
+        // Stairs and slopes are not level.
+        let free = self.plane_through(i, (near, all), UNEVEN)?;
+        if free.of.normalize_or_zero().dot(up).abs() < LEVEL {
+            return None;
+        }
         let upright = main.iter().filter(|m| m.dot(up).abs() < UPRIGHT).filter_map(|m| self.plane_along(i, near, *m, UNEVEN));
         upright.into_iter().all(|p| p.support < LESS * level.support).then_some(level)
     }

@@ -51,9 +51,6 @@ const LOWEST: f32 = 0.1;
 const BOUNCES: usize = 4;
 /// Difference in sRGB beyond which points count less and less.
 const TRUSTED: f32 = 0.15;
-/// Linear light from which a photograph may be clipped, and how much it then tells of the albedo.
-const CLIPPED: f32 = 0.93;
-const UNSURE: f32 = 0.02;
 /// Linear light below which errors do not count more.
 const DARK: f32 = 0.02;
 
@@ -193,8 +190,6 @@ struct Lit {
     sent: Vec3,
     /// How much the point counts: shadows that are a little off must not blur what is told apart.
     trust: f32,
-    /// How much a channel counts that may be clipped.
-    clipped: f32,
 }
 
 /// State of one light while lights are told apart.
@@ -354,7 +349,7 @@ fn lit(seen: &[Seen], albedos: &[Vec3], light: usize, sent: &[Vec3], by: Option<
     let of = |(i, s): (usize, &Seen)| {
         let (albedo, color) = (albedos[i], s.colors[light]);
         let trust = by.map_or(1.0, |g| trust(albedo * g.irradiance(i, &places[i]), color));
-        Lit { albedo, seen: color, sent: sent[i], trust, clipped: UNSURE }
+        Lit { albedo, seen: color, sent: sent[i], trust }
     };
     seen.iter().enumerate().map(of).collect()
 }
@@ -372,8 +367,7 @@ fn explained(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess], left_out: Op
             }
             let white = g.irradiance(i, &surfaces.points[i]);
             // The derivative of sRGB at what is seen, squared.
-            let by_channel = c.max(Vec3::splat(DARK)).to_array().map(|v| v.powf(-1.16) * if v < CLIPPED { 1.0 } else { UNSURE });
-            let weight = Vec3::from(by_channel) * trust(before * white, *c);
+            let weight = Vec3::from(c.max(Vec3::splat(DARK)).to_array().map(|v| v.powf(-1.16))) * trust(before * white, *c);
             (a, b) = (a + weight * white * *c, b + weight * white * white);
         }
         (a / b).max(Vec3::ZERO)

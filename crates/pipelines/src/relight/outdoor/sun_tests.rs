@@ -88,7 +88,7 @@ fn the_sun_is_found_where_it_stands() {
         })
         .collect();
     let surfaces = Surfaces::new(seen.iter().map(|s| (s.0, s.1)), seen.iter().map(|s| s.2).collect(), &visibility);
-    let pixels: Vec<Lit> = seen.iter().map(|s| Lit { albedo: s.2, seen: s.3, sent: Vec3::ZERO, trust: 1.0, clipped: 1.0 }).collect();
+    let pixels: Vec<Lit> = seen.iter().map(|s| Lit { albedo: s.2, seen: s.3, sent: Vec3::ZERO, trust: 1.0 }).collect();
     let found = fit(&pixels, &surfaces, &visibility, None);
     let direction = Vec3::from_slice(&found.sun[..3]);
     assert!(direction.angle_between(sun).to_degrees() < 2.0, "{direction} {sun}");

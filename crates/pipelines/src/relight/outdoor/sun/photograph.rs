@@ -37,7 +37,6 @@ pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility
     // What is overexposed says that there is at least so much light.
     let counting = |found: &Option<Guess>, sent: &[Vec3]| {
         let mut points = lit(&seen, &albedos, 0, sent, found.as_ref(), &places.points);
-        points.iter_mut().for_each(|p| p.clipped = 1.0);
         for (i, p) in points.iter_mut().enumerate().filter(|(_, p)| p.seen.max_element() > OVEREXPOSED) {
             let is_reached = |g: &Guess| (p.albedo * g.irradiance(i, &places.points[i])).max_element() >= p.seen.max_element();
             p.trust *= found.as_ref().is_some_and(|g| !is_reached(g)) as u8 as f32;
