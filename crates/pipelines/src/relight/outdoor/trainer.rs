@@ -43,8 +43,6 @@ const DISTORTION_RAMP: u64 = 2000;
 /// Times that surfaces are flattened in their stage, and pixels that then tell distances.
 const FLATTENED: u64 = 3;
 const FLAT_PIXELS: usize = 100_000;
-/// Step before which surfaces are not flattened, as they may still be wrong.
-const EARLIEST: u64 = 1000;
 /// Steps before robust weights begin.
 const SETTLED: u64 = 200;
 
@@ -304,8 +302,7 @@ impl Trainee for Trainer<'_> {
             return Ok(());
         }
         match self.model.config.light.stage(progress as f32) {
-            (Stage::Surfaces, share) if step >= EARLIEST => self.flatten(share, events),
-            (Stage::Surfaces, _) => {}
+            (Stage::Surfaces, share) => self.flatten(share, events),
             (Stage::Light, _) if self.model.stage == Stage::Surfaces => self.begin_light(step, interrupt, events)?,
             (Stage::Light, _) => {}
         }
