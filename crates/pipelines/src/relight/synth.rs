@@ -73,7 +73,7 @@ impl Place {
         let model = street::northern_row(options.seed);
         let held_out = options.views / HOLD_OUT;
         let count = held_out + options.lights * (options.views - held_out);
-        let mut cameras = looking_at_one_place(&model, street::cameras(CANDIDATES * count, w, h, options.seed), count);
+        let cameras = looking_at_one_place(&model, street::cameras(CANDIDATES * count, w, h, options.seed), count);
         // Along the street: one that is held out after the same number of others.
         let every = count.checked_div(held_out).unwrap_or(usize::MAX);
         let mut walked = 0;
@@ -82,7 +82,7 @@ impl Place {
             walked += !is_held_out as usize;
             Viewpoint { camera, pose, light: (!is_held_out).then(|| walked % options.lights.max(1)), is_held_out }
         };
-        Place { model, viewpoints: cameras.drain(..).enumerate().map(viewpoint).collect() }
+        Place { model, viewpoints: cameras.into_iter().enumerate().map(viewpoint).collect() }
     }
 }
 

@@ -85,9 +85,7 @@ impl NormalMaps {
     /// Of a model's surfaces. Cameras that stand alike share a map; so many that their maps would be large together get smaller ones.
     pub fn of(model: &SceneModel, cameras: &[PosedCamera]) -> NormalMaps {
         let (shown, of) = apart(cameras);
-        let pixels: f64 = shown.iter().map(|c| shrunk(c, 1.0)).map(|c| c.camera.width as f64 * c.camera.height as f64).sum();
-        let by = (PIXELS / pixels).sqrt().min(1.0);
-        let size = |c: &PosedCamera| [c.camera.width as f32, c.camera.height as f32];
+        let by = (PIXELS / pixels(&shown)).sqrt().min(1.0);
         let of = of.iter().zip(cameras).map(|(map, c)| Some((*map, size(c)))).collect();
         NormalMaps::shown(model, shown.iter().map(|c| shrunk(c, by)).collect(), of)
     }
@@ -95,11 +93,8 @@ impl NormalMaps {
     /// Of some of the cameras, as many as have large maps; `turn` says which of them, so that each has its turn.
     pub fn of_some(model: &SceneModel, cameras: &[PosedCamera], turn: usize) -> NormalMaps {
         let (shown, of) = apart(cameras);
-        let of_one = |c: &PosedCamera| shrunk(c, 1.0).camera;
-        let pixels: f64 = shown.iter().map(of_one).map(|c| c.width as f64 * c.height as f64).sum();
-        let every = ((pixels / PIXELS).ceil() as usize).max(1);
+        let every = ((pixels(&shown) / PIXELS).ceil() as usize).max(1);
         let is_used = |map: usize| map % every == turn % every;
-        let size = |c: &PosedCamera| [c.camera.width as f32, c.camera.height as f32];
         let place = |map: usize| is_used(map).then(|| map / every);
         let of = of.iter().zip(cameras).map(|(map, c)| Some((place(*map)?, size(c)))).collect();
         let used = shown.iter().enumerate().filter(|(map, _)| is_used(*map)).map(|(_, c)| shrunk(c, 1.0));
@@ -249,8 +244,8 @@ impl Seen {
         if free.of.normalize_or_zero().dot(up).abs() < LEVEL {
             return None;
         }
-        let upright = main.iter().filter(|m| m.dot(up).abs() < UPRIGHT).filter_map(|m| self.plane_along(i, near, *m, UNEVEN));
-        upright.into_iter().all(|p| p.support < LESS * level.support).then_some(level)
+        let mut upright = main.iter().filter(|m| m.dot(up).abs() < UPRIGHT).filter_map(|m| self.plane_along(i, near, *m, UNEVEN));
+        upright.all(|p| p.support < LESS * level.support).then_some(level)
     }
 
     /// The normals, each of the free plane or of one along a main direction.
@@ -300,6 +295,16 @@ fn apart(cameras: &[PosedCamera]) -> (Vec<PosedCamera>, Vec<usize>) {
     });
     let of = of.collect();
     (shown, of)
+}
+
+/// Width and height of a camera's photographs.
+fn size(camera: &PosedCamera) -> [f32; 2] {
+    [camera.camera.width as f32, camera.camera.height as f32]
+}
+
+/// Pixels of the largest maps of cameras.
+fn pixels(cameras: &[PosedCamera]) -> f64 {
+    cameras.iter().map(|c| shrunk(c, 1.0).camera).map(|c| c.width as f64 * c.height as f64).sum()
 }
 
 /// A camera of at most [`LONGEST`] pixels along its longer side, times a factor.

@@ -32,7 +32,7 @@ const SOLID: f32 = 0.5;
 /// Length below which a vector has no direction.
 const SHORTEST: f32 = 1e-12;
 /// Value in sRGB from which a photograph may be clipped.
-pub const CLIPPED: f32 = 0.99;
+const CLIPPED: f32 = 0.99;
 /// Directions in which irradiance must not be negative.
 const DIRECTIONS: usize = 64;
 
@@ -248,7 +248,12 @@ fn unhidden(sun: &[f32], normal: &[f32; 3]) -> Vec3 {
 impl Sunlit<'_> {
     /// Light that a white surface sends of which a share of the suns is not hidden by what is too small to be traced.
     fn received(&self, normal: &[f32; 3], share: f32) -> Vec3 {
-        share * (self.reach[0] * unhidden(self.sun, normal) + self.of_lamps) + self.ambient
+        share * self.direct(normal) + self.ambient
+    }
+
+    /// Light of the suns that a white surface sends where nothing small hides them.
+    fn direct(&self, normal: &[f32; 3]) -> Vec3 {
+        self.reach[0] * unhidden(self.sun, normal) + self.of_lamps
     }
 }
 
@@ -364,7 +369,7 @@ impl SceneLoss<'_> {
             }
             d_values[k] += dc * white[k];
             if let Some(l) = sunlit {
-                d_values[3] += dc * values[k] * l.reach[0] * unhidden(l.sun, &s.normal)[k];
+                d_values[3] += dc * values[k] * l.direct(&s.normal)[k];
             }
             if sunlit.is_none() && s.lit[k] > 0.0 {
                 d_values[3] += dc * values[k] * s.lit[k];
