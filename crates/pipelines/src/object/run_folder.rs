@@ -124,11 +124,7 @@ pub fn add_points(model: &mut ObjectModel, run: &Path, data: Option<&Path>) -> R
 fn read_points(kept: &mut Capture, config: &Config, data: &Path) {
     let mut config = config.clone();
     config.data.path = data.to_path_buf();
-    match loading::load_capture(&config) {
-        Ok(fresh) if kept_capture::has_same_views(&fresh, kept) => kept.points = fresh.points,
-        Ok(_) => kept.notes.push("the capture has changed since the run began: its sparse points are not used".into()),
-        Err(e) => kept.notes.push(format!("the capture's sparse points cannot be read again: {e}")),
-    }
+    kept_capture::add_points(kept, loading::load_capture(&config));
 }
 
 #[cfg(test)]

@@ -84,13 +84,22 @@ fn open(run: &Path) -> Result<KeptCapture> {
 }
 
 /// Whether photographs have the same names and poses: else the points are of another world.
-pub fn has_same_views(a: &Capture, b: &Capture) -> bool {
+fn has_same_views(a: &Capture, b: &Capture) -> bool {
     let close = 1e-5 * b.scene.half;
     let is_same = |(a, b): (&Frame, &Frame)| {
         let (p, q) = (&a.world_from_camera, &b.world_from_camera);
         a.name == b.name && (p.translation - q.translation).length() <= close && p.rotation.abs_diff_eq(q.rotation, 1e-5)
     };
     a.frames.len() == b.frames.len() && a.frames.iter().zip(&b.frames).all(is_same)
+}
+
+/// Gives a kept capture the sparse points of its data set as it is read now, which a run has not kept; a note says so where they cannot be had.
+pub fn add_points(kept: &mut Capture, fresh: Result<Capture>) {
+    match fresh {
+        Ok(fresh) if has_same_views(&fresh, kept) => kept.points = fresh.points,
+        Ok(_) => kept.notes.push("the capture has changed since the run began: its sparse points are not used".into()),
+        Err(e) => kept.notes.push(format!("the capture's sparse points cannot be read again: {e}")),
+    }
 }
 
 /// The folder in which the first photograph lies: where it was, else where it lay as seen from the run.

@@ -17,6 +17,8 @@ const CAMERAS: usize = 48;
 /// Cameras that must see a surface, and the difference of distances that is none.
 const FEWEST: usize = 2;
 const SAME: f64 = 0.05;
+/// By how much larger a pixel of such a camera may be on the surface: what is seen coarsely only is a blur from close by.
+const COARSER: f64 = 2.0;
 
 /// Share of the longer side by which windows reach to each side, and the correlation in them from which pictures are alike; deviations up to
 /// which a window of albedo is even, and one of the photograph shows shades.
@@ -47,18 +49,20 @@ impl Known {
         Known(seen.collect())
     }
 
-    /// Leaves out of a photograph what fewer than two cameras of training see.
+    /// Leaves out of a photograph what fewer than two cameras of training see as finely.
     pub fn keep(&self, shot: &mut Shot, view: &SceneView) {
         let (w, h) = (shot.photo.width, shot.photo.height);
         let all = || ImageU8 { width: w, height: h, channels: 1, data: vec![255; w * h] };
         let camera = shot.camera;
+        let focal = |c: &PosedCamera| c.camera.fx / c.camera.width.max(c.camera.height) as f64;
+        // In parts of the longer side: photographs of one capture have about as many pixels.
+        let size = |c: &PosedCamera, point: DVec3| (point - c.pose.translation).length() / focal(c);
         let mask = shot.mask.get_or_insert_with(all);
         for (i, v) in mask.data.iter_mut().enumerate() {
             let point = point(&camera, view, i);
             // The sky is no surface and needs nobody to see it.
-            if view.opacity.data[i] > super::SURFACE
-                && self.0.iter().filter(|(c, depth)| sees(c, depth, point)).take(FEWEST).count() < FEWEST
-            {
+            let is_seen = |(c, depth): &&(PosedCamera, Image)| size(c, point) <= COARSER * size(&camera, point) && sees(c, depth, point);
+            if view.opacity.data[i] > super::SURFACE && self.0.iter().filter(is_seen).take(FEWEST).count() < FEWEST {
                 *v = 0;
             }
         }

@@ -38,6 +38,9 @@ const UPRIGHT: f64 = 0.5;
 const LESS: f64 = 0.9;
 /// Least cosine between up and a plane that is fitted to them freely.
 const LEVEL: f64 = 0.97;
+/// Relative difference of depths that is none, and pixels beside each other.
+const AS_DEEP: f64 = 0.05;
+const BESIDE: [f64; 3] = [0.0, -1.0, 1.0];
 /// Normals of which the main directions are found, directions that are tried, and most that are kept.
 const SAMPLED: usize = 50_000;
 const TRIED: usize = 3000;
@@ -61,12 +64,16 @@ struct Map {
     normals: Vec<Vec3>,
     /// Distance along the ray to the plane; 0 where few distances lie on it.
     distances: Vec<f32>,
+    camera: PosedCamera,
+    /// One over the depth of the surface, 0 where there is none.
+    inverse: Vec<f64>,
 }
 
 /// Distances of a view.
 struct Seen {
     width: usize,
     height: usize,
+    camera: PosedCamera,
     to_model: DMat3,
     /// Rays whose component along the view axis is 1.
     rays: Vec<DVec3>,
@@ -117,6 +124,20 @@ impl NormalMaps {
         map.normals[at(y, h, map.height) * map.width + at(x, w, map.width)]
     }
 
+    /// Whether a training camera sees a point: the surface that it sees there, or a pixel beside, is as deep.
+    pub fn shows(&self, image: usize, point: Vec3) -> bool {
+        let Some((map, _)) = self.of[image] else { return false };
+        let map = &self.maps[map];
+        let local = map.camera.pose.inverse().point(point.as_dvec3());
+        let Some(at) = map.camera.camera.project(local).filter(|_| local.z > 0.0) else { return false };
+        let is_as_deep = |x: f64, y: f64| {
+            (0.0..map.width as f64).contains(&x)
+                && (0.0..map.height as f64).contains(&y)
+                && (map.inverse[y as usize * map.width + x as usize] * local.z - 1.0).abs() < AS_DEEP
+        };
+        BESIDE.iter().any(|dy| BESIDE.iter().any(|dx| is_as_deep(at.x + dx, at.y + dy)))
+    }
+
     /// Distances to the planes, of about `count` pixels of the cameras' photographs.
     pub fn observations(&self, count: usize) -> Vec<Observation> {
         let known = |m: &Map| m.distances.iter().filter(|d| **d > 0.0).count();
@@ -150,7 +171,7 @@ impl Seen {
             if view.opacity.data[i] > SURFACE && d > 0.0 && r.z > 0.0 { r.length() / (d * r.z) } else { 0.0 }
         };
         let inverse = (0..w * h).map(inverse).collect();
-        Seen { width: w, height: h, to_model: small.pose.rotation, rays: rays.iter().map(|r| *r / r.z).collect(), inverse }
+        Seen { width: w, height: h, camera: *small, to_model: small.pose.rotation, rays: rays.iter().map(|r| *r / r.z).collect(), inverse }
     }
 
     /// Rays and inverse depths around a pixel, and how many there would be in a full window.
@@ -273,7 +294,7 @@ impl Seen {
             (self.normal(i, plane), if is_on { (self.rays[i].length() / inverse) as f32 } else { 0.0 })
         };
         let (normals, distances) = (0..free.len()).into_par_iter().map(of).unzip();
-        Map { width: self.width, height: self.height, normals, distances }
+        Map { width: self.width, height: self.height, normals, distances, camera: self.camera, inverse: self.inverse.clone() }
     }
 
     /// Normal of a plane in model space, toward the camera.

@@ -40,7 +40,7 @@ pub fn train(
     interrupt: &AtomicBool,
     events: &mut dyn FnMut(&Event),
 ) -> Result<Trained> {
-    let capture = if resume { folder.capture()? } else { load_capture(config)? };
+    let capture = if resume { kept(folder, config)? } else { load_capture(config)? };
     capture.notes.iter().for_each(|n| events(&Event::Note(n.clone())));
     single_light(&capture).into_iter().for_each(|n| events(&Event::Note(n)));
     check_memory(config, &capture)?;
@@ -89,6 +89,15 @@ pub fn train(
     trainer.show();
     folder.draw_curves()?;
     Ok(Trained { model: trainer.model, summary })
+}
+
+/// The capture of a run that goes on, with the sparse points of its data set.
+fn kept(folder: &RunFolder, config: &Config) -> Result<Capture> {
+    let mut capture = folder.capture()?;
+    let mut config = config.clone();
+    config.data.path = folder.data_set()?;
+    kept_capture::add_points(&mut capture, load_capture(&config));
+    Ok(capture)
 }
 
 /// Refuses sizes that do not fit into memory.

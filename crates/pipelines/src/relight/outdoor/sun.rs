@@ -11,9 +11,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 mod least_squares;
 mod photograph;
+mod selection;
 
 use least_squares::solve;
 pub use photograph::{Shown, of_photograph};
+use selection::Selection;
 
 /// Numbers of a sun: direction and power.
 pub const SUN: usize = 6;
@@ -41,16 +43,14 @@ const SEARCHED: usize = 1;
 const SETTLING: usize = 15;
 /// Every so many of these, light from surfaces is found anew.
 const SENT_AGAIN: usize = 3;
-/// Share of a level surface's light below which a sun may be one that is not there, and factor by which what is seen may then be explained
-/// worse without it.
-const WEAK: f32 = 0.5;
-const NO_WORSE: f64 = 1.05;
 /// Share of the points, the lowest, that the ground outside looks like.
 const LOWEST: f32 = 0.1;
 /// Bounces of light between surfaces, where a light is given.
 const BOUNCES: usize = 4;
 /// Difference in sRGB beyond which points count less and less.
 const TRUSTED: f32 = 0.15;
+/// How much the color of a point counts that no photograph in a light shows.
+const UNSHOWN: f32 = 0.03;
 /// Linear light below which errors do not count more.
 const DARK: f32 = 0.02;
 
@@ -60,6 +60,15 @@ pub struct Seen {
     pub point: Vec3,
     pub normal: Vec3,
     pub colors: Vec<Vec3>,
+    /// Whether a photograph in each light shows it; elsewhere its color is a guess.
+    pub shown: Vec<bool>,
+}
+
+impl Seen {
+    /// How much its color in a light counts.
+    fn counts(&self, light: usize) -> f32 {
+        if self.shown[light] { 1.0 } else { UNSHOWN }
+    }
 }
 
 /// Light that explains points.
@@ -190,6 +199,8 @@ struct Lit {
     sent: Vec3,
     /// How much the point counts: shadows that are a little off must not blur what is told apart.
     trust: f32,
+    /// sRGB's slope, by which errors in linear light become those that are seen.
+    slope: Vec3,
 }
 
 /// State of one light while lights are told apart.
@@ -263,23 +274,8 @@ pub fn tell_apart(
             return None;
         }
     }
-    // An overcast sky gets a weak sun that explains shadows of other lights which are still in the albedos.
-    let share = |g: &Guess| g.fitted.sun[2] * gray(&g.fitted.sun[3..]) / gray(&level(&g.fitted.sun, &g.fitted.sky).to_array()).max(1e-6);
-    let mut weak: Vec<usize> = (0..lights).filter(|l| share(&guesses[*l]) < WEAK).collect();
-    weak.sort_by(|a, b| share(&guesses[*a]).total_cmp(&share(&guesses[*b])));
-    for l in weak {
-        let before = misfit(seen, &surfaces, &guesses);
-        let mut without = guesses.clone();
-        let mut dimmed = surfaces.clone();
-        without[l].sunlit.fill(0.0);
-        if !settle(seen, &mut dimmed, visibility, &mut without, SETTLING, &mut go_on) {
-            return None;
-        }
-        if misfit(seen, &dimmed, &without) <= NO_WORSE * before {
-            (guesses, surfaces) = (without, dimmed);
-        }
-    }
-    Some((guesses.into_iter().map(|g| g.fitted).collect(), surfaces))
+    let told = Selection { seen, visibility }.best(guesses, surfaces, &mut go_on)?;
+    Some((told.guesses.into_iter().map(|g| g.fitted).collect(), told.surfaces))
 }
 
 /// Albedos if one light were an even sky: what is seen over how open a surface is.
@@ -337,19 +333,24 @@ fn settle(
 
 /// How badly lights and albedos explain what is seen: mean of `e² / (e² + t²)` over points and lights, in sRGB.
 fn misfit(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess]) -> f64 {
-    let of = |(i, s): (usize, &Seen)| -> f64 {
-        let each = guesses.iter().zip(&s.colors);
-        each.map(|(g, c)| (1.0 - trust(surfaces.albedos[i] * g.irradiance(i, &surfaces.points[i]), *c).sqrt()) as f64).sum()
-    };
-    seen.iter().enumerate().map(of).sum::<f64>() / (seen.len() * guesses.len()).max(1) as f64
+    let (mut sum, mut total) = (0.0, 1e-9);
+    for (i, s) in seen.iter().enumerate() {
+        for (l, (g, c)) in guesses.iter().zip(&s.colors).enumerate() {
+            let weight = s.counts(l) as f64;
+            sum += weight * (1.0 - trust(surfaces.albedos[i] * g.irradiance(i, &surfaces.points[i]), *c).sqrt()) as f64;
+            total += weight;
+        }
+    }
+    sum / total
 }
 
 /// Surface points in one light, each trusted as an explanation of it says.
 fn lit(seen: &[Seen], albedos: &[Vec3], light: usize, sent: &[Vec3], by: Option<&Guess>, places: &[Place]) -> Vec<Lit> {
     let of = |(i, s): (usize, &Seen)| {
         let (albedo, color) = (albedos[i], s.colors[light]);
-        let trust = by.map_or(1.0, |g| trust(albedo * g.irradiance(i, &places[i]), color));
-        Lit { albedo, seen: color, sent: sent[i], trust }
+        let got = by.map(|g| albedo * g.irradiance(i, &places[i]));
+        let trust = got.map_or(1.0, |got| trust(got, color));
+        Lit { albedo, seen: color, sent: sent[i], trust: trust * s.counts(light), slope: slope(got.unwrap_or(color), color) }
     };
     seen.iter().enumerate().map(of).collect()
 }
@@ -366,8 +367,7 @@ fn explained(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess], left_out: Op
                 continue;
             }
             let white = g.irradiance(i, &surfaces.points[i]);
-            // The derivative of sRGB at what is seen, squared.
-            let weight = Vec3::from(c.max(Vec3::splat(DARK)).to_array().map(|v| v.powf(-1.16))) * trust(before * white, *c);
+            let weight = slope(*c, *c).powf(2.0) * trust(before * white, *c) * s.counts(l);
             (a, b) = (a + weight * white * *c, b + weight * white * white);
         }
         (a / b).max(Vec3::ZERO)
@@ -443,11 +443,25 @@ fn fit(lit: &[Lit], surfaces: &Surfaces, visibility: &Visibility, near: Option<V
     solve(lit, &surfaces.points, &surfaces.sunlit(visibility, direction), direction)
 }
 
+/// Slope of sRGB's curve between two linear values, of about its power: at what is seen alone, dark outliers would count most of all.
+fn slope(a: Vec3, b: Vec3) -> Vec3 {
+    let middle = 0.5 * (a.max(Vec3::ZERO) + b);
+    Vec3::from(middle.max(Vec3::splat(DARK)).to_array().map(|v| 0.44 * v.powf(-0.58)))
+}
+
 /// How much a point counts that should look like another color (Geman–McClure in about sRGB).
 fn trust(got: Vec3, seen: Vec3) -> f32 {
+    trust_within(TRUSTED, off(got, seen))
+}
+
+/// Squared difference of two colors in sRGB.
+fn off(got: Vec3, seen: Vec3) -> f32 {
     let shown = |v: f32| srgb_from_linear(v.clamp(0.0, 1.0));
-    let squared: f32 = (0..3).map(|k| (shown(got[k]) - shown(seen[k])).powi(2)).sum();
-    (TRUSTED * TRUSTED / (TRUSTED * TRUSTED + squared)).powi(2)
+    (0..3).map(|k| (shown(got[k]) - shown(seen[k])).powi(2)).sum()
+}
+
+fn trust_within(trusted: f32, squared: f32) -> f32 {
+    (trusted * trusted / (trusted * trusted + squared)).powi(2)
 }
 
 #[cfg(test)]

@@ -55,7 +55,7 @@ fn suns_are_told_apart_and_an_overcast_sky_has_none() {
             let direct = place.sunlit(&visibility, Vec3::from_slice(sun)) * Vec3::from_slice(&sun[3..]);
             *albedo * (direct + ambient.at(&place.corners, *normal, &sky))
         };
-        Seen { point: *point, normal: *normal, colors: lights.iter().map(color).collect() }
+        Seen { point: *point, normal: *normal, colors: lights.iter().map(color).collect(), shown: vec![true; lights.len()] }
     };
     let seen: Vec<Seen> = surfaces.points.iter().zip(&places).map(look).collect();
     let (found, told) = tell_apart(&seen, &visibility, &AtomicBool::new(false), &mut |_| {}).expect("no interrupt");
@@ -88,7 +88,8 @@ fn the_sun_is_found_where_it_stands() {
         })
         .collect();
     let surfaces = Surfaces::new(seen.iter().map(|s| (s.0, s.1)), seen.iter().map(|s| s.2).collect(), &visibility);
-    let pixels: Vec<Lit> = seen.iter().map(|s| Lit { albedo: s.2, seen: s.3, sent: Vec3::ZERO, trust: 1.0 }).collect();
+    let pixels: Vec<Lit> =
+        seen.iter().map(|s| Lit { albedo: s.2, seen: s.3, sent: Vec3::ZERO, trust: 1.0, slope: slope(s.3, s.3) }).collect();
     let found = fit(&pixels, &surfaces, &visibility, None);
     let direction = Vec3::from_slice(&found.sun[..3]);
     assert!(direction.angle_between(sun).to_degrees() < 2.0, "{direction} {sun}");
@@ -96,4 +97,62 @@ fn the_sun_is_found_where_it_stands() {
     // From nearby, only the neighborhood is searched.
     let again = fit(&pixels, &surfaces, &visibility, Some((sun + Vec3::new(0.05, 0.0, 0.0)).normalize()));
     assert!(Vec3::from_slice(&again.sun[..3]).angle_between(sun).to_degrees() < 2.0);
+}
+
+/// A plain frontal shade in the albedos is none of a sun's; one sun among overcast skies is found alone.
+#[test]
+fn a_shade_that_all_lights_share_is_no_sun() {
+    let visibility = Visibility::of(&Tower, &Occupancy::new(64, 1, false), (0.0, 1.0), 64);
+    let toward = Vec3::new(0.7, -0.5, 0.6).normalize();
+    let places: Vec<(Vec3, Vec3, Vec3)> = places(1200).collect();
+    let shade = |p: &(Vec3, Vec3, Vec3)| 0.4 + 0.6 * p.1.dot(Vec3::new(0.3, -0.9, 0.3).normalize()).max(0.0);
+    let albedos: Vec<Vec3> = places.iter().map(|p| shade(p) * p.2).collect();
+    let surfaces = Surfaces::new(places.iter().map(|p| (p.0, p.1)), albedos.clone(), &visibility);
+    let sky: Vec<f32> = sky().0.iter().flatten().map(|v| *v as f32).collect();
+    let light = |l: usize| {
+        let sun = [toward.x, toward.y, toward.z, 0.9, 0.8, 0.6].map(|v| if l == 2 { v } else { 0.0 });
+        let sky: Vec<f32> = sky.iter().map(|v| v * (0.6 + 0.2 * l as f32)).collect();
+        (surfaces.light(&visibility, &sun, &sky), sun, sky)
+    };
+    let lights: Vec<_> = (0..5).map(light).collect();
+    let rng = Rng::new(3, 1);
+    let look = |(i, (place, albedo)): (usize, (&Place, &Vec3))| {
+        let color = |(l, (ambient, sun, sky)): (usize, &(Ambient, [f32; SUN], Vec<f32>))| {
+            let direct = if sun[2] > 0.0 { place.sunlit(&visibility, toward) * Vec3::from_slice(&sun[3..]) } else { Vec3::ZERO };
+            // Surfaces are never known well.
+            let noise = 1.0 + 0.1 * rng.normal((5 * i + l) as u64);
+            noise * *albedo * (direct + ambient.at(&place.corners, place.normal, sky))
+        };
+        let colors = lights.iter().enumerate().map(color).collect();
+        Seen { point: place.point, normal: place.normal, colors, shown: vec![true; lights.len()] }
+    };
+    let seen: Vec<Seen> = surfaces.points.iter().zip(&albedos).enumerate().map(look).collect();
+    let (found, _) = tell_apart(&seen, &visibility, &AtomicBool::new(false), &mut |_| {}).expect("no interrupt");
+    for (l, fitted) in found.iter().enumerate() {
+        match l {
+            2 => assert!(Vec3::from_slice(&fitted.sun).angle_between(toward).to_degrees() < 5.0 && fitted.sun[3] > 0.3, "{fitted:?}"),
+            _ => assert_eq!(fitted.sun[3..], [0.0; 3], "light {l}"),
+        }
+    }
+}
+
+/// Two fifths of a photograph show dark things before the place.
+#[test]
+fn dark_things_before_a_place_do_not_take_its_sun() {
+    let visibility = Visibility::of(&Tower, &Occupancy::new(64, 1, false), (0.0, 1.0), 64);
+    let sun = Vec3::new(0.5, -0.6, 0.7).normalize();
+    let places: Vec<(Vec3, Vec3, Vec3)> = places(2000).collect();
+    let surfaces = Surfaces::new(places.iter().map(|p| (p.0, p.1)), places.iter().map(|p| p.2).collect(), &visibility);
+    let sky: Vec<f32> = sky().0.iter().flatten().map(|v| *v as f32).collect();
+    let ambient = surfaces.light(&visibility, &[sun.x, sun.y, sun.z, 0.9, 0.8, 0.6], &sky);
+    let look = |(i, (place, albedo)): (usize, (&Place, &Vec3))| {
+        let direct = place.sunlit(&visibility, sun) * Vec3::new(0.9, 0.8, 0.6);
+        let lit = *albedo * (direct + ambient.at(&place.corners, place.normal, &sky));
+        let color = if i % 5 < 2 { Vec3::splat(0.004 + 0.02 * (i % 7) as f32) } else { lit };
+        Shown { point: place.point, normal: place.normal, albedo: *albedo, share: 1.0, color }
+    };
+    let shown: Vec<Shown> = surfaces.points.iter().zip(&surfaces.albedos).enumerate().map(look).collect();
+    let found = of_photograph(&shown, &surfaces, &visibility, &AtomicBool::new(false)).expect("no interrupt");
+    let off = Vec3::from_slice(&found.sun).angle_between(sun).to_degrees();
+    assert!(off < 5.0 && (found.sun[3] - 0.9).abs() < 0.2, "{off}° off: {found:?}");
 }

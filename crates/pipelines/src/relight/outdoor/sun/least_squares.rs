@@ -1,6 +1,6 @@
 //! The light of surface points by linear least squares, once the direction of its sun is given.
 
-use super::{DARK, Fitted, Lit, Place, SUN};
+use super::{Fitted, Lit, Place, SUN};
 use diorama_geom::glam::Vec3;
 
 /// Unknowns: sun, nine of the sky.
@@ -16,8 +16,7 @@ pub fn solve(points: &[Lit], places: &[Place], sunlit: &[f32], direction: Vec3) 
     for ((p, place), sun) in points.iter().zip(places).zip(sunlit) {
         let row: [f64; UNKNOWNS] = std::array::from_fn(|i| if i == 0 { *sun } else { place.sky[i - 1] } as f64);
         for k in 0..3 {
-            // The derivative of sRGB at what is seen.
-            let weight = p.trust.sqrt() * 0.44 * p.seen[k].max(DARK).powf(-0.58);
+            let weight = p.trust.sqrt() * p.slope[k];
             let (a, y) = ((weight * p.albedo[k]) as f64, (weight * (p.seen[k] - p.albedo[k] * p.sent[k])) as f64);
             for (i, line) in sums[k].iter_mut().enumerate() {
                 (i..UNKNOWNS).for_each(|j| line[j] += a * a * row[i] * row[j]);

@@ -1,6 +1,8 @@
 //! The light of a photograph that shows surfaces of known albedo.
 
-use super::{BOUNCED, FIRST_ALBEDO, Fitted, Guess, Place, SEARCHED, Seen, Surfaces, fit, lit, misfit, solve};
+use super::{
+    BOUNCED, FIRST_ALBEDO, Fitted, Guess, Place, SEARCHED, Seen, Surfaces, TRUSTED, fit, lit, misfit, off, slope, solve, trust_within,
+};
 use crate::relight::outdoor::visibility::Visibility;
 use diorama_geom::glam::Vec3;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -10,7 +12,9 @@ const OVEREXPOSED: f32 = 0.97;
 /// Factor by which a photograph may be explained worse without a sun for it to have none.
 const NO_WORSE: f64 = 1.01;
 /// Times that the light of a photograph and what surfaces send are found in turn.
-const PHOTOGRAPH_ROUNDS: usize = 5;
+const PHOTOGRAPH_ROUNDS: usize = 10;
+/// Errors up to so many times their median are trusted: who stands before the place may be more than the place.
+const MEDIANS: f32 = 2.0;
 
 /// A surface point in one photograph, with what a model knows of it.
 #[derive(Clone, Copy, Debug)]
@@ -30,16 +34,31 @@ pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility
     let albedos: Vec<Vec3> = shown.iter().map(|s| s.albedo).collect();
     let mut places = Surfaces::new(shown.iter().map(|s| (s.point, s.normal)), albedos.clone(), visibility);
     places.points.iter_mut().zip(shown).for_each(|(p, s)| p.share = s.share);
-    let seen: Vec<Seen> = shown.iter().map(|s| Seen { point: s.point, normal: s.normal, colors: vec![s.color] }).collect();
+    let seen: Vec<Seen> =
+        shown.iter().map(|s| Seen { point: s.point, normal: s.normal, colors: vec![s.color], shown: vec![true] }).collect();
     let mean = shown.iter().map(|s| s.color).sum::<Vec3>() / shown.len().max(1) as f32;
     let sent_first = |p: &Place| (1.0 - visibility.from_sky(&p.corners, p.normal)) * BOUNCED / FIRST_ALBEDO * mean;
     let mut sent: Vec<Vec3> = places.points.iter().map(sent_first).collect();
     // What is overexposed says that there is at least so much light.
     let counting = |found: &Option<Guess>, sent: &[Vec3]| {
         let mut points = lit(&seen, &albedos, 0, sent, found.as_ref(), &places.points);
+        if let Some(g) = found {
+            let errors = points.iter().enumerate().map(|(i, p)| off(p.albedo * g.irradiance(i, &places.points[i]), p.seen));
+            let errors: Vec<f32> = errors.collect();
+            let mut sorted = errors.clone();
+            sorted.sort_by(f32::total_cmp);
+            let trusted = TRUSTED.max(MEDIANS * sorted[sorted.len() / 2].sqrt());
+            points.iter_mut().zip(errors).for_each(|(p, e)| p.trust = trust_within(trusted, e));
+        } else {
+            // As bright as the place is on the median, before its light is known.
+            let mut ratios: Vec<f32> = points.iter().map(|p| p.seen.element_sum() / p.albedo.element_sum().max(1e-3)).collect();
+            ratios.sort_by(f32::total_cmp);
+            let light = ratios[ratios.len() / 2];
+            points.iter_mut().for_each(|p| p.slope = slope(light * p.albedo, p.seen));
+        }
         for (i, p) in points.iter_mut().enumerate().filter(|(_, p)| p.seen.max_element() > OVEREXPOSED) {
             let is_reached = |g: &Guess| (p.albedo * g.irradiance(i, &places.points[i])).max_element() >= p.seen.max_element();
-            p.trust *= found.as_ref().is_some_and(|g| !is_reached(g)) as u8 as f32;
+            p.trust *= found.as_ref().is_none_or(|g| !is_reached(g)) as u8 as f32;
         }
         points
     };

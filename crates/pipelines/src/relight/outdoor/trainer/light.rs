@@ -17,6 +17,7 @@ use diorama_engine::train::{Event, StepReport};
 use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::Vec3;
 use diorama_geom::rng::Rng;
+use rayon::prelude::*;
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 
@@ -98,12 +99,14 @@ impl Trainer<'_> {
             });
             for (i, (r, normal)) in shown.enumerate() {
                 if l == 0 {
-                    out.push(Seen { point: point(&batch, &traced, r), normal, colors: Vec::new() });
+                    out.push(Seen { point: point(&batch, &traced, r), normal, colors: Vec::new(), shown: Vec::new() });
                 }
                 let color = [0, 1, 2].map(|k| linear_from_srgb((traced.rgb[3 * r + k] / traced.opacity[r]).clamp(0.0, 1.0)));
                 out[i].colors.push(Vec3::from(color));
             }
         }
+        let lit_by = |l: usize| m.light_of.iter().enumerate().filter(move |(_, of)| **of as usize == l).map(|(image, _)| image);
+        out.par_iter_mut().for_each(|s| s.shown = (0..lights).map(|l| lit_by(l).any(|image| normals.shows(image, s.point))).collect());
         out
     }
 
