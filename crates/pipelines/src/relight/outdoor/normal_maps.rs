@@ -118,10 +118,20 @@ impl NormalMaps {
 
     /// Normal at a pixel of a training camera; 0 where it is not known.
     pub fn at(&self, image: usize, x: f32, y: f32) -> Vec3 {
-        let Some((map, [w, h])) = self.of[image] else { return Vec3::ZERO };
+        self.pixel(image, x, y).map_or(Vec3::ZERO, |(map, i)| map.normals[i])
+    }
+
+    /// The map of a training camera, and the index in it of a pixel.
+    fn pixel(&self, image: usize, x: f32, y: f32) -> Option<(&Map, usize)> {
+        let (map, [w, h]) = self.of[image]?;
         let map = &self.maps[map];
         let at = |v: f32, of: f32, n: usize| ((v / of * n as f32) as usize).min(n - 1);
-        map.normals[at(y, h, map.height) * map.width + at(x, w, map.width)]
+        Some((map, at(y, h, map.height) * map.width + at(x, w, map.width)))
+    }
+
+    /// Whether a pixel of a training camera lies on a plane: edges, steps and lumps do not.
+    pub fn is_flat(&self, image: usize, x: f32, y: f32) -> bool {
+        self.pixel(image, x, y).is_some_and(|(map, i)| map.distances[i] > 0.0)
     }
 
     /// Whether a training camera sees a point: the surface that it sees there, or a pixel beside, is as deep.

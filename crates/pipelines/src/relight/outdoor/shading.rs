@@ -3,10 +3,10 @@
 //!
 //! Per ray, the field composites albedo `A` (premultiplied by the opacity `o`), shadow `S` (1 where nothing is hit) and the normal that a
 //! head of the network says, whose direction `N` counts. Light `L` `[9, 3]` and sky `[16, 3]` are of the ray's session. In training, the
-//! normal is that of the surfaces as they were learned, which the head is taught.
+//! normal is that of the surfaces as they were learned, which the head is taught; with suns apart it bends from there to what the suns show.
 
 use super::sun::{BOUNCED, SUN, level};
-use super::visibility::{Ambient, Visibility, spread};
+use super::visibility::{Ambient, Visibility, of_normal, spread};
 use diorama_geom::color::LUMINANCE;
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
@@ -73,6 +73,8 @@ pub struct SceneLoss<'a> {
     pub gains: &'a [f32],
     /// Suns apart; none: the shadow that the field says.
     pub suns: Option<Suns<'a>>,
+    /// Whether normals bend from those of the surfaces to what the suns apart show: what is too small for distances has sides too.
+    pub bends: bool,
     /// Light that shadows are traced in, for the field to learn them.
     pub traced: Option<TracedLight<'a>>,
     pub out: Mutex<SceneGradients>,
@@ -107,7 +109,8 @@ pub struct TracedLight<'a> {
 pub struct Sunlit<'a> {
     pub sun: &'a [f32],
     pub reach: [f32; 2],
-    pub ambient: Vec3,
+    /// By spherical harmonics of the normal.
+    pub ambient: [Vec3; 9],
     /// Light of lamps that arrives.
     pub of_lamps: Vec3,
 }
@@ -135,7 +138,7 @@ pub fn sunlit<'a>(
 ) -> Sunlit<'a> {
     let (sun, lamps) = suns.split_at(SUN);
     match surface(normal, hit, origin, dir) {
-        None => Sunlit { sun, reach: [1.0; 2], ambient: Vec3::ONE, of_lamps: Vec3::ZERO },
+        None => Sunlit { sun, reach: [1.0; 2], ambient: [Vec3::ZERO; 9], of_lamps: Vec3::ZERO },
         Some(at) => {
             let corners = visibility.corners(at.0, at.1);
             let from_lamp = |lamp: &[f32]| {
@@ -144,7 +147,7 @@ pub fn sunlit<'a>(
                 arrives * Vec3::from_slice(&lamp[3..])
             };
             let lamps: Vec3 = lamps.chunks_exact(SUN).map(from_lamp).sum();
-            Sunlit { sun, reach: reach(visibility, sun, at), ambient: ambient.at(&corners, at.1, sky), of_lamps: lamps }
+            Sunlit { sun, reach: reach(visibility, sun, at), ambient: ambient.around(&corners, sky), of_lamps: lamps }
         }
     }
 }
@@ -248,7 +251,18 @@ fn unhidden(sun: &[f32], normal: &[f32; 3]) -> Vec3 {
 impl Sunlit<'_> {
     /// Light that a white surface sends of which a share of the suns is not hidden by what is too small to be traced.
     fn received(&self, normal: &[f32; 3], share: f32) -> Vec3 {
-        share * self.direct(normal) + self.ambient
+        share * self.direct(normal) + of_normal(&self.ambient, Vec3::from(*normal))
+    }
+
+    /// Gradient of [`Sunlit::received`] by the normal, for gradients `d` by its channels; lamps have none.
+    fn by_normal(&self, normal: &[f32; 3], share: f32, d: Vec3) -> [f32; 3] {
+        let n = Vec3::from(*normal);
+        let toward = Vec3::from_slice(self.sun);
+        let of_sun = if n.dot(toward) > 0.0 { share * self.reach[0] * Vec3::from_slice(&self.sun[3..]).dot(d) } else { 0.0 };
+        let ambient = of_normal(&self.ambient, n);
+        let d = Vec3::select(ambient.cmpgt(Vec3::ZERO), d, Vec3::ZERO);
+        let bent = sh_light::basis_gradient(n.as_dvec3()).into_iter().zip(&self.ambient).map(|(b, v)| v.dot(d) * b.as_vec3());
+        (of_sun * toward + bent.sum::<Vec3>()).to_array()
     }
 
     /// Light of the suns that a white surface sends where nothing small hides them.
@@ -310,11 +324,11 @@ struct RayIn<'a> {
 }
 
 impl SceneLoss<'_> {
-    /// Normal of a ray's surface: as it was learned, else what the head says.
+    /// Normal of a ray's surface: as it was learned, else, or where it bends, what the head says.
     fn normal(&self, r: usize, out: &RayOutputs) -> [f32; 3] {
         let own = &self.normals[3 * r..3 * r + 3];
-        let is_known = own.iter().any(|v| *v != 0.0);
-        unit(if is_known { own } else { &out.values[r * CHANNELS + NORMAL..][..3] }).0
+        let is_given = !self.bends && own.iter().any(|v| *v != 0.0);
+        unit(if is_given { own } else { &out.values[r * CHANNELS + NORMAL..][..3] }).0
     }
 
     /// Sun of a ray and what of its light arrives.
@@ -360,6 +374,7 @@ impl SceneLoss<'_> {
         let part = share * self.counts[r] * trust(squared, w.robust);
         let mut loss = 0.0;
         let d_values = &mut d.values[r * CHANNELS..][..CHANNELS];
+        let mut d_white = Vec3::ZERO;
         for k in 0..3 {
             let (value, slope) = huber(errors[k], w.huber);
             loss += (part * value / 3.0) as f64;
@@ -368,6 +383,7 @@ impl SceneLoss<'_> {
                 tables.gains[3 * image + k] += dc * plain[k];
             }
             d_values[k] += dc * white[k];
+            d_white[k] = dc * values[k];
             if let Some(l) = sunlit {
                 d_values[3] += dc * values[k] * l.direct(&s.normal)[k];
             }
@@ -378,6 +394,10 @@ impl SceneLoss<'_> {
             }
             let of_sky = &mut tables.skies[light_of * SKY..][..SKY];
             sky_gradient(of_sky, k, &s.sky, &s.sky_basis, dc * (1.0 - opacity), share);
+        }
+        if let Some(l) = sunlit.filter(|_| self.bends) {
+            let said = unit(&values[NORMAL..]);
+            add_direction(&mut d_values[NORMAL..], l.by_normal(&s.normal, shadow, d_white), said);
         }
         (loss, squared as f64 / 3.0, errors.iter().fold(0.0, |m, e| m.max(e.abs())))
     }
@@ -390,10 +410,10 @@ impl SceneLoss<'_> {
         let off = values[3] - want;
         loss += (share * weight * off * off) as f64;
         d_values[3] += 2.0 * share * weight * off;
-        let said = unit(&values[NORMAL..]);
-        if said.1 > SHORTEST && self.normals[3 * r..3 * r + 3].iter().any(|v| *v != 0.0) {
-            loss += (share * w.tie * (1.0 - (0..3).map(|a| said.0[a] * ray.normal[a]).sum::<f32>())) as f64;
-            add_direction(&mut d_values[NORMAL..], ray.normal.map(|n| -share * w.tie * n), said);
+        let (said, learned) = (unit(&values[NORMAL..]), &self.normals[3 * r..3 * r + 3]);
+        if said.1 > SHORTEST && learned.iter().any(|v| *v != 0.0) {
+            loss += (share * w.tie * (1.0 - (0..3).map(|a| said.0[a] * learned[a]).sum::<f32>())) as f64;
+            add_direction(&mut d_values[NORMAL..], [0, 1, 2].map(|a| -share * w.tie * learned[a]), said);
         }
         loss
     }

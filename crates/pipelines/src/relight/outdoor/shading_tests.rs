@@ -21,6 +21,7 @@ struct Case {
     suns: Vec<f32>,
     /// Of the surfaces.
     normals: Vec<f32>,
+    bends: bool,
 }
 
 /// Space without matter.
@@ -68,6 +69,7 @@ fn case() -> Case {
         suns: Vec::new(),
         // Of slopes that the suns shine on.
         normals: (0..RAYS).flat_map(|r| [0.5, -0.6 + 0.1 * r as f32, 0.6]).collect(),
+        bends: false,
     }
 }
 
@@ -92,6 +94,7 @@ fn run(c: &Case) -> (f64, RayGradients, SceneGradients) {
         skies: &c.skies,
         gains: &c.gains,
         suns: (!c.suns.is_empty()).then(|| Suns { values: &c.suns, ambients: &ambients, visibility: &EMPTY, origins: &[0.5; 3 * RAYS] }),
+        bends: c.bends,
         traced: c.suns.is_empty().then(|| TracedLight { suns: &suns, skies: &skies, visibility: &HALF, origins: &[0.5; 3 * RAYS] }),
         out: Mutex::default(),
     };
@@ -137,6 +140,24 @@ fn gradients_with_suns_apart_are_those_of_the_loss() {
     check("values", sunlit_case, |c| &mut c.values, &d.values, 3e-3);
     // Suns and skies are given.
     assert!(tables.lights.iter().all(|d| *d == 0.0));
+}
+
+fn bent_case() -> Case {
+    let mut c = Case { bends: true, ..sunlit_case() };
+    // What the head says is lit by the suns, and short enough for its direction to change.
+    c.values.chunks_exact_mut(CHANNELS).enumerate().for_each(|(r, v)| {
+        v[NORMAL..].copy_from_slice(&[0.5 - 0.1 * r as f32, -0.3, 0.7]);
+    });
+    c
+}
+
+#[test]
+fn gradients_of_bent_normals_are_those_of_the_loss() {
+    let (_, d, _) = run(&bent_case());
+    check("values", bent_case, |c| &mut c.values, &d.values, 1e-3);
+    let normals = |d: &RayGradients| d.values.chunks_exact(CHANNELS).flat_map(|v| v[NORMAL..].to_vec()).collect::<Vec<f32>>();
+    let stiff = run(&Case { bends: false, ..bent_case() }).1;
+    assert!(normals(&d).iter().zip(normals(&stiff)).filter(|(a, b)| (**a - b).abs() > 1e-3).count() > RAYS, "colors do not bend normals");
 }
 
 #[test]
@@ -185,6 +206,7 @@ fn pixels_that_fit_badly_count_less() {
             skies: &c.skies,
             gains: &[],
             suns: None,
+            bends: false,
             traced: None,
             out: Mutex::default(),
         };

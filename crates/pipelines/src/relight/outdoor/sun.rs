@@ -51,6 +51,8 @@ const BOUNCES: usize = 4;
 const TRUSTED: f32 = 0.15;
 /// How much the color of a point counts that no photograph in a light shows.
 const UNSHOWN: f32 = 0.03;
+/// How much a point tells of lights that lies on no plane.
+const UNSURE: f32 = 0.1;
 /// Linear light below which errors do not count more.
 const DARK: f32 = 0.02;
 
@@ -62,12 +64,19 @@ pub struct Seen {
     pub colors: Vec<Vec3>,
     /// Whether a photograph in each light shows it; elsewhere its color is a guess.
     pub shown: Vec<bool>,
+    /// Whether it lies on a plane, so that its sides and shadows are sure.
+    pub is_flat: bool,
 }
 
 impl Seen {
     /// How much its color in a light counts.
     fn counts(&self, light: usize) -> f32 {
         if self.shown[light] { 1.0 } else { UNSHOWN }
+    }
+
+    /// How much it tells of a light: shadows that are wrong make suns weak.
+    fn tells(&self, light: usize) -> f32 {
+        self.counts(light) * if self.is_flat { 1.0 } else { UNSURE }
     }
 }
 
@@ -350,7 +359,7 @@ fn lit(seen: &[Seen], albedos: &[Vec3], light: usize, sent: &[Vec3], by: Option<
         let (albedo, color) = (albedos[i], s.colors[light]);
         let got = by.map(|g| albedo * g.irradiance(i, &places[i]));
         let trust = got.map_or(1.0, |got| trust(got, color));
-        Lit { albedo, seen: color, sent: sent[i], trust: trust * s.counts(light), slope: slope(got.unwrap_or(color), color) }
+        Lit { albedo, seen: color, sent: sent[i], trust: trust * s.tells(light), slope: slope(got.unwrap_or(color), color) }
     };
     seen.iter().enumerate().map(of).collect()
 }

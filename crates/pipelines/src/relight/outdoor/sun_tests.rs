@@ -55,7 +55,7 @@ fn suns_are_told_apart_and_an_overcast_sky_has_none() {
             let direct = place.sunlit(&visibility, Vec3::from_slice(sun)) * Vec3::from_slice(&sun[3..]);
             *albedo * (direct + ambient.at(&place.corners, *normal, &sky))
         };
-        Seen { point: *point, normal: *normal, colors: lights.iter().map(color).collect(), shown: vec![true; lights.len()] }
+        Seen { point: *point, normal: *normal, colors: lights.iter().map(color).collect(), shown: vec![true; lights.len()], is_flat: true }
     };
     let seen: Vec<Seen> = surfaces.points.iter().zip(&places).map(look).collect();
     let (found, told) = tell_apart(&seen, &visibility, &AtomicBool::new(false), &mut |_| {}).expect("no interrupt");
@@ -124,7 +124,7 @@ fn a_shade_that_all_lights_share_is_no_sun() {
             noise * *albedo * (direct + ambient.at(&place.corners, place.normal, sky))
         };
         let colors = lights.iter().enumerate().map(color).collect();
-        Seen { point: place.point, normal: place.normal, colors, shown: vec![true; lights.len()] }
+        Seen { point: place.point, normal: place.normal, colors, shown: vec![true; lights.len()], is_flat: true }
     };
     let seen: Vec<Seen> = surfaces.points.iter().zip(&albedos).enumerate().map(look).collect();
     let (found, _) = tell_apart(&seen, &visibility, &AtomicBool::new(false), &mut |_| {}).expect("no interrupt");

@@ -323,13 +323,21 @@ impl Corners {
 impl Ambient {
     /// Irradiance over π of a surface; `sky` `[9, 3]` where nothing is near.
     pub fn at(&self, corners: &Corners, normal: Vec3, sky: &[f32]) -> Vec3 {
-        let basis = basis(normal);
-        let lit: Vec3 = match corners.1 {
-            0 => (0..9).map(|i| basis[i] * Vec3::from_slice(&sky[3 * i..])).sum(),
-            _ => corners.each().map(|(v, w)| w * (0..9).map(|i| basis[i] * self.0[v as usize][i]).sum::<Vec3>()).sum(),
-        };
-        lit.max(Vec3::ZERO)
+        of_normal(&self.around(corners, sky), normal)
     }
+
+    /// The same as spherical harmonics of the normal, whatever that is.
+    pub fn around(&self, corners: &Corners, sky: &[f32]) -> [Vec3; 9] {
+        match corners.1 {
+            0 => std::array::from_fn(|i| Vec3::from_slice(&sky[3 * i..])),
+            _ => std::array::from_fn(|i| corners.each().map(|(v, w)| w * self.0[v as usize][i]).sum()),
+        }
+    }
+}
+
+/// Irradiance over π of a surface by spherical harmonics of its normal.
+pub fn of_normal(around: &[Vec3; 9], normal: Vec3) -> Vec3 {
+    basis(normal).iter().zip(around).map(|(b, v)| *b * *v).sum::<Vec3>().max(Vec3::ZERO)
 }
 
 fn basis(normal: Vec3) -> [f32; 9] {

@@ -35,7 +35,7 @@ pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility
     let mut places = Surfaces::new(shown.iter().map(|s| (s.point, s.normal)), albedos.clone(), visibility);
     places.points.iter_mut().zip(shown).for_each(|(p, s)| p.share = s.share);
     let seen: Vec<Seen> =
-        shown.iter().map(|s| Seen { point: s.point, normal: s.normal, colors: vec![s.color], shown: vec![true] }).collect();
+        shown.iter().map(|s| Seen { point: s.point, normal: s.normal, colors: vec![s.color], shown: vec![true], is_flat: true }).collect();
     let mean = shown.iter().map(|s| s.color).sum::<Vec3>() / shown.len().max(1) as f32;
     let sent_first = |p: &Place| (1.0 - visibility.from_sky(&p.corners, p.normal)) * BOUNCED / FIRST_ALBEDO * mean;
     let mut sent: Vec<Vec3> = places.points.iter().map(sent_first).collect();

@@ -93,13 +93,17 @@ impl Trainer<'_> {
         for l in 0..lights {
             let tracer = Tracer { field: &field, appearance: Some(l as u32), ..m.tracer(Quality::Full) };
             let traced = tracer.trace_layers(&mut batch, &[], &mut FieldBuffers::default());
+            let pixel = |r: usize| (batch.images[r] as usize, batch.pixels[2 * r], batch.pixels[2 * r + 1]);
             let shown = (0..batch.len()).filter(|r| batch.counts[*r]).filter_map(|r| {
-                let normal = normals.at(batch.images[r] as usize, batch.pixels[2 * r], batch.pixels[2 * r + 1]);
+                let (image, x, y) = pixel(r);
+                let normal = normals.at(image, x, y);
                 (traced.opacity[r] > SURFACE && normal != Vec3::ZERO).then_some((r, normal))
             });
             for (i, (r, normal)) in shown.enumerate() {
                 if l == 0 {
-                    out.push(Seen { point: point(&batch, &traced, r), normal, colors: Vec::new(), shown: Vec::new() });
+                    let (image, x, y) = pixel(r);
+                    let is_flat = normals.is_flat(image, x, y);
+                    out.push(Seen { point: point(&batch, &traced, r), normal, colors: Vec::new(), shown: Vec::new(), is_flat });
                 }
                 let color = [0, 1, 2].map(|k| linear_from_srgb((traced.rgb[3 * r + k] / traced.opacity[r]).clamp(0.0, 1.0)));
                 out[i].colors.push(Vec3::from(color));
@@ -200,6 +204,7 @@ impl Trainer<'_> {
             skies: &self.model.skies.values,
             gains: &self.model.gains.values,
             suns: is_apart.then_some(Suns { values: &suns, ambients, visibility, origins }),
+            bends: is_apart && settled,
             traced: (!is_apart).then_some(TracedLight { suns: &taught.suns, skies: &taught.skies, visibility, origins }),
             out: Mutex::default(),
         };
