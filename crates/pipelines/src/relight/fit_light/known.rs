@@ -3,6 +3,7 @@
 
 use super::Shot;
 use crate::relight::outdoor::model::SceneModel;
+use crate::relight::outdoor::normal_maps::sees;
 use crate::relight::outdoor::render::SceneView;
 use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_geom::color::srgb_from_linear;
@@ -14,9 +15,8 @@ use diorama_kernels::ops::ray_generation::PosedCamera;
 /// Pixels along the longer side of the distances that are compared, and cameras at most.
 const LONGEST: f64 = 96.0;
 const CAMERAS: usize = 48;
-/// Cameras that must see a surface, and the difference of distances that is none.
+/// Cameras that must see a surface.
 const FEWEST: usize = 2;
-const SAME: f64 = 0.05;
 /// By how much larger a pixel of such a camera may be on the surface: what is seen coarsely only is a blur from close by.
 const COARSER: f64 = 2.0;
 
@@ -100,19 +100,4 @@ pub fn point(camera: &PosedCamera, view: &SceneView, i: usize) -> DVec3 {
     let (x, y) = (i % view.depth.width, i / view.depth.width);
     let direction = camera.pose.rotation * camera.camera.direction(x as f64 + 0.5, y as f64 + 0.5).normalize();
     camera.pose.translation + direction * view.depth.data[i] as f64
-}
-
-/// Whether a camera sees a point at its distance, or a neighboring pixel does.
-fn sees(camera: &PosedCamera, depth: &Image, point: DVec3) -> bool {
-    let local = camera.pose.inverse().point(point);
-    let Some(at) = camera.camera.project(local).filter(|_| local.z > 0.0) else { return false };
-    let (x, y, distance) = (at.x.floor() as isize, at.y.floor() as isize, local.length());
-    let is_inside = |x: isize, y: isize| (0..depth.width as isize).contains(&x) && (0..depth.height as isize).contains(&y);
-    is_inside(x, y)
-        && (-1..=1).any(|dy| {
-            (-1..=1).any(|dx| {
-                let (x, y) = (x + dx, y + dy);
-                is_inside(x, y) && (depth.data[y as usize * depth.width + x as usize] as f64 / distance - 1.0).abs() < SAME
-            })
-        })
 }

@@ -9,7 +9,7 @@ pub mod config;
 mod fields;
 pub mod joint;
 pub mod model;
-mod normal_maps;
+pub(super) mod normal_maps;
 pub mod pictures;
 pub mod recipe;
 pub mod render;

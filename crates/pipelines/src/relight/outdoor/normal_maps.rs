@@ -9,6 +9,7 @@ use super::model::SceneModel;
 use super::visibility::spread;
 use diorama_engine::renderers::volume::{Quality, Tracer};
 use diorama_engine::samplers::pixels::Observation;
+use diorama_geom::Image;
 use diorama_geom::glam::{DMat3, DVec3, Vec3};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use rayon::prelude::*;
@@ -38,9 +39,8 @@ const UPRIGHT: f64 = 0.5;
 const LESS: f64 = 0.9;
 /// Least cosine between up and a plane that is fitted to them freely.
 const LEVEL: f64 = 0.97;
-/// Relative difference of depths that is none, and pixels beside each other.
-const AS_DEEP: f64 = 0.05;
-const BESIDE: [f64; 3] = [0.0, -1.0, 1.0];
+/// Relative difference of distances that is none.
+const SAME: f64 = 0.05;
 /// Normals of which the main directions are found, directions that are tried, and most that are kept.
 const SAMPLED: usize = 50_000;
 const TRIED: usize = 3000;
@@ -65,8 +65,8 @@ struct Map {
     /// Distance along the ray to the plane; 0 where few distances lie on it.
     distances: Vec<f32>,
     camera: PosedCamera,
-    /// One over the depth of the surface, 0 where there is none.
-    inverse: Vec<f64>,
+    /// Distances of the surface.
+    depth: Image,
 }
 
 /// Distances of a view.
@@ -74,6 +74,7 @@ struct Seen {
     width: usize,
     height: usize,
     camera: PosedCamera,
+    depth: Image,
     to_model: DMat3,
     /// Rays whose component along the view axis is 1.
     rays: Vec<DVec3>,
@@ -134,18 +135,9 @@ impl NormalMaps {
         self.pixel(image, x, y).is_some_and(|(map, i)| map.distances[i] > 0.0)
     }
 
-    /// Whether a training camera sees a point: the surface that it sees there, or a pixel beside, is as deep.
+    /// Whether a training camera sees a point.
     pub fn shows(&self, image: usize, point: Vec3) -> bool {
-        let Some((map, _)) = self.of[image] else { return false };
-        let map = &self.maps[map];
-        let local = map.camera.pose.inverse().point(point.as_dvec3());
-        let Some(at) = map.camera.camera.project(local).filter(|_| local.z > 0.0) else { return false };
-        let is_as_deep = |x: f64, y: f64| {
-            (0.0..map.width as f64).contains(&x)
-                && (0.0..map.height as f64).contains(&y)
-                && (map.inverse[y as usize * map.width + x as usize] * local.z - 1.0).abs() < AS_DEEP
-        };
-        BESIDE.iter().any(|dy| BESIDE.iter().any(|dx| is_as_deep(at.x + dx, at.y + dy)))
+        self.of[image].is_some_and(|(map, _)| sees(&self.maps[map].camera, &self.maps[map].depth, point.as_dvec3()))
     }
 
     /// Distances to the planes, of about `count` pixels of the cameras' photographs.
@@ -181,7 +173,8 @@ impl Seen {
             if view.opacity.data[i] > SURFACE && d > 0.0 && r.z > 0.0 { r.length() / (d * r.z) } else { 0.0 }
         };
         let inverse = (0..w * h).map(inverse).collect();
-        Seen { width: w, height: h, camera: *small, to_model: small.pose.rotation, rays: rays.iter().map(|r| *r / r.z).collect(), inverse }
+        let rays = rays.iter().map(|r| *r / r.z).collect();
+        Seen { width: w, height: h, camera: *small, depth: view.depth, to_model: small.pose.rotation, rays, inverse }
     }
 
     /// Rays and inverse depths around a pixel, and how many there would be in a full window.
@@ -304,7 +297,7 @@ impl Seen {
             (self.normal(i, plane), if is_on { (self.rays[i].length() / inverse) as f32 } else { 0.0 })
         };
         let (normals, distances) = (0..free.len()).into_par_iter().map(of).unzip();
-        Map { width: self.width, height: self.height, normals, distances, camera: self.camera, inverse: self.inverse.clone() }
+        Map { width: self.width, height: self.height, normals, distances, camera: self.camera, depth: self.depth.clone() }
     }
 
     /// Normal of a plane in model space, toward the camera.
@@ -344,6 +337,21 @@ fn shrunk(camera: &PosedCamera, by: f64) -> PosedCamera {
     let shrink = by * (LONGEST as f64 / c.width.max(c.height) as f64).min(1.0);
     let size = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
     PosedCamera { camera: c.resized(size(c.width), size(c.height)), pose: camera.pose }
+}
+
+/// Whether a camera sees a point at its distance, or a neighboring pixel does.
+pub fn sees(camera: &PosedCamera, depth: &Image, point: DVec3) -> bool {
+    let local = camera.pose.inverse().point(point);
+    let Some(at) = camera.camera.project(local).filter(|_| local.z > 0.0) else { return false };
+    let (x, y, distance) = (at.x.floor() as isize, at.y.floor() as isize, local.length());
+    let is_inside = |x: isize, y: isize| (0..depth.width as isize).contains(&x) && (0..depth.height as isize).contains(&y);
+    is_inside(x, y)
+        && (-1..=1).any(|dy| {
+            (-1..=1).any(|dx| {
+                let (x, y) = (x + dx, y + dy);
+                is_inside(x, y) && (depth.data[y as usize * depth.width + x as usize] as f64 / distance - 1.0).abs() < SAME
+            })
+        })
 }
 
 /// How much a relative difference counts (Geman–McClure).

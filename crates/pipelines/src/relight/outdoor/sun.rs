@@ -248,7 +248,7 @@ pub fn tell_apart(
     // What is seen in a light without a sun shows albedos best, and each may be such a light.
     let step = lights.div_ceil(TAKEN_FOR_EVEN).max(1);
     let begun: Vec<usize> = (0..lights).step_by(step).collect();
-    let total = (begun.len() * (1 + BEGUN) + (ROUNDS - 1 + lights) * SETTLING) as f64;
+    let total = (begun.len() * (1 + BEGUN) + (ROUNDS - 1 + selection::most_settled(lights)) * SETTLING) as f64;
     let mut done = 0;
     let mut go_on = || {
         done += 1;
@@ -323,7 +323,7 @@ fn settle(
         surfaces.albedos = explained(seen, surfaces, guesses, None);
         set_scale(guesses, &mut surfaces.albedos);
         let refit = |(l, g): (usize, &mut Guess)| {
-            let trusted = lit(seen, &surfaces.albedos, l, &g.sent, Some(g), &surfaces.points);
+            let trusted = lit(seen, &surfaces.albedos, l, &g.sent, Some((g, TRUSTED)), &surfaces.points);
             g.fitted = solve(&trusted, &surfaces.points, &g.sunlit, Vec3::from_slice(&g.fitted.sun));
             if k % SENT_AGAIN == 0 {
                 let irradiance: Vec<Vec3> = surfaces.points.iter().enumerate().map(|(i, p)| g.irradiance(i, p)).collect();
@@ -346,20 +346,22 @@ fn misfit(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess]) -> f64 {
     for (i, s) in seen.iter().enumerate() {
         for (l, (g, c)) in guesses.iter().zip(&s.colors).enumerate() {
             let weight = s.counts(l) as f64;
-            sum += weight * (1.0 - trust(surfaces.albedos[i] * g.irradiance(i, &surfaces.points[i]), *c).sqrt()) as f64;
+            sum += weight * (1.0 - trust(surfaces.albedos[i] * g.irradiance(i, &surfaces.points[i]), *c, TRUSTED).sqrt()) as f64;
             total += weight;
         }
     }
     sum / total
 }
 
-/// Surface points in one light, each trusted as an explanation of it says.
-fn lit(seen: &[Seen], albedos: &[Vec3], light: usize, sent: &[Vec3], by: Option<&Guess>, places: &[Place]) -> Vec<Lit> {
+/// Surface points in one light, each trusted as an explanation of it says, with errors up to about the number beside it.
+fn lit(seen: &[Seen], albedos: &[Vec3], light: usize, sent: &[Vec3], by: Option<(&Guess, f32)>, places: &[Place]) -> Vec<Lit> {
     let of = |(i, s): (usize, &Seen)| {
         let (albedo, color) = (albedos[i], s.colors[light]);
-        let got = by.map(|g| albedo * g.irradiance(i, &places[i]));
-        let trust = got.map_or(1.0, |got| trust(got, color));
-        Lit { albedo, seen: color, sent: sent[i], trust: trust * s.tells(light), slope: slope(got.unwrap_or(color), color) }
+        let (got, trust) = by.map_or((color, 1.0), |(g, trusted)| {
+            let got = albedo * g.irradiance(i, &places[i]);
+            (got, trust(got, color, trusted))
+        });
+        Lit { albedo, seen: color, sent: sent[i], trust: trust * s.tells(light), slope: slope(got, color) }
     };
     seen.iter().enumerate().map(of).collect()
 }
@@ -376,7 +378,7 @@ fn explained(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess], left_out: Op
                 continue;
             }
             let white = g.irradiance(i, &surfaces.points[i]);
-            let weight = slope(*c, *c).powf(2.0) * trust(before * white, *c) * s.counts(l);
+            let weight = slope(*c, *c).powf(2.0) * trust(before * white, *c, TRUSTED) * s.counts(l);
             (a, b) = (a + weight * white * *c, b + weight * white * white);
         }
         (a / b).max(Vec3::ZERO)
@@ -458,19 +460,15 @@ fn slope(a: Vec3, b: Vec3) -> Vec3 {
     Vec3::from(middle.max(Vec3::splat(DARK)).to_array().map(|v| 0.44 * v.powf(-0.58)))
 }
 
-/// How much a point counts that should look like another color (Geman–McClure in about sRGB).
-fn trust(got: Vec3, seen: Vec3) -> f32 {
-    trust_within(TRUSTED, off(got, seen))
+/// How much a point counts that should look like another color (Geman–McClure in about sRGB), with errors up to about `trusted`.
+fn trust(got: Vec3, seen: Vec3, trusted: f32) -> f32 {
+    (trusted * trusted / (trusted * trusted + off(got, seen))).powi(2)
 }
 
 /// Squared difference of two colors in sRGB.
 fn off(got: Vec3, seen: Vec3) -> f32 {
     let shown = |v: f32| srgb_from_linear(v.clamp(0.0, 1.0));
     (0..3).map(|k| (shown(got[k]) - shown(seen[k])).powi(2)).sum()
-}
-
-fn trust_within(trusted: f32, squared: f32) -> f32 {
-    (trusted * trusted / (trusted * trusted + squared)).powi(2)
 }
 
 #[cfg(test)]

@@ -43,7 +43,7 @@ const DISTORTION_RAMP: u64 = 2000;
 /// Times that surfaces are flattened in their stage, and pixels that then tell distances.
 const FLATTENED: u64 = 3;
 const FLAT_PIXELS: usize = 100_000;
-/// Steps before robust weights begin.
+/// Steps before robust weights begin, and normals bend.
 const SETTLED: u64 = 200;
 
 mod at_once;

@@ -1,8 +1,6 @@
 //! The light of a photograph that shows surfaces of known albedo.
 
-use super::{
-    BOUNCED, FIRST_ALBEDO, Fitted, Guess, Place, SEARCHED, Seen, Surfaces, TRUSTED, fit, lit, misfit, off, slope, solve, trust_within,
-};
+use super::{BOUNCED, FIRST_ALBEDO, Fitted, Guess, Place, SEARCHED, Seen, Surfaces, TRUSTED, fit, lit, misfit, off, slope, solve};
 use crate::relight::outdoor::visibility::Visibility;
 use diorama_geom::glam::Vec3;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -41,19 +39,14 @@ pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility
     let mut sent: Vec<Vec3> = places.points.iter().map(sent_first).collect();
     // What is overexposed says that there is at least so much light.
     let counting = |found: &Option<Guess>, sent: &[Vec3]| {
-        let mut points = lit(&seen, &albedos, 0, sent, found.as_ref(), &places.points);
-        if let Some(g) = found {
-            let errors = points.iter().enumerate().map(|(i, p)| off(p.albedo * g.irradiance(i, &places.points[i]), p.seen));
-            let errors: Vec<f32> = errors.collect();
-            let mut sorted = errors.clone();
-            sorted.sort_by(f32::total_cmp);
-            let trusted = TRUSTED.max(MEDIANS * sorted[sorted.len() / 2].sqrt());
-            points.iter_mut().zip(errors).for_each(|(p, e)| p.trust = trust_within(trusted, e));
-        } else {
+        let by = found.as_ref().map(|g| {
+            let error = |(i, s): (usize, &Shown)| off(s.albedo * g.irradiance(i, &places.points[i]), s.color).sqrt();
+            (g, TRUSTED.max(MEDIANS * median(shown.iter().enumerate().map(error))))
+        });
+        let mut points = lit(&seen, &albedos, 0, sent, by, &places.points);
+        if found.is_none() {
             // As bright as the place is on the median, before its light is known.
-            let mut ratios: Vec<f32> = points.iter().map(|p| p.seen.element_sum() / p.albedo.element_sum().max(1e-3)).collect();
-            ratios.sort_by(f32::total_cmp);
-            let light = ratios[ratios.len() / 2];
+            let light = median(shown.iter().map(|s| s.color.element_sum() / s.albedo.element_sum().max(1e-3)));
             points.iter_mut().for_each(|p| p.slope = slope(light * p.albedo, p.seen));
         }
         for (i, p) in points.iter_mut().enumerate().filter(|(_, p)| p.seen.max_element() > OVEREXPOSED) {
@@ -83,4 +76,10 @@ pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility
     let is_needed =
         misfit(&seen, &places, std::slice::from_ref(&without)) > NO_WORSE * misfit(&seen, &places, std::slice::from_ref(&found));
     Some(if is_needed { found } else { without }.fitted)
+}
+
+fn median(values: impl Iterator<Item = f32>) -> f32 {
+    let mut values: Vec<f32> = values.collect();
+    values.sort_by(f32::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
 }

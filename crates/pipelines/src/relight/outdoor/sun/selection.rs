@@ -9,6 +9,13 @@ use diorama_geom::glam::Vec3;
 const WEAK: f32 = 0.5;
 /// Factor by which what is seen may be explained worse for every sun that is left out.
 const PER_SUN: f64 = 1.03;
+/// Times that lights settle once all suns are left out.
+const WITHOUT: usize = 3;
+
+/// Times at most that lights and albedos settle while suns are selected.
+pub fn most_settled(lights: usize) -> usize {
+    lights + WITHOUT + lights * (lights + 1) / 2
+}
 
 /// Lights with their surfaces, and how badly they explain what is seen.
 #[derive(Clone)]
@@ -60,7 +67,7 @@ impl Selection<'_> {
             let points = lit(self.seen, &all.surfaces.albedos, l, &g.sent, None, &all.surfaces.points);
             g.fitted = solve(&points, &all.surfaces.points, &g.sunlit, Vec3::from_slice(&g.fitted.sun));
         }
-        let mut told = self.settled(none, &all.surfaces, 3, go_on)?;
+        let mut told = self.settled(none, &all.surfaces, WITHOUT, go_on)?;
         loop {
             let mut best: Option<Told> = None;
             for l in (0..told.guesses.len()).filter(|l| !told.guesses[*l].has_sun()) {
