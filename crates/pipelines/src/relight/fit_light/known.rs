@@ -44,7 +44,7 @@ impl Known {
             let size = |n: u32| ((n as f64 * shrink).round() as u32).max(1);
             let small = PosedCamera { camera: c.camera.resized(size(c.camera.width), size(c.camera.height)), pose: c.pose };
             let tracer: Tracer = model.tracer(Quality::Full);
-            (small, tracer.layers(&small, &[&[0.0; 9]], &mut |_| {}).depth)
+            (small, tracer.layers(&small, &model.unlit_codes(), &mut |_| {}).depth)
         });
         Known(seen.collect())
     }

@@ -114,7 +114,8 @@ pub struct LossConfig {
     pub huber: f32,
     /// Error beyond which a pixel counts less and less, in multiples of the running median; 0: all count alike.
     pub robust: f32,
-    /// Deviation of the shadow from 1 where it is not traced, and from the traced one.
+    /// Deviation of the shadow from 1 where it is not traced, or with suns apart from the traced one; and from the traced one, or with suns apart
+    /// of what arrives of any sun from what does of those of training.
     pub shadow: f32,
     pub traced: f32,
     /// Angle between the normals that the field says and those of its surfaces.
@@ -265,7 +266,7 @@ impl Config {
             loss: LossConfig {
                 huber: 0.1,
                 robust: 2.0,
-                shadow: 1e-4,
+                shadow: 3e-3,
                 traced: 0.1,
                 normal: 0.1,
                 negative: 0.1,

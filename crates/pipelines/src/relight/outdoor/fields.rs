@@ -79,7 +79,8 @@ pub fn of_surfaces(config: &Config, space: Space, lights: usize) -> Field {
 }
 
 /// Albedo, shadow and normal on the surfaces of a field, which stay as they are: the grid's and the density's features → albedo and normal;
-/// these and gray light → shadow.
+/// these and gray light → shadow. Where suns are apart, the shadow reads the sun of a light of training, and the share that is left of any sun
+/// whose traced ray passes reads its direction.
 ///
 /// # Errors
 /// When the field is not one of surfaces.
@@ -90,30 +91,35 @@ pub fn of_materials(config: &Config, surfaces: Field) -> Result<Field> {
         return Err(PipelineError::Usage("the field has no surfaces to begin with".into()));
     }
     let mut layers = net.layers[..DENSITY].to_vec();
-    for given in [&[][..], &[Input(1)], &[]] {
+    let is_apart = config.light.has_sun();
+    let heads: &[&[Source]] = if is_apart { &[&[], &[Input(2)], &[], &[Input(1)]] } else { &[&[], &[Input(1)], &[]] };
+    for given in heads {
         let first = layers.len();
         layers.extend([
-            layer([Input(0), L(1)].iter().chain(given).copied().collect(), width, Activation::Relu),
+            layer([Input(0), L(1)].iter().chain(*given).copied().collect(), width, Activation::Relu),
             layer(vec![L(first)], width, Activation::Relu),
             layer(vec![L(first + 1)], PADDED, Activation::None),
         ]);
     }
-    let net = FieldNet {
-        density: surfaces.net.density,
-        outputs: vec![
-            Output { head: head(4, Activation::Sigmoid, 0.0), channels: 3 },
-            Output { head: head(7, Activation::Sigmoid, LIT), channels: 1 },
-            Output { head: head(10, Activation::Tanh, 0.0), channels: 3 },
-        ],
-        mlp: Mlp { precision: Precision::Bf16, ..Mlp::new(vec![surfaces.encoder.dims(), 9], layers) },
-    };
+    let mut outputs = vec![
+        Output { head: head(4, Activation::Sigmoid, 0.0), channels: 3 },
+        Output { head: head(7, Activation::Sigmoid, LIT), channels: 1 },
+        Output { head: head(10, Activation::Tanh, 0.0), channels: 3 },
+    ];
+    let mut given = vec![9];
+    if is_apart {
+        outputs.push(Output { head: head(13, Activation::Sigmoid, LIT), channels: 1 });
+        given.push(9);
+    }
+    let inputs = std::iter::once(surfaces.encoder.dims()).chain(given.iter().copied()).collect();
+    let net = FieldNet { density: surfaces.net.density, outputs, mlp: Mlp { precision: Precision::Bf16, ..Mlp::new(inputs, layers) } };
     let mut weights = net.mlp.init(&Rng::new(config.seed, MATERIALS));
     let kept = net.mlp.offsets[DENSITY];
     weights[..kept].copy_from_slice(&surfaces.weights.values[..kept]);
     let adam = Adam { rate: config.optim.net_rate, ..Adam::default() };
     let mut field = Field {
         weights: ParamGroup { schedule: schedule(config), ..ParamGroup::dense("weights", weights, adam) },
-        codes: RayCodes { direction: DirectionCode::None, appearance: None, given: vec![9] },
+        codes: RayCodes { direction: DirectionCode::None, appearance: None, given },
         net,
         ..surfaces
     };

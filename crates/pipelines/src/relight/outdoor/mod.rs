@@ -19,6 +19,7 @@ pub mod shading;
 mod shading_tests;
 pub mod stepper;
 pub mod sun;
+pub mod sunlit;
 pub mod surface_field;
 mod trainer;
 pub mod viewing;

@@ -30,6 +30,9 @@ use std::sync::Arc;
 const FAR: f32 = 1024.0;
 const SKY_FROM: f32 = 8.0;
 
+/// What shadows read where they do not matter.
+const UNLIT: [f32; 9] = [0.0; 9];
+
 /// What stands around: what hides light, and surfaces that send it on.
 pub struct Around {
     pub visibility: Visibility,
@@ -202,6 +205,11 @@ impl SceneModel {
             within: self.joint.as_ref().filter(|j| !j.backgrounds.is_empty()).map(|j| j.sphere),
             accelerator: None,
         }
+    }
+
+    /// Codes of the field for layers that no light changes; none in the stage of surfaces.
+    pub fn unlit_codes(&self) -> Vec<&'static [f32]> {
+        vec![&UNLIT; self.field.codes.given.len()]
     }
 
     /// The light of a session or photograph.

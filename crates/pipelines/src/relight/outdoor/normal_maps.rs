@@ -163,8 +163,7 @@ impl Seen {
     fn of(model: &SceneModel, small: &PosedCamera) -> Seen {
         // The same surfaces whether light is about to be told apart or has been.
         let tracer = Tracer { cube: model.cube_in(Stage::Light), ..model.tracer(Quality::Full) };
-        let codes: &[&[f32]] = if model.stage == Stage::Light { &[&[0.0; 9]] } else { &[] };
-        let view = tracer.layers(small, codes, &mut |_| {});
+        let view = tracer.layers(small, &model.unlit_codes(), &mut |_| {});
         let (w, h) = (view.depth.width, view.depth.height);
         let rays: Vec<DVec3> = (0..w * h).map(|i| small.camera.direction((i % w) as f64 + 0.5, (i / w) as f64 + 0.5)).collect();
         let inverse = |i: usize| {

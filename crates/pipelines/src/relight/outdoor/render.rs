@@ -3,8 +3,9 @@
 use super::config::Stage;
 use super::joint;
 use super::model::SceneModel;
-use super::shading::{self, CHANNELS, NORMAL, RayColor, gray};
-use super::sun::SUN;
+use super::shading::{self, NORMAL, RayColor, SUNLIT_CHANNELS};
+use super::sun::{SUN, gray};
+use super::sunlit::{LEFT, sun_code, sunlit};
 use super::visibility::Ambient;
 use crate::error::Result;
 use crate::run::memory;
@@ -34,6 +35,8 @@ pub struct ViewLight {
     pub sky: Vec<f32>,
     /// A sun apart, whose light the harmonics then lack: direction, power.
     pub sun: Option<[f32; SUN]>,
+    /// Whether it is one of those of training, of which the field says itself where the sun arrives.
+    is_learned: bool,
     /// More of them, from what is bright in a map: their shadows together are soft.
     lamps: Vec<f32>,
     /// The sky behind as a map, to which `sky` is added.
@@ -47,7 +50,7 @@ impl ViewLight {
     pub fn of(light: ShLight) -> ViewLight {
         let above = light.shade(DVec3::Z);
         let sky = (0..shading::SKY).map(|i| if i < 3 { above[i].max(0.0) as f32 / 0.282_094_8 } else { 0.0 }).collect();
-        ViewLight { light, sky, sun: None, lamps: Vec::new(), behind: None, ambient: OnceLock::new() }
+        ViewLight { light, sky, sun: None, is_learned: false, lamps: Vec::new(), behind: None, ambient: OnceLock::new() }
     }
 
     /// Harmonics, and a sun (direction and irradiance) besides, as a model takes them: apart, if it tells suns apart.
@@ -104,6 +107,7 @@ impl ViewLight {
             light: model.light(index),
             sky: model.sky(index).to_vec(),
             sun: model.sun(index),
+            is_learned: true,
             lamps: Vec::new(),
             behind: None,
             ambient: OnceLock::new(),
@@ -116,11 +120,11 @@ impl ViewLight {
         self.behind.as_ref().map_or([0.0; 3], radiance)
     }
 
-    /// What shadows read of it.
-    fn code(&self) -> [f32; 9] {
+    /// What shadows read of it: the second only where suns are apart.
+    fn codes(&self) -> [[f32; 9]; 2] {
         match self.sun {
-            Some(sun) => shading::sun_code(&sun),
-            None => std::array::from_fn(|i| gray(&self.light.0[i].map(|v| v as f32))),
+            Some(sun) => [sun_code(&sun), if self.is_learned { sun_code(&sun) } else { [0.0; 9] }],
+            None => [std::array::from_fn(|i| gray(&self.light.0[i].map(|v| v as f32))), [0.0; 9]],
         }
     }
 
@@ -138,7 +142,7 @@ pub struct SceneView {
     /// Of unit length.
     pub normal: Image,
     pub shadow: Image,
-    /// Share of a sun that is left by what is too small to be traced, where suns are apart.
+    /// Share that small things leave of a sun whose traced ray passes, where suns are apart.
     pub share: Image,
     /// Light that a white surface would send, shadow included.
     pub irradiance: Image,
@@ -167,8 +171,9 @@ impl SceneModel {
 
     /// What the field says of each pixel.
     fn layers(&self, tracer: &Tracer, camera: &PosedCamera, light: &ViewLight, progress: &mut dyn FnMut(usize)) -> Layers {
-        let code = light.code();
-        tracer.layers(camera, &[&code], progress)
+        let codes = light.codes();
+        let codes: Vec<&[f32]> = codes.iter().map(|c| &c[..]).take(self.field.codes.given.len()).collect();
+        tracer.layers(camera, &codes, progress)
     }
 
     /// A view under a light, of what the field says of it. Lamps are shared among the `samples`² rays of a pixel.
@@ -199,10 +204,11 @@ impl SceneModel {
             (&around.visibility, ambient)
         });
         let shaded = |i: usize| {
-            let mut v: [f32; CHANNELS] = std::array::from_fn(|k| values.data[CHANNELS * i + k]);
+            let mut v = [0.0; SUNLIT_CHANNELS];
+            v[..values.channels].copy_from_slice(&values.data[values.channels * i..][..values.channels]);
             let o = out.opacity.data[i];
-            // The shadow is composited before 1.
-            v[3] += 1.0 - o;
+            // Shadows are composited before 1.
+            [3, LEFT].into_iter().for_each(|k| v[k] += 1.0 - o);
             let at = 3 * i..3 * i + 3;
             let hit = (o, out.depth.data[i] * o);
             let ray = (&origins[at.clone()], &dirs[at.clone()]);
@@ -219,7 +225,7 @@ impl SceneModel {
                 return (v, color);
             }
             let own = (i / w % side) * side + i % w % side;
-            let sunlit = sunlight.map(|around| shading::sunlit(around, (&shares[own], &numbers), &v[NORMAL..], hit, ray));
+            let sunlit = sunlight.map(|around| sunlit(around, (&shares[own], &numbers, light.is_learned), &v[NORMAL..], hit, ray));
             let mut color = shading::color(&v, o, ray.1, &numbers, &light.sky, sunlit);
             if o < 1.0 {
                 let radiance = light.map_toward(ray.1);
@@ -227,7 +233,7 @@ impl SceneModel {
             }
             (v, color)
         };
-        let all: Vec<([f32; CHANNELS], RayColor)> = (0..w * h).into_par_iter().map(shaded).collect();
+        let all: Vec<([f32; SUNLIT_CHANNELS], RayColor)> = (0..w * h).into_par_iter().map(shaded).collect();
         for (i, (v, color)) in all.into_iter().enumerate() {
             let o = out.opacity.data[i];
             let length = v[NORMAL..NORMAL + 3].iter().map(|n| n * n).sum::<f32>().sqrt().max(1e-20);
@@ -238,7 +244,7 @@ impl SceneModel {
                 out.irradiance.data[3 * i + k] = color.irradiance[k];
             }
             out.shadow.data[i] = color.shadow;
-            out.share.data[i] = v[3];
+            out.share.data[i] = v[LEFT];
         }
         out
     }
@@ -249,7 +255,7 @@ pub struct FineViews<'a> {
     model: &'a SceneModel,
     /// Rays per pixel and axis.
     samples: u32,
-    last: Option<(PosedCamera, [f32; 9], Layers)>,
+    last: Option<(PosedCamera, [[f32; 9]; 2], Layers)>,
 }
 
 impl FineViews<'_> {
@@ -269,10 +275,10 @@ impl FineViews<'_> {
     pub fn view(&mut self, camera: &PosedCamera, light: &ViewLight) -> SceneView {
         let (model, (w, h)) = (self.model, (camera.camera.width, camera.camera.height));
         let fine = PosedCamera { camera: camera.camera.resized(self.samples * w, self.samples * h), pose: camera.pose };
-        let code = light.code();
-        let is_traced = self.last.as_ref().is_some_and(|l| l.0.camera == fine.camera && l.0.pose == fine.pose && l.1 == code);
+        let codes = light.codes();
+        let is_traced = self.last.as_ref().is_some_and(|l| l.0.camera == fine.camera && l.0.pose == fine.pose && l.1 == codes);
         if !is_traced {
-            self.last = Some((fine, code, model.layers(&model.tracer(Quality::Full), &fine, light, &mut |_| {})));
+            self.last = Some((fine, codes, model.layers(&model.tracer(Quality::Full), &fine, light, &mut |_| {})));
         }
         let view = model.lit(&self.last.as_ref().expect("traced").2, &fine, light, self.samples);
         let mean = |image: Image| image.downsampled(w as usize, h as usize);

@@ -1,12 +1,17 @@
 //! Loss of the scene model: `C = S · A ⊙ max(0, Lᵀ b(N)) + (1 − o) · sky(d)` in linear light, compared in sRGB, and its gradient. With a
 //! sun apart, its light, the sky's and that of surfaces around (see [`super::sun`]) take the place of `S · max(0, Lᵀ b(N))`, and are given.
 //!
+//! What of the sun arrives at a surface is traced, `T`, through surfaces that are learned, so shadows are a little off, and albedo must not make
+//! up for it. In the lights of training, the field therefore says itself what arrives, `V`, near `T` wherever photographs agree. For any other
+//! sun it says what is left where the traced ray passes, of which small things take a share: `T s`, learned from `V`.
+//!
 //! Per ray, the field composites albedo `A` (premultiplied by the opacity `o`), shadow `S` (1 where nothing is hit) and the normal that a
 //! head of the network says, whose direction `N` counts. Light `L` `[9, 3]` and sky `[16, 3]` are of the ray's session. In training, the
 //! normal is that of the surfaces as they were learned, which the head is taught; with suns apart it bends from there to what the suns show.
 
-use super::sun::{BOUNCED, SUN, level};
-use super::visibility::{Ambient, Visibility, of_normal, spread};
+use super::sun::{BOUNCED, SUN, gray, level};
+use super::sunlit::{FAINT, LEFT, SHORTEST, Sunlit, arriving, reach, sunlit, surface, unhidden, unit};
+use super::visibility::{Ambient, Visibility, spread};
 use diorama_geom::color::LUMINANCE;
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
@@ -24,13 +29,14 @@ pub const SKY: usize = 48;
 pub const CHANNELS: usize = 7;
 /// First channel of the normal.
 pub const NORMAL: usize = 4;
+/// Channels where suns are apart: the share that is left of a sun whose traced ray passes, besides.
+pub const SUNLIT_CHANNELS: usize = 8;
 /// Luminance of albedo that few surfaces exceed.
 const BRIGHTEST: f32 = 0.9;
-/// Opacity below which a ray shows no surface, and above which it shows little else.
-const FAINT: f32 = 0.05;
+/// Opacity above which a ray shows little but a surface.
 const SOLID: f32 = 0.5;
-/// Length below which a vector has no direction.
-const SHORTEST: f32 = 1e-12;
+/// Difference from the traced shadow up to which the square counts.
+const TRACED_WIDTH: f32 = 0.1;
 /// Value in sRGB from which a photograph may be clipped.
 const CLIPPED: f32 = 0.99;
 /// Directions in which irradiance must not be negative.
@@ -42,9 +48,9 @@ pub struct Weights {
     pub huber: f32,
     /// Error beyond which a pixel counts less (Geman–McClure), in sRGB; 0: all count alike.
     pub robust: f32,
-    /// Deviation of the shadow from 1.
+    /// Deviation of the shadow from 1; with suns apart, from the traced one.
     pub shadow: f32,
-    /// Deviation of the shadow from the traced one.
+    /// Deviation of the shadow from the traced one; with suns apart, of what is left of any sun from what is of those of training.
     pub traced: f32,
     pub negative: f32,
     /// Albedos beyond what surfaces have.
@@ -102,54 +108,6 @@ pub struct TracedLight<'a> {
     pub visibility: &'a Visibility,
     /// Of the rays, `[R, 3]`.
     pub origins: &'a [f32],
-}
-
-/// Sun of a surface point, the shares of its light and the sky's that reach the point, and light from sky and surfaces.
-#[derive(Clone, Copy)]
-pub struct Sunlit<'a> {
-    pub sun: &'a [f32],
-    pub reach: [f32; 2],
-    /// By spherical harmonics of the normal.
-    pub ambient: [Vec3; 9],
-    /// Light of lamps that arrives.
-    pub of_lamps: Vec3,
-}
-
-/// What a ray shows: a point and its normal; none where it meets nothing. `depth` is `Σ w t`.
-fn surface(normal: &[f32], (opacity, depth): (f32, f32), origin: &[f32], dir: &[f32]) -> Option<(Vec3, Vec3)> {
-    let point = Vec3::from_slice(origin) + Vec3::from_slice(dir) * (depth / opacity.max(FAINT));
-    (opacity >= FAINT).then(|| (point, Vec3::from(unit(normal).0)))
-}
-
-/// Shares of a sun's and the sky's light that reach a surface, `[sun, sky]`.
-fn reach(visibility: &Visibility, sun: &[f32], (point, normal): (Vec3, Vec3)) -> [f32; 2] {
-    let toward = Vec3::from_slice(sun);
-    let direct = if normal.dot(toward) > 0.0 { visibility.from_sun(point, normal, toward) } else { 1.0 };
-    [direct, visibility.from_sky(&visibility.corners(point, normal), normal)]
-}
-
-/// The light of a sun, perhaps more suns after it, and what is around at what a ray shows; `sky` `[9, 3]` is that of the light.
-pub fn sunlit<'a>(
-    (visibility, ambient): (&Visibility, &Ambient),
-    (suns, sky): (&'a [f32], &[f32]),
-    normal: &[f32],
-    hit: (f32, f32),
-    (origin, dir): (&[f32], &[f32]),
-) -> Sunlit<'a> {
-    let (sun, lamps) = suns.split_at(SUN);
-    match surface(normal, hit, origin, dir) {
-        None => Sunlit { sun, reach: [1.0; 2], ambient: [Vec3::ZERO; 9], of_lamps: Vec3::ZERO },
-        Some(at) => {
-            let corners = visibility.corners(at.0, at.1);
-            let from_lamp = |lamp: &[f32]| {
-                let facing = at.1.dot(Vec3::from_slice(lamp));
-                let arrives = if facing > 0.0 { facing * visibility.from_sun(at.0, at.1, Vec3::from_slice(lamp)) } else { 0.0 };
-                arrives * Vec3::from_slice(&lamp[3..])
-            };
-            let lamps: Vec3 = lamps.chunks_exact(SUN).map(from_lamp).sum();
-            Sunlit { sun, reach: reach(visibility, sun, at), ambient: ambient.around(&corners, sky), of_lamps: lamps }
-        }
-    }
 }
 
 /// Gradients of the tables, and figures of the step.
@@ -216,12 +174,6 @@ struct Shaded {
     sky_basis: [f32; 16],
 }
 
-/// Direction and length of a vector; straight up if there is none.
-fn unit(v: &[f32]) -> ([f32; 3], f32) {
-    let length = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
-    (if length > SHORTEST { [v[0] / length, v[1] / length, v[2] / length] } else { [0.0, 0.0, 1.0] }, length)
-}
-
 /// Adds the gradient of a vector of which only the direction counts.
 fn add_direction(d: &mut [f32], gradient: [f32; 3], (direction, length): ([f32; 3], f32)) {
     if length > SHORTEST {
@@ -239,43 +191,8 @@ fn shade(normal: &[f32], dir: &[f32], light: &[f32], sky: &[f32]) -> Shaded {
 }
 
 /// Light that a white surface sends, with its shadow.
-fn received(values: &[f32], s: &Shaded, sunlit: Option<Sunlit>, k: usize) -> f32 {
-    sunlit.map_or(values[3] * s.lit[k].max(0.0), |l| l.received(&s.normal, values[3])[k])
-}
-
-/// Light of a sun that reaches a surface without shadows.
-fn unhidden(sun: &[f32], normal: &[f32; 3]) -> Vec3 {
-    Vec3::from_slice(&sun[3..]) * (0..3).map(|a| normal[a] * sun[a]).sum::<f32>().max(0.0)
-}
-
-impl Sunlit<'_> {
-    /// Light that a white surface sends of which a share of the suns is not hidden by what is too small to be traced.
-    fn received(&self, normal: &[f32; 3], share: f32) -> Vec3 {
-        share * self.direct(normal) + of_normal(&self.ambient, Vec3::from(*normal))
-    }
-
-    /// Gradient of [`Sunlit::received`] by the normal, for gradients `d` by its channels; lamps have none.
-    fn by_normal(&self, normal: &[f32; 3], share: f32, d: Vec3) -> [f32; 3] {
-        let n = Vec3::from(*normal);
-        let toward = Vec3::from_slice(self.sun);
-        let of_sun = if n.dot(toward) > 0.0 { share * self.reach[0] * Vec3::from_slice(&self.sun[3..]).dot(d) } else { 0.0 };
-        let ambient = of_normal(&self.ambient, n);
-        let d = Vec3::select(ambient.cmpgt(Vec3::ZERO), d, Vec3::ZERO);
-        let bent = sh_light::basis_gradient(n.as_dvec3()).into_iter().zip(&self.ambient).map(|(b, v)| v.dot(d) * b.as_vec3());
-        (of_sun * toward + bent.sum::<Vec3>()).to_array()
-    }
-
-    /// Light of the suns that a white surface sends where nothing small hides them.
-    fn direct(&self, normal: &[f32; 3]) -> Vec3 {
-        self.reach[0] * unhidden(self.sun, normal) + self.of_lamps
-    }
-}
-
-/// Share of the light of a sun and a sky that reaches a surface; `lit` is that of the whole sky, `sent` what surfaces send where they hide it.
-fn arriving(sun: &[f32], reach: [f32; 2], normal: &[f32; 3], lit: [f32; 3], sent: Vec3) -> f32 {
-    let (direct, sky) = (unhidden(sun, normal), Vec3::from(lit).max(Vec3::ZERO));
-    let all = gray(&(direct + sky).to_array()).max(1e-6);
-    (gray(&(reach[0] * direct + reach[1] * sky + (1.0 - reach[1]) * sent).to_array()) / all).clamp(0.0, 1.0)
+fn received(values: &[f32], s: &Shaded, sunlit: Option<Sunlit>) -> [f32; 3] {
+    sunlit.map_or(s.lit.map(|lit| values[3] * lit.max(0.0)), |l| l.received(&s.normal, values).to_array())
 }
 
 /// Color of a ray, and what makes it.
@@ -291,25 +208,14 @@ pub struct RayColor {
 /// Linear color of composited values under a light and before a sky.
 pub fn color(values: &[f32], opacity: f32, dir: &[f32], light: &[f32], sky: &[f32], sunlit: Option<Sunlit>) -> RayColor {
     let s = shade(&values[NORMAL..], dir, light, sky);
-    let irradiance: [f32; 3] = std::array::from_fn(|k| received(values, &s, sunlit, k));
+    let irradiance = received(values, &s, sunlit);
     let rgb = std::array::from_fn(|k| values[k] * irradiance[k] + (1.0 - opacity) * s.sky[k].max(0.0));
     let shadow = match sunlit {
         Some(_) if opacity < FAINT => 1.0,
-        Some(l) => arriving(l.sun, [values[3] * l.reach[0], l.reach[1]], &s.normal, s.lit, Vec3::ZERO),
+        Some(l) => arriving(l.sun, [l.arrives(values), l.reach[1]], &s.normal, s.lit, Vec3::ZERO),
         None => values[3],
     };
     RayColor { rgb, irradiance, shadow }
-}
-
-/// What the shadow's head reads of a sun apart: its direction; zeros where there is none.
-pub fn sun_code(sun: &[f32]) -> [f32; 9] {
-    let is_there = sun[3..SUN].iter().any(|v| *v > 0.0);
-    std::array::from_fn(|i| if is_there && i < 3 { sun[i] } else { 0.0 })
-}
-
-/// Luminance of a color or coefficient.
-pub fn gray(c: &[f32]) -> f32 {
-    (0..3).map(|k| LUMINANCE[k] * c[k]).sum()
 }
 
 /// What the loss of a ray reads.
@@ -324,17 +230,21 @@ struct RayIn<'a> {
 }
 
 impl SceneLoss<'_> {
+    fn channels(&self) -> usize {
+        if self.suns.is_some() { SUNLIT_CHANNELS } else { CHANNELS }
+    }
+
     /// Normal of a ray's surface: as it was learned, else, or where it bends, what the head says.
     fn normal(&self, r: usize, out: &RayOutputs) -> [f32; 3] {
         let own = &self.normals[3 * r..3 * r + 3];
         let is_given = !self.bends && own.iter().any(|v| *v != 0.0);
-        unit(if is_given { own } else { &out.values[r * CHANNELS + NORMAL..][..3] }).0
+        unit(if is_given { own } else { &out.values[r * self.channels() + NORMAL..][..3] }).0
     }
 
     /// Sun of a ray and what of its light arrives.
     fn sunlit(&self, r: usize, out: &RayOutputs) -> Option<Sunlit<'_>> {
         let (s, l, at) = (self.suns.as_ref()?, self.light[r] as usize, 3 * r..3 * r + 3);
-        let light = (&s.values[SUN * l..][..SUN], &self.lights[LIGHT * l..][..LIGHT]);
+        let light = (&s.values[SUN * l..][..SUN], &self.lights[LIGHT * l..][..LIGHT], true);
         let hit = (out.opacity[r], out.depth[r]);
         Some(sunlit((s.visibility, &s.ambients[l]), light, &self.normal(r, out), hit, (&s.origins[at.clone()], &self.dirs[at])))
     }
@@ -359,9 +269,8 @@ impl SceneLoss<'_> {
         let (shadow, gain) = (values[3], self.gains.get(3 * image..3 * image + 3));
         let w = self.weights;
         let (mut errors, mut d_colors) = ([0.0; 3], [0.0; 3]);
-        let (mut white, mut plain) = ([0.0; 3], [0.0; 3]);
+        let (white, mut plain) = (received(values, &s, sunlit), [0.0; 3]);
         for k in 0..3 {
-            white[k] = received(values, &s, sunlit, k);
             plain[k] = values[k] * white[k] + (1.0 - opacity) * s.sky[k].max(0.0);
             let factor = gain.map_or(1.0, |g| g[k].exp());
             let (srgb, slope) = encode(factor * plain[k]);
@@ -373,7 +282,7 @@ impl SceneLoss<'_> {
         let squared: f32 = errors.iter().map(|e| e * e).sum();
         let part = share * self.counts[r] * trust(squared, w.robust);
         let mut loss = 0.0;
-        let d_values = &mut d.values[r * CHANNELS..][..CHANNELS];
+        let d_values = &mut d.values[r * self.channels()..][..self.channels()];
         let mut d_white = Vec3::ZERO;
         for k in 0..3 {
             let (value, slope) = huber(errors[k], w.huber);
@@ -385,7 +294,7 @@ impl SceneLoss<'_> {
             d_values[k] += dc * white[k];
             d_white[k] = dc * values[k];
             if let Some(l) = sunlit {
-                d_values[3] += dc * values[k] * l.direct(&s.normal)[k];
+                d_values[3] += dc * values[k] * unhidden(l.sun, &s.normal)[k];
             }
             if sunlit.is_none() && s.lit[k] > 0.0 {
                 d_values[3] += dc * values[k] * s.lit[k];
@@ -397,7 +306,7 @@ impl SceneLoss<'_> {
         }
         if let Some(l) = sunlit.filter(|_| self.bends) {
             let said = unit(&values[NORMAL..]);
-            add_direction(&mut d_values[NORMAL..], l.by_normal(&s.normal, shadow, d_white), said);
+            add_direction(&mut d_values[NORMAL..], l.by_normal(&s.normal, values, d_white), said);
         }
         (loss, squared as f64 / 3.0, errors.iter().fold(0.0, |m, e| m.max(e.abs())))
     }
@@ -405,11 +314,24 @@ impl SceneLoss<'_> {
     /// What the heads of normal and shadow are taught besides the color; adds gradients.
     fn teach(&self, r: usize, ray: &RayIn, d: &mut RayGradients, share: f32) -> f64 {
         let (w, values, mut loss) = (self.weights, ray.values, 0.0);
-        let d_values = &mut d.values[r * CHANNELS..][..CHANNELS];
-        let (want, weight) = ray.traced.map_or((1.0, w.shadow), |t| (t, w.traced));
-        let off = values[3] - want;
-        loss += (share * weight * off * off) as f64;
-        d_values[3] += 2.0 * share * weight * off;
+        let d_values = &mut d.values[r * self.channels()..][..self.channels()];
+        if let Some(l) = &ray.sunlit {
+            // Of what faces no sun, photographs tell nothing.
+            if ray.opacity > SOLID && unhidden(l.sun, &ray.normal) != Vec3::ZERO {
+                let off = values[3] - (1.0 - ray.opacity * (1.0 - l.reach[0]));
+                let (value, slope) = huber(off, TRACED_WIDTH);
+                loss += (share * w.shadow * value) as f64;
+                d_values[3] += share * w.shadow * slope;
+                let (off, part) = (values[LEFT] - values[3], share * w.traced * l.reach[0]);
+                loss += (part * off * off) as f64;
+                d_values[LEFT] += 2.0 * part * off;
+            }
+        } else {
+            let (want, weight) = ray.traced.map_or((1.0, w.shadow), |t| (t, w.traced));
+            let off = values[3] - want;
+            loss += (share * weight * off * off) as f64;
+            d_values[3] += 2.0 * share * weight * off;
+        }
         let (said, learned) = (unit(&values[NORMAL..]), &self.normals[3 * r..3 * r + 3]);
         if said.1 > SHORTEST && learned.iter().any(|v| *v != 0.0) {
             loss += (share * w.tie * (1.0 - (0..3).map(|a| said.0[a] * learned[a]).sum::<f32>())) as f64;
@@ -420,7 +342,7 @@ impl SceneLoss<'_> {
 
     /// Penalty of albedos so bright that light would have to be dark: of the brightest twentieth, where that begins above [`BRIGHTEST`].
     fn gauge(&self, out: &RayOutputs, gradients: &mut RayGradients, share: f32) -> f64 {
-        let luminance = |r: usize| gray(&out.values[r * CHANNELS..][..3]);
+        let luminance = |r: usize| gray(&out.values[r * self.channels()..][..3]);
         let surfaces: Vec<usize> = (0..out.opacity.len()).filter(|r| self.counts[*r] > 0.0 && out.opacity[*r] > 0.5).collect();
         let mut sorted: Vec<f32> = surfaces.iter().map(|r| luminance(*r)).collect();
         sorted.sort_by(f32::total_cmp);
@@ -429,7 +351,7 @@ impl SceneLoss<'_> {
         for r in surfaces.into_iter().filter(|r| luminance(*r) >= *from) {
             let (e, part) = (luminance(r) - BRIGHTEST, share * self.weights.gauge);
             loss += (part * e * e) as f64;
-            gradients.values[r * CHANNELS..].iter_mut().zip(LUMINANCE).for_each(|(d, w)| *d += 2.0 * part * e * w);
+            gradients.values[r * self.channels()..].iter_mut().zip(LUMINANCE).for_each(|(d, w)| *d += 2.0 * part * e * w);
         }
         loss
     }
@@ -466,7 +388,7 @@ impl BatchLoss for SceneLoss<'_> {
         let (mut loss, mut mse, mut worst) = (0.0, 0.0, Vec::with_capacity(rays));
         let reached = (0..rays).into_par_iter().map(|r| (self.sunlit(r, out), self.traced(r, out)));
         for (r, (sunlit, traced)) in reached.collect::<Vec<_>>().into_iter().enumerate() {
-            let values = &out.values[r * CHANNELS..][..CHANNELS];
+            let values = &out.values[r * self.channels()..][..self.channels()];
             let ray = RayIn { values, opacity: out.opacity[r], normal: self.normal(r, out), sunlit, traced };
             loss += self.teach(r, &ray, gradients, 1.0 / rays as f32);
             if self.counts[r] > 0.0 {

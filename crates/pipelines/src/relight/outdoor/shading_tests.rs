@@ -1,7 +1,8 @@
 //! The loss against central differences.
 
 use super::shading::*;
-use super::visibility::{Ambient, Visibility};
+use super::sunlit::{LEFT, sunlit};
+use super::visibility::{Ambient, OPEN_CELLS, Visibility};
 use diorama_engine::fields::DensityQuery;
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_geom::glam::Vec3;
@@ -46,12 +47,13 @@ static HALF: LazyLock<Visibility> = LazyLock::new(|| Visibility::of(&Ceiling, &O
 static EMPTY: LazyLock<Visibility> = LazyLock::new(|| Visibility::of(&Empty, &Occupancy::new(16, 1, false), (0.0, 1.0), 16));
 
 const RAYS: usize = 5;
+const LIGHTS: [u32; RAYS] = [0, 1, 1, 0, 1];
 
 fn case() -> Case {
     let rng = Rng::new(3, 1);
     let draw = |n: usize, stream: u64| (0..n).map(|i| rng.uniform(stream * 1000 + i as u64)).collect::<Vec<f32>>();
     let mut values = draw(RAYS * CHANNELS, 1);
-    values.chunks_exact_mut(CHANNELS).for_each(|v| v[NORMAL..].iter_mut().for_each(|n| *n = 20.0 * (*n - 0.5)));
+    values.chunks_exact_mut(CHANNELS).for_each(|v| v[NORMAL..NORMAL + 3].iter_mut().for_each(|n| *n = 20.0 * (*n - 0.5)));
     let mut dirs: Vec<f32> = draw(RAYS * 3, 2).iter().map(|d| d - 0.5).collect();
     dirs.chunks_exact_mut(3).for_each(|d| {
         let l = d.iter().map(|v| v * v).sum::<f32>().sqrt();
@@ -75,31 +77,39 @@ fn case() -> Case {
 
 fn sunlit_case() -> Case {
     let sun = |toward: [f32; 3], power: f32| [toward[0], toward[1], toward[2], power, 0.8 * power, 0.6];
-    Case { suns: [sun([0.6, 0.0, 0.8], 0.9), sun([0.0, -0.8, 0.6], 0.5)].concat(), ..case() }
+    let left = |(r, v): (usize, &[f32])| [v, &[0.2 + 0.15 * r as f32]].concat();
+    let values = case().values.chunks_exact(CHANNELS).enumerate().flat_map(left).collect();
+    Case { values, suns: [sun([0.6, 0.0, 0.8], 0.9), sun([0.0, -0.8, 0.6], 0.5)].concat(), ..case() }
 }
 
+/// Without what is left of any sun, which is taught by what the field says of those of training and does not teach that.
 fn run(c: &Case) -> (f64, RayGradients, SceneGradients) {
+    run_with(c, if c.suns.is_empty() { 0.3 } else { 0.0 }, &EMPTY)
+}
+
+fn run_with(c: &Case, traced: f32, visibility: &Visibility) -> (f64, RayGradients, SceneGradients) {
     let suns = [0.6, 0.0, 0.8, 0.9, 0.8, 0.6].repeat(RAYS);
-    let ambients: [Ambient; 2] = std::array::from_fn(|l| EMPTY.ambient(&c.lights[LIGHT * l..], &[], Vec3::ZERO));
+    let ambients: [Ambient; 2] =
+        std::array::from_fn(|l| visibility.ambient(&c.lights[LIGHT * l..], &[Vec3::ZERO; OPEN_CELLS.pow(3)], Vec3::ZERO));
     let skies = (0..LIGHT).map(|i| if i < 3 { 0.5 } else { 0.05 }).collect::<Vec<f32>>().repeat(RAYS);
     let loss = SceneLoss {
-        weights: Weights { huber: 0.4, robust: 0.0, shadow: 0.2, traced: 0.3, negative: 0.5, gauge: 0.0, tie: 0.3 },
+        weights: Weights { huber: 0.4, robust: 0.0, shadow: 0.2, traced, negative: 0.5, gauge: 0.0, tie: 0.3 },
         target: &c.target,
         counts: &[1.0, 0.5, 1.0, 0.0, 1.0],
         normals: &c.normals,
         dirs: &c.dirs,
-        light: &[0, 1, 1, 0, 1],
+        light: &LIGHTS,
         image: &[0, 1, 2, 3, 4],
         lights: &c.lights,
         skies: &c.skies,
         gains: &c.gains,
-        suns: (!c.suns.is_empty()).then(|| Suns { values: &c.suns, ambients: &ambients, visibility: &EMPTY, origins: &[0.5; 3 * RAYS] }),
+        suns: (!c.suns.is_empty()).then(|| Suns { values: &c.suns, ambients: &ambients, visibility, origins: &[0.5; 3 * RAYS] }),
         bends: c.bends,
         traced: c.suns.is_empty().then(|| TracedLight { suns: &suns, skies: &skies, visibility: &HALF, origins: &[0.5; 3 * RAYS] }),
         out: Mutex::default(),
     };
     let mut d = RayGradients::default();
-    d.clear(RAYS, CHANNELS);
+    d.clear(RAYS, c.values.len() / RAYS);
     let out = RayOutputs { values: &c.values, opacity: &c.opacity, depth: &[0.0; RAYS] };
     let value = loss.batch(&out, &mut d);
     (value, d, loss.out.into_inner().unwrap())
@@ -145,8 +155,8 @@ fn gradients_with_suns_apart_are_those_of_the_loss() {
 fn bent_case() -> Case {
     let mut c = Case { bends: true, ..sunlit_case() };
     // What the head says is lit by the suns, and short enough for its direction to change.
-    c.values.chunks_exact_mut(CHANNELS).enumerate().for_each(|(r, v)| {
-        v[NORMAL..].copy_from_slice(&[0.5 - 0.1 * r as f32, -0.3, 0.7]);
+    c.values.chunks_exact_mut(SUNLIT_CHANNELS).enumerate().for_each(|(r, v)| {
+        v[NORMAL..NORMAL + 3].copy_from_slice(&[0.5 - 0.1 * r as f32, -0.3, 0.7]);
     });
     c
 }
@@ -155,9 +165,55 @@ fn bent_case() -> Case {
 fn gradients_of_bent_normals_are_those_of_the_loss() {
     let (_, d, _) = run(&bent_case());
     check("values", bent_case, |c| &mut c.values, &d.values, 1e-3);
-    let normals = |d: &RayGradients| d.values.chunks_exact(CHANNELS).flat_map(|v| v[NORMAL..].to_vec()).collect::<Vec<f32>>();
+    let normals = |d: &RayGradients| d.values.chunks_exact(SUNLIT_CHANNELS).flat_map(|v| v[NORMAL..LEFT].to_vec()).collect::<Vec<f32>>();
     let stiff = run(&Case { bends: false, ..bent_case() }).1;
     assert!(normals(&d).iter().zip(normals(&stiff)).filter(|(a, b)| (**a - b).abs() > 1e-3).count() > RAYS, "colors do not bend normals");
+}
+
+/// Below a ceiling, which the traced rays meet.
+#[test]
+fn the_field_says_where_suns_of_training_arrive_and_tracing_where_others_do() {
+    let (sun, dir, mut values) = ([0.6, 0.0, 0.8, 1.0, 1.0, 1.0], [0.0, 0.0, -1.0], [0.0; SUNLIT_CHANNELS]);
+    values[..3].fill(1.0);
+    (values[3], values[NORMAL + 2], values[LEFT]) = (0.7, 1.0, 0.5);
+    let shade = |visibility: &Visibility, is_learned: bool| {
+        let ambient = visibility.ambient(&[0.0; LIGHT], &[Vec3::ZERO; OPEN_CELLS.pow(3)], Vec3::ZERO);
+        let light = (&sun[..], &[0.0; LIGHT][..], is_learned);
+        let sunlit = sunlit((visibility, &ambient), light, &values[NORMAL..], (1.0, 0.0), (&[0.5; 3], &dir));
+        color(&values, 1.0, &dir, &[0.0; LIGHT], &[0.0; SKY], Some(sunlit)).rgb[0]
+    };
+    for (visibility, is_learned, want) in [(&*HALF, true, 0.7), (&*EMPTY, true, 0.7), (&*HALF, false, 0.0), (&*EMPTY, false, 0.5)] {
+        let got = shade(visibility, is_learned);
+        assert!((got - 0.8 * want).abs() < 0.01, "{is_learned}: {got} {want}");
+    }
+}
+
+#[test]
+fn what_is_left_of_any_sun_is_taught_by_those_of_training_where_rays_pass() {
+    let values = |d: &RayGradients, k: usize| d.values.chunks_exact(SUNLIT_CHANNELS).map(|v| v[k]).collect::<Vec<f32>>();
+    let (c, without) = (sunlit_case(), run(&sunlit_case()).1);
+    assert!(c.opacity.iter().any(|o| *o > 0.5));
+    for (visibility, most) in [(&*EMPTY, 1.0), (&*HALF, 0.5)] {
+        let d = run_with(&c, 0.3, visibility).1;
+        for (r, v) in c.values.chunks_exact(SUNLIT_CHANNELS).enumerate() {
+            let (normal, sun) = (Vec3::from_slice(&c.normals[3 * r..]).normalize(), &c.suns[6 * LIGHTS[r] as usize..]);
+            let passes = visibility.from_sun(Vec3::splat(0.5), normal, Vec3::from_slice(sun));
+            assert!(passes <= most);
+            let passes = if c.opacity[r] > 0.5 { passes } else { 0.0 };
+            let want = 2.0 * 0.3 * passes * (v[LEFT] - v[3]) / RAYS as f32;
+            assert!((values(&d, LEFT)[r] - want).abs() < 1e-3, "{r}: {} {want}", values(&d, LEFT)[r]);
+        }
+    }
+    assert_eq!(values(&run_with(&c, 0.3, &EMPTY).1, 3), values(&without, 3), "it teaches what it is taught by");
+    let near = |c: &Case, visibility: &Visibility| values(&run_with(c, 0.0, visibility).1, 3);
+    let nothing = |c: Case| Case { target: vec![1.0; 3 * RAYS], gains: vec![3.0; 3 * RAYS], ..c };
+    // Of colors that say nothing, the traced shadow remains.
+    let bright = nothing(sunlit_case());
+    assert!(
+        near(&bright, &EMPTY).iter().any(|d| *d < 0.0)
+            && near(&bright, &EMPTY).iter().all(|d| *d <= 0.0)
+            && near(&bright, &HALF).iter().any(|d| *d > 0.0)
+    );
 }
 
 #[test]
@@ -181,7 +237,7 @@ fn the_light_of_a_perfect_explanation_has_no_loss() {
     let mut c = case();
     c.normals.fill(0.0);
     for r in 0..RAYS {
-        let l = [0, 1, 1, 0, 1][r];
+        let l = LIGHTS[r] as usize;
         let (light, sky) = (&c.lights[l * LIGHT..][..LIGHT], &c.skies[l * SKY..][..SKY]);
         let rgb = color(&c.values[r * CHANNELS..][..CHANNELS], c.opacity[r], &c.dirs[3 * r..3 * r + 3], light, sky, None).rgb;
         (0..3).for_each(|k| c.target[3 * r + k] = encode(rgb[k] * c.gains[3 * r + k].exp()).0);

@@ -3,7 +3,8 @@
 use super::config::Config;
 use super::joint::{Joint, JointGradients, JointLoss};
 use super::model::SceneModel;
-use super::shading::{LIGHT, gray};
+use super::shading::LIGHT;
+use super::sun::gray;
 use diorama_engine::fields::{Batch, Field, FieldBuffers, InvertedSphere, Loss, OuterSamples, VisibleSamples};
 use diorama_engine::params::ParamGroup;
 use diorama_engine::samplers::RayBatch;

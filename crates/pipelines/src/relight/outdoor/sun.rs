@@ -15,7 +15,7 @@ mod selection;
 
 use least_squares::solve;
 pub use photograph::{Shown, of_photograph};
-use selection::Selection;
+use selection::{Selection, Told};
 
 /// Numbers of a sun: direction and power.
 pub const SUN: usize = 6;
@@ -40,6 +40,8 @@ const BEGUN: usize = 5;
 /// Times that lights and albedos are found in turn, and after which the sun's direction is followed only.
 const ROUNDS: usize = 5;
 const SEARCHED: usize = 1;
+/// Times of these at the end, by sure points alone.
+const SURE: usize = 2;
 const SETTLING: usize = 15;
 /// Every so many of these, light from surfaces is found anew.
 const SENT_AGAIN: usize = 3;
@@ -107,7 +109,7 @@ struct Place {
     corners: Corners,
     /// Light that arrives for each of the sky's coefficients.
     sky: [f32; 9],
-    /// Share of a sun that is left by what is too small to be traced.
+    /// Share that small things leave of a sun whose traced ray passes.
     share: f32,
 }
 
@@ -248,23 +250,25 @@ pub fn tell_apart(
     // What is seen in a light without a sun shows albedos best, and each may be such a light.
     let step = lights.div_ceil(TAKEN_FOR_EVEN).max(1);
     let begun: Vec<usize> = (0..lights).step_by(step).collect();
-    let total = (begun.len() * (1 + BEGUN) + (ROUNDS - 1 + selection::most_settled(lights)) * SETTLING) as f64;
+    let total = (begun.len() * (1 + BEGUN) + (ROUNDS - 1 + selection::most_settled(lights) + SURE) * SETTLING) as f64;
     let mut done = 0;
     let mut go_on = || {
         done += 1;
         progress(done as f64 / total);
         !interrupt.load(Ordering::Relaxed)
     };
+    // Few planes look about as well in a sun that all lights share: whether there are suns, all points tell.
+    let alike: Vec<Seen> = seen.iter().map(|s| Seen { is_flat: true, ..s.clone() }).collect();
     let mut best: Option<(f64, Vec<Guess>, Vec<Vec3>)> = None;
     for even in begun {
-        surfaces.albedos = albedos_under(seen, even, &open);
-        let find = |l: usize, albedos: Vec<Vec3>| guess(seen, &surfaces, visibility, albedos, l, &first_sent[l], None);
+        surfaces.albedos = albedos_under(&alike, even, &open);
+        let find = |l: usize, albedos: Vec<Vec3>| guess(&alike, &surfaces, visibility, albedos, l, &first_sent[l], None);
         let mut guesses: Vec<Guess> = (0..lights).map(|l| find(l, surfaces.albedos.clone())).collect();
-        guesses[even] = find(even, explained(seen, &surfaces, &guesses, Some(even)));
-        if !go_on() || !settle(seen, &mut surfaces, visibility, &mut guesses, BEGUN, &mut go_on) {
+        guesses[even] = find(even, explained(&alike, &surfaces, &guesses, Some(even)));
+        if !go_on() || !settle(&alike, &mut surfaces, visibility, &mut guesses, BEGUN, &mut go_on) {
             return None;
         }
-        let misfit = misfit(seen, &surfaces, &guesses);
+        let misfit = misfit(&alike, &surfaces, &guesses);
         if best.as_ref().is_none_or(|b| misfit < b.0) {
             best = Some((misfit, guesses, surfaces.albedos.clone()));
         }
@@ -275,16 +279,29 @@ pub fn tell_apart(
         // Shadows may still be in the albedos, so the suns are looked for once more.
         let again = |(l, g): (usize, &Guess)| {
             let near = (round > SEARCHED).then(|| Vec3::from_slice(&g.fitted.sun));
+            let albedos = explained(&alike, &surfaces, &guesses, Some(l));
+            guess(&alike, &surfaces, visibility, albedos, l, &g.sent, near)
+        };
+        guesses = guesses.iter().enumerate().map(again).collect();
+        if !settle(&alike, &mut surfaces, visibility, &mut guesses, SETTLING, &mut go_on) {
+            return None;
+        }
+    }
+    let Told { mut guesses, mut surfaces, .. } = Selection { seen: &alike, visibility }.best(guesses, surfaces, &mut go_on)?;
+    for _ in 0..SURE {
+        let again = |(l, g): (usize, &Guess)| {
+            if !g.has_sun() {
+                return g.clone();
+            }
             let albedos = explained(seen, &surfaces, &guesses, Some(l));
-            guess(seen, &surfaces, visibility, albedos, l, &g.sent, near)
+            guess(seen, &surfaces, visibility, albedos, l, &g.sent, Some(Vec3::from_slice(&g.fitted.sun)))
         };
         guesses = guesses.iter().enumerate().map(again).collect();
         if !settle(seen, &mut surfaces, visibility, &mut guesses, SETTLING, &mut go_on) {
             return None;
         }
     }
-    let told = Selection { seen, visibility }.best(guesses, surfaces, &mut go_on)?;
-    Some((told.guesses.into_iter().map(|g| g.fitted).collect(), told.surfaces))
+    Some((guesses.into_iter().map(|g| g.fitted).collect(), surfaces))
 }
 
 /// Albedos if one light were an even sky: what is seen over how open a surface is.
@@ -386,7 +403,8 @@ fn explained(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess], left_out: Op
     seen.par_iter().enumerate().map(of).collect()
 }
 
-fn gray(c: &[f32]) -> f32 {
+/// Luminance of a color or coefficient.
+pub fn gray(c: &[f32]) -> f32 {
     Vec3::from_slice(c).dot(LUMINANCE.into())
 }
 

@@ -15,8 +15,6 @@ use diorama_kernels::ops::march::OccupancyBits;
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use rayon::prelude::*;
 
-/// Numbers of the gray light that the shadow reads; albedo and density do not depend on it.
-const DARK: [f32; 9] = [0.0; 9];
 /// Points per evaluation.
 const CHUNK: usize = 1 << 16;
 /// Opacity of a short ray from which its albedo counts.
@@ -73,7 +71,7 @@ impl<'a> SurfaceField<'a> {
         let shrink = (longest as f64 / c.width.max(c.height) as f64).min(1.0);
         let small = c.resized(((c.width as f64 * shrink) as u32).max(1), ((c.height as f64 * shrink) as u32).max(1));
         let posed = PosedCamera { camera: small, pose: self.model.model_from_world.pose(&frame.world_from_camera) };
-        let mut view = self.tracer().layers(&posed, &[&DARK], &mut |_| {});
+        let mut view = self.tracer().layers(&posed, &self.model.unlit_codes(), &mut |_| {});
         let scale = self.model.model_from_world.scale as f32;
         view.depth.data.iter_mut().for_each(|d| *d /= scale);
         (view, small)
@@ -105,7 +103,7 @@ impl<'a> SurfaceField<'a> {
                 batch.near_far[2 * r..2 * r + 2].copy_from_slice(&[0.0, 2.0 * reach]);
                 (batch.jitter[r], batch.images[r]) = (0.5, 0);
             }
-            let traced = tracer.trace_layers(&mut batch, &[&DARK], &mut buf);
+            let traced = tracer.trace_layers(&mut batch, &self.model.unlit_codes(), &mut buf);
             let channels = self.field.channels();
             out.extend(traced.rgb.chunks_exact(channels).zip(&traced.opacity).map(|(v, o)| match *o > MATTER {
                 true => std::array::from_fn(|k| self.srgb_albedo(v[k] / o)),
@@ -153,7 +151,8 @@ impl FieldQuery for SurfaceField<'_> {
             // One sample per ray, so long that it is opaque.
             let offsets: Vec<u32> = (0..=p.len() as u32).collect();
             let (t, dt, background) = (vec![0.0; p.len()], vec![1e30f32; p.len()], vec![0.0; p.len() * channels]);
-            let light = DARK.repeat(p.len());
+            let codes: Vec<Vec<f32>> = self.model.unlit_codes().iter().map(|c| c.repeat(p.len())).collect();
+            let given: Vec<&[f32]> = codes.iter().map(|c| &c[..]).collect();
             let mut encoded = Encoded::default();
             self.field.encode(&positions, &mut encoded);
             let batch = Batch {
@@ -161,7 +160,7 @@ impl FieldQuery for SurfaceField<'_> {
                 positions: &positions,
                 dirs: d.as_flattened(),
                 images: None,
-                given: &[&light],
+                given: &given,
                 background: &background,
                 near_scaling: 0.0,
             };

@@ -20,7 +20,7 @@ pub struct Shown {
     pub point: Vec3,
     pub normal: Vec3,
     pub albedo: Vec3,
-    /// Share of a sun that is left by what is too small to be traced.
+    /// Share that small things leave of a sun whose traced ray passes.
     pub share: f32,
     /// Linear.
     pub color: Vec3,

@@ -104,7 +104,7 @@ impl Told {
 }
 
 impl Guess {
-    fn has_sun(&self) -> bool {
+    pub fn has_sun(&self) -> bool {
         self.fitted.sun[3..] != [0.0; 3]
     }
 }

@@ -2,8 +2,9 @@
 
 use super::super::model::Around;
 use super::super::normal_maps::NormalMaps;
-use super::super::shading::{LIGHT, SceneGradients, SceneLoss, Suns, TracedLight, Weights, gray, sun_code};
-use super::super::sun::{self, SUN, Seen};
+use super::super::shading::{LIGHT, SceneGradients, SceneLoss, Suns, TracedLight, Weights};
+use super::super::sun::{self, SUN, Seen, gray};
+use super::super::sunlit::sun_code;
 use super::super::visibility::Visibility;
 use super::{SETTLED, Trainer, WithoutGlass};
 use crate::error::{PipelineError, Result};
@@ -153,16 +154,17 @@ impl Trainer<'_> {
         out
     }
 
-    /// What shadows read of the rays' suns, with noise; of some rays, nothing, as where there is no sun.
-    fn sun_codes(&self, light: &[u32], step: u64) -> Vec<f32> {
+    /// What shadows read of the rays' suns: as of any sun, with noise, and of some rays nothing, as where there is no sun; and as they are.
+    fn sun_codes(&self, light: &[u32], step: u64) -> [Vec<f32>; 2] {
         let (noise, rng) = (self.rng(NOISE, step), self.rng(TAUGHT, step));
+        let exact = |l: &u32| sun_code(&self.model.suns.values[SUN * *l as usize..][..SUN]);
         let of_ray = |(r, l): (usize, &u32)| {
-            let mut code = sun_code(&self.model.suns.values[SUN * *l as usize..][..SUN]);
+            let mut code = exact(l);
             let is_read = code != [0.0; 9] && rng.uniform(r as u64) > UNREAD;
             (0..3).for_each(|i| code[i] = if is_read { code[i] + SUN_NOISE * noise.normal((3 * r + i) as u64) } else { 0.0 });
             code
         };
-        light.iter().enumerate().flat_map(of_ray).collect()
+        [light.iter().enumerate().flat_map(of_ray).collect(), light.iter().flat_map(exact).collect()]
     }
 
     /// One step of the light's stage.
@@ -208,9 +210,9 @@ impl Trainer<'_> {
             traced: (!is_apart).then_some(TracedLight { suns: &taught.suns, skies: &taught.skies, visibility, origins }),
             out: Mutex::default(),
         };
-        let of_suns = if is_apart { self.sun_codes(&drawn.light, step) } else { Vec::new() };
-        let codes = [if is_apart { &of_suns[..] } else { &taught.codes }];
-        let background = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0].repeat(n);
+        let of_suns = if is_apart { self.sun_codes(&drawn.light, step) } else { [Vec::new(), Vec::new()] };
+        let codes = if is_apart { vec![&of_suns[0][..], &of_suns[1]] } else { vec![&taught.codes[..]] };
+        let background = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0][..self.model.field.channels()].repeat(n);
         let given = given(&self.batch, &drawn.light, &background, &codes);
         let described = self.described(step - self.model.began, share, given, Loss::Batch(&loss));
         let (field, occupancy) = (&mut self.model.field, Some(&mut self.model.occupancy));
