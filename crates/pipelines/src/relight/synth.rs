@@ -33,6 +33,8 @@ const OUTLIERS: f64 = 0.1;
 const MOST_SCALE: u32 = 8;
 /// Bounces of light.
 const BOUNCES: u32 = 6;
+/// How many times the samples of the others held-out views have: their noise would count as errors of what is measured.
+const HELD_OUT_SAMPLES: u32 = 4;
 /// Every so many views, one is held out.
 const HOLD_OUT: usize = 5;
 
@@ -256,7 +258,8 @@ pub fn generate(
                 light_layers: true,
                 ..Settings::default()
             };
-            cpu::render(&scene, &view, &settings, options.samples, &mut film);
+            let samples = options.samples * if *is_held_out { HELD_OUT_SAMPLES } else { 1 };
+            cpu::render(&scene, &view, &settings, samples, &mut film);
             denoise::cpu::run(&mut film);
             let name = format!("v{v:03}_{}", LIGHTS[lights[l]].0);
             save_photograph(&out.join("images").join(format!("{name}.png")), &film)?;
