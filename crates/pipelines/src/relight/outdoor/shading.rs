@@ -316,6 +316,10 @@ impl SceneLoss<'_> {
         let (w, values, mut loss) = (self.weights, ray.values, 0.0);
         let d_values = &mut d.values[r * self.channels()..][..self.channels()];
         if let Some(l) = &ray.sunlit {
+            // Where no photograph has a sun, small things take nothing of one.
+            let off = values[LEFT] - 1.0;
+            loss += (share * w.shadow * off * off) as f64;
+            d_values[LEFT] += 2.0 * share * w.shadow * off;
             // Of what faces no sun, photographs tell nothing.
             if ray.opacity > SOLID && unhidden(l.sun, &ray.normal) != Vec3::ZERO {
                 let off = values[3] - (1.0 - ray.opacity * (1.0 - l.reach[0]));

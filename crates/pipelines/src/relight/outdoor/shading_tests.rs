@@ -194,14 +194,17 @@ fn what_is_left_of_any_sun_is_taught_by_those_of_training_where_rays_pass() {
     let (c, without) = (sunlit_case(), run(&sunlit_case()).1);
     assert!(c.opacity.iter().any(|o| *o > 0.5));
     for (visibility, most) in [(&*EMPTY, 1.0), (&*HALF, 0.5)] {
-        let d = run_with(&c, 0.3, visibility).1;
+        let (d, untaught) = (run_with(&c, 0.3, visibility).1, run_with(&c, 0.0, visibility).1);
         for (r, v) in c.values.chunks_exact(SUNLIT_CHANNELS).enumerate() {
             let (normal, sun) = (Vec3::from_slice(&c.normals[3 * r..]).normalize(), &c.suns[6 * LIGHTS[r] as usize..]);
             let passes = visibility.from_sun(Vec3::splat(0.5), normal, Vec3::from_slice(sun));
             assert!(passes <= most);
             let passes = if c.opacity[r] > 0.5 { passes } else { 0.0 };
             let want = 2.0 * 0.3 * passes * (v[LEFT] - v[3]) / RAYS as f32;
-            assert!((values(&d, LEFT)[r] - want).abs() < 1e-3, "{r}: {} {want}", values(&d, LEFT)[r]);
+            let got = values(&d, LEFT)[r] - values(&untaught, LEFT)[r];
+            assert!((got - want).abs() < 1e-3, "{r}: {got} {want}");
+            let alone = 2.0 * 0.2 * (v[LEFT] - 1.0) / RAYS as f32;
+            assert!((values(&untaught, LEFT)[r] - alone).abs() < 1e-5, "without suns, all is left");
         }
     }
     assert_eq!(values(&run_with(&c, 0.3, &EMPTY).1, 3), values(&without, 3), "it teaches what it is taught by");
