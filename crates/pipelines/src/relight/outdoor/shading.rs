@@ -48,7 +48,7 @@ pub struct Weights {
     pub huber: f32,
     /// Error beyond which a pixel counts less (Geman–McClure), in sRGB; 0: all count alike.
     pub robust: f32,
-    /// Deviation of the shadow from 1; with suns apart, from the traced one.
+    /// Deviation of the shadow from 1; with suns apart, from the traced one, and of what is left of any sun from all.
     pub shadow: f32,
     /// Deviation of the shadow from the traced one; with suns apart, of what is left of any sun from what is of those of training.
     pub traced: f32,
@@ -256,7 +256,7 @@ impl SceneLoss<'_> {
         let normal = self.normal(r, out);
         let hit = surface(&normal, (out.opacity[r], out.depth[r]), &t.origins[at.clone()], &self.dirs[at])?;
         let lit = irradiance(sky, &sh_light::basis(DVec3::from(normal.map(f64::from))));
-        Some(arriving(sun, reach(t.visibility, sun, hit), &normal, lit, BOUNCED * level(sun, sky)))
+        Some(arriving(sun, reach(t.visibility, sun, hit, &t.visibility.corners(hit.0, hit.1)), &normal, lit, BOUNCED * level(sun, sky)))
     }
 
     /// One ray: its loss; adds gradients. `share` is its part of the sum. Returns the loss, the squared error and the largest error.

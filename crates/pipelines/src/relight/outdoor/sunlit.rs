@@ -1,7 +1,7 @@
 //! Light of a sun, and of all that is around, at what a ray shows.
 
 use super::sun::{SUN, gray};
-use super::visibility::{Ambient, Visibility, of_normal};
+use super::visibility::{Ambient, Corners, Visibility, of_normal};
 use diorama_geom::glam::Vec3;
 use diorama_geom::sh_light;
 
@@ -32,10 +32,10 @@ pub(super) fn surface(normal: &[f32], (opacity, depth): (f32, f32), origin: &[f3
 }
 
 /// Shares of a sun's and the sky's light that reach a surface, `[sun, sky]`.
-pub(super) fn reach(visibility: &Visibility, sun: &[f32], (point, normal): (Vec3, Vec3)) -> [f32; 2] {
+pub(super) fn reach(visibility: &Visibility, sun: &[f32], (point, normal): (Vec3, Vec3), corners: &Corners) -> [f32; 2] {
     let toward = Vec3::from_slice(sun);
     let direct = if normal.dot(toward) > 0.0 { visibility.from_sun(point, normal, toward) } else { 1.0 };
-    [direct, visibility.from_sky(&visibility.corners(point, normal), normal)]
+    [direct, visibility.from_sky(corners, normal)]
 }
 
 /// The light of a sun, perhaps more suns after it, and what is around at what a ray shows; `sky` `[9, 3]` is that of the light, and the flag
@@ -58,7 +58,7 @@ pub fn sunlit<'a>(
                 arrives * Vec3::from_slice(&lamp[3..])
             };
             let of_lamps = lamps.chunks_exact(SUN).map(from_lamp).sum();
-            Sunlit { sun, reach: reach(visibility, sun, at), is_learned, ambient: ambient.around(&corners, sky), of_lamps }
+            Sunlit { sun, reach: reach(visibility, sun, at, &corners), is_learned, ambient: ambient.around(&corners, sky), of_lamps }
         }
     }
 }
