@@ -75,6 +75,9 @@ static std::string translated(const std::string &source, std::string &entry) {
         out += m[4].str() + " = cuda_on_cpu::atomic_" + m[1].str() + "((" + type + " *)(" + m[5].str() + "), (" + type + ")(" + m[6].str() + ")" + third + ")";
     }
     out.append(at, s.cend());
+    // Two numbers at once are two numbers one after the other.
+    std::regex pair(R"(asm volatile\s*\(\s*"atom\.relaxed\.add\.v2\.f32 \{%0, %1\}, \[%2\], \{%3, %4\};"\s*:\s*"=f"\(([^()]*)\),\s*"=f"\(([^()]*)\)\s*:\s*"l"\(([^()]*)\),\s*"f"\(([^()]*)\),\s*"f"\(([^()]*)\)\s*\))");
+    out = std::regex_replace(out, pair, "$1 = cuda_on_cpu::atomic_add((float *)($3), (float)($4)); $2 = cuda_on_cpu::atomic_add((float *)($3) + 1, (float)($5))");
     std::regex global(R"(__global__\s+void\s+(?:__launch_bounds__\s*\([^)]*\)\s*)?(\w+)\s*\()");
     std::smatch m;
     if (std::regex_search(out, m, global)) entry = m[1];

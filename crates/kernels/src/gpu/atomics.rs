@@ -2,6 +2,9 @@
 
 use cubecl::prelude::*;
 
+/// Two adjacent numbers, which some devices add at once.
+pub type Pair = Vector<f32, Const<2>>;
+
 /// A cell that f32 can be added to.
 #[cube]
 pub trait Accumulate: 'static + Send + Sync {

@@ -47,6 +47,17 @@ impl<T> Buffer<T> {
         self.len == 0
     }
 
+    /// The last number, in the same memory.
+    ///
+    /// # Panics
+    /// When there is none.
+    pub fn last(&self) -> Buffer<T> {
+        let before = self.len.checked_sub(1).expect("a number") * size_of::<T>();
+        let after = self.handle.size_in_used() - (before + size_of::<T>()) as u64;
+        let handle = self.handle.clone().offset_start(before as u64).offset_end(after);
+        Buffer { handle, len: 1, element: PhantomData }
+    }
+
     /// The same bits as numbers of another type, as many as the memory of these holds.
     pub fn cast<U>(&self) -> Buffer<U> {
         Buffer { handle: self.handle.clone(), len: self.len * size_of::<T>() / size_of::<U>(), element: PhantomData }

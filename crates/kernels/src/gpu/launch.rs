@@ -1,6 +1,6 @@
 //! The one place where kernels are launched: [`launch!`](crate::gpu::launch).
 
-use super::{Buffer, CUBE};
+use super::{Buffer, CUBE, Pair};
 use cubecl::prelude::*;
 
 /// Most cubes along one axis that every API allows.
@@ -38,6 +38,9 @@ impl Binds<&'static [Atomic<f32>]> for Buffer<f32> {}
 /// [`crate::gpu::Swap`] exchanges bits.
 impl Binds<&'static [Atomic<u32>]> for Buffer<f32> {}
 impl Binds<&'static [Atomic<u32>]> for Buffer<u32> {}
+impl Binds<&'static [Pair]> for Buffer<[f32; 2]> {}
+impl Binds<&'static mut [Pair]> for Buffer<[f32; 2]> {}
+impl Binds<&'static [Atomic<Pair>]> for Buffer<[f32; 2]> {}
 
 /// Stand-in for a bound buffer in code that the compiler checks and nobody runs.
 pub(crate) fn stand_in<T, P>(_: &Buffer<T>) -> P

@@ -9,7 +9,7 @@ pub(crate) mod table;
 pub(crate) mod vector;
 
 use crate::api::Api;
-pub use atomics::{Accumulate, Native, Swap};
+pub use atomics::{Accumulate, Native, Pair, Swap};
 pub use buffer::{Buffer, Rows};
 use cubecl::client::Client;
 use cubecl::device::{WgpuBackend, WgpuDevice, WgpuDeviceKind};
@@ -50,6 +50,8 @@ pub struct Gpu {
     pub(crate) client: Client,
     /// Whether the device adds f32 atomically; without it kernels use exchanges ([`Swap`]).
     pub(crate) native_atomics: bool,
+    /// Whether the device adds pairs of f32 atomically.
+    pair_atomics: bool,
     /// Whether kernels use memory shared by a cube. Mesa's software Vulkan before 23 crashes on it as SPIR-V
     /// declares it, and gains nothing from it.
     pub(crate) shared: bool,
@@ -84,13 +86,18 @@ impl Gpu {
     }
 
     fn with(api: Api, device: cubecl::Device, software: bool, client: Client) -> Gpu {
-        let add = Type::atomic(f32::elem_type_native().with_vector_size(1));
-        let native_atomics = client.properties().atomic_type_usage(add).contains(AtomicUsage::Add);
+        let adds = |width: usize| {
+            let cell = Type::atomic(f32::elem_type_native().with_vector_size(width));
+            client.properties().atomic_type_usage(cell).contains(AtomicUsage::Add)
+        };
+        let native_atomics = adds(1);
         let name = client.properties().identity.name.clone();
+        // The emulation has them without the other properties of compute capability 9.0, which CubeCL concludes them from.
+        let pair_atomics = adds(2) || name == CUDA_ON_CPU;
         let software = software || name == CUDA_ON_CPU;
         // A build with Vulkan speaks SPIR-V to it under any name.
         let spirv = api == Api::Vulkan || (api == Api::WebGpu && Api::Vulkan.is_built());
-        Gpu { shared: !(software && spirv), api, name, software, device, client, native_atomics }
+        Gpu { shared: !(software && spirv), api, name, software, device, client, native_atomics, pair_atomics }
     }
 
     /// A device that another library has opened.
@@ -125,7 +132,17 @@ impl Gpu {
 
     /// The same device adding without native f32 atomics.
     pub fn without_native_atomics(&self) -> Gpu {
-        Gpu { native_atomics: false, ..self.clone() }
+        Gpu { native_atomics: false, pair_atomics: false, ..self.clone() }
+    }
+
+    /// The same device adding pairs of f32 number by number.
+    pub fn without_pair_atomics(&self) -> Gpu {
+        Gpu { pair_atomics: false, ..self.clone() }
+    }
+
+    /// Whether kernels add pairs of f32 at once.
+    pub fn has_pair_atomics(&self) -> bool {
+        self.pair_atomics
     }
 
     pub fn has_native_atomics(&self) -> bool {
@@ -187,6 +204,16 @@ impl Gpu {
     pub fn read<T: CubeElement>(&self, buffer: &Buffer<T>) -> Result<Vec<T>, GpuError> {
         let bytes = self.client.read_one(buffer.memory()).map_err(|e| self.lost(&e))?;
         Ok(T::from_bytes(&bytes)[..buffer.len()].to_vec())
+    }
+
+    /// Waits for the device once and downloads several buffers.
+    ///
+    /// # Errors
+    /// As [`Gpu::read`].
+    pub fn read_together<const N: usize>(&self, buffers: [&Buffer; N]) -> Result<[Vec<f32>; N], GpuError> {
+        let memory = buffers.iter().map(|b| b.memory()).collect();
+        let bytes = self.client.read(memory).map_err(|e| self.lost(&e))?;
+        Ok(std::array::from_fn(|i| f32::from_bytes(&bytes[i])[..buffers[i].len()].to_vec()))
     }
 
     /// Waits until all work is done.

@@ -90,7 +90,7 @@ fn compare_bits(got: &[u32], want: &[u32]) -> Result<f64, String> {
 pub(crate) fn adders(gpu: &Gpu) -> Vec<(&'static str, Gpu)> {
     let mut all = Vec::new();
     if gpu.has_native_atomics() {
-        all.push(("d table, native", gpu.clone()));
+        all.push(("d table, native", gpu.without_pair_atomics()));
     }
     if !gpu.has_native_atomics() || gpu.api == Api::WebGpu {
         all.push(("d table, exchanged", gpu.without_native_atomics()));

@@ -53,7 +53,8 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         let jacobian = reference::jacobian(&c.grid, &pw, &tw);
         table.close("hash grid", "jacobian", &shape, &on_gpu.jacobian(gpu, &rows, &p, &t), &jacobian)?;
         let djt = reference::jacobian_backward(&c.grid, &pw, &wide(&c.d_jacobian));
-        for (name, adder) in adders(gpu) {
+        let pairs = (c.grid.config.features == 2 && gpu.has_pair_atomics()).then(|| ("d table, pairs", gpu.clone()));
+        for (name, adder) in pairs.into_iter().chain(adders(gpu)) {
             let (sum, sum_j) = (gpu.zeros(c.grid.params_len()), gpu.zeros(c.grid.params_len()));
             on_gpu.backward(&adder, &rows, &p, &d, &sum);
             table.close("hash grid", name, &shape, &sum, &dt)?;

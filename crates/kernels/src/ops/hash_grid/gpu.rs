@@ -1,7 +1,8 @@
-//! One unit per level and point; the table's gradient is added atomically.
+//! One unit per level and point; the table's gradient is added atomically. A row of two features is read as
+//! one pair, and added to as one where the device can.
 
 use super::HashGrid;
-use crate::gpu::{Accumulate, Buffer, Gpu, Rows, launch};
+use crate::gpu::{Accumulate, Buffer, Gpu, Pair, Rows, launch};
 use cubecl::prelude::*;
 
 /// Numbers per level in the kernels' description: cells, whether dense, first row, rows.
@@ -30,6 +31,25 @@ impl GpuHashGrid {
     pub fn forward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, table: &Buffer) -> Buffer {
         let ((s, n), f) = (self.work(points), self.grid.config.features);
         let out = gpu.empty(n * f);
+        if f == 2 {
+            let (pairs, of): (Buffer<[f32; 2]>, Buffer<[f32; 2]>) = (out.cast(), table.cast());
+            launch!(
+                gpu,
+                encode_pairs,
+                n,
+                [
+                    rows.live => rows.at + 1,
+                    points => s * 3,
+                    self.levels => self.grid.levels.len() * LEVEL,
+                    of => self.grid.params_len() / 2,
+                    pairs => n,
+                ],
+                rows.place(),
+                s as u32,
+                n as u32,
+            );
+            return out;
+        }
         launch!(
             gpu,
             encode,
@@ -52,6 +72,25 @@ impl GpuHashGrid {
     /// Adds to the gradient of the table.
     pub fn backward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, d_out: &Buffer, d_table: &Buffer) {
         let ((s, n), f) = (self.work(points), self.grid.config.features);
+        if f == 2 && gpu.has_pair_atomics() {
+            let (d_out, d_table): (Buffer<[f32; 2]>, Buffer<[f32; 2]>) = (d_out.cast(), d_table.cast());
+            launch!(
+                gpu,
+                scatter_pairs,
+                n,
+                [
+                    rows.live => rows.at + 1,
+                    points => s * 3,
+                    self.levels => self.grid.levels.len() * LEVEL,
+                    d_out => n,
+                    d_table => self.grid.params_len() / 2,
+                ],
+                rows.place(),
+                s as u32,
+                n as u32,
+            );
+            return;
+        }
         launch!(
             gpu,
             scatter::<Adder>,
@@ -243,6 +282,39 @@ fn encode(live: &[u32], points: &[f32], levels: &[u32], table: &[f32], out: &mut
     #[unroll]
     for k in 0..f {
         out[unit * f + k] = sum[k];
+    }
+}
+
+/// [`encode`] of two features.
+#[cube(launch_unchecked)]
+fn encode_pairs(live: &[u32], points: &[f32], levels: &[u32], table: &[Pair], out: &mut [Pair], at: u32, s: u32, n: u32) {
+    let unit = ABSOLUTE_POS;
+    if unit >= n as usize || unit % s as usize >= live[at as usize] as usize {
+        terminate!();
+    }
+    let place = place(points, levels, unit / s as usize, unit % s as usize);
+    let mut sum = Pair::new(0.0f32);
+    #[unroll]
+    for c in 0..8u32 {
+        let corner = corner(&place, levels, c, 1usize);
+        sum += Pair::new(corner.weight) * table[corner.row];
+    }
+    out[unit] = sum;
+}
+
+/// [`scatter`] of two features.
+#[cube(launch_unchecked)]
+fn scatter_pairs(live: &[u32], points: &[f32], levels: &[u32], d_out: &[Pair], d_table: &[Atomic<Pair>], at: u32, s: u32, n: u32) {
+    let unit = ABSOLUTE_POS;
+    if unit >= n as usize || unit % s as usize >= live[at as usize] as usize {
+        terminate!();
+    }
+    let place = place(points, levels, unit / s as usize, unit % s as usize);
+    let d = d_out[unit];
+    #[unroll]
+    for c in 0..8u32 {
+        let corner = corner(&place, levels, c, 1usize);
+        d_table[corner.row].fetch_add(Pair::new(corner.weight) * d);
     }
 }
 
