@@ -25,7 +25,7 @@ use state::{BatchLaunch, PATH, accumulate};
 use steps::{arrive, ask_layers, follow, scatter};
 
 /// Paths in flight: on a hardware GPU, and on a software device.
-const PATHS: [usize; 2] = [1 << 19, 1 << 15];
+const PATHS: [usize; 2] = [1 << 21, 1 << 15];
 
 /// A scene on a device.
 pub struct GpuScene {
@@ -92,7 +92,8 @@ fn put(gpu: &Gpu, words: &[u32], what: &str) -> Result<Buffer<u32>, GpuError> {
 /// # Panics
 /// When film and camera differ in size.
 pub fn render(gpu: &Gpu, scene: &GpuScene, view: &View, settings: &Settings, samples: u32, film: &mut Film) -> Result<(), GpuError> {
-    let paths = PATHS[gpu.software as usize];
+    let most = gpu.largest_buffer() as usize / (size_of::<u32>() * PATH);
+    let paths = PATHS[gpu.software as usize].min(most.max(1));
     render_batches(gpu, scene, view, settings, samples, film, paths)
 }
 
