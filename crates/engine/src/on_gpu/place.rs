@@ -36,8 +36,6 @@ pub struct PlaceOn<'a> {
     pub first: u64,
     /// Samples that there is memory for, before and after [`Placement::Occupancy`] drops those that cannot matter.
     pub room: (usize, usize),
-    /// Whether rays that lose samples for want of room make the result `None`.
-    pub all_or_none: bool,
 }
 
 /// Samples on the device, encoded.
@@ -46,7 +44,7 @@ pub struct GpuSamples {
     /// In the field's space, `[S, 3]`.
     pub points: Buffer,
     pub features: Buffer,
-    /// Offsets of all samples that were marched, `[R + 1]`.
+    /// Offsets of all samples that were marched, had there been room for them, `[R + 1]`.
     pub marched: Buffer<u32>,
     /// Where an occupancy grid placed them.
     pub march: Option<MarchTrace>,
@@ -76,13 +74,10 @@ pub fn place(
     placement: &Placement,
     on: &PlaceOn,
     coarse: &mut dyn FnMut(&GpuPacked) -> Result<Buffer, GpuError>,
-) -> Result<Option<GpuSamples>, GpuError> {
+) -> Result<GpuSamples, GpuError> {
     let packed = match placement {
         Placement::Occupancy { march: config, pruning } => {
             let marched = march::march(gpu, on.grid.expect("an occupancy grid"), on.rays, config, on.room.0);
-            if on.all_or_none && gpu.read(&marched.cut)?.contains(&1) {
-                return Ok(None);
-            }
             // All samples in occupied cells: their densities decide which stay.
             let (points, features) = on.field.encode(gpu, on.rays, &marched.packed);
             let (net, rows) = (&on.field.shape.net, marched.packed.rows());
@@ -90,8 +85,8 @@ pub fn place(
             let pruned = prune::prune(gpu, &marched.packed, &sigma, pruning, &marched.cut, on.room.1);
             let (points, features) = (pruned.take(gpu, &points, 3), net.take(gpu, &pruned, &features));
             let march = MarchTrace { cut: marched.cut, light: pruned.light, rows, cells: marched.cells, sigma };
-            let marched = marched.packed.offsets;
-            return Ok(Some(GpuSamples { packed: pruned.packed, points, features, marched, march: Some(march) }));
+            let marched = marched.whole;
+            return Ok(GpuSamples { packed: pruned.packed, points, features, marched, march: Some(march) });
         }
         Placement::Stratified { samples, noise } => strata::stratified(gpu, &on.rays.near_far, *samples, noise.map(|rng| (rng, on.first))),
         Placement::Hierarchical { samples, more, noise } => {
@@ -101,5 +96,5 @@ pub fn place(
         }
     };
     let (points, features) = on.field.encode(gpu, on.rays, &packed);
-    Ok(Some(GpuSamples { marched: packed.offsets.clone(), packed, points, features, march: None }))
+    Ok(GpuSamples { marched: packed.offsets.clone(), packed, points, features, march: None })
 }

@@ -12,12 +12,23 @@ use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::{GpuComposited, GpuPacked};
 use diorama_kernels::ops::field_step::gpu::{self as field, FieldInput};
 use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays};
+use std::sync::atomic::AtomicU32;
+use std::sync::atomic::Ordering::Relaxed;
 
-/// Samples per call: on a GPU, and where the CPU plays one.
-const ROOM: usize = 1 << 20;
+/// Samples per part: on a GPU, and where the CPU plays one.
+const ROOM: usize = 1 << 21;
 const SOFTWARE_ROOM: usize = 1 << 17;
-/// Samples per call of networks that run layer by layer and keep the outputs of every layer.
+/// Samples per part of networks that run layer by layer and keep the outputs of every layer.
 const LAYERED_ROOM: usize = 1 << 16;
+/// Samples per part at least.
+const LEAST_ROOM: usize = 1 << 14;
+/// Numbers per sample in the widest matrix, which must lie in one piece of memory.
+const WIDTH: usize = 64;
+/// Samples of a ray, before any is known.
+const FIRST_GUESS: f32 = 64.0;
+/// Share of the room that a part is meant to fill, and share of what rays needed before that is expected of the next at least.
+const FILL: f32 = 0.8;
+const FORGET: f32 = 0.7;
 
 /// A trained field's parameters on the device.
 struct ViewField {
@@ -63,24 +74,28 @@ pub struct GpuTracer {
     field: ViewField,
     coarse: Option<ViewField>,
     occupancy: Option<GpuOccupancy>,
-    /// Samples per call.
+    /// Samples per part.
     room: usize,
+    /// Marched samples per ray that the next part is expected to need, as bits of f32.
+    per_ray: AtomicU32,
 }
 
 impl GpuTracer {
     pub fn new(gpu: Gpu, field: &Field, coarse: Option<&Field>, occupancy: Option<&Occupancy>) -> Self {
         let field = ViewField::upload(&gpu, field);
-        let all = if gpu.software { SOFTWARE_ROOM } else { ROOM };
+        let fitting = gpu.largest_buffer() as usize / (size_of::<f32>() * WIDTH);
+        let all = if gpu.software { SOFTWARE_ROOM } else { ROOM.min(fitting).max(LEAST_ROOM) };
         GpuTracer {
             coarse: coarse.map(|f| ViewField::upload(&gpu, f)),
             occupancy: occupancy.map(|o| GpuOccupancy::upload(&gpu, o.bits())),
             room: if field.shape.net.element().is_some() || occupancy.is_some() { all } else { LAYERED_ROOM },
+            per_ray: AtomicU32::new(FIRST_GUESS.to_bits()),
             field,
             gpu,
         }
     }
 
-    /// The same tracer with memory for `samples` samples per call.
+    /// The same tracer with memory for `samples` samples per part.
     #[must_use]
     pub fn with_room(self, samples: usize) -> Self {
         GpuTracer { room: samples, ..self }
@@ -125,15 +140,17 @@ impl GpuTracer {
         Ok(out)
     }
 
-    /// Rays `first..first + n` of a batch; halves are traced apart where their samples find no room together.
+    /// Rays `first..first + n` of a batch; how many samples were marched to, had there been room for them. Without room for all of them
+    /// the rays are not added to `out`, unless `last_resort`.
     fn part(
         &self,
         batch: &RayBatch,
         (first, n): (usize, usize),
+        (room, last_resort): (usize, bool),
         placement: &Placement,
         appearance: Option<u32>,
         out: &mut (Traced, Vec<f32>),
-    ) -> Result<(), GpuError> {
+    ) -> Result<usize, GpuError> {
         let gpu = &self.gpu;
         let of = |v: &[f32], width: usize| gpu.upload(&v[first * width..(first + n) * width]);
         let rays = GpuRays {
@@ -143,24 +160,50 @@ impl GpuTracer {
             jitter: of(&batch.jitter, 1),
             resumed: false,
         };
-        let (grid, room) = (self.occupancy.as_ref(), (self.room, self.room));
-        let on = PlaceOn { field: self.field.read(), grid, rays: &rays, first: 0, room, all_or_none: n > 1 };
+        let on = PlaceOn { field: self.field.read(), grid: self.occupancy.as_ref(), rays: &rays, first: 0, room: (room, room) };
         let mut weights = |packed: &GpuPacked| {
             let coarse = self.coarse.as_ref().expect("a coarse field");
             let (_, features) = coarse.read().encode(gpu, &rays, packed);
             Ok(coarse.shade(gpu, &rays, packed, &features, appearance).weights)
         };
-        let Some(samples) = place::place(gpu, placement, &on, &mut weights)? else {
-            self.part(batch, (first, n / 2), placement, appearance, out)?;
-            return self.part(batch, (first + n / 2, n - n / 2), placement, appearance, out);
-        };
+        let samples = place::place(gpu, placement, &on, &mut weights)?;
         let view = self.field.shade(gpu, &rays, &samples.packed, &samples.features, appearance);
-        if let Some(march) = &samples.march {
-            out.1.extend(gpu.read(&march.light)?);
+        let light = samples.march.map_or_else(|| gpu.empty(0), |m| m.light);
+        let [needed, light, rgb, opacity, depth] =
+            gpu.read_together([&samples.marched.last().cast(), &light, &view.color, &view.opacity, &view.depth])?;
+        let needed = needed[0].to_bits() as usize;
+        if needed <= room || last_resort {
+            out.1.extend(light);
+            out.0.rgb.extend(rgb);
+            out.0.opacity.extend(opacity);
+            out.0.depth.extend(depth);
         }
-        out.0.rgb.extend(gpu.read(&view.color)?);
-        out.0.opacity.extend(gpu.read(&view.opacity)?);
-        out.0.depth.extend(gpu.read(&view.depth)?);
+        Ok(needed)
+    }
+
+    /// Traces a batch in parts of as many rays as find room for their samples, judged by the parts before.
+    fn marched_parts(
+        &self,
+        batch: &RayBatch,
+        placement: &Placement,
+        appearance: Option<u32>,
+        out: &mut (Traced, Vec<f32>),
+    ) -> Result<(), GpuError> {
+        let mut first = 0;
+        while first < batch.len() {
+            let expected = f32::from_bits(self.per_ray.load(Relaxed));
+            let n = ((FILL * self.room as f32 / expected) as usize).clamp(1, batch.len() - first);
+            let room = ((n as f32 * expected / FILL) as usize).next_power_of_two().clamp(LEAST_ROOM.min(self.room), self.room);
+            let last_resort = n == 1 && room == self.room;
+            let needed = self.part(batch, (first, n), (room, last_resort), placement, appearance, out)?;
+            // Of a part that found no room it is known what that part needs.
+            let is_done = needed <= room || last_resort;
+            let floor = if is_done { FORGET * expected } else { 0.0 };
+            self.per_ray.store((needed as f32 / n as f32).max(floor).max(1.0).to_bits(), Relaxed);
+            if is_done {
+                first += n;
+            }
+        }
         Ok(())
     }
 }
@@ -172,16 +215,20 @@ fn unserved(e: GpuError) -> Unserved {
 impl Accelerator for GpuTracer {
     fn trace(&self, batch: &RayBatch, placement: &Placement, appearance: Option<u32>) -> Result<(Traced, Option<Vec<f32>>), Unserved> {
         let mut out = (Traced::default(), Vec::new());
-        let at_once = match placement {
-            Placement::Occupancy { .. } => batch.len(),
-            Placement::Stratified { samples, .. } => self.room / samples.max(&1),
-            Placement::Hierarchical { samples, more, .. } => self.room / (samples + more).max(1),
+        let per_ray = match placement {
+            Placement::Occupancy { .. } => {
+                self.marched_parts(batch, placement, appearance, &mut out).map_err(unserved)?;
+                return Ok((out.0, Some(out.1)));
+            }
+            Placement::Stratified { samples, .. } => *samples,
+            Placement::Hierarchical { samples, more, .. } => samples + more,
         };
-        for first in (0..batch.len()).step_by(at_once.max(1)) {
-            let n = at_once.max(1).min(batch.len() - first);
-            self.part(batch, (first, n), placement, appearance, &mut out).map_err(unserved)?;
+        let at_once = (self.room / per_ray.max(1)).max(1);
+        for first in (0..batch.len()).step_by(at_once) {
+            let n = at_once.min(batch.len() - first);
+            self.part(batch, (first, n), (self.room, true), placement, appearance, &mut out).map_err(unserved)?;
         }
-        Ok((out.0, matches!(placement, Placement::Occupancy { .. }).then_some(out.1)))
+        Ok((out.0, None))
     }
 
     fn density(&self, model: &[f32]) -> Result<Vec<f32>, Unserved> {

@@ -177,7 +177,8 @@ impl GpuField {
                 let terms = (terms, self.shape.measure);
                 let (rgba, distance) = (&r.drawn.target, &r.drawn.distance);
                 let target = Target { rgba, background, left_out: pass.left_out, distance };
-                let figures = loss::Figures { sums, marched: &on.marched, is_main: pass.is_main };
+                let cut = on.march.as_ref().map_or_else(|| gpu.zeros(packed.rays()), |m| m.cut.clone());
+                let figures = loss::Figures { sums, marched: &on.marched, cut: &cut, is_main: pass.is_main };
                 if !pass.wants_weights {
                     let out = net.evaluate(gpu, weights, &input, true);
                     let (d, errors) =
@@ -316,6 +317,8 @@ impl GpuTrainer {
             let (trained, marched) = (last(&samples.offsets)?, last(&marched)?);
             let f = &mut self.on_host;
             (f.steps, f.loss, f.trained, f.marched) = (f.steps + 1, f.loss + loss, f.trained + trained, f.marched + marched);
+            // A batch loss counts rays that were cut.
+            f.whole += s.rays.count() as u64;
         }
         self.on_host.rays += s.rays.count() as u64;
         if let (Some((group, activation)), Some((all_rays, codes, rgb))) = (self.learned.as_ref().filter(|l| !l.0.frozen), &backdrop) {
@@ -375,14 +378,7 @@ impl GpuTrainer {
     fn place(&self, s: &Step, r: &Rays) -> Result<(GpuPacked, Buffer<u32>, Learned), GpuError> {
         let at = Executor { gpu: &self.gpu, step: s, sums: &self.sums };
         let grid = self.occupancy.as_ref();
-        let on = PlaceOn {
-            field: self.field.read(),
-            grid: grid.map(|g| &g.bits),
-            rays: &r.rays,
-            first: s.first,
-            room: s.room,
-            all_or_none: false,
-        };
+        let on = PlaceOn { field: self.field.read(), grid: grid.map(|g| &g.bits), rays: &r.rays, first: s.first, room: s.room };
         let mut coarse_loss = None;
         let mut train_coarse = |packed: &GpuPacked| {
             let field = self.coarse.as_ref().expect("a coarse field");
@@ -393,7 +389,7 @@ impl GpuTrainer {
             coarse_loss = learned.loss;
             Ok(learned.weights.expect("weights were asked for"))
         };
-        let samples = place::place(at.gpu, &s.placement, &on, &mut train_coarse)?.expect("rays without room are left out");
+        let samples = place::place(at.gpu, &s.placement, &on, &mut train_coarse)?;
         let left_out = match (&samples.march, grid) {
             (Some(m), Some(grid)) => {
                 grid.record(at.gpu, &m.rows, &m.cells, &m.sigma);
@@ -426,10 +422,16 @@ impl GpuTrainer {
         let sums = std::mem::replace(&mut self.sums, self.gpu.zeros(SUMS));
         let sums: Vec<f64> = self.gpu.read(&sums)?.iter().map(|v| *v as f64).collect();
         let other = std::mem::take(&mut self.on_host);
-        let steps = sums[4] as u64 + other.steps;
-        let mse = if sums[4] > 0.0 { sums[1] / sums[4] } else { f64::NAN };
-        let loss = (sums[0] + other.loss) / steps.max(1) as f64;
-        Ok(Figures { steps, rays: other.rays, loss, mse, trained: sums[2] + other.trained, marched: sums[3] + other.marched })
+        let steps = sums[5] as u64 + other.steps;
+        Ok(Figures {
+            steps,
+            rays: other.rays,
+            whole: sums[4] as u64 + other.whole,
+            loss: (sums[0] + other.loss) / steps.max(1) as f64,
+            mse: if sums[5] > 0.0 { sums[1] / sums[5] } else { f64::NAN },
+            trained: sums[2] + other.trained,
+            marched: sums[3] + other.marched,
+        })
     }
 
     /// Brings parameters, moments, occupancy and errors back.

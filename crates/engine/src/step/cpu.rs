@@ -88,7 +88,8 @@ impl CpuTrainer {
             }
             Loss::Batch(_) => f64::NAN,
         };
-        let figures = Figures { steps: 1, rays: self.batch.len() as u64, loss, mse, trained: trained as f64, marched: marched as f64 };
+        let (rays, trained, marched) = (self.batch.len() as u64, trained as f64, marched as f64);
+        let figures = Figures { steps: 1, rays, whole: rays, loss, mse, trained, marched };
         if !loss.is_finite() {
             return figures;
         }

@@ -203,12 +203,15 @@ impl<'a> Trainees<'a> {
 pub struct Figures {
     pub steps: u64,
     pub rays: u64,
+    /// Rays that did not lose samples for want of room; all on the CPU.
+    pub whole: u64,
     /// Means over the steps.
     pub loss: f64,
     /// Squared color error of the rays; not a number with a [`BatchLoss`].
     pub mse: f64,
-    /// Samples trained and marched, all steps together.
+    /// Samples of whole rays that were trained on, all steps together.
     pub trained: f64,
+    /// Samples that were marched to, those that found no room among them.
     pub marched: f64,
 }
 

@@ -183,7 +183,7 @@ fn rays(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let target = Target { rgba: &target, background: &background, left_out: &left_out, distance: &distance };
     let terms = Terms { color: ColorLoss::Mse, distortion: 0.0, depth: 0.0, alpha: 0.0 };
     t.row("composite, loss and backward", "3 channels, 32 samples per ray", ("sample", s), 0.0, 64.0, || {
-        let figures = Figures { sums: &sums, marched: &p.offsets, is_main: true };
+        let figures = Figures { sums: &sums, marched: &p.offsets, cut: &left_out, is_main: true };
         loss::composite_and_loss(gpu, (terms, Measure::default()), &p, (&sigma, &rgb), target, 0.0, figures);
     })
 }

@@ -184,15 +184,15 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
     }
     trainer.settle()?;
     trainer.device.stages().into_iter().for_each(|s| *s = Stages::default());
-    let before = (trainer.model.rays, trainer.model.samples, trainer.marched);
+    let before = (trainer.model.rays, trainer.whole, trainer.model.samples, trainer.marched);
     let begin = Instant::now();
     for step in warmup..warmup + steps {
         trainer.step(step, 0.0)?;
     }
     trainer.settle()?;
     let seconds = begin.elapsed().as_secs_f64();
-    let marched = trainer.marched - before.2;
-    let (rays, trained) = ((trainer.model.rays - before.0) as f64, (trainer.model.samples - before.1) as f64);
+    let (rays, whole) = ((trainer.model.rays - before.0) as f64, (trainer.whole - before.1) as f64);
+    let (trained, marched) = ((trainer.model.samples - before.2) as f64, trainer.marched - before.3);
     let stages = trainer.device.stages().map(|s| s.seconds.clone()).unwrap_or_default();
     let total: f64 = stages.iter().map(|s| s.1).sum();
     Ok(TrainReport {
@@ -201,11 +201,11 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
         device: trainer.device.name(),
         steps,
         seconds,
-        rays_per_s: rays / seconds,
+        rays_per_s: whole / seconds,
         marched_per_s: marched as f64 / seconds,
         trained_per_s: trained / seconds,
         marched_per_ray: marched as f64 / rays,
-        trained_per_ray: trained / rays,
+        trained_per_ray: trained / whole,
         occupied: trainer.model.occupancy.as_ref().map(|o| o.bits().fill()),
         stages: stages.iter().map(|s| StageFigure { stage: s.0, share: s.1 / total, ms: s.1 * 1e3 / steps as f64 }).collect(),
     })

@@ -40,6 +40,9 @@ const MARCH_RAMP: (f32, u64) = (16.0, 1024);
 /// Room for marched and for trained samples on a GPU, in wanted samples per step.
 const ROOM: (usize, usize) = (6, 2);
 
+/// Share of the room for marched samples that rays are meant to fill.
+const FILL: f64 = 0.9;
+
 /// Most steps between which a GPU is not asked how they went.
 const UNASKED: u64 = 16;
 
@@ -65,6 +68,10 @@ pub(super) struct Trainer<'a> {
     pub view: Option<&'a RunView>,
     /// Samples before any were left out.
     pub marched: u64,
+    /// Rays that did not lose samples for want of room.
+    pub whole: u64,
+    /// Samples per ray that a device marched to when it was asked last, without regard to room; 0: not asked yet.
+    marched_per_ray: f64,
     /// Rays that were trained on before this part of the run.
     began: u64,
     checkpoints: &'a Path,
@@ -91,6 +98,8 @@ impl<'a> Trainer<'a> {
             view: None,
             began: 0,
             marched: 0,
+            whole: 0,
+            marched_per_ray: 0.0,
             checkpoints,
             recovered: false,
             setback: None,
@@ -102,6 +111,7 @@ impl<'a> Trainer<'a> {
 
     /// Uploads the model to the device.
     fn begin(&mut self) -> Result<()> {
+        self.marched_per_ray = 0.0;
         let scene = self.model.scene();
         let pictures = Pictures { photographs: &self.photographs, observations: &self.observations };
         self.device.begin(&self.model.trainees(), scene, Some(pictures))
@@ -134,11 +144,19 @@ impl<'a> Trainer<'a> {
         let before = m.samples;
         m.samples += f.trained as u64;
         self.marched += f.marched as u64;
+        self.whole += f.whole;
+        if self.device.is_gpu() && f.rays > 0 {
+            self.marched_per_ray = f.marched / f.rays as f64;
+        }
         // Without an occupancy grid, each ray has as many samples as the configuration says.
         if m.occupancy.is_none() && !self.device.is_gpu() {
             return;
         }
-        let per_ray = f.trained / f.rays as f64;
+        // Rays that were cut for want of room say nothing of what a ray needs.
+        if f.whole == 0 {
+            return;
+        }
+        let per_ray = f.trained / f.whole as f64;
         match before {
             0 => m.samples_per_ray = per_ray,
             _ => (0..f.steps).for_each(|_| m.samples_per_ray = 0.9 * m.samples_per_ray + 0.1 * per_ray),
@@ -146,7 +164,7 @@ impl<'a> Trainer<'a> {
     }
 
     /// As many rays as give about the wanted number of samples, fewer while coarse steps in quick succession
-    /// teach more.
+    /// teach more, and no more than a device has room for.
     fn rays(&self, step: u64) -> usize {
         let s = &self.model.config.sampling;
         if s.rays > 0 {
@@ -155,7 +173,8 @@ impl<'a> Trainer<'a> {
         let (from, until) = BATCH_RAMP;
         let grown = step.saturating_sub(from) as f64 / (until - from) as f64;
         let n = self.batch_samples() as f64 * (0.25 + 0.75 * grown.min(1.0)) / self.model.samples_per_ray.max(1.0);
-        (n as usize).clamp(64, self.device.most_rays()).next_multiple_of(64)
+        let fitting = fitting(self.batch_samples() * ROOM.0, self.marched_per_ray);
+        (n as usize).min(fitting).clamp(64, self.device.most_rays()).next_multiple_of(64)
     }
 
     fn batch_samples(&self) -> usize {
@@ -252,12 +271,14 @@ impl Trainee for Trainer<'_> {
             done.counted.iter().for_each(|f| self.count(f));
         }
         let m = &self.model;
+        let whole = if f.rays > 0 { f.whole as f64 / f.rays as f64 } else { 1.0 };
         let scalars = Scalars::from([
             Scalar::new("mse", f.mse).logged_only(),
             Scalar::psnr("psnr", f.mse),
             Scalar::count("rays", m.rays),
             Scalar::count("samples", m.samples),
-            Scalar::rate("rays_per_s", rays as f64),
+            // Only rays that were trained on.
+            Scalar::rate("rays_per_s", rays as f64 * whole),
         ]);
         Ok(StepReport { loss: f.loss, scalars })
     }
@@ -325,8 +346,28 @@ impl Trainee for Trainer<'_> {
     }
 }
 
+/// Rays whose marched samples find room, at so many per ray; 0: not known.
+fn fitting(room: usize, marched_per_ray: f64) -> usize {
+    if marched_per_ray > 0.0 { (FILL * room as f64 / marched_per_ray) as usize } else { usize::MAX }
+}
+
 /// How much longer a march's steps are at a training step.
 fn stretch(step: u64) -> f32 {
     let (most, until) = MARCH_RAMP;
     most.powf(1.0 - step.min(until) as f32 / until as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rays_fill_no_more_than_the_room_for_marched_samples() {
+        let room = (1 << 18) * ROOM.0;
+        assert_eq!(fitting(room, 0.0), usize::MAX, "nothing is known before the first step");
+        for needed in [0.3, 12.0, 150.0, 4096.0] {
+            let marched = fitting(room, needed) as f64 * needed;
+            assert!(marched <= FILL * room as f64 && marched > FILL * room as f64 - needed, "{needed}: {marched}");
+        }
+    }
 }

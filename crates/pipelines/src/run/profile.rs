@@ -20,12 +20,15 @@ pub struct TrainReport {
     pub device: String,
     pub steps: u64,
     pub seconds: f64,
+    /// Rays that were trained on, per second; a device leaves out those whose samples find no room.
     pub rays_per_s: f64,
     /// Samples that were marched to, per second.
     pub marched_per_s: f64,
     /// Samples that went back through the network, per second.
     pub trained_per_s: f64,
+    /// Of all rays.
     pub marched_per_ray: f64,
+    /// Of rays that were trained on.
     pub trained_per_ray: f64,
     /// Share of occupied cells.
     pub occupied: Option<f64>,

@@ -72,6 +72,8 @@ impl GpuRays {
 /// What a march gives.
 pub struct GpuMarched {
     pub packed: GpuPacked,
+    /// Offsets of the samples, had there been room for all, `[R + 1]`.
+    pub whole: Buffer<u32>,
     /// Cells `[capacity]` that the samples lie in.
     pub cells: Buffer<u32>,
     /// 1 for each ray that lost samples for want of room, `[R]`.
@@ -120,7 +122,7 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
     let cut = gpu.zeros(n);
     pass(&whole, true);
     let offsets = bounded(gpu, &whole, &cut, capacity);
-    GpuMarched { packed: GpuPacked { offsets, t, dt }, cells, cut }
+    GpuMarched { packed: GpuPacked { offsets, t, dt }, whole, cells, cut }
 }
 
 /// Offsets limited to the capacity, so that no reader exceeds it; rays that lose samples are marked in `cut`.

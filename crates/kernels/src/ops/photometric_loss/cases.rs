@@ -25,6 +25,9 @@ pub struct Case {
     pub rgba: Vec<f32>,
     pub background: Vec<f32>,
     pub counts: Vec<bool>,
+    /// 1 for rays that lost samples, which are among those that do not count.
+    #[cfg(feature = "gpu")]
+    pub cut: Vec<u32>,
     pub distance: Vec<f32>,
 }
 
@@ -40,12 +43,14 @@ pub fn cases() -> Vec<Case> {
             rgba: random_unit(rays * 4, 7),
             background: random_unit(rays * 3, 9),
             counts: (0..rays).map(|r| r % 9 != 2).collect(),
+            #[cfg(feature = "gpu")]
+            cut: (0..rays).map(|r| (r % 27 == 2) as u32).collect(),
             // Of every third ray.
             distance: random_unit(rays, 10).iter().zip(0..).map(|(u, r)| if r % 3 == 0 { 0.1 + 3.0 * u } else { 0.0 }).collect(),
             scene,
         }
     };
-    [0, 1, 130].into_iter().flat_map(|rays| kinds.map(|kind| (rays, kind))).map(of).collect()
+    [0, 1, 130, 700].into_iter().flat_map(|rays| kinds.map(|kind| (rays, kind))).map(of).collect()
 }
 
 /// The loss in f64.
@@ -82,6 +87,7 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             rgba: gpu.upload(&case.rgba),
             background: gpu.upload(&case.background),
             left_out: gpu.upload(&left_out),
+            cut: gpu.upload(&case.cut),
             distance: gpu.upload(&case.distance),
         };
         rays.check_composited(gpu, table, &case, &want)?;
@@ -100,6 +106,7 @@ struct OnGpu {
     rgba: Buffer,
     background: Buffer,
     left_out: Buffer<u32>,
+    cut: Buffer<u32>,
     distance: Buffer,
 }
 
@@ -114,7 +121,7 @@ impl OnGpu {
         let up = |v: &[f64]| gpu.upload(&v.iter().map(|v| *v as f32).collect::<Vec<f32>>());
         let (out, d, sums) = (&want.out, &want.d, gpu.zeros(SUMS));
         let out = GpuComposited { color: up(&out.color), depth: up(&out.depth), opacity: up(&out.opacity), weights: up(&out.weights) };
-        let figures = Figures { sums: &sums, marched: &self.packed.offsets, is_main: true };
+        let figures = Figures { sums: &sums, marched: &self.packed.offsets, cut: &self.cut, is_main: true };
         let (got, errors) = on_gpu::loss(gpu, (case.terms, case.measure), &self.packed, &out, self.target(), figures);
         table.close("loss", "errors", &self.shape, &errors, &want.errors)?;
         table.close("loss", "d color", &self.shape, &got.color, &d.color)?;
@@ -127,7 +134,7 @@ impl OnGpu {
     fn check_at_once(&self, gpu: &Gpu, table: &mut Table, case: &Case, want: &Want, near: f32) -> Result<(), GpuError> {
         let (p, sums) = (case.scene.packed(), gpu.zeros(SUMS));
         let (sigma, rgb) = (gpu.upload(&case.scene.sigma), gpu.upload(&case.rgb));
-        let figures = Figures { sums: &sums, marched: &self.packed.offsets, is_main: true };
+        let figures = Figures { sums: &sums, marched: &self.packed.offsets, cut: &self.cut, is_main: true };
         let loss = (case.terms, case.measure);
         let (g, errors) = on_gpu::composite_and_loss(gpu, loss, &self.packed, (&sigma, &rgb), self.target(), near, figures);
         let (sigma, rgb, background) = (wide(&case.scene.sigma), wide(&case.rgb), wide(&case.background));
@@ -152,9 +159,11 @@ impl OnGpu {
         sums: &Buffer,
     ) -> Result<(), GpuError> {
         let (sums, s, rays) = (gpu.read(sums)?, case.scene.t.len() as f64, case.counts.len());
+        let whole: Vec<usize> = (0..rays).filter(|r| case.cut[*r] == 0).collect();
+        let trained: u32 = whole.iter().map(|r| case.scene.offsets[r + 1] - case.scene.offsets[*r]).sum();
         let counted = case.counts.iter().filter(|c| **c).count();
         let means = [want.values.iter().sum::<f64>() / rays.max(1) as f64, want.errors.iter().sum::<f64>() / counted.max(1) as f64];
         table.close(op, "sums", &self.shape, &gpu.upload(&sums[..2]), &means)?;
-        table.close(op, "counts", &self.shape, &gpu.upload(&sums[2..]), &[s, s, 1.0])
+        table.close(op, "counts", &self.shape, &gpu.upload(&sums[2..]), &[trained as f64, s, whole.len() as f64, 1.0])
     }
 }

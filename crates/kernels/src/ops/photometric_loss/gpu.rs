@@ -9,11 +9,15 @@ use crate::ops::{depth_loss, distortion};
 use blend::blend_and_compare;
 use cubecl::prelude::*;
 
-/// Sums that [`loss`] adds to: loss, mean squared error, trained samples, marched samples, steps.
-pub const SUMS: usize = 5;
+/// Sums that [`loss`] adds to: loss, mean squared error, trained samples, marched samples, rays that were not cut, steps.
+pub const SUMS: usize = 6;
 
-/// Parts in which rays are summed.
-const PARTS: usize = 256;
+/// Most units that sum rays, the rays that each has at least, and the parts that a unit sums afterwards.
+const MOST_PARTS: usize = 1 << 13;
+const LEAST_RAYS: usize = 8;
+const FOLD: usize = 32;
+/// Sums of a part: loss, squared error, rays that count, rays that were not cut, samples of those.
+const WIDTH: usize = 5;
 
 impl ColorLoss {
     /// Width of the quadratic part as kernels take it; 0: all of it.
@@ -30,8 +34,10 @@ impl ColorLoss {
 pub struct Figures<'a> {
     /// `[SUMS]`
     pub sums: &'a Buffer,
-    /// Offsets of all samples that were marched, `[R + 1]`.
+    /// Offsets of all samples that were marched, had there been room for them, `[R + 1]`.
     pub marched: &'a Buffer<u32>,
+    /// Rays that lost samples for want of room: not 0, `[R]`. Their samples are not counted as trained.
+    pub cut: &'a Buffer<u32>,
     /// Whether this is what the step is judged by; else only loss and samples are added.
     pub is_main: bool,
 }
@@ -151,23 +157,39 @@ pub fn loss(
 
 /// Adds a step's figures to `sums`.
 fn add_up(gpu: &Gpu, p: &GpuPacked, left_out: &Buffer<u32>, [values, errors, spread]: [&Buffer; 3], distortion: f32, figures: Figures) {
-    let (r, parts) = (p.rays(), gpu.empty(PARTS * 3));
+    let r = p.rays();
+    let mut n = r.div_ceil(LEAST_RAYS).clamp(1, MOST_PARTS);
+    let mut parts = gpu.empty(n * WIDTH);
     launch!(
         gpu,
         gather,
-        PARTS,
-        [left_out => r, values => r, errors => r, spread => r, parts => PARTS * 3],
+        n,
+        [
+            left_out => r,
+            figures.cut => r,
+            p.offsets => r + 1,
+            values => r,
+            errors => r,
+            spread => r,
+            parts => n * WIDTH,
+        ],
         r as u32,
-        PARTS as u32,
+        n as u32,
         distortion,
     );
+    while n > FOLD {
+        let (all, few) = (n, n.div_ceil(FOLD));
+        let folded = gpu.empty(few * WIDTH);
+        launch!(gpu, fold, few, [parts => all * WIDTH, folded => few * WIDTH], all as u32, few as u32);
+        (n, parts) = (few, folded);
+    }
     launch!(
         gpu,
         finish,
         ([1; 3], CubeDim::new_1d(1)),
-        [parts => PARTS * 3, p.offsets => r + 1, figures.marched => r + 1, figures.sums => SUMS],
+        [parts => n * WIDTH, figures.marched => r + 1, figures.sums => SUMS],
         r as u32,
-        PARTS as u32,
+        n as u32,
         figures.is_main,
     );
 }
@@ -264,7 +286,18 @@ fn compare(
 }
 
 #[cube(launch_unchecked)]
-fn gather(left_out: &[u32], values: &[f32], errors: &[f32], spread: &[f32], parts: &mut [f32], rays: u32, n: u32, distortion: f32) {
+fn gather(
+    left_out: &[u32],
+    cut: &[u32],
+    offsets: &[u32],
+    values: &[f32],
+    errors: &[f32],
+    spread: &[f32],
+    parts: &mut [f32],
+    rays: u32,
+    n: u32,
+    distortion: f32,
+) {
     let unit = ABSOLUTE_POS;
     if unit >= n as usize {
         terminate!();
@@ -272,6 +305,8 @@ fn gather(left_out: &[u32], values: &[f32], errors: &[f32], spread: &[f32], part
     let mut value = 0.0f32;
     let mut error = 0.0f32;
     let mut count = 0.0f32;
+    let mut whole = 0.0f32;
+    let mut samples = 0u32;
     let mut r = unit;
     while r < rays as usize {
         if left_out[r] == 0 {
@@ -279,28 +314,65 @@ fn gather(left_out: &[u32], values: &[f32], errors: &[f32], spread: &[f32], part
             error += errors[r];
             count += 1.0;
         }
+        if cut[r] == 0 {
+            whole += 1.0;
+            samples += offsets[r + 1] - offsets[r];
+        }
         r += n as usize;
     }
-    parts[unit * 3] = value;
-    parts[unit * 3 + 1] = error;
-    parts[unit * 3 + 2] = count;
+    parts[unit * WIDTH] = value;
+    parts[unit * WIDTH + 1] = error;
+    parts[unit * WIDTH + 2] = count;
+    parts[unit * WIDTH + 3] = whole;
+    parts[unit * WIDTH + 4] = f32::cast_from(samples);
+}
+
+/// Sums of every `to`-th of `n` parts.
+#[cube(launch_unchecked)]
+fn fold(parts: &[f32], out: &mut [f32], n: u32, to: u32) {
+    let unit = ABSOLUTE_POS;
+    if unit >= to as usize {
+        terminate!();
+    }
+    let mut sums = Array::<f32>::new(WIDTH);
+    #[unroll]
+    for k in 0..WIDTH {
+        sums[k] = 0.0;
+    }
+    let mut i = unit;
+    while i < n as usize {
+        #[unroll]
+        for k in 0..WIDTH {
+            sums[k] += parts[i * WIDTH + k];
+        }
+        i += to as usize;
+    }
+    #[unroll]
+    for k in 0..WIDTH {
+        out[unit * WIDTH + k] = sums[k];
+    }
 }
 
 #[cube(launch_unchecked)]
-fn finish(parts: &[f32], offsets: &[u32], marched: &[u32], sums: &mut [f32], rays: u32, n: u32, #[comptime] is_main: bool) {
+fn finish(parts: &[f32], marched: &[u32], sums: &mut [f32], rays: u32, n: u32, #[comptime] is_main: bool) {
     let mut value = 0.0f32;
     let mut error = 0.0f32;
     let mut count = 0.0f32;
+    let mut whole = 0.0f32;
+    let mut samples = 0.0f32;
     for i in 0..n as usize {
-        value += parts[i * 3];
-        error += parts[i * 3 + 1];
-        count += parts[i * 3 + 2];
+        value += parts[i * WIDTH];
+        error += parts[i * WIDTH + 1];
+        count += parts[i * WIDTH + 2];
+        whole += parts[i * WIDTH + 3];
+        samples += parts[i * WIDTH + 4];
     }
     sums[0] += value / max(f32::cast_from(rays), 1.0f32);
-    sums[2] += f32::cast_from(offsets[rays as usize]);
+    sums[2] += samples;
     sums[3] += f32::cast_from(marched[rays as usize]);
     if comptime!(is_main) {
         sums[1] += error / max(count, 1.0f32);
-        sums[4] += 1.0;
+        sums[4] += whole;
+        sums[5] += 1.0;
     }
 }
