@@ -33,6 +33,8 @@ const OUTLIERS: f64 = 0.1;
 const MOST_SCALE: u32 = 8;
 /// Bounces of light.
 const BOUNCES: u32 = 6;
+/// Rays of a pixel along an axis by which masks are decided.
+const FOOTPRINT: usize = 3;
 /// How many times the samples of the others held-out views have: their noise would count as errors of what is measured.
 const HELD_OUT_SAMPLES: u32 = 4;
 /// Every so many views, one is held out.
@@ -300,16 +302,23 @@ fn save_photograph(path: &Path, film: &Film) -> Result<()> {
     Ok(photo::save_png(path, &srgb.to_u8())?)
 }
 
-/// The mask of a view: what is at the middle of each pixel.
+/// The mask of a view: glass where any of [`FOOTPRINT`]² rays of a pixel meets some, else what the middle one meets.
 fn classes(scene: &Scene, view: &View, model: &Model) -> ImageU8 {
+    let (w, h, n) = (view.camera.width as usize, view.camera.height as usize, FOOTPRINT);
     let is_glass = |i: u32| model.materials[model.parts[model.instances[i as usize].part].material].transmission > 0.0;
-    let data = cpu::first_hits(scene, view, true).into_iter().map(|hit| match hit {
+    let fine = View { camera: view.camera.resized((n * w) as u32, (n * h) as u32), ..*view };
+    let hits = cpu::first_hits(scene, &fine, true);
+    let class_of = |x: usize, y: usize| match &hits[y * n * w + x] {
         None => SKY_CLASS,
         Some(h) if is_glass(h.instance) => GLASS_CLASS,
         Some(_) => STATIC_CLASS,
-    });
-    let data = data.collect();
-    ImageU8 { width: view.camera.width as usize, height: view.camera.height as usize, channels: 1, data }
+    };
+    let of_pixel = |i: usize| {
+        let (x, y) = (n * (i % w), n * (i / w));
+        let shows_glass = (0..n * n).any(|k| class_of(x + k % n, y + k / n) == GLASS_CLASS);
+        if shows_glass { GLASS_CLASS } else { class_of(x + n / 2, y + n / 2) }
+    };
+    ImageU8 { width: w, height: h, channels: 1, data: (0..w * h).map(of_pixel).collect() }
 }
 
 /// Where a pixel shows an opaque surface: neither sky nor glass.
