@@ -25,6 +25,8 @@ use std::sync::OnceLock;
 const GLARING: f64 = 4.0;
 const LAMPS: usize = 64;
 
+/// Directions in which a ray's surface looks for sky and other surfaces.
+const LOOKS: usize = 32;
 /// Bytes of a ray of a view, while it is lit.
 const RAY: u64 = 200;
 
@@ -225,7 +227,7 @@ impl SceneModel {
                 return (v, color);
             }
             let own = (i / w % side) * side + i % w % side;
-            let sunlit = sunlight.map(|around| sunlit(around, (&shares[own], &numbers, light.is_learned), &v[NORMAL..], hit, ray));
+            let sunlit = sunlight.map(|around| sunlit(around, (&shares[own], light.is_learned), (LOOKS, i as u32), &v[NORMAL..], hit, ray));
             let mut color = shading::color(&v, o, ray.1, &numbers, &light.sky, sunlit);
             if o < 1.0 {
                 let radiance = light.map_toward(ray.1);

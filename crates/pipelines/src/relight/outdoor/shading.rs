@@ -10,7 +10,7 @@
 //! normal is that of the surfaces as they were learned, which the head is taught; with suns apart it bends from there to what the suns show.
 
 use super::sun::{BOUNCED, SUN, gray, level};
-use super::sunlit::{FAINT, LEFT, SHORTEST, Sunlit, arriving, reach, sunlit, surface, unhidden, unit};
+use super::sunlit::{FAINT, LEFT, SHORTEST, Sunlit, arriving, direct, sunlit, surface, unhidden, unit};
 use super::visibility::{Ambient, Visibility, spread};
 use diorama_geom::color::LUMINANCE;
 use diorama_geom::glam::{DVec3, Vec3};
@@ -39,6 +39,8 @@ const SOLID: f32 = 0.5;
 const TRACED_WIDTH: f32 = 0.1;
 /// Value in sRGB from which a photograph may be clipped.
 const CLIPPED: f32 = 0.99;
+/// Directions in which a ray's surface looks for sky and other surfaces.
+const LOOKS: usize = 16;
 /// Directions in which irradiance must not be negative.
 const DIRECTIONS: usize = 64;
 
@@ -96,6 +98,8 @@ pub struct Suns<'a> {
     pub visibility: &'a Visibility,
     /// Of the rays, `[R, 3]`.
     pub origins: &'a [f32],
+    /// Of the directions in which surfaces look.
+    pub seed: u32,
 }
 
 /// A sun and a sky of each ray, with what hides them.
@@ -108,6 +112,8 @@ pub struct TracedLight<'a> {
     pub visibility: &'a Visibility,
     /// Of the rays, `[R, 3]`.
     pub origins: &'a [f32],
+    /// Of the directions in which surfaces look.
+    pub seed: u32,
 }
 
 /// Gradients of the tables, and figures of the step.
@@ -244,9 +250,9 @@ impl SceneLoss<'_> {
     /// Sun of a ray and what of its light arrives.
     fn sunlit(&self, r: usize, out: &RayOutputs) -> Option<Sunlit<'_>> {
         let (s, l, at) = (self.suns.as_ref()?, self.light[r] as usize, 3 * r..3 * r + 3);
-        let light = (&s.values[SUN * l..][..SUN], &self.lights[LIGHT * l..][..LIGHT], true);
+        let (light, looks) = ((&s.values[SUN * l..][..SUN], true), (LOOKS, s.seed));
         let hit = (out.opacity[r], out.depth[r]);
-        Some(sunlit((s.visibility, &s.ambients[l]), light, &self.normal(r, out), hit, (&s.origins[at.clone()], &self.dirs[at])))
+        Some(sunlit((s.visibility, &s.ambients[l]), light, looks, &self.normal(r, out), hit, (&s.origins[at.clone()], &self.dirs[at])))
     }
 
     /// Share of the light of a ray's sun and sky that arrives; none where the ray meets no surface.
@@ -256,7 +262,8 @@ impl SceneLoss<'_> {
         let normal = self.normal(r, out);
         let hit = surface(&normal, (out.opacity[r], out.depth[r]), &t.origins[at.clone()], &self.dirs[at])?;
         let lit = irradiance(sky, &sh_light::basis(DVec3::from(normal.map(f64::from))));
-        Some(arriving(sun, reach(t.visibility, sun, hit, &t.visibility.corners(hit.0, hit.1)), &normal, lit, BOUNCED * level(sun, sky)))
+        let reach = [direct(t.visibility, sun, hit), t.visibility.from_sky(hit.0, hit.1, LOOKS, t.seed)];
+        Some(arriving(sun, reach, &normal, lit, BOUNCED * level(sun, sky)))
     }
 
     /// One ray: its loss; adds gradients. `share` is its part of the sum. Returns the loss, the squared error and the largest error.

@@ -2,7 +2,7 @@
 //! visibility `V`, the sky's harmonics `L` as what stands around lets them through, `T`, and light `B` from surfaces around. Directions are
 //! searched, the rest then is linear; `B` follows from light and albedo, again and again.
 
-use super::visibility::{Ambient, Corners, OPEN_CELLS, Visibility, spread};
+use super::visibility::{Visibility, spread};
 use diorama_geom::color::{LUMINANCE, srgb_from_linear};
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
@@ -12,10 +12,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 mod least_squares;
 mod photograph;
 mod selection;
+mod surfaces;
 
 use least_squares::solve;
 pub use photograph::{Shown, of_photograph};
 use selection::{Selection, Told};
+use surfaces::Place;
+pub use surfaces::Surfaces;
 
 /// Numbers of a sun: direction and power.
 pub const SUN: usize = 6;
@@ -45,10 +48,6 @@ const SURE: usize = 2;
 const SETTLING: usize = 15;
 /// Every so many of these, light from surfaces is found anew.
 const SENT_AGAIN: usize = 3;
-/// Share of the points, the lowest, that the ground outside looks like.
-const LOWEST: f32 = 0.1;
-/// Bounces of light between surfaces, where a light is given.
-const BOUNCES: usize = 4;
 /// Difference in sRGB beyond which points count less and less.
 const TRUSTED: f32 = 0.15;
 /// How much the color of a point counts that no photograph in a light shows.
@@ -91,114 +90,6 @@ pub struct Fitted {
     pub sky: [f32; 27],
     /// Mean squared error, about that of sRGB.
     pub error: f64,
-}
-
-/// Points of surfaces with their albedo, which send light to each other.
-#[derive(Clone, Default)]
-pub struct Surfaces {
-    points: Vec<Place>,
-    pub albedos: Vec<Vec3>,
-}
-
-/// A point and what does not depend on light.
-#[derive(Clone)]
-struct Place {
-    point: Vec3,
-    normal: Vec3,
-    cell: u32,
-    corners: Corners,
-    /// Light that arrives for each of the sky's coefficients.
-    sky: [f32; 9],
-    /// Share that small things leave of a sun whose traced ray passes.
-    share: f32,
-}
-
-impl Surfaces {
-    /// Points with normals and albedos.
-    pub fn new(points: impl Iterator<Item = (Vec3, Vec3)>, albedos: Vec<Vec3>, visibility: &Visibility) -> Surfaces {
-        let points: Vec<(Vec3, Vec3)> = points.collect();
-        let place = |(point, normal): &(Vec3, Vec3)| {
-            let corners = visibility.corners(*point, *normal);
-            let sky = visibility.sky_row(&corners, *normal);
-            Place { point: *point, normal: *normal, cell: visibility.cell_of(*point), corners, sky, share: 1.0 }
-        };
-        Surfaces { points: points.par_iter().map(place).collect(), albedos }
-    }
-
-    /// The same from [`Surfaces::numbers`].
-    pub fn from_numbers(numbers: &[f32], visibility: &Visibility) -> Surfaces {
-        let at = |p: &[f32], k: usize| Vec3::from_slice(&p[3 * k..]);
-        let points = numbers.chunks_exact(9).map(|p| (at(p, 0), at(p, 1)));
-        Surfaces::new(points, numbers.chunks_exact(9).map(|p| at(p, 2)).collect(), visibility)
-    }
-
-    /// Points, normals and albedos as a checkpoint keeps them, `[N, 9]`.
-    pub fn numbers(&self) -> Vec<f32> {
-        let each = self.points.iter().zip(&self.albedos);
-        each.flat_map(|(p, a)| [p.point, p.normal, *a].into_iter().flat_map(|v| v.to_array())).collect()
-    }
-
-    /// Share of a sun's light that reaches each point, times the cosine.
-    fn sunlit(&self, visibility: &Visibility, toward: Vec3) -> Vec<f32> {
-        self.points.par_iter().map(|p| p.sunlit(visibility, toward)).collect()
-    }
-
-    /// Light of the sky and of surfaces, of which each receives `irradiance`.
-    fn ambient(&self, visibility: &Visibility, sky: &[f32], irradiance: &[Vec3]) -> Ambient {
-        let mut sent: Vec<(Vec3, f32)> = vec![(Vec3::ZERO, 0.0); OPEN_CELLS.pow(3)];
-        let mut by_height = [(Vec3::ZERO, 0.0); OPEN_CELLS];
-        for ((p, a), e) in self.points.iter().zip(&self.albedos).zip(irradiance) {
-            for of in [&mut sent[p.cell as usize], &mut by_height[p.cell as usize / OPEN_CELLS.pow(2)]] {
-                *of = (of.0 + *a * *e, of.1 + 1.0);
-            }
-        }
-        // What no photograph shows looks like the rest at its height; the ground outside, like the lowest tenth.
-        let (mut ground, mut count) = (Vec3::ZERO, 0.0);
-        for (sum, n) in by_height {
-            if count < LOWEST * self.points.len() as f32 {
-                (ground, count) = (ground + sum, count + n);
-            }
-        }
-        let ground = ground / count.max(1.0);
-        let mut last = ground;
-        let by_height = by_height.map(|(sum, n)| {
-            if n > 0.0 {
-                last = sum / n;
-            }
-            last
-        });
-        let of_cell = |(i, (sum, n)): (usize, (Vec3, f32))| if n > 0.0 { sum / n } else { by_height[i / OPEN_CELLS.pow(2)] };
-        let radiosity: Vec<Vec3> = sent.into_iter().enumerate().map(of_cell).collect();
-        visibility.ambient(sky, &radiosity, ground)
-    }
-
-    /// What of the sky, and of surfaces that it and suns `[N, 6]` light, reaches any place.
-    pub fn light(&self, visibility: &Visibility, suns: &[f32], sky: &[f32]) -> Ambient {
-        let of_suns = |p: &Place| {
-            let of = |sun: &[f32]| p.sunlit(visibility, Vec3::from_slice(sun)) * Vec3::from_slice(&sun[3..]);
-            suns.chunks_exact(SUN).map(of).sum::<Vec3>()
-        };
-        let direct: Vec<Vec3> = self.points.par_iter().map(of_suns).collect();
-        let mut irradiance: Vec<Vec3> = self.points.iter().zip(&direct).map(|(p, d)| *d + p.of_sky(sky).max(Vec3::ZERO)).collect();
-        let mut ambient = Ambient::default();
-        for _ in 0..BOUNCES {
-            ambient = self.ambient(visibility, sky, &irradiance);
-            irradiance = self.points.par_iter().zip(&direct).map(|(p, d)| *d + ambient.at(&p.corners, p.normal, sky)).collect();
-        }
-        ambient
-    }
-}
-
-impl Place {
-    fn sunlit(&self, visibility: &Visibility, toward: Vec3) -> f32 {
-        let facing = self.normal.dot(toward);
-        if facing > 0.0 { self.share * facing * visibility.from_sun(self.point, self.normal, toward) } else { 0.0 }
-    }
-
-    /// Light of a sky `[9, 3]`.
-    fn of_sky(&self, sky: &[f32]) -> Vec3 {
-        (0..9).map(|i| self.sky[i] * Vec3::from_slice(&sky[3 * i..])).sum()
-    }
 }
 
 /// A point in one light, for a fit.
@@ -244,7 +135,7 @@ pub fn tell_apart(
     let means: Vec<Vec3> = (0..lights).map(|l| mean(&|s| s.colors[l]).max(Vec3::splat(1e-4))).collect();
     let mut surfaces = Surfaces::new(seen.iter().map(|s| (s.point, s.normal)), vec![Vec3::ZERO; seen.len()], visibility);
     // Before anything is known, closed places receive a share of what is seen.
-    let open: Vec<f32> = surfaces.points.iter().map(|p| visibility.from_sky(&p.corners, p.normal)).collect();
+    let open: Vec<f32> = surfaces.points.iter().map(|p| p.open).collect();
     let sent = |l: usize| open.iter().map(|o| (1.0 - o) * BOUNCED / FIRST_ALBEDO * means[l]).collect();
     let first_sent: Vec<Vec<Vec3>> = (0..lights).map(sent).collect();
     // What is seen in a light without a sun shows albedos best, and each may be such a light.
@@ -265,7 +156,7 @@ pub fn tell_apart(
         let find = |l: usize, albedos: Vec<Vec3>| guess(&alike, &surfaces, visibility, albedos, l, &first_sent[l], None);
         let mut guesses: Vec<Guess> = (0..lights).map(|l| find(l, surfaces.albedos.clone())).collect();
         guesses[even] = find(even, explained(&alike, &surfaces, &guesses, Some(even)));
-        if !go_on() || !settle(&alike, &mut surfaces, visibility, &mut guesses, BEGUN, &mut go_on) {
+        if !go_on() || !settle(&alike, &mut surfaces, &mut guesses, BEGUN, &mut go_on) {
             return None;
         }
         let misfit = misfit(&alike, &surfaces, &guesses);
@@ -283,7 +174,7 @@ pub fn tell_apart(
             guess(&alike, &surfaces, visibility, albedos, l, &g.sent, near)
         };
         guesses = guesses.iter().enumerate().map(again).collect();
-        if !settle(&alike, &mut surfaces, visibility, &mut guesses, SETTLING, &mut go_on) {
+        if !settle(&alike, &mut surfaces, &mut guesses, SETTLING, &mut go_on) {
             return None;
         }
     }
@@ -297,7 +188,7 @@ pub fn tell_apart(
             guess(seen, &surfaces, visibility, albedos, l, &g.sent, Some(Vec3::from_slice(&g.fitted.sun)))
         };
         guesses = guesses.iter().enumerate().map(again).collect();
-        if !settle(seen, &mut surfaces, visibility, &mut guesses, SETTLING, &mut go_on) {
+        if !settle(seen, &mut surfaces, &mut guesses, SETTLING, &mut go_on) {
             return None;
         }
     }
@@ -328,14 +219,7 @@ fn guess(
 
 /// Lets albedo and light approach each other a number of times, which they do slowly; meanwhile suns stay where they are. Ends early, with
 /// false, once `go_on` says so.
-fn settle(
-    seen: &[Seen],
-    surfaces: &mut Surfaces,
-    visibility: &Visibility,
-    guesses: &mut [Guess],
-    times: usize,
-    go_on: &mut dyn FnMut() -> bool,
-) -> bool {
+fn settle(seen: &[Seen], surfaces: &mut Surfaces, guesses: &mut [Guess], times: usize, go_on: &mut dyn FnMut() -> bool) -> bool {
     for k in 0..times {
         surfaces.albedos = explained(seen, surfaces, guesses, None);
         set_scale(guesses, &mut surfaces.albedos);
@@ -344,9 +228,8 @@ fn settle(
             g.fitted = solve(&trusted, &surfaces.points, &g.sunlit, Vec3::from_slice(&g.fitted.sun));
             if k % SENT_AGAIN == 0 {
                 let irradiance: Vec<Vec3> = surfaces.points.iter().enumerate().map(|(i, p)| g.irradiance(i, p)).collect();
-                let dark = [0.0; 27];
-                let sent = surfaces.ambient(visibility, &dark, &irradiance);
-                g.sent = surfaces.points.iter().map(|p| sent.at(&p.corners, p.normal, &dark)).collect();
+                let radiosity = surfaces.radiosity(&irradiance);
+                g.sent = surfaces.points.iter().map(|p| p.sent(&radiosity)).collect();
             }
         };
         guesses.par_iter_mut().enumerate().for_each(refit);

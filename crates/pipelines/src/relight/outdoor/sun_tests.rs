@@ -1,6 +1,7 @@
 //! Tests of the search for suns.
 
 use super::*;
+use crate::relight::outdoor::visibility::Ambient;
 use diorama_engine::fields::DensityQuery;
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_geom::rng::Rng;
@@ -53,7 +54,7 @@ fn suns_are_told_apart_and_an_overcast_sky_has_none() {
     let look = |(place, (point, normal, albedo)): (&Place, &(Vec3, Vec3, Vec3))| {
         let color = |(sun, ambient): &([f32; SUN], Ambient)| {
             let direct = place.sunlit(&visibility, Vec3::from_slice(sun)) * Vec3::from_slice(&sun[3..]);
-            *albedo * (direct + ambient.at(&place.corners, *normal, &sky))
+            *albedo * (direct + place.ambient(ambient))
         };
         Seen { point: *point, normal: *normal, colors: lights.iter().map(color).collect(), shown: vec![true; lights.len()], is_flat: true }
     };
@@ -81,8 +82,8 @@ fn the_sun_is_found_where_it_stands() {
     let sky = sky();
     let seen: Vec<(Vec3, Vec3, Vec3, Vec3)> = places(3000)
         .map(|(point, normal, albedo)| {
-            let corners = visibility.corners(point, normal);
-            let lit: Vec3 = visibility.sky_row(&corners, normal).iter().zip(sky.0).map(|(t, l)| *t * Vec3::from(l.map(|v| v as f32))).sum();
+            let place = Place::of(&visibility, point, normal);
+            let lit: Vec3 = place.sky.iter().zip(sky.0).map(|(t, l)| *t * Vec3::from(l.map(|v| v as f32))).sum();
             let direct = power * normal.dot(sun).max(0.0) * visibility.from_sun(point, normal, sun);
             (point, normal, albedo, albedo * (lit + direct))
         })
@@ -112,16 +113,16 @@ fn a_shade_that_all_lights_share_is_no_sun() {
     let light = |l: usize| {
         let sun = [toward.x, toward.y, toward.z, 0.9, 0.8, 0.6].map(|v| if l == 2 { v } else { 0.0 });
         let sky: Vec<f32> = sky.iter().map(|v| v * (0.6 + 0.2 * l as f32)).collect();
-        (surfaces.light(&visibility, &sun, &sky), sun, sky)
+        (surfaces.light(&visibility, &sun, &sky), sun)
     };
     let lights: Vec<_> = (0..5).map(light).collect();
     let rng = Rng::new(3, 1);
     let look = |(i, (place, albedo)): (usize, (&Place, &Vec3))| {
-        let color = |(l, (ambient, sun, sky)): (usize, &(Ambient, [f32; SUN], Vec<f32>))| {
+        let color = |(l, (ambient, sun)): (usize, &(Ambient, [f32; SUN]))| {
             let direct = if sun[2] > 0.0 { place.sunlit(&visibility, toward) * Vec3::from_slice(&sun[3..]) } else { Vec3::ZERO };
             // Surfaces are never known well.
             let noise = 1.0 + 0.1 * rng.normal((5 * i + l) as u64);
-            noise * *albedo * (direct + ambient.at(&place.corners, place.normal, sky))
+            noise * *albedo * (direct + place.ambient(ambient))
         };
         let colors = lights.iter().enumerate().map(color).collect();
         Seen { point: place.point, normal: place.normal, colors, shown: vec![true; lights.len()], is_flat: true }
@@ -147,7 +148,7 @@ fn dark_things_before_a_place_do_not_take_its_sun() {
     let ambient = surfaces.light(&visibility, &[sun.x, sun.y, sun.z, 0.9, 0.8, 0.6], &sky);
     let look = |(i, (place, albedo)): (usize, (&Place, &Vec3))| {
         let direct = place.sunlit(&visibility, sun) * Vec3::new(0.9, 0.8, 0.6);
-        let lit = *albedo * (direct + ambient.at(&place.corners, place.normal, &sky));
+        let lit = *albedo * (direct + place.ambient(&ambient));
         let color = if i % 5 < 2 { Vec3::splat(0.004 + 0.02 * (i % 7) as f32) } else { lit };
         Shown { point: place.point, normal: place.normal, albedo: *albedo, share: 1.0, color }
     };

@@ -1,9 +1,8 @@
 //! Light of a sun, and of all that is around, at what a ray shows.
 
 use super::sun::{SUN, gray};
-use super::visibility::{Ambient, Corners, Visibility, of_normal};
+use super::visibility::{Ambient, Gathered, Visibility};
 use diorama_geom::glam::Vec3;
-use diorama_geom::sh_light;
 
 /// Channel of the share that is left of a sun whose traced ray passes.
 pub const LEFT: usize = 7;
@@ -19,8 +18,7 @@ pub struct Sunlit<'a> {
     pub reach: [f32; 2],
     /// Whether it is the sun of a light of training.
     pub is_learned: bool,
-    /// By spherical harmonics of the normal.
-    pub ambient: [Vec3; 9],
+    pub ambient: Gathered,
     /// Light of lamps whose traced rays pass.
     pub of_lamps: Vec3,
 }
@@ -31,34 +29,34 @@ pub(super) fn surface(normal: &[f32], (opacity, depth): (f32, f32), origin: &[f3
     (opacity >= FAINT).then(|| (point, Vec3::from(unit(normal).0)))
 }
 
-/// Shares of a sun's and the sky's light that reach a surface, `[sun, sky]`.
-pub(super) fn reach(visibility: &Visibility, sun: &[f32], (point, normal): (Vec3, Vec3), corners: &Corners) -> [f32; 2] {
+/// Share of a sun's light that reaches a surface.
+pub(super) fn direct(visibility: &Visibility, sun: &[f32], (point, normal): (Vec3, Vec3)) -> f32 {
     let toward = Vec3::from_slice(sun);
-    let direct = if normal.dot(toward) > 0.0 { visibility.from_sun(point, normal, toward) } else { 1.0 };
-    [direct, visibility.from_sky(corners, normal)]
+    if normal.dot(toward) > 0.0 { visibility.from_sun(point, normal, toward) } else { 1.0 }
 }
 
-/// The light of a sun, perhaps more suns after it, and what is around at what a ray shows; `sky` `[9, 3]` is that of the light, and the flag
-/// says whether it is one of training.
+/// The light of a sun, perhaps more suns after it, and what is around at what a ray shows, from so many directions with a seed; the flag says
+/// whether the light is one of training.
 pub fn sunlit<'a>(
     (visibility, ambient): (&Visibility, &Ambient),
-    (suns, sky, is_learned): (&'a [f32], &[f32], bool),
+    (suns, is_learned): (&'a [f32], bool),
+    (looks, seed): (usize, u32),
     normal: &[f32],
     hit: (f32, f32),
     (origin, dir): (&[f32], &[f32]),
 ) -> Sunlit<'a> {
     let (sun, lamps) = suns.split_at(SUN);
     match surface(normal, hit, origin, dir) {
-        None => Sunlit { sun, reach: [1.0; 2], is_learned, ambient: [Vec3::ZERO; 9], of_lamps: Vec3::ZERO },
+        None => Sunlit { sun, reach: [1.0; 2], is_learned, ambient: Gathered::NONE, of_lamps: Vec3::ZERO },
         Some(at) => {
-            let corners = visibility.corners(at.0, at.1);
             let from_lamp = |lamp: &[f32]| {
                 let facing = at.1.dot(Vec3::from_slice(lamp));
                 let arrives = if facing > 0.0 { facing * visibility.from_sun(at.0, at.1, Vec3::from_slice(lamp)) } else { 0.0 };
                 arrives * Vec3::from_slice(&lamp[3..])
             };
             let of_lamps = lamps.chunks_exact(SUN).map(from_lamp).sum();
-            Sunlit { sun, reach: reach(visibility, sun, at, &corners), is_learned, ambient: ambient.around(&corners, sky), of_lamps }
+            let ambient = ambient.gathered(at.1, visibility.looks(at.0, at.1, looks, seed));
+            Sunlit { sun, reach: [direct(visibility, sun, at), ambient.open], is_learned, ambient, of_lamps }
         }
     }
 }
@@ -72,7 +70,7 @@ impl Sunlit<'_> {
     /// Light that a white surface sends where the field says these values.
     pub(super) fn received(&self, normal: &[f32; 3], values: &[f32]) -> Vec3 {
         let of_lamps = if self.is_learned { Vec3::ZERO } else { values[LEFT] * self.of_lamps };
-        self.arrives(values) * unhidden(self.sun, normal) + of_lamps + of_normal(&self.ambient, Vec3::from(*normal))
+        self.arrives(values) * unhidden(self.sun, normal) + of_lamps + self.ambient.at(Vec3::from(*normal))
     }
 
     /// Share of the sun's light that arrives.
@@ -85,10 +83,8 @@ impl Sunlit<'_> {
         let n = Vec3::from(*normal);
         let toward = Vec3::from_slice(self.sun);
         let of_sun = if n.dot(toward) > 0.0 { self.arrives(values) * Vec3::from_slice(&self.sun[3..]).dot(d) } else { 0.0 };
-        let ambient = of_normal(&self.ambient, n);
-        let d = Vec3::select(ambient.cmpgt(Vec3::ZERO), d, Vec3::ZERO);
-        let bent = sh_light::basis_gradient(n.as_dvec3()).into_iter().zip(&self.ambient).map(|(b, v)| v.dot(d) * b.as_vec3());
-        (of_sun * toward + bent.sum::<Vec3>()).to_array()
+        let d = Vec3::select(self.ambient.at(n).cmpgt(Vec3::ZERO), d, Vec3::ZERO);
+        (of_sun * toward + Vec3::from(self.ambient.slope.map(|s| s.dot(d)))).to_array()
     }
 }
 

@@ -3,15 +3,12 @@
 use diorama_engine::fields::DensityQuery;
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_geom::glam::{DVec3, Vec3};
-use diorama_geom::sh_light::{self, ShLight};
+use diorama_geom::sh_light;
 use diorama_kernels::ops::march::OccupancyBits;
 use rayon::prelude::*;
 
-/// Cells per axis of the grid that holds what points see around them.
+/// Cells per axis of the grid that holds what surfaces send.
 pub const OPEN_CELLS: usize = 64;
-/// Directions in which points look, and points of a cell that do.
-const DIRECTIONS: usize = 96;
-const POINTS: usize = 2;
 /// Cells per axis of the blocks that shadow rays skip where nothing is solid.
 const BLOCK: usize = 8;
 /// Share of a cell that must be opaque for it to be solid.
@@ -28,6 +25,10 @@ const STEP: f32 = 0.7;
 const PACKED: usize = 16;
 /// Share of the light of a direction from which surfaces in it matter.
 const SEEN: f32 = 0.05;
+/// Turn between directions in which points look, and least cosines of them to the normal, and of those by which light changes with the normal.
+const GOLDEN: f32 = 0.618_034;
+const LEAST_FACING: f32 = 0.01;
+const LEAST_SLOPING: f32 = 0.2;
 /// The surface that a ray downward meets outside of the cube.
 pub const GROUND: u32 = u32::MAX;
 /// From irradiance over π to radiance, by band of the spherical harmonics.
@@ -40,38 +41,48 @@ pub struct Visibility {
     n: usize,
     /// One bit per cell.
     solid: Vec<u64>,
+    /// The same of cells from whose center on to the next centers something is solid.
+    near: Vec<u64>,
     /// Whether something in a block, or next to it, is solid.
     blocks: Vec<bool>,
-    /// View of each cell of `[OPEN_CELLS³]` near something solid; [`NONE`] for the others.
-    view_of: Vec<u32>,
-    views: Vec<Surroundings>,
 }
 
-const NONE: u32 = u32::MAX;
-
-/// What the points of a cell see around them.
-struct Surroundings {
-    /// Irradiance over π under a sky of radiance 1, as spherical harmonics of the normal.
-    even: [f32; 9],
-    /// The same for each coefficient of a sky, given as irradiance over π; `[normal, sky]`.
-    sky: [[f32; 9]; 9],
-    seen: Vec<SeenSurface>,
+/// What a surface sees in one direction.
+pub struct Look {
+    pub direction: Vec3,
+    /// Cosine to the normal.
+    pub facing: f32,
+    /// Share of light that passes; of the sky's, none does from below, where the ground outside is.
+    pub passes: f32,
+    pub open: f32,
+    /// Cell of `[OPEN_CELLS³]`, or [`GROUND`], of what hides the rest.
+    pub cell: u32,
 }
 
-/// Surfaces of a cell of `[OPEN_CELLS³]`, or [`GROUND`], seen in a direction; and the share of that direction's light that is theirs.
-struct SeenSurface {
-    cell: u32,
-    direction: u16,
-    share: f32,
+/// What surfaces send, over π, by cell of `[OPEN_CELLS³]`, and the ground outside.
+#[derive(Clone)]
+pub struct Radiosity {
+    pub cells: Vec<Vec3>,
+    pub ground: Vec3,
 }
 
-/// Cells of `[OPEN_CELLS³]` around a point that count for it, by view and weight.
-#[derive(Clone, Copy, Default)]
-pub struct Corners([(u32, f32); 8], usize);
+/// Light of a sky `[9, 3]`, given as irradiance over π, and of surfaces.
+#[derive(Clone)]
+pub struct Ambient {
+    pub sky: Vec<f32>,
+    pub radiosity: Radiosity,
+}
 
-/// Light of the sky and of surfaces where there are views, `[views, 9, 3]`: irradiance over π as spherical harmonics of the normal.
-#[derive(Clone, Default)]
-pub struct Ambient(Vec<[Vec3; 9]>);
+/// Irradiance over π of a surface from sky and surfaces, for normals near its own.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Gathered {
+    pub normal: Vec3,
+    pub light: Vec3,
+    /// Derivatives with respect to the normal's axes.
+    pub slope: [Vec3; 3],
+    /// Share of an even sky's light that arrives.
+    pub open: f32,
+}
 
 /// Length of [`Visibility::numbers`] for `n` cells per axis.
 pub fn numbers_len(n: usize) -> usize {
@@ -113,7 +124,7 @@ impl Visibility {
 
     fn new(solid: Vec<u64>, (low, size): (f32, f32), n: usize) -> Visibility {
         let edge = n.div_ceil(BLOCK);
-        let mut blocks = vec![false; edge.pow(3)];
+        let (mut blocks, mut near) = (vec![false; edge.pow(3)], vec![0u64; solid.len()]);
         let set = solid
             .iter()
             .enumerate()
@@ -125,16 +136,12 @@ impl Visibility {
             for k in 0..8 {
                 let b = [0, 1, 2].map(|a| (if k >> a & 1 == 0 { at[a].saturating_sub(1) } else { (at[a] + 1).min(n - 1) }) / BLOCK);
                 blocks[(b[2] * edge + b[1]) * edge + b[0]] = true;
+                let c = [0, 1, 2].map(|a| at[a].saturating_sub(k >> a & 1));
+                let c = (c[2] * n + c[1]) * n + c[0];
+                near[c / 64] |= 1 << (c % 64);
             }
         }
-        let mut all = Visibility { low, size, n, solid, blocks, view_of: vec![NONE; OPEN_CELLS.pow(3)], views: Vec::new() };
-        let found: Vec<(usize, Surroundings)> =
-            (0..OPEN_CELLS.pow(3)).into_par_iter().filter_map(|i| Some((i, all.surroundings(i)?))).collect();
-        for (i, view) in found {
-            all.view_of[i] = all.views.len() as u32;
-            all.views.push(view);
-        }
-        all
+        Visibility { low, size, n, solid, near, blocks }
     }
 
     fn cell(&self) -> f32 {
@@ -150,6 +157,11 @@ impl Visibility {
         let p = at - 0.5;
         let (base, f) = (p.floor(), p - p.floor());
         let n = self.n as i32;
+        let at = [base.x, base.y, base.z].map(|v| v.max(0.0) as usize);
+        let at = (at[2] * self.n + at[1]) * self.n + at[0];
+        if self.near[at / 64] >> (at % 64) & 1 == 0 {
+            return 0.0;
+        }
         let get = |k: i32| {
             let q = [base.x as i32 + (k & 1), base.y as i32 + (k >> 1 & 1), base.z as i32 + (k >> 2)].map(|v| v.clamp(0, n - 1));
             self.is_solid(((q[2] * n + q[1]) * n + q[0]) as usize) as u8 as f32
@@ -186,59 +198,37 @@ impl Visibility {
         ((-depth).exp(), first.unwrap_or(at))
     }
 
+    /// Beginning in cells of a ray from a surface: on the ray, not beside it, where shadows would be shifted.
+    fn lifted(&self, point: Vec3, normal: Vec3, direction: Vec3, facing: f32) -> Vec3 {
+        let along = (LIFT / facing.max(1e-3)).min(FARTHEST);
+        (point - self.low) / self.cell() + along * direction + (LIFT - along * facing) * normal
+    }
+
     /// Share of the light from a direction that reaches a surface.
     pub fn from_sun(&self, point: Vec3, normal: Vec3, direction: Vec3) -> f32 {
-        // On the ray, not beside it: off to the side, shadows would be shifted.
-        let facing = normal.dot(direction).max(0.0);
-        let along = (LIFT / facing.max(1e-3)).min(FARTHEST);
-        let beside = (LIFT - along * facing) * normal;
-        self.pass((point - self.low) / self.cell() + along * direction + beside, direction).0
+        self.pass(self.lifted(point, normal, direction, normal.dot(direction).max(0.0)), direction).0
     }
 
-    /// Whether a block with something solid touches a cell of `[OPEN_CELLS³]` or one next to it.
-    fn is_near_solid(&self, at: [usize; 3]) -> bool {
-        let (edge, blocks) = (self.n as f32 / OPEN_CELLS as f32, self.n.div_ceil(BLOCK));
-        let range = |k: usize| {
-            let block = |v: f32| ((v * edge).clamp(0.0, self.n as f32 - 1.0) as usize) / BLOCK;
-            block(at[k] as f32 - 1.0)..=block(at[k] as f32 + 2.0)
-        };
-        let along = |z: usize, y: usize| range(0).any(|x| self.blocks[(z * blocks + y) * blocks + x]);
-        range(2).any(|z| range(1).any(|y| along(z, y)))
-    }
-
-    /// What is seen from a cell: none where nothing is near, or no point is free.
-    fn surroundings(&self, cell: usize) -> Option<Surroundings> {
-        let at = [cell % OPEN_CELLS, cell / OPEN_CELLS % OPEN_CELLS, cell / OPEN_CELLS / OPEN_CELLS];
-        if !self.is_near_solid(at) {
-            return None;
-        }
+    /// What a surface sees in `n` directions whose density is the cosine over π; which they are depends on the point and a seed.
+    pub fn looks(&self, point: Vec3, normal: Vec3, n: usize, seed: u32) -> impl Iterator<Item = Look> {
+        let (a, b) = normal.any_orthonormal_pair();
+        let bits = point.to_array().iter().fold(seed ^ 0x9e37_79b9, |h, v| (h ^ v.to_bits()).wrapping_mul(0x85eb_ca6b).rotate_left(13));
+        let (turn, shift) = ((bits & 0xffff) as f32 / 65_536.0, (bits >> 16) as f32 / 65_536.0);
         let edge = self.n as f32 / OPEN_CELLS as f32;
-        let corner = Vec3::from(at.map(|k| k as f32));
-        // Golden-ratio points in the cell.
-        let points = (1..30).map(|k| (corner + (k as f32 * Vec3::new(0.819_172_5, 0.671_043_6, 0.549_700_5)).fract()) * edge);
-        let free: Vec<Vec3> = points.filter(|p| self.solidity(*p) < 0.05).take(POINTS).collect();
-        if free.is_empty() {
-            return None;
-        }
-        let mut out = Surroundings { even: [0.0; 9], sky: [[0.0; 9]; 9], seen: Vec::new() };
-        let each = 1.0 / free.len() as f32;
-        for i in 0..DIRECTIONS {
-            let (basis, weights) = looks(i);
-            let d = spread(i, DIRECTIONS).as_vec3();
-            for p in &free {
-                let (open, first) = self.pass(*p, d);
-                (0..9).for_each(|j| out.even[j] += each * open * weights[j]);
-                // What lies below and outside of the cube is ground, not sky.
-                let (open, cell) = if open > SEEN && d.z < 0.0 { (0.0, GROUND) } else { (open, self.open_cell(first / edge)) };
-                for j in 0..9 {
-                    (0..9).for_each(|k| out.sky[j][k] += each * open * weights[j] * RADIANCE[k] * basis[k]);
-                }
-                if open < 1.0 - SEEN {
-                    out.seen.push(SeenSurface { cell, direction: i as u16, share: each * (1.0 - open) });
-                }
-            }
-        }
-        Some(out)
+        (0..n).map(move |i| {
+            let square = (i as f32 + shift) / n as f32;
+            let (y, x) = (std::f32::consts::TAU * (turn + i as f32 * GOLDEN)).sin_cos();
+            let facing = (1.0 - square).max(LEAST_FACING * LEAST_FACING).sqrt();
+            let direction = square.sqrt() * (x * a + y * b) + facing * normal;
+            let (passes, first) = self.pass(self.lifted(point, normal, direction, facing), direction);
+            let (open, cell) = if passes > SEEN && direction.z < 0.0 { (0.0, GROUND) } else { (passes, self.open_cell(first / edge)) };
+            Look { direction, facing, passes, open, cell }
+        })
+    }
+
+    /// Share of an even sky's light that reaches a surface.
+    pub fn from_sky(&self, point: Vec3, normal: Vec3, n: usize, seed: u32) -> f32 {
+        self.looks(point, normal, n, seed).map(|l| l.passes).sum::<f32>() / n as f32
     }
 
     /// The cell of `[OPEN_CELLS³]` at a point given in such cells.
@@ -251,105 +241,56 @@ impl Visibility {
     pub fn cell_of(&self, point: Vec3) -> u32 {
         self.open_cell((point - self.low) * (OPEN_CELLS as f32 / self.size))
     }
-
-    /// The views that count for a surface.
-    pub fn corners(&self, point: Vec3, normal: Vec3) -> Corners {
-        let edge = self.size / OPEN_CELLS as f32;
-        let p = (point - self.low) / edge + 0.5 * normal - 0.5;
-        let (base, f) = (p.floor(), p - p.floor());
-        let mut out = Corners::default();
-        let mut weights = 0.0;
-        for k in 0..8 {
-            let corner = [k & 1, k >> 1 & 1, k >> 2];
-            let q = [0, 1, 2].map(|a| base[a] as i32 + corner[a]);
-            if q.iter().any(|v| !(0..OPEN_CELLS as i32).contains(v)) {
-                continue;
-            }
-            let view = self.view_of[(q[2] as usize * OPEN_CELLS + q[1] as usize) * OPEN_CELLS + q[0] as usize];
-            if view != NONE {
-                let weight: f32 = [0, 1, 2].map(|a| if corner[a] == 1 { f[a] } else { 1.0 - f[a] }).iter().product::<f32>() + 1e-4;
-                out.0[out.1] = (view, weight);
-                out.1 += 1;
-                weights += weight;
-            }
-        }
-        out.0[..out.1].iter_mut().for_each(|c| c.1 /= weights);
-        out
-    }
-
-    /// Share of an even sky's light that reaches a surface.
-    pub fn from_sky(&self, corners: &Corners, normal: Vec3) -> f32 {
-        let basis = basis(normal);
-        let of = |v: u32| (0..9).map(|i| self.views[v as usize].even[i] * basis[i]).sum::<f32>();
-        if corners.1 == 0 { 1.0 } else { corners.each().map(|(v, w)| w * of(v)).sum::<f32>().clamp(0.0, 1.0) }
-    }
-
-    /// Light that reaches a surface for each coefficient of a sky, all as irradiance over π.
-    pub fn sky_row(&self, corners: &Corners, normal: Vec3) -> [f32; 9] {
-        let basis = basis(normal);
-        if corners.1 == 0 {
-            return basis;
-        }
-        let mut row = [0.0; 9];
-        for (v, w) in corners.each() {
-            for (of_sky, b) in self.views[v as usize].sky.iter().zip(basis) {
-                (0..9).for_each(|i| row[i] += w * b * of_sky[i]);
-            }
-        }
-        row
-    }
-
-    /// Light of a sky `[9, 3]` and of surfaces of which `radiosity` over π is given by cell, and of the ground outside.
-    pub fn ambient(&self, sky: &[f32], radiosity: &[Vec3], ground: Vec3) -> Ambient {
-        let weights: Vec<[f32; 9]> = (0..DIRECTIONS).map(|i| looks(i).1).collect();
-        let of = |s: &Surroundings| {
-            let mut out: [Vec3; 9] = std::array::from_fn(|j| (0..9).map(|i| s.sky[j][i] * Vec3::from_slice(&sky[3 * i..])).sum());
-            for seen in &s.seen {
-                let sent = seen.share * if seen.cell == GROUND { ground } else { radiosity[seen.cell as usize] };
-                (0..9).for_each(|j| out[j] += weights[seen.direction as usize][j] * sent);
-            }
-            out
-        };
-        Ambient(self.views.par_iter().map(of).collect())
-    }
 }
 
-impl Corners {
-    fn each(&self) -> impl Iterator<Item = (u32, f32)> {
-        self.0[..self.1].iter().copied()
+impl Radiosity {
+    /// That of surfaces that send nothing.
+    pub fn dark() -> Radiosity {
+        Radiosity { cells: vec![Vec3::ZERO; OPEN_CELLS.pow(3)], ground: Vec3::ZERO }
+    }
+
+    pub fn of(&self, cell: u32) -> Vec3 {
+        if cell == GROUND { self.ground } else { self.cells[cell as usize] }
     }
 }
 
 impl Ambient {
-    /// Irradiance over π of a surface; `sky` `[9, 3]` where nothing is near.
-    pub fn at(&self, corners: &Corners, normal: Vec3, sky: &[f32]) -> Vec3 {
-        of_normal(&self.around(corners, sky), normal)
-    }
-
-    /// The same as spherical harmonics of the normal, whatever that is.
-    pub fn around(&self, corners: &Corners, sky: &[f32]) -> [Vec3; 9] {
-        match corners.1 {
-            0 => std::array::from_fn(|i| Vec3::from_slice(&sky[3 * i..])),
-            _ => std::array::from_fn(|i| corners.each().map(|(v, w)| w * self.0[v as usize][i]).sum()),
+    /// Light that arrives from where a surface looks.
+    pub fn gathered(&self, normal: Vec3, looks: impl Iterator<Item = Look>) -> Gathered {
+        let mut out = Gathered { normal, light: Vec3::ZERO, slope: [Vec3::ZERO; 3], open: 0.0 };
+        let mut n = 0.0;
+        for look in looks {
+            let mut radiance = (1.0 - look.open) * if look.open < 1.0 - SEEN { self.radiosity.of(look.cell) } else { Vec3::ZERO };
+            if look.open > 0.0 {
+                let of_sky: Vec3 =
+                    radiances(look.direction).iter().zip(self.sky.chunks_exact(3)).map(|(r, s)| *r * Vec3::from_slice(s)).sum();
+                radiance += look.open * of_sky;
+            }
+            out.light += radiance;
+            out.open += look.passes;
+            let by = radiance / look.facing.max(LEAST_SLOPING);
+            out.slope = [0, 1, 2].map(|k| out.slope[k] + look.direction[k] * by);
+            n += 1.0;
         }
+        Gathered { light: out.light / n, open: out.open / n, slope: out.slope.map(|s| s / n), ..out }
     }
 }
 
-/// Irradiance over π of a surface by spherical harmonics of its normal.
-pub fn of_normal(around: &[Vec3; 9], normal: Vec3) -> Vec3 {
-    basis(normal).iter().zip(around).map(|(b, v)| *b * *v).sum::<Vec3>().max(Vec3::ZERO)
+impl Gathered {
+    /// Of a place that nothing reaches.
+    pub const NONE: Gathered = Gathered { normal: Vec3::Z, light: Vec3::ZERO, slope: [Vec3::ZERO; 3], open: 1.0 };
+
+    /// Irradiance over π for a normal near the surface's.
+    pub fn at(&self, normal: Vec3) -> Vec3 {
+        let turned = normal - self.normal;
+        (self.light + turned.x * self.slope[0] + turned.y * self.slope[1] + turned.z * self.slope[2]).max(Vec3::ZERO)
+    }
 }
 
-fn basis(normal: Vec3) -> [f32; 9] {
-    sh_light::basis(normal.as_dvec3()).map(|b| b as f32)
-}
-
-/// Basis functions of a direction in which points look, and irradiance over π that a radiance of 1 in its part of the sphere gives.
-fn looks(i: usize) -> ([f32; 9], [f32; 9]) {
-    let d = spread(i, DIRECTIONS);
-    let mut light = ShLight::DARK;
-    light.add_sun(d, [4.0 * std::f64::consts::PI / DIRECTIONS as f64, 0.0, 0.0]);
-    (sh_light::basis(d).map(|b| b as f32), std::array::from_fn(|j| light.0[j][0] as f32))
+/// Radiance in a direction for each coefficient of a sky that is given as irradiance over π.
+pub fn radiances(direction: Vec3) -> [f32; 9] {
+    let basis = sh_light::basis(direction.as_dvec3());
+    std::array::from_fn(|k| RADIANCE[k] * basis[k] as f32)
 }
 
 /// Direction `i` of `n` that are spread evenly over the sphere.
@@ -376,6 +317,10 @@ fn is_occupied(bits: &OccupancyBits, p: [f32; 3]) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn basis(n: Vec3) -> [f32; 9] {
+        sh_light::basis(n.as_dvec3()).map(|b| b as f32)
+    }
 
     /// A plate at z = 0.25 and a wall on it at x = 0.5, each 0.1 thick.
     struct Corner;
@@ -423,12 +368,47 @@ mod tests {
     #[test]
     fn corners_are_less_open_than_the_plain() {
         let v = corner();
-        let open = |point: Vec3, normal: Vec3| v.from_sky(&v.corners(point, normal), normal);
+        let open = |point: Vec3, normal: Vec3| v.from_sky(point, normal, 512, 0);
         let [far, near] = [0.05, 0.47].map(|x| open(Vec3::new(x, 0.5, 0.25), Vec3::Z));
         // A wall of height h at distance d hides (1 − d / √(d² + h²)) / 2 of what a plain receives, if it is long.
         assert!((far - 0.83).abs() < 0.1 && (near - 0.55).abs() < 0.12, "{far} {near}");
         let side = open(Vec3::new(0.5, 0.5, 0.5), Vec3::NEG_X);
         assert!((side - 0.72).abs() < 0.1, "{side}");
+    }
+
+    /// Open space under a sky of which the upper half is seen, before a ground that sends what the sky would.
+    #[test]
+    fn light_in_the_open_is_that_of_the_sky_and_changes_with_the_normal_as_it_does() {
+        let empty = Visibility::new(vec![0; 64], (0.0, 1.0), 16);
+        let mut sky = [0.0; 27];
+        (0..27).for_each(|i| sky[i] = [0.9, 0.2, 0.1][i % 3] * [1.0, -0.1, 0.3, 0.2, 0.04, -0.03, 0.05, 0.02, -0.06][i / 3]);
+        let ambient = Ambient { sky: sky.to_vec(), radiosity: Radiosity::dark() };
+        let normal = Vec3::new(0.1, -0.2, 1.0).normalize();
+        // Of directions below, which see the ground, few count for a surface that looks up.
+        let light = |n: Vec3| (0..9).map(|i| basis(n)[i] * Vec3::from_slice(&sky[3 * i..])).sum::<Vec3>();
+        let got = ambient.gathered(normal, empty.looks(Vec3::splat(0.5), normal, 8192, 1));
+        assert!((got.light - light(normal)).abs().max_element() < 0.03, "{} {}", got.light, light(normal));
+        for side in [Vec3::X, Vec3::Y] {
+            let turned = (normal + 0.05 * side).normalize();
+            let (want, by) = (light(turned) - light(normal), got.at(turned) - got.light);
+            assert!((want - by).abs().max_element() < 0.15 * want.abs().max_element() + 1e-3, "{want} {by}");
+        }
+        assert!(got.open > 0.97);
+    }
+
+    #[test]
+    fn what_hides_the_sky_sends_its_own_light() {
+        let v = corner();
+        let (point, up) = (Vec3::new(0.47, 0.5, 0.25), Vec3::Z);
+        let with = |cells: Vec3| {
+            let radiosity = Radiosity { cells: vec![cells; OPEN_CELLS.pow(3)], ground: Vec3::ZERO };
+            Ambient { sky: vec![0.0; 27], radiosity }.gathered(up, v.looks(point, up, 2048, 0))
+        };
+        let (dark, lit) = (with(Vec3::ZERO), with(Vec3::new(1.0, 0.5, 0.0)));
+        assert_eq!(dark.light, Vec3::ZERO);
+        assert!((lit.light - (1.0 - lit.open) * Vec3::new(1.0, 0.5, 0.0)).abs().max_element() < 0.02, "{lit:?}");
+        // The wall stands at +x: a surface that turns there receives more of it.
+        assert!(lit.slope[0].x > 0.1 && lit.at(Vec3::new(0.1, 0.0, 0.995)).x > lit.light.x, "{lit:?}");
     }
 
     #[test]

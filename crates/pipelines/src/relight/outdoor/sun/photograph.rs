@@ -35,7 +35,7 @@ pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility
     let seen: Vec<Seen> =
         shown.iter().map(|s| Seen { point: s.point, normal: s.normal, colors: vec![s.color], shown: vec![true], is_flat: true }).collect();
     let mean = shown.iter().map(|s| s.color).sum::<Vec3>() / shown.len().max(1) as f32;
-    let sent_first = |p: &Place| (1.0 - visibility.from_sky(&p.corners, p.normal)) * BOUNCED / FIRST_ALBEDO * mean;
+    let sent_first = |p: &Place| (1.0 - p.open) * BOUNCED / FIRST_ALBEDO * mean;
     let mut sent: Vec<Vec3> = places.points.iter().map(sent_first).collect();
     // What is overexposed says that there is at least so much light.
     let counting = |found: &Option<Guess>, sent: &[Vec3]| {
@@ -64,8 +64,7 @@ pub fn of_photograph(shown: &[Shown], around: &Surfaces, visibility: &Visibility
         let near = found.as_ref().filter(|_| round > SEARCHED).map(|g| Vec3::from_slice(&g.fitted.sun));
         let fitted = fit(&points, &places, visibility, near);
         let ambient = around.light(visibility, &fitted.sun, &fitted.sky);
-        let bounced = |p: &Place| ambient.at(&p.corners, p.normal, &fitted.sky) - p.of_sky(&fitted.sky).max(Vec3::ZERO);
-        sent = places.points.iter().map(bounced).collect();
+        sent = places.points.iter().map(|p| p.sent(&ambient.radiosity)).collect();
         found = Some(Guess { sunlit: places.sunlit(visibility, Vec3::from_slice(&fitted.sun)), sent: sent.clone(), fitted });
     }
     let points = counting(&found, &sent);

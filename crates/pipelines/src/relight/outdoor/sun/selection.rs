@@ -88,7 +88,7 @@ impl Selection<'_> {
 
     fn settled(&self, mut guesses: Vec<Guess>, surfaces: &Surfaces, times: usize, go_on: &mut dyn FnMut() -> bool) -> Option<Told> {
         let mut surfaces = surfaces.clone();
-        if !settle(self.seen, &mut surfaces, self.visibility, &mut guesses, times * SETTLING, go_on) {
+        if !settle(self.seen, &mut surfaces, &mut guesses, times * SETTLING, go_on) {
             return None;
         }
         Some(Told { misfit: misfit(self.seen, &surfaces, &guesses), guesses, surfaces })

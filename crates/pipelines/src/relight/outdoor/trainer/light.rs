@@ -205,9 +205,9 @@ impl Trainer<'_> {
             lights: &lights,
             skies: &self.model.skies.values,
             gains: &self.model.gains.values,
-            suns: is_apart.then_some(Suns { values: &suns, ambients, visibility, origins }),
+            suns: is_apart.then_some(Suns { values: &suns, ambients, visibility, origins, seed: step as u32 }),
             bends: is_apart && settled,
-            traced: (!is_apart).then_some(TracedLight { suns: &taught.suns, skies: &taught.skies, visibility, origins }),
+            traced: (!is_apart).then_some(TracedLight { suns: &taught.suns, skies: &taught.skies, visibility, origins, seed: step as u32 }),
             out: Mutex::default(),
         };
         let of_suns = if is_apart { self.sun_codes(&drawn.light, step) } else { [Vec::new(), Vec::new()] };
