@@ -114,10 +114,11 @@ fn add_errors<A: Accumulate>(
         terminate!();
     }
     let image = images[r] as usize;
-    let u = pixels[r * 2] / f32::cast_from(sizes[image * 2]);
-    let v = pixels[r * 2 + 1] / f32::cast_from(sizes[image * 2 + 1]);
-    let x = min(u32::cast_from(u * comptime!(CELLS as f32)), comptime!(CELLS as u32 - 1)) as usize;
-    let y = min(u32::cast_from(v * comptime!(CELLS as f32)), comptime!(CELLS as u32 - 1)) as usize;
+    // In whole numbers: devices round divisions of f32 as they like, and centers of pixels lie on borders of cells.
+    let x = u32::cast_from(2.0 * pixels[r * 2]) * comptime!(CELLS as u32) / (2 * sizes[image * 2]);
+    let y = u32::cast_from(2.0 * pixels[r * 2 + 1]) * comptime!(CELLS as u32) / (2 * sizes[image * 2 + 1]);
+    let x = min(x, comptime!(CELLS as u32 - 1)) as usize;
+    let y = min(y, comptime!(CELLS as u32 - 1)) as usize;
     let cell = (image * CELLS + y) * CELLS + x;
     A::add(&gains[cell], errors[r]);
     A::add(&hits[cell], 1.0);
