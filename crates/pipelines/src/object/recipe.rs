@@ -194,6 +194,8 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
     let (rays, whole) = ((trainer.model.rays - before.0) as f64, (trainer.whole - before.1) as f64);
     let (trained, marched) = ((trainer.model.samples - before.2) as f64, trainer.marched - before.3);
     let stages = trainer.device.stages().map(|s| s.seconds.clone()).unwrap_or_default();
+    // A device keeps the grid.
+    trainer.download()?;
     let total: f64 = stages.iter().map(|s| s.1).sum();
     Ok(TrainReport {
         threads: rayon::current_num_threads(),
