@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
 /// What only the hash grid and its stages read.
-const GRID_KEYS: [&str; 22] = [
+const GRID_KEYS: [&str; 23] = [
     "field.levels",
     "field.log2_size",
     "field.base",
@@ -24,6 +24,7 @@ const GRID_KEYS: [&str; 22] = [
     "loss.distortion",
     "loss.depth",
     "loss.gauge",
+    "loss.retinex",
     "loss.near_scaling",
     "optim.grid_rate",
     "optim.table_decay",
@@ -128,6 +129,9 @@ pub struct LossConfig {
     pub depth: f32,
     /// Brightest twentieth of the albedo beyond a luminance of 0.9.
     pub gauge: f32,
+    /// Albedo that differs between neighboring pixels which look alike (Land and McCann 1971); 0: none, else rays are drawn in pairs.
+    #[serde(default)]
+    pub retinex: f32,
     /// Distance, in inner cubes, within which samples learn more slowly the closer they are to the camera; 0: none.
     #[serde(default = "one_cube")]
     pub near_scaling: f32,
@@ -273,6 +277,7 @@ impl Config {
                 distortion: 0.1,
                 depth: 0.3,
                 gauge: 0.1,
+                retinex: 0.0,
                 near_scaling: 0.0,
             },
             optim: OptimConfig { grid_rate: 1.5e-2, table_decay: 1e-5, net_rate: 3e-3, light_rate: 5e-3, final_scale: 0.05 },
@@ -391,6 +396,7 @@ impl Configuration for Config {
             self.loss.distortion,
             self.loss.depth,
             self.loss.gauge,
+            self.loss.retinex,
             self.loss.near_scaling,
         ];
         if self.loss.huber <= 0.0 || weights.iter().any(|w| !(*w >= 0.0 && w.is_finite())) {

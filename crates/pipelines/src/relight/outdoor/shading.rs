@@ -12,7 +12,7 @@
 use super::sun::{BOUNCED, SUN, gray, level};
 use super::sunlit::{FAINT, LEFT, SHORTEST, Sunlit, arriving, direct, sunlit, surface, unhidden, unit};
 use super::visibility::{Ambient, Visibility, spread};
-use diorama_geom::color::LUMINANCE;
+use diorama_geom::color::{LUMINANCE, linear_from_srgb};
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
 use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
@@ -39,6 +39,9 @@ const SOLID: f32 = 0.5;
 const TRACED_WIDTH: f32 = 0.1;
 /// Value in sRGB from which a photograph may be clipped.
 const CLIPPED: f32 = 0.99;
+/// Natural logarithm of the linear colors of two pixels up to which they look alike, and color below which that says nothing.
+const ALIKE: f32 = 0.1;
+const DARKEST: f32 = 0.01;
 /// Directions in which a ray's surface looks for sky and other surfaces.
 const LOOKS: usize = 16;
 /// Directions in which irradiance must not be negative.
@@ -59,6 +62,8 @@ pub struct Weights {
     pub gauge: f32,
     /// Angle between the head's normal and the surface's.
     pub tie: f32,
+    /// Albedo that differs between the two rays of a pair which look alike; 0: rays are no pairs.
+    pub retinex: f32,
 }
 
 /// What the rays of a step are compared with.
@@ -367,6 +372,25 @@ impl SceneLoss<'_> {
         loss
     }
 
+    /// Retinex prior: where the two pixels of a pair look alike, their albedo does. Adds gradients.
+    fn alike(&self, out: &RayOutputs, gradients: &mut RayGradients, share: f32) -> f64 {
+        let (c, w, mut loss) = (self.channels(), self.weights.retinex, 0.0);
+        let logarithm = |r: usize, k: usize| linear_from_srgb(self.target[3 * r + k]).max(DARKEST).ln();
+        for (a, b) in (1..out.opacity.len()).step_by(2).map(|b| (b - 1, b)) {
+            let is_seen = [a, b].iter().all(|r| self.counts[*r] > 0.0 && out.opacity[*r] > SOLID);
+            if w == 0.0 || !is_seen || (0..3).any(|k| (logarithm(a, k) - logarithm(b, k)).abs() > ALIKE) {
+                continue;
+            }
+            for k in 0..3 {
+                let off = out.values[c * a + k] - out.values[c * b + k];
+                loss += (share * w * off * off) as f64;
+                gradients.values[c * a + k] += 2.0 * share * w * off;
+                gradients.values[c * b + k] -= 2.0 * share * w * off;
+            }
+        }
+        loss
+    }
+
     /// Penalty of negative irradiance, the same directions for every light.
     fn negative(&self, tables: &mut SceneGradients) -> f64 {
         let mut loss = 0.0;
@@ -412,7 +436,7 @@ impl BatchLoss for SceneLoss<'_> {
         if self.suns.is_none() {
             loss += self.negative(&mut tables);
         }
-        loss += self.gauge(out, gradients, share);
+        loss += self.gauge(out, gradients, share) + self.alike(out, gradients, share);
         if !worst.is_empty() {
             let at = worst.len() / 2;
             tables.median = *worst.select_nth_unstable_by(at, f32::total_cmp).1;

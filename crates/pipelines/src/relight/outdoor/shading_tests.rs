@@ -98,7 +98,7 @@ fn run_with(c: &Case, traced: f32, visibility: &Visibility) -> (f64, RayGradient
     let ambients: [Ambient; 2] = std::array::from_fn(|l| ambient(&c.lights[LIGHT * l..][..LIGHT]));
     let skies = (0..LIGHT).map(|i| if i < 3 { 0.5 } else { 0.05 }).collect::<Vec<f32>>().repeat(RAYS);
     let loss = SceneLoss {
-        weights: Weights { huber: 0.4, robust: 0.0, shadow: 0.2, traced, negative: 0.5, gauge: 0.0, tie: 0.3 },
+        weights: Weights { huber: 0.4, robust: 0.0, shadow: 0.2, traced, negative: 0.5, gauge: 0.0, tie: 0.3, retinex: 0.0 },
         target: &c.target,
         counts: &[1.0, 0.5, 1.0, 0.0, 1.0],
         normals: &c.normals,
@@ -261,29 +261,50 @@ fn the_light_of_a_perfect_explanation_has_no_loss() {
     assert!(tables.mse < 1e-10 && tables.median < 1e-5, "{tables:?}");
 }
 
+/// The loss of a case's colors, with weights of robustness and of the Retinex prior, and its gradient.
+fn plain(c: &Case, robust: f32, retinex: f32) -> (f64, Vec<f32>) {
+    let loss = SceneLoss {
+        weights: Weights { huber: 1.0, robust, shadow: 0.0, traced: 0.0, negative: 0.0, gauge: 0.0, tie: 0.0, retinex },
+        target: &c.target,
+        counts: &[1.0; RAYS],
+        normals: &c.normals,
+        dirs: &c.dirs,
+        light: &[0; RAYS],
+        image: &[0; RAYS],
+        lights: &c.lights,
+        skies: &c.skies,
+        gains: &[],
+        suns: None,
+        bends: false,
+        traced: None,
+        out: Mutex::default(),
+    };
+    let mut d = RayGradients::default();
+    d.clear(RAYS, CHANNELS);
+    let value = loss.batch(&RayOutputs { values: &c.values, opacity: &c.opacity, depth: &[0.0; RAYS] }, &mut d);
+    (value, d.values)
+}
+
 #[test]
 fn pixels_that_fit_badly_count_less() {
-    let c = case();
-    let with = |robust: f32| {
-        let loss = SceneLoss {
-            weights: Weights { huber: 1.0, robust, shadow: 0.0, traced: 0.0, negative: 0.0, gauge: 0.0, tie: 0.0 },
-            target: &c.target,
-            counts: &[1.0; RAYS],
-            normals: &c.normals,
-            dirs: &c.dirs,
-            light: &[0; RAYS],
-            image: &[0; RAYS],
-            lights: &c.lights,
-            skies: &c.skies,
-            gains: &[],
-            suns: None,
-            bends: false,
-            traced: None,
-            out: Mutex::default(),
-        };
-        let mut d = RayGradients::default();
-        d.clear(RAYS, CHANNELS);
-        loss.batch(&RayOutputs { values: &c.values, opacity: &c.opacity, depth: &[0.0; RAYS] }, &mut d)
-    };
+    let with = |robust: f32| plain(&case(), robust, 0.0).0;
     assert!(with(0.05) < 0.2 * with(0.0), "{} {}", with(0.05), with(0.0));
+}
+
+#[test]
+fn albedo_of_pairs_that_look_alike_is_drawn_together() {
+    let mut c = case();
+    c.opacity.fill(1.0);
+    // The first pair looks alike, the second does not.
+    c.target = vec![0.5; 3 * RAYS];
+    c.target[3 * 3] = 0.6;
+    let [with, without] = [0.7, 0.0].map(|retinex| plain(&c, 0.0, retinex));
+    let albedo = |r: usize, k: usize| c.values[r * CHANNELS + k];
+    let squares: f32 = (0..3).map(|k| (albedo(0, k) - albedo(1, k)).powi(2)).sum();
+    assert!(squares > 0.01 && (with.0 - without.0 - (0.7 * squares / RAYS as f32) as f64).abs() < 1e-5);
+    for (i, (a, b)) in with.1.iter().zip(&without.1).enumerate() {
+        let (r, k) = (i / CHANNELS, i % CHANNELS);
+        let want = if r < 2 && k < 3 { 2.0 * 0.7 / RAYS as f32 * (albedo(r, k) - albedo(1 - r, k)) } else { 0.0 };
+        assert!((a - b - want).abs() < 1e-5, "ray {r}, channel {k}: {} {want}", a - b);
+    }
 }

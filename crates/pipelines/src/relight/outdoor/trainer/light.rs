@@ -126,6 +126,24 @@ impl Trainer<'_> {
         batch
     }
 
+    /// Replaces every second ray by one through a neighbor of the pixel before, to its right or below.
+    fn pair(&mut self) {
+        let (source, b) = (WithoutGlass(&self.photographs), &mut self.batch);
+        let stride = source.stride();
+        for r in (1..b.len()).step_by(2) {
+            let (image, at) = (b.images[r - 1], [0, 1].map(|k| b.pixels[2 * (r - 1) + k] as u32));
+            let size: [u32; 2] = source.size(image as usize).into();
+            let (axis, mut to) = (r / 2 % 2, at);
+            to[axis] = if at[axis] + stride < size[axis] { at[axis] + stride } else { at[axis].saturating_sub(stride) };
+            let (x, y) = source.snap(image as usize, to[0], to[1]);
+            b.images[r] = image;
+            b.pixels[2 * r..2 * r + 2].copy_from_slice(&[x as f32 + 0.5, y as f32 + 0.5]);
+            b.target[4 * r..4 * r + 4].copy_from_slice(&source.rgba(image as usize, x, y));
+            b.counts[r] = source.counts(image as usize, x, y);
+        }
+        pixels::rays(&self.cameras, self.model.config.sampling.near, self.model.cube(), &mut self.batch);
+    }
+
     /// The lights of the rays; every [`TAUGHT_RAYS`]th ray has a sun of its own. Shadows read a little noise besides.
     fn taught(&self, light: &[u32], step: u64) -> Taught {
         let (m, rng, noise) = (&self.model, self.rng(TAUGHT, step), self.rng(NOISE, step));
@@ -170,7 +188,11 @@ impl Trainer<'_> {
     /// One step of the light's stage.
     pub(super) fn relight(&mut self, step: u64, share: f32) -> Result<StepReport> {
         self.draw(step);
-        let (n, mut drawn, c) = (self.batch.len(), self.drawn(), self.model.config.clone());
+        let c = self.model.config.clone();
+        if c.loss.retinex > 0.0 {
+            self.pair();
+        }
+        let (n, mut drawn) = (self.batch.len(), self.drawn());
         let is_apart = c.light.has_sun();
         // Where suns are apart, shadows are traced and not learned.
         let taught = if is_apart { Taught::default() } else { self.taught(&drawn.light, step) };
@@ -195,6 +217,7 @@ impl Trainer<'_> {
                 negative: c.loss.negative,
                 gauge: c.loss.gauge,
                 tie: c.loss.normal,
+                retinex: c.loss.retinex,
             },
             target: &drawn.target,
             counts: &drawn.counts,
