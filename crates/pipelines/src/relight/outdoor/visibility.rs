@@ -17,7 +17,7 @@ const SOLID: f32 = 0.5;
 const DEPTH: f32 = 2.0;
 const OPAQUE: f32 = 6.0;
 /// Cells above its surface at which what a ray meets begins to count, and farthest along the ray that this is.
-const LIFT: f32 = 1.5;
+const LIFT: f32 = 1.0;
 const FARTHEST: f32 = 8.0;
 /// Length of a step in cells.
 const STEP: f32 = 0.7;
