@@ -315,3 +315,41 @@ fn what_glass_mirrors_teaches_no_light() {
     assert!(plain == train("glass", 12..24), "what glass shows changes the light");
     assert!(plain != train("wall", 0..12), "what walls show changes nothing");
 }
+
+/// The error of training on photographs of which all masks hold one value.
+fn refusal_of_masks(value: u8) -> String {
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("data");
+    generate(&data, 5, (24, 16));
+    for entry in std::fs::read_dir(data.join("masks")).unwrap().flatten() {
+        photo::save_png(&entry.path(), &ImageU8 { width: 24, height: 16, channels: 1, data: vec![value; 24 * 16] }).unwrap();
+    }
+    let mut folder = RunFolder::create(&dir.path().join("run"), false).unwrap();
+    let trained = recipe::train(&config(&data, 1), &mut folder, false, None, &AtomicBool::new(false), &mut |_| {});
+    let e = trained.err().expect("nothing to train on");
+    assert!(e.is_input(), "{e}");
+    e.to_string()
+}
+
+#[test]
+fn masks_that_leave_no_surface_are_named() {
+    let (transient, glass) = (refusal_of_masks(0), refusal_of_masks(192));
+    assert!(["masks", ".png", "100 %", "255 is static"].iter().all(|w| transient.contains(w)), "{transient}");
+    assert!(["masks", ".png", "192 is glass", "255"].iter().all(|w| glass.contains(w)), "{glass}");
+}
+
+/// Panes so thin that no ray through the middle of a pixel meets them are marked as well.
+#[test]
+fn masks_of_a_generated_place_mark_all_pixels_that_show_glass() {
+    let marked = |width: f32| {
+        let (dir, mut place) = (tempfile::tempdir().unwrap(), place(5, (24, 16)));
+        place.model.materials[1].transmission = 0.9;
+        place.model.parts[1].mesh = cuboid([-0.5 * width, -0.4, 0.0], [0.5 * width, 1.2, 1.8]);
+        let options = SynthOptions { views: 5, lights: 1, size: (24, 16), samples: 1, seed: 0 };
+        synth::generate(dir.path(), &place, &options, true, &AtomicBool::new(false), &mut |_| {}).unwrap();
+        let masks = std::fs::read_dir(dir.path().join("masks")).unwrap().flatten();
+        masks.map(|m| photo::load(&m.path()).unwrap().data.iter().filter(|v| **v == 192).count()).sum::<usize>()
+    };
+    let (wide, thin) = (marked(1.4), marked(0.1));
+    assert!(wide > 5 * 20 && thin > 5 * 3 && thin < wide, "{wide} {thin}");
+}

@@ -195,7 +195,7 @@ pub fn fit(model: &SceneModel, o: &FitOptions, stop: &AtomicBool, progress: &mut
         pixels = used.len();
         if pixels < FEWEST {
             let why = "the region shows hardly any well-exposed surface that the model and other photographs know; give another --region or \
-                       --camera";
+                       --camera, or mend its mask";
             return Err(DataError::input(&o.photo, why).into());
         }
         if let Some(around) = model.surroundings.as_deref().filter(|_| model.has_suns()) {

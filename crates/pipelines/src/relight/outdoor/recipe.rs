@@ -181,10 +181,30 @@ fn load_pixels(config: &Config, capture: &Capture) -> Result<StoredPhotographs> 
                 "its mask covers {:.0} % as transient; 255 is static, 0 transient: invert the masks if they are",
                 100.0 * (1.0 - share)
             );
-            return Err(DataError::input(&frame.image, what).into());
+            return Err(DataError::input(frame.mask.as_ref().unwrap_or(&frame.image), what).into());
         }
     }
-    Ok(StoredPhotographs::new(store))
+    let photographs = StoredPhotographs::new(store);
+    let masked = frames.iter().find_map(|f| f.mask.as_ref());
+    if let Some(mask) = masked.filter(|_| !shows_surface(&photographs)) {
+        let what = "this mask and all others leave nothing but glass and sky: 192 is glass, 160 sky, 255 what stays as it is";
+        return Err(DataError::input(mask, what).into());
+    }
+    Ok(photographs)
+}
+
+/// Whether any pixel that counts shows what is neither glass nor empty space.
+fn shows_surface(photographs: &StoredPhotographs) -> bool {
+    (0..photographs.images()).any(|image| {
+        let (w, h) = photographs.size(image);
+        let shows = |x: u32, y: u32| {
+            photographs.snap(image, x, y) == (x, y)
+                && photographs.counts(image, x, y)
+                && !photographs.store().is_glass(image, x, y)
+                && photographs.rgba(image, x, y)[3] > 0.5
+        };
+        (0..h).any(|y| (0..w).any(|x| shows(x, y)))
+    })
 }
 
 /// A trained model, and notes.
