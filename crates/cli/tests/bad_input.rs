@@ -372,3 +372,14 @@ fn doctor_names_what_the_contract_asks_for() {
         assert!(json.get(key).is_some(), "{key}");
     }
 }
+
+#[test]
+fn poses_bounds_of_another_shape() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::create_dir(dir.path().join("images")).unwrap();
+    std::fs::copy(good().join("images/view_00.png"), dir.path().join("images/a.png")).unwrap();
+    let header = format!("{:<117}\n", "{'descr': '<f8', 'fortran_order': False, 'shape': (1, 15), }");
+    let npy = [&b"\x93NUMPY\x01\x00\x76\x00"[..], header.as_bytes(), &[0; 120]].concat();
+    std::fs::write(dir.path().join("poses_bounds.npy"), npy).unwrap();
+    refused(dir.path(), &[], &["poses_bounds.npy", "[1, 15]", "[images, 17]"]);
+}

@@ -122,6 +122,35 @@ fn what_does_not_fit_into_memory_is_refused_before_anything_is_written() {
     let said = String::from_utf8_lossy(&o.stderr);
     assert!(o.status.code() == Some(1) && said.contains("out of memory: the picture") && said.contains("smaller size"), "{said}");
     assert!(!dir.path().join("b.exr").exists());
+    for (call, left) in [
+        (&["compose", "scene.toml", "-o", "b.exr", "--export-blender", "blend"][..], "blend"),
+        (&["turntable", "cube.obj", "--size", "4096x4096", "--frames", "1", "-o", "turn"], "turn"),
+    ] {
+        let o = command(dir.path(), call).env("DIORAMA_MEMORY", "100MiB").output().unwrap();
+        let said = String::from_utf8_lossy(&o.stderr);
+        assert!(o.status.code() == Some(1) && said.contains("100 MiB are free") && !dir.path().join(left).exists(), "{said}");
+    }
+}
+
+#[test]
+fn bad_objects_are_refused_before_a_run_begins_and_lost_surfaces_begin_again() {
+    let (dir, call) = (folder(), "synth --object cube.obj --views 16 --size 48x48 --spp 2 --light uniform --unseen-light uniform -o data");
+    let at = dir.path();
+    assert!(run(at, &call.split(' ').collect::<Vec<_>>()).status.success());
+    std::fs::write(at.join("cut.hdr"), "#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 4 +X 8\nabc").unwrap();
+    let object = |more: &[&'static str]| [&["object", "data", "--preset", "ci", "--run", "run", "-o", "o.glb"], more].concat();
+    refused(at, &object(&["--set", "grid.scale=0.3"]), &[" pixels of the masks (", "grid.scale=1.", "auto"]);
+    refused(at, &object(&["--fixed-light", "cut.hdr"]), &["cut.hdr", "copy it again"]);
+    std::fs::write(at.join("bad.npz"), "no archive").unwrap();
+    refused(at, &object(&["--set", "grid.file=bad.npz"]), &["bad.npz"]);
+    let o = run(at, &object(&["--steps", "6", "--score-spp", "0", "--set", "optim.shape_rate=50"]));
+    let text = String::from_utf8_lossy(&o.stderr);
+    let again = text.lines().find(|l| l.contains("begins again")).unwrap_or_else(|| panic!("{text}"));
+    assert!(again.starts_with("step ") && again.contains("half the rate"), "{again}");
+    let image = diorama_data::photo::load(&at.join("data/images/003.png")).unwrap();
+    let data = image.data.chunks_exact(image.channels).flat_map(|p| p[..3].to_vec()).collect();
+    diorama_data::photo::save_png(&at.join("data/images/003.png"), &diorama_geom::ImageU8 { channels: 3, data, ..image }).unwrap();
+    refused(at, &object(&["--force"]), &["003.png", "RGBA", "masks/"]);
 }
 
 #[test]

@@ -240,3 +240,15 @@ fn runs_and_meshes_that_were_interrupted_are_whole_or_not_there() {
     interrupted(at, &object, || at.join("object/metrics.jsonl").exists(), "object.glb");
     checkpoint::load(&at.join("object/checkpoints")).unwrap();
 }
+
+#[test]
+fn a_scene_model_that_does_not_fit_is_refused() {
+    let dir = folder();
+    street(dir.path());
+    let call = settings(&["train", "street", "--preset", "ci", "--steps", "4", "-o", "run"], &SMALL_SCENE);
+    let mut c = Command::new(env!("CARGO_BIN_EXE_diorama"));
+    let o = c.arg("relight").args(call).current_dir(dir.path()).env("DIORAMA_MEMORY", "1MiB").output().unwrap();
+    let text = String::from_utf8_lossy(&o.stderr);
+    assert!(["out of memory: the field", "1 MiB are free", "field.log2_size=11"].iter().all(|w| text.contains(w)), "{text}");
+    assert!(o.status.code() == Some(1) && !dir.path().join("run").exists());
+}

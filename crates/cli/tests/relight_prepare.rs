@@ -92,6 +92,17 @@ fn what_does_not_fit_is_named_before_anything_is_written() {
     photo::save_png(&mask, &ImageU8 { width: 32, height: 20, channels: 1, data: vec![255; 640] }).unwrap();
     let (code, text, _) = prepare(&source, &out, &["--rescale"]);
     assert!(code == Some(2) && text.contains("32×20") && text.contains("32×24"), "{text}");
+    std::fs::remove_file(&mask).unwrap();
+    let (code, text, _) = prepare(&source, &out, &["--rescale"]);
+    assert!(code == Some(2) && text.contains("5 files for 6 photographs") && text.contains("IMG_2"), "{text}");
+    for i in 0..8 {
+        let file = format!("{}/mask/0{}-08_07_30_IMG_{i}.png", if i < 6 { "train" } else { "test" }, 1 + i % 2);
+        let data = (0..32 * 24).map(|k| if k % 32 < 8 { 255 } else { 0 }).collect();
+        photo::save_png(&source.join(file), &ImageU8 { width: 32, height: 24, channels: 1, data }).unwrap();
+    }
+    let (code, text, _) = prepare(&source, &out, &["--rescale"]);
+    assert!(code == Some(2) && text.contains("75 %") && text.contains("inverted"), "{text}");
+    assert!(!out.exists());
 }
 
 /// Paints a bluish sky onto the upper third of all photographs, of which the masks say that nothing moved.

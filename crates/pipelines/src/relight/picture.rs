@@ -6,7 +6,7 @@ use crate::run::memory;
 use diorama_data::checkpoint::{self, Entry};
 use diorama_data::{DataError, photo};
 use diorama_geom::color::{srgb_from_linear, u8_from_unit};
-use diorama_geom::{Image, ImageU8};
+use diorama_geom::{Camera, Image, ImageU8};
 use diorama_kernels::ops::path_trace::{Film, Pixel, Scene, Settings, View};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -37,14 +37,21 @@ pub struct Job<'a> {
     pub key: String,
 }
 
+/// Refuses pictures that do not fit into memory.
+///
+/// # Errors
+/// When a camera's does not.
+pub fn require_memory(camera: &Camera) -> Result<()> {
+    memory::require("the picture", camera.width as u64 * camera.height as u64 * PIXEL, "render a smaller size")
+}
+
 /// Renders a picture of the scene that `tracer` has loaded, continuing an unfinished one, and whether it was interrupted. `progress` gets the
 /// share that is done.
 ///
 /// # Errors
 /// When the unfinished picture cannot be written, or a device that was named failed.
 pub fn render(job: &Job, tracer: &mut PathTracer, stop: &AtomicBool, progress: &mut dyn FnMut(f64)) -> Result<(Film, bool)> {
-    let pixels = job.view.camera.width as u64 * job.view.camera.height as u64;
-    memory::require("the picture", pixels * PIXEL, "render a smaller size")?;
+    require_memory(&job.view.camera)?;
     let mut film = job.continued().unwrap_or_else(|| Film::new(&job.view.camera));
     let mut last = Instant::now();
     while film.samples < job.samples {

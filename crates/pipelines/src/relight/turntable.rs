@@ -77,6 +77,7 @@ pub fn render(
         return Err(DataError::input(model, "holds no triangles").into());
     };
     let camera = Camera::pinhole(options.size.0, options.size.1, options.fov);
+    picture::require_memory(&camera)?;
     let mut scene = Scene::new(&geometry, &light);
     tracer.load(&scene)?;
     let mut output = Output::open(&options.out, options.size, force)?;

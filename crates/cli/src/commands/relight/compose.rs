@@ -63,6 +63,7 @@ impl Verb for Compose {
         let mut tracer = PathTracer::open(&self.device, Box::new(note))?;
         let mut composition = compose::load(&file)?;
         composition.notes.iter().for_each(|n| note(n));
+        picture::require_memory(&composition.view.camera)?;
         if let Some(folder) = &self.export_blender {
             export_blender::write(folder, &composition, &file, self.force)?.iter().for_each(|n| note(n));
             note(&format!("to render it with Cycles: {}", export_blender::hint(folder)));

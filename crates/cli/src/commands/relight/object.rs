@@ -168,6 +168,7 @@ impl Verb for Object {
         };
         let mut config = self.config(begun)?;
         watch_interrupts();
+        let existed = self.run.exists();
         // Nothing is written before the request is known to be sound.
         let (mut folder, imported) = match (folder, self.source()) {
             (Some(folder), _) => {
@@ -188,7 +189,13 @@ impl Verb for Object {
             }
         };
         let mut progress = Progress::new();
-        let trained = recipe::train(&config, &imported, &mut folder, self.resume, &INTERRUPT, &mut |e| progress.event(e))?;
+        let trained = recipe::train(&config, &imported, &mut folder, self.resume, &INTERRUPT, &mut |e| progress.event(e));
+        if trained.is_err() && !existed && !folder.checkpoints().exists() {
+            // A run that never started leaves nothing behind.
+            drop(folder);
+            let _ = std::fs::remove_dir_all(&self.run);
+        }
+        let trained = trained?;
         if trained.summary.interrupted {
             note(&format!("stopped at step {}; go on with --resume --run {}", trained.summary.step, self.run.display()));
             return Ok(Outcome::Interrupted);

@@ -2,6 +2,7 @@
 
 use super::config::{CHANNELS, Config};
 use crate::error::{PipelineError, Result};
+use crate::run::memory::size;
 
 /// Bytes of a number.
 const NUMBER: f64 = 4.0;
@@ -46,9 +47,9 @@ pub fn check(config: &Config, photographs: usize, pixels: usize, available: Opti
     match asked.into_iter().find(|(_, bytes, _)| kept + bytes > available as f64) {
         None => Ok(()),
         Some((stage, bytes, cure)) => Err(PipelineError::Memory(format!(
-            "out of memory: {stage} would take about {:.1} GiB, {:.1} GiB are free; {cure}",
-            (kept + bytes) / (1u64 << 30) as f64,
-            available as f64 / (1u64 << 30) as f64
+            "out of memory: {stage} would take about {}, {} are free; {cure}",
+            size((kept + bytes) as u64),
+            size(available)
         ))),
     }
 }

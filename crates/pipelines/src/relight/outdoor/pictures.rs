@@ -93,8 +93,8 @@ pub fn render(model: &SceneModel, options: &PicturesOptions, stop: &AtomicBool, 
         Some(_) => Vec::new(),
         None => frames.iter().map(|f| own_light(model, *f)).collect::<Result<Vec<_>>>()?,
     };
-    std::fs::create_dir_all(&options.out).map_err(DataError::io(&options.out, "create"))?;
     let mut fine = FineViews::new(model, options.samples)?;
+    std::fs::create_dir_all(&options.out).map_err(DataError::io(&options.out, "create"))?;
     for (i, frame) in frames.iter().enumerate() {
         let light = given.as_ref().unwrap_or_else(|| &own[i]);
         let view = fine.view(&model.posed(*frame), light);
