@@ -185,13 +185,19 @@ fn a_turntable_writes_its_frames_and_keeps_those_that_are_there() {
     let dir = folder();
     let turn = ["turntable", "cube.obj", "--frames", "3", "--size", "32x24", "--spp", "4", "-o", "turn"];
     assert!(run(dir.path(), &turn).status.success());
-    let frame = dir.path().join("turn/0001.png");
-    std::fs::write(&frame, b"mine").unwrap();
+    let frames: Vec<_> = (0..3).map(|i| dir.path().join(format!("turn/{i:04}.png"))).collect();
+    let read = || frames.iter().map(|f| std::fs::read(f).unwrap()).collect::<Vec<_>>();
+    let (whole, written) = (read(), || std::fs::metadata(&frames[0]).unwrap().modified().unwrap());
+    let first = written();
+    // What is missing is brightened as it was.
+    std::fs::remove_file(&frames[1]).unwrap();
     assert!(run(dir.path(), &turn).status.success());
-    assert_eq!(std::fs::read(&frame).unwrap(), b"mine");
-    assert!(run(dir.path(), &[&turn[..], &["--force"]].concat()).status.success());
-    assert_ne!(std::fs::read(&frame).unwrap(), b"mine");
-    assert!(dir.path().join("turn/0002.png").exists() && !dir.path().join("turn/0003.png").exists());
+    assert!(read() == whole && written() == first);
+    let other = turn.map(|a| if a == "32x24" { "24x24" } else { a });
+    refused(dir.path(), &other, &["0000.png", "32×24", "24×24", "--force"]);
+    assert!(read() == whole);
+    assert!(run(dir.path(), &[&other[..], &["--force"]].concat()).status.success());
+    assert!(read() != whole && !dir.path().join("turn/0003.png").exists());
 }
 
 #[test]

@@ -81,6 +81,7 @@ pub fn render(
     let mut scene = Scene::new(&geometry, &light);
     tracer.load(&scene)?;
     let mut output = Output::open(&options.out, options.size, force)?;
+    (0..options.frames).try_for_each(|i| output.check(i, options.size))?;
     let settings = Settings { shows_light: options.background, ..Settings::default() };
     let mut made = Turntable {
         out: options.out.clone(),
@@ -91,14 +92,17 @@ pub fn render(
         interrupted: false,
         notes,
     };
+    let is_first_needed = options.exposure.is_none() && (0..options.frames).any(|i| !output.has(i));
     for i in 0..options.frames {
+        let is_kept = output.has(i);
         let turn = i as f64 / options.frames as f64 * std::f64::consts::TAU;
         if options.turn_model {
             // Seen from a camera that moves, a light that moves along stands still.
             scene.set_light(&light.clone().turned(turn, 1.0));
             tracer.set_light(&scene)?;
         }
-        let rgba = if output.has(i) {
+        // The first frame tells how much all are brightened, the ones that are missing too.
+        let rgba = if is_kept && !(i == 0 && is_first_needed) {
             None
         } else {
             let view = View { camera, world_from_camera: orbit(&camera, [low, high], options.elevation, turn), lens: None };
@@ -117,7 +121,9 @@ pub fn render(
             if i == 0 && options.exposure.is_none() {
                 made.exposure = picture::automatic_exposure(&rgba);
             }
-            output.push(i, &rgba, made.exposure)?;
+            if !is_kept {
+                output.push(i, &rgba, made.exposure)?;
+            }
         }
         made.frames += 1;
         if stop.load(Ordering::Relaxed) && made.frames < options.frames {
@@ -166,6 +172,21 @@ impl Output {
 
     fn has(&self, i: usize) -> bool {
         matches!(self, Output::Folder { folder, force: false } if Output::file(folder, i).exists())
+    }
+
+    /// Refuses a frame of another turn.
+    fn check(&self, i: usize, size: (u32, u32)) -> Result<()> {
+        let Output::Folder { folder, .. } = self else { return Ok(()) };
+        let file = Output::file(folder, i);
+        let found = if self.has(i) { photo::load(&file)? } else { return Ok(()) };
+        if (found.width as u32, found.height as u32) != size {
+            let what = format!(
+                "is of another turn, {}×{} pixels, not {}×{}; give --force to replace it",
+                found.width, found.height, size.0, size.1
+            );
+            return Err(DataError::input(&file, what).into());
+        }
+        Ok(())
     }
 
     fn push(&mut self, i: usize, rgba: &diorama_geom::Image, exposure: f64) -> Result<()> {
