@@ -32,6 +32,8 @@ pub fn report(error: &PipelineError, json: bool) -> u8 {
 pub struct Progress {
     bar: Option<ProgressBar>,
     last_line: Option<Instant>,
+    /// What is being prepared; its first line is printed at once.
+    preparing: Option<&'static str>,
     /// Of the last evaluation.
     scores: Scores,
 }
@@ -43,7 +45,7 @@ impl Progress {
             bar.set_style(ProgressStyle::with_template("{bar:30} {msg} {eta} left").expect("a valid template"));
             bar
         });
-        Progress { bar, last_line: None, scores: Scores::default() }
+        Progress { bar, last_line: None, preparing: None, scores: Scores::default() }
     }
 
     fn line(&self, text: &str) {
@@ -72,10 +74,11 @@ impl Progress {
             Event::Preparing { what, share } => {
                 if let Some(b) = &self.bar {
                     b.set_message(format!("{what}: {:.0} %", 100.0 * share));
-                } else if self.last_line.is_none_or(|t| t.elapsed() >= LINE_EVERY) {
+                } else if self.preparing != Some(what) || self.last_line.is_none_or(|t| t.elapsed() >= LINE_EVERY) {
                     self.last_line = Some(Instant::now());
                     eprintln!("{what}: {:.0} %", 100.0 * share);
                 }
+                self.preparing = Some(what);
             }
             Event::Evaluated { scores, .. } => self.scores = scores.clone(),
             Event::Recovered { step, to_step, why } => self.line(&format!("step {step}: {why}; back to step {to_step}")),
