@@ -1,6 +1,6 @@
 //! Sums over all rays, and sums within rays by one unit each.
 //!
-//! Exclusive sums take three launches where cubes share memory: sums of parts of [`PART`] counts, exclusive sums of those by the same
+//! Exclusive sums take three launches where cubes share memory: sums of parts of `PART` counts, exclusive sums of those by the same
 //! means, and the sums within parts. Elsewhere one cube does it all.
 
 use crate::gpu::{Buffer, CUBE, Gpu, launch};
