@@ -126,7 +126,7 @@ pub fn assign(
         ),
         MaskMeaning::Classes => format!(
             "masks for {count} (in {place}{read}): 255 is static, 192 glass, 160 sky, which is empty space, and 0 is neither trained on nor \
-             scored, {why}; `diorama train --mask ignore` uses none"
+             scored, {why}; --mask ignore uses none"
         ),
     });
     Ok(MaskRule { meaning, inverted })

@@ -49,12 +49,14 @@ impl Verb for Quickstart {
         }
         watch_interrupts();
         let (mut progress, shown) = (Progress::new(), RefCell::new(ShareShown::new()));
+        let stage = RefCell::new(String::new());
         let listeners = Listeners {
             stage: &mut |name| {
                 shown.replace(ShareShown::new()).finish();
+                stage.replace(name.to_string());
                 eprintln!("{name}");
             },
-            share: &mut |share| shown.borrow_mut().show(share, "done"),
+            share: &mut |share| shown.borrow_mut().show(share, &format!("{}: {:.0} %", stage.borrow(), 100.0 * share)),
             events: &mut |e| progress.event(e),
         };
         let made = quickstart::quickstart(&self.out, &QuickstartOptions::default(), &INTERRUPT, listeners)?;

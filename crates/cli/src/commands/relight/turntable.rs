@@ -17,7 +17,7 @@ use std::time::Instant;
     after_help = "Examples:\n  diorama relight turntable chair.glb --light dusk.hdr --frames 36 -o turn/\n  diorama relight turntable chair.glb --light sky:8,200 --background -o turn.mp4"
 )]
 pub struct Turntable {
-    /// Model (.glb or .gltf)
+    /// Model (.glb, .gltf or .obj)
     model: PathBuf,
     #[command(flatten)]
     light: LightFlags,

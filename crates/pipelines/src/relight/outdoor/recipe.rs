@@ -155,7 +155,10 @@ fn observations(
 /// When it cannot be read.
 pub fn load_capture(config: &Config) -> Result<Capture> {
     let options = ImportOptions { split: config.data.split.parse().map_err(PipelineError::Usage)?, ..ImportOptions::default() };
-    Ok(import::import(&config.data.path, &options)?)
+    let mut capture = import::import(&config.data.path, &options)?;
+    // Advice on masks is for the object application, which has options for them.
+    capture.notes.iter_mut().for_each(|n| n.truncate(n.find("; --mask").unwrap_or(n.len())));
+    Ok(capture)
 }
 
 /// A warning where all photographs are of one light: then albedo and light cannot be told apart.
