@@ -203,6 +203,8 @@ fn a_turntable_writes_its_frames_and_keeps_those_that_are_there() {
 #[test]
 fn wrong_requests_are_refused_in_one_line() {
     let dir = folder();
+    refused(dir.path(), &["compose", "scene.toml", "-o", "nowhere/a.png"], &["nowhere", "no such folder"]);
+    refused(dir.path(), &["turntable", "cube.obj", "-o", "turn.avi"], &["turn.avi", ".mp4, .gif, or a folder"]);
     let at = dir.path();
     let scene = |name: &str, from: &str, to: &str| std::fs::write(at.join(name), SCENE.replace(from, to)).unwrap();
     scene("key.toml", "scale =", "scal =");

@@ -148,6 +148,9 @@ pub(crate) fn orbit(camera: &Camera, [low, high]: [DVec3; 2], elevation: f64, tu
     Pose::look_at(center + distance * DVec3::new(level * ahead.cos(), level * ahead.sin(), up), center, DVec3::Z)
 }
 
+/// Extensions of files that no turn is written to.
+const OTHER_FILES: [&str; 8] = ["avi", "mov", "mkv", "webm", "png", "jpg", "jpeg", "exr"];
+
 enum Output {
     Folder { folder: PathBuf, force: bool },
     Video(Box<Video>),
@@ -161,6 +164,10 @@ impl Output {
                 return Err(PipelineError::Usage(format!("{}: exists; give --force to replace it", out.display())));
             }
             return Ok(Output::Video(Box::new(Video::create(out, width as usize, height as usize, FPS)?)));
+        }
+        if out.extension().is_some_and(|e| OTHER_FILES.iter().any(|o| e.eq_ignore_ascii_case(o))) {
+            let what = "turns are .mp4, .gif, or a folder of pictures";
+            return Err(PipelineError::Usage(format!("{}: {what}", out.display())));
         }
         std::fs::create_dir_all(out).map_err(DataError::io(out, "create"))?;
         Ok(Output::Folder { folder: out.to_path_buf(), force })

@@ -59,6 +59,9 @@ impl Verb for Compose {
         if self.out.exists() && !self.force {
             return Err(PipelineError::Usage(format!("{}: exists; give --force to replace it", self.out.display())));
         }
+        if let Some(folder) = self.out.parent().filter(|f| !f.as_os_str().is_empty() && !f.is_dir()) {
+            return Err(PipelineError::Usage(format!("{}: no such folder; make it, or give another --out", folder.display())));
+        }
         watch_interrupts();
         let mut tracer = PathTracer::open(&self.device, Box::new(note))?;
         let mut composition = compose::load(&file)?;
