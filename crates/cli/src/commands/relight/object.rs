@@ -193,7 +193,9 @@ impl Verb for Object {
         if trained.is_err() && !existed && !folder.checkpoints().exists() {
             // A run that never started leaves nothing behind.
             drop(folder);
-            let _ = std::fs::remove_dir_all(&self.run);
+            if let Err(e) = std::fs::remove_dir_all(&self.run) {
+                note(&format!("{}: cannot remove the run that did not start: {e}", self.run.display()));
+            }
         }
         let trained = trained?;
         if trained.summary.interrupted {
