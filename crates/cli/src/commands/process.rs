@@ -36,6 +36,13 @@ pub fn note(text: &str) {
     eprintln!("note: {text}");
 }
 
+/// Removes the folder of a run that did not start, and says so where it cannot.
+pub fn discard(run: &std::path::Path) {
+    if let Err(e) = std::fs::remove_dir_all(run) {
+        note(&format!("{}: cannot remove the run that did not start: {e}", run.display()));
+    }
+}
+
 /// Error for an option's value; `text` begins with the option's name.
 pub fn usage(text: String) -> PipelineError {
     PipelineError::Usage(format!("--{text}"))

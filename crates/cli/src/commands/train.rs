@@ -1,7 +1,7 @@
 //! `diorama train`
 
 use super::mask_flags::MaskFlags;
-use super::process::{INTERRUPT, usage, use_threads, watch_interrupts};
+use super::process::{INTERRUPT, discard, usage, use_threads, watch_interrupts};
 use super::view::ListenFlags;
 use super::{Outcome, Verb};
 use crate::terminal::Progress;
@@ -137,7 +137,7 @@ impl Train {
         if trained.is_err() && !existed && !folder.checkpoints().exists() {
             // A run that never started leaves nothing behind, and earlier files stay.
             drop(folder);
-            let _ = std::fs::remove_dir_all(&self.out);
+            discard(&self.out);
         }
         let trained = trained?;
         if self.json {

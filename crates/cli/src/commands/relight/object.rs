@@ -1,7 +1,7 @@
 //! `diorama relight object`
 
 use super::from_run::Source;
-use crate::commands::process::{INTERRUPT, note, usage, use_threads, watch_interrupts};
+use crate::commands::process::{INTERRUPT, discard, note, usage, use_threads, watch_interrupts};
 use crate::commands::{Outcome, Verb};
 use crate::terminal::Progress;
 use clap::Args;
@@ -193,9 +193,7 @@ impl Verb for Object {
         if trained.is_err() && !existed && !folder.checkpoints().exists() {
             // A run that never started leaves nothing behind.
             drop(folder);
-            if let Err(e) = std::fs::remove_dir_all(&self.run) {
-                note(&format!("{}: cannot remove the run that did not start: {e}", self.run.display()));
-            }
+            discard(&self.run);
         }
         let trained = trained?;
         if trained.summary.interrupted {

@@ -1,6 +1,6 @@
 //! `diorama relight train`
 
-use crate::commands::process::{INTERRUPT, use_threads, watch_interrupts};
+use crate::commands::process::{INTERRUPT, discard, use_threads, watch_interrupts};
 use crate::commands::view::ListenFlags;
 use crate::commands::{Outcome, Verb};
 use crate::terminal::Progress;
@@ -111,7 +111,7 @@ impl Verb for Train {
         if trained.is_err() && !existed && !folder.checkpoints().exists() {
             // A run that never started leaves nothing behind.
             drop(folder);
-            let _ = std::fs::remove_dir_all(&self.out);
+            discard(&self.out);
         }
         let trained = trained?;
         let s = &trained.summary;
