@@ -34,7 +34,7 @@ fn nerf_forward_equals_pytorch() {
     let mut sigma = vec![0.0; n];
     field.density(&model, &mut sigma);
     let mut buf = FieldBuffers::default();
-    let colors = field.outputs_at(&model, &dirs, &mut buf).to_vec();
+    let colors = field.outputs_at(&model, &dirs, &[], &mut buf).to_vec();
     let dir = tempfile::tempdir().unwrap();
     // The points as the field saw them, after the way through model space.
     let seen: Vec<f32> = model.iter().map(|v| 2.0 * (v - 0.5)).collect();

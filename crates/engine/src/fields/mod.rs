@@ -169,8 +169,9 @@ impl Field {
         (buf.direction, buf.appearance) = (direction, appearance);
     }
 
-    /// Outputs `[N, C]` of the field, normals included, at model points `[N, 3]`, viewed along unit directions `[N, 3]`, with the mean appearance code.
-    pub fn outputs_at<'a>(&self, model: &[f32], dirs: &[f32], buf: &'a mut FieldBuffers) -> &'a [f32] {
+    /// Outputs `[N, C]` of the field, normals included, at model points `[N, 3]`, viewed along unit directions `[N, 3]`, with the mean appearance
+    /// code and the given codes, `[N, width]` each.
+    pub fn outputs_at<'a>(&self, model: &[f32], dirs: &[f32], given: &[&[f32]], buf: &'a mut FieldBuffers) -> &'a [f32] {
         // One sample per ray, so long that it is opaque.
         let n = model.len() / 3;
         let offsets: Vec<u32> = (0..=n as u32).collect();
@@ -178,7 +179,7 @@ impl Field {
         let samples = Packed { offsets: &offsets, t: &t, dt: &dt };
         let mut encoded = Encoded::default();
         self.encode(model, &mut encoded);
-        let batch = Batch { samples, positions: model, dirs, images: None, given: &[], background: &background, near_scaling: 0.0 };
+        let batch = Batch { samples, positions: model, dirs, images: None, given, background: &background, near_scaling: 0.0 };
         self.render(&batch, &mut encoded, buf);
         &buf.out.values
     }

@@ -350,7 +350,7 @@ impl FieldQuery for ObjectModel {
         }
         let mut buf = FieldBuffers::default();
         for ((p, d), out) in points_in_world.chunks(CHUNK).zip(directions.chunks(CHUNK)).zip(rgb_srgb.chunks_mut(CHUNK)) {
-            let own = self.field.outputs_at(&self.model_points(p), d.as_flattened(), &mut buf);
+            let own = self.field.outputs_at(&self.model_points(p), d.as_flattened(), &[], &mut buf);
             out.as_flattened_mut().copy_from_slice(own);
         }
         self.encode(rgb_srgb);

@@ -75,7 +75,7 @@ pub(super) fn other_views(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> 
             table.close("view", "densities", &shape, &gpu.upload(&device.density(&points)?), &wide(&sigma))?;
             let dirs: Vec<f32> = points.chunks_exact(3).flat_map(unit).collect();
             let mut buf = FieldBuffers::default();
-            let colors = wide(field.outputs_at(&points, &dirs, &mut buf));
+            let colors = wide(field.outputs_at(&points, &dirs, &[], &mut buf));
             table.close("view", "own colors", &shape, &gpu.upload(&device.color(&points, &dirs)?), &colors)?;
         }
     }

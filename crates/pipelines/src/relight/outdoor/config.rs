@@ -115,8 +115,8 @@ pub struct LossConfig {
     pub huber: f32,
     /// Error beyond which a pixel counts less and less, in multiples of the running median; 0: all count alike.
     pub robust: f32,
-    /// Deviation of the shadow from 1 where it is not traced, or with suns apart from the traced one, and of what is left of any sun from all;
-    /// and from the traced one, or with suns apart of what is left of any sun from what arrives of those of training.
+    /// Deviation of the shadow from 1 where it is not traced, or with suns apart a thirtieth of it from the traced one, and of what is left of any sun
+    /// from all; and from the traced one, or with suns apart of what is left of any sun from what arrives of those of training.
     pub shadow: f32,
     pub traced: f32,
     /// Angle between the normals that the field says and those of its surfaces.

@@ -9,7 +9,7 @@ use super::visibility::{self, Ambient, Visibility};
 use crate::error::{PipelineError, Result};
 use crate::run::param_state::{self, entry};
 use diorama_data::checkpoint::{Checkpoint, Entry};
-use diorama_engine::fields::{Field, Pruning};
+use diorama_engine::fields::{Field, FieldBuffers, Pruning};
 use diorama_engine::params::{ParamGroup, ParamSet};
 use diorama_engine::renderers::volume::{Backdrop, Quality, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
@@ -18,6 +18,7 @@ use diorama_engine::step::Scene;
 use diorama_engine::train::Origin;
 use diorama_geom::capture::{Frame, Split};
 use diorama_geom::contraction::Space;
+use diorama_geom::glam::Vec3;
 use diorama_geom::sh_light::ShLight;
 use diorama_geom::{Capture, Similarity};
 use diorama_kernels::ops::adam::Adam;
@@ -35,7 +36,7 @@ const UNLIT: [f32; 9] = [0.0; 9];
 
 /// What stands around: what hides light, and surfaces that send it on.
 pub struct Around {
-    pub visibility: Visibility,
+    pub visibility: Arc<Visibility>,
     pub surfaces: Surfaces,
 }
 
@@ -62,6 +63,8 @@ pub struct SceneModel {
     /// Times that surfaces were flattened, and the distances that are from this: `[N, 4]` of image, column, row, distance.
     pub flattened: u64,
     pub flat: Vec<f32>,
+    /// Suns and lights `[lights, 6 + 27]` in which surfaces sent light on when that was found last; empty: as they are.
+    pub sent: Vec<f32>,
     /// What hides light and sends it on, from the light's stage on.
     pub surroundings: Option<Arc<Around>>,
     /// Training frames, as indices into the capture, and the light of each.
@@ -132,6 +135,7 @@ impl SceneModel {
             suns: group("suns", vec![0.0; SUN * n], rate),
             flattened: 0,
             flat: Vec::new(),
+            sent: Vec::new(),
             surroundings: None,
             train,
             light_of,
@@ -262,6 +266,7 @@ impl SceneModel {
             suns: self.suns.values_only(),
             flattened: self.flattened,
             flat: Vec::new(),
+            sent: self.sent.clone(),
             surroundings: self.surroundings.clone(),
             train: self.train.clone(),
             light_of: self.light_of.clone(),
@@ -310,8 +315,39 @@ impl SceneModel {
     /// Light of the sky and of surfaces in each learned light, where suns are apart.
     pub fn ambients(&self) -> Vec<Ambient> {
         let Some(around) = self.surroundings.as_ref().filter(|_| self.has_suns()) else { return Vec::new() };
+        let sent = if self.sent.is_empty() { self.sun_and_sky() } else { self.sent.clone() };
+        let of = |(sent, sky): (&[f32], &[f32])| {
+            let mut ambient = around.surfaces.light(&around.visibility, &sent[..SUN], &sent[SUN..]);
+            ambient.sky = sky.to_vec();
+            ambient
+        };
+        sent.chunks_exact(SUN + LIGHT).zip(self.lights.values.chunks_exact(LIGHT)).map(of).collect()
+    }
+
+    /// Sun and light of each light, `[lights, 6 + 27]`.
+    pub fn sun_and_sky(&self) -> Vec<f32> {
         let lights = self.suns.values.chunks_exact(SUN).zip(self.lights.values.chunks_exact(LIGHT));
-        lights.map(|(sun, sky)| around.surfaces.light(&around.visibility, sun, sky)).collect()
+        lights.flat_map(|(sun, sky)| sun.iter().chain(sky).copied()).collect()
+    }
+
+    /// Finds anew what surfaces send, in the lights and with the albedos that the model knows now.
+    pub fn send_again(&mut self) {
+        let Some(around) = &self.surroundings else { return };
+        let albedos = self.albedos(&around.surfaces.positions());
+        let mut surfaces = around.surfaces.clone();
+        surfaces.albedos = albedos;
+        self.surroundings = Some(Arc::new(Around { visibility: around.visibility.clone(), surfaces }));
+        self.sent = self.sun_and_sky();
+    }
+
+    /// Albedos at points of surfaces.
+    fn albedos(&self, points: &[Vec3]) -> Vec<Vec3> {
+        let model: Vec<f32> = points.iter().flat_map(|p| p.to_array()).collect();
+        let codes = vec![vec![0.0; 9 * points.len()]; self.field.codes.given.len()];
+        let given: Vec<&[f32]> = codes.iter().map(|c| &c[..]).collect();
+        let mut buffers = FieldBuffers::default();
+        let out = self.field.outputs_at(&model, &vec![0.0; model.len()], &given, &mut buffers);
+        out.chunks_exact(self.field.channels()).map(Vec3::from_slice).collect()
     }
 
     /// A field that renders each light by the mean code of its photographs, in place of the photographs' codes.
@@ -357,7 +393,7 @@ impl SceneModel {
         let tables = [&mut self.lights, &mut self.skies, &mut self.gains, &mut self.suns];
         let mut entries = param_state::entries(params(&mut self.field, &mut self.joint, tables));
         entries.extend([entry("occupancy", &self.occupancy.grid.density), entry("occupancy.fresh", &self.occupancy.grid.fresh)]);
-        entries.push(entry("flat", &self.flat));
+        entries.extend([entry("flat", &self.flat), entry("sent", &self.sent)]);
         entries.extend(around.iter().flat_map(|a| ["solid", "surfaces"].into_iter().zip(a)).map(|(name, v)| entry(name, v)));
         (entries, metadata)
     }
@@ -401,7 +437,18 @@ impl SceneModel {
             }
             let visibility = Visibility::from_numbers(&solid, self.shaded_cube(), cells);
             let surfaces = Surfaces::from_numbers(&tensor(&mut c, "surfaces", file)?, &visibility);
-            self.surroundings = Some(Arc::new(Around { visibility, surfaces }));
+            self.surroundings = Some(Arc::new(Around { visibility: Arc::new(visibility), surfaces }));
+            // Runs of before lights followed photographs have none.
+            let sent = c.take("sent").unwrap_or_default();
+            if !sent.is_empty() && sent.len() != (SUN + LIGHT) * self.light_count() {
+                return Err(PipelineError::Usage(format!(
+                    "{}: sent has {} numbers for {} lights",
+                    file.display(),
+                    sent.len(),
+                    self.light_count()
+                )));
+            }
+            self.sent = sent;
         }
         Ok(())
     }

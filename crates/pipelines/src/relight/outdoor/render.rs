@@ -203,7 +203,7 @@ impl SceneModel {
         let sunlight = suns.as_ref().map(|suns| {
             let around = self.surroundings.as_deref().expect("a model with suns apart knows what stands around");
             let ambient = light.ambient.get_or_init(|| around.surfaces.light(&around.visibility, suns, &numbers));
-            (&around.visibility, ambient)
+            (&*around.visibility, ambient)
         });
         let shaded = |i: usize| {
             let mut v = [0.0; SUNLIT_CHANNELS];

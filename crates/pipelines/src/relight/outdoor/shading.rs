@@ -125,6 +125,8 @@ pub struct TracedLight<'a> {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SceneGradients {
     pub lights: Vec<f32>,
+    /// `[lights, 6]`, of the power alone; empty where suns are not apart.
+    pub suns: Vec<f32>,
     pub skies: Vec<f32>,
     pub gains: Vec<f32>,
     /// Mean squared error in sRGB of the pixels that count.
@@ -316,6 +318,17 @@ impl SceneLoss<'_> {
             let of_sky = &mut tables.skies[light_of * SKY..][..SKY];
             sky_gradient(of_sky, k, &s.sky, &s.sky_basis, dc * (1.0 - opacity), share);
         }
+        if let Some(l) = sunlit {
+            let (arrives, n) = (l.arrives(values), Vec3::from(normal));
+            let facing = (0..3).map(|a| normal[a] * l.sun[a]).sum::<f32>().max(0.0);
+            let ambient = l.ambient.at(n);
+            for k in 0..3 {
+                tables.suns[SUN * light_of + 3 + k] += d_white[k] * arrives * facing * (l.sun[3 + k] > 0.0) as u8 as f32;
+                if ambient[k] > 0.0 {
+                    (0..9).for_each(|i| tables.lights[LIGHT * light_of + 3 * i + k] += d_white[k] * l.ambient.of_sky[i]);
+                }
+            }
+        }
         if let Some(l) = sunlit.filter(|_| self.bends) {
             let said = unit(&values[NORMAL..]);
             add_direction(&mut d_values[NORMAL..], l.by_normal(&s.normal, values, d_white), said);
@@ -415,6 +428,7 @@ impl BatchLoss for SceneLoss<'_> {
         let rays = out.opacity.len();
         let mut tables = SceneGradients {
             lights: vec![0.0; self.lights.len()],
+            suns: vec![0.0; self.suns.map_or(0, |s| s.values.len())],
             skies: vec![0.0; self.skies.len()],
             gains: vec![0.0; self.gains.len()],
             ..SceneGradients::default()

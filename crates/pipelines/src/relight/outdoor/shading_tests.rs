@@ -75,9 +75,9 @@ fn case() -> Case {
     }
 }
 
-/// Of a sky, and of a ground that is as bright as its mean.
-fn ambient(sky: &[f32]) -> Ambient {
-    let ground = Vec3::from_slice(sky) * radiances(Vec3::Z)[0];
+/// Of a sky, and of a ground that is as bright as the mean of one.
+fn ambient(sky: &[f32], over: &[f32]) -> Ambient {
+    let ground = Vec3::from_slice(over) * radiances(Vec3::Z)[0];
     Ambient { sky: sky.to_vec(), radiosity: Radiosity { ground, ..Radiosity::dark() } }
 }
 
@@ -95,7 +95,8 @@ fn run(c: &Case) -> (f64, RayGradients, SceneGradients) {
 
 fn run_with(c: &Case, traced: f32, visibility: &Visibility) -> (f64, RayGradients, SceneGradients) {
     let suns = [0.6, 0.0, 0.8, 0.9, 0.8, 0.6].repeat(RAYS);
-    let ambients: [Ambient; 2] = std::array::from_fn(|l| ambient(&c.lights[LIGHT * l..][..LIGHT]));
+    let over = case().lights;
+    let ambients: [Ambient; 2] = std::array::from_fn(|l| ambient(&c.lights[LIGHT * l..][..LIGHT], &over[LIGHT * l..]));
     let skies = (0..LIGHT).map(|i| if i < 3 { 0.5 } else { 0.05 }).collect::<Vec<f32>>().repeat(RAYS);
     let loss = SceneLoss {
         weights: Weights { huber: 0.4, robust: 0.0, shadow: 0.2, traced, negative: 0.5, gauge: 0.0, tie: 0.3, retinex: 0.0 },
@@ -159,8 +160,18 @@ fn gradients_are_those_of_the_loss() {
 fn gradients_with_suns_apart_are_those_of_the_loss() {
     let (_, d, tables) = run(&sunlit_case());
     check("values", sunlit_case, |c| &mut c.values, &d.values, 3e-3);
-    // Suns and skies are given.
-    assert!(tables.lights.iter().all(|d| *d == 0.0));
+    check("lights", sunlit_case, |c| &mut c.lights, &tables.lights, 3e-3);
+    // What surfaces send of a changed light does not follow at once, and suns stand where they are.
+    assert!(tables.suns.chunks_exact(6).all(|s| s[..3] == [0.0; 3] && s[3..].iter().all(|d| *d != 0.0)));
+    for (i, got) in tables.suns.iter().enumerate().filter(|(i, _)| i % 6 > 2) {
+        let at = |by: f32| {
+            let mut c = sunlit_case();
+            c.suns[i] += by;
+            run(&c).0
+        };
+        let want = (at(3e-3) - at(-3e-3)) / 6e-3;
+        assert!((*got as f64 - want).abs() < 0.02 * want.abs() + 1e-3, "sun {i}: {got} {want}");
+    }
 }
 
 fn bent_case() -> Case {
@@ -190,7 +201,7 @@ fn the_field_says_where_suns_of_training_arrive_and_tracing_where_others_do() {
     values[..3].fill(1.0);
     (values[3], values[NORMAL + 2], values[LEFT]) = (0.7, 1.0, 0.5);
     let shade = |visibility: &Visibility, is_learned: bool| {
-        let ambient = ambient(&[0.0; LIGHT]);
+        let ambient = ambient(&[0.0; LIGHT], &[0.0; 3]);
         let sunlit = sunlit((visibility, &ambient), (&sun[..], is_learned), (8, 0), &values[NORMAL..], (1.0, 0.0), (&[0.5; 3], &dir));
         color(&values, 1.0, &dir, &[0.0; LIGHT], &[0.0; SKY], Some(sunlit)).rgb[0]
     };

@@ -78,6 +78,8 @@ pub struct Ambient {
 pub struct Gathered {
     pub normal: Vec3,
     pub light: Vec3,
+    /// What of it each coefficient of the sky gives.
+    pub of_sky: [f32; 9],
     /// Derivatives with respect to the normal's axes.
     pub slope: [Vec3; 3],
     /// Share of an even sky's light that arrives.
@@ -257,14 +259,15 @@ impl Radiosity {
 impl Ambient {
     /// Light that arrives from where a surface looks.
     pub fn gathered(&self, normal: Vec3, looks: impl Iterator<Item = Look>) -> Gathered {
-        let mut out = Gathered { normal, light: Vec3::ZERO, slope: [Vec3::ZERO; 3], open: 0.0 };
+        let mut out = Gathered { normal, open: 0.0, ..Gathered::NONE };
         let mut n = 0.0;
         for look in looks {
             let mut radiance = (1.0 - look.open) * if look.open < 1.0 - SEEN { self.radiosity.of(look.cell) } else { Vec3::ZERO };
             if look.open > 0.0 {
-                let of_sky: Vec3 =
-                    radiances(look.direction).iter().zip(self.sky.chunks_exact(3)).map(|(r, s)| *r * Vec3::from_slice(s)).sum();
-                radiance += look.open * of_sky;
+                for ((r, s), of_sky) in radiances(look.direction).iter().zip(self.sky.chunks_exact(3)).zip(&mut out.of_sky) {
+                    *of_sky += look.open * r;
+                    radiance += look.open * r * Vec3::from_slice(s);
+                }
             }
             out.light += radiance;
             out.open += look.passes;
@@ -272,13 +275,14 @@ impl Ambient {
             out.slope = [0, 1, 2].map(|k| out.slope[k] + look.direction[k] * by);
             n += 1.0;
         }
-        Gathered { light: out.light / n, open: out.open / n, slope: out.slope.map(|s| s / n), ..out }
+        let (light, open) = (out.light / n, out.open / n);
+        Gathered { light, open, of_sky: out.of_sky.map(|v| v / n), slope: out.slope.map(|s| s / n), ..out }
     }
 }
 
 impl Gathered {
     /// Of a place that nothing reaches.
-    pub const NONE: Gathered = Gathered { normal: Vec3::Z, light: Vec3::ZERO, slope: [Vec3::ZERO; 3], open: 1.0 };
+    pub const NONE: Gathered = Gathered { normal: Vec3::Z, light: Vec3::ZERO, of_sky: [0.0; 9], slope: [Vec3::ZERO; 3], open: 1.0 };
 
     /// Irradiance over π for a normal near the surface's.
     pub fn at(&self, normal: Vec3) -> Vec3 {

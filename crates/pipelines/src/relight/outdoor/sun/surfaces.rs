@@ -55,6 +55,11 @@ impl Surfaces {
         each.flat_map(|(p, a)| [p.point, p.normal, *a].into_iter().flat_map(|v| v.to_array())).collect()
     }
 
+    /// Where the points lie.
+    pub fn positions(&self) -> Vec<Vec3> {
+        self.points.iter().map(|p| p.point).collect()
+    }
+
     /// Share of a sun's light that reaches each point, times the cosine.
     pub(super) fn sunlit(&self, visibility: &Visibility, toward: Vec3) -> Vec<f32> {
         self.points.par_iter().map(|p| p.sunlit(visibility, toward)).collect()

@@ -30,6 +30,12 @@ const TAUGHT: u64 = 14;
 /// photographs' at most.
 const TELLING: (usize, usize, usize) = (40_000, 1000, 6000);
 const TELLS: usize = 4;
+/// Rate of suns and lights apart over that of lights that hold suns: these begin with little.
+const APART: f32 = 0.1;
+/// Weight of shadows that are traced in a sun apart over that of learned ones: most are a little off.
+const APART_SHADOW: f32 = 1.0 / 30.0;
+/// Steps after which what surfaces send is found anew.
+const SENT_EVERY: u64 = 100;
 /// Opacity from which a pixel shows a surface.
 const SURFACE: f32 = 0.9;
 /// Standard deviation of noise on the light that the shadow sees.
@@ -74,8 +80,9 @@ impl Trainer<'_> {
                 light.iter_mut().zip(sun::harmonics(&found.sun)).for_each(|(v, s)| *v += s);
             }
         }
-        (m.surroundings, self.normals) = (Some(Arc::new(Around { visibility, surfaces })), Some(normals));
+        (m.surroundings, self.normals) = (Some(Arc::new(Around { visibility: Arc::new(visibility), surfaces })), Some(normals));
         m.begin_light()?;
+        m.sent = m.sun_and_sky();
         self.ambients = m.ambients();
         (m.began, m.median) = (step, 0.1);
         let scene = m.scene();
@@ -212,7 +219,7 @@ impl Trainer<'_> {
             weights: Weights {
                 huber: c.loss.huber,
                 robust: if settled { c.loss.robust * self.model.median } else { 0.0 },
-                shadow: c.loss.shadow,
+                shadow: if is_apart { APART_SHADOW * c.loss.shadow } else { c.loss.shadow },
                 traced: c.loss.traced,
                 negative: c.loss.negative,
                 gauge: c.loss.gauge,
@@ -249,15 +256,27 @@ impl Trainer<'_> {
         Ok(StepReport { loss: done.shown.loss, scalars: self.scalars(tables.mse, n, done.shown.trained) })
     }
 
-    /// One optimizer step of lights, skies and gains; where suns are apart, lights stay.
+    /// One optimizer step of lights, skies and gains; where suns are apart, of their power, too, and what surfaces send follows.
     fn update_lights(&mut self, step: u64, share: f32, tables: &SceneGradients) {
         let m = &mut self.model;
         m.median = 0.95 * m.median + 0.05 * tables.median;
-        let lights = (!m.config.light.has_sun()).then_some((&mut m.lights, &tables.lights));
-        for (group, d) in [(&mut m.skies, &tables.skies), (&mut m.gains, &tables.gains)].into_iter().chain(lights) {
+        let is_apart = m.config.light.has_sun();
+        let (slow, suns) = if is_apart { (APART, Some((&mut m.suns, &tables.suns, APART))) } else { (1.0, None) };
+        let all = [(&mut m.skies, &tables.skies, 1.0), (&mut m.gains, &tables.gains, 1.0), (&mut m.lights, &tables.lights, slow)];
+        for (group, d, by) in all.into_iter().chain(suns) {
             group.grads.copy_from_slice(d);
-            group.step(step as u32 + 1, group.schedule.scale(share) * m.rate_scale);
+            group.step(step as u32 + 1, by * group.schedule.scale(share) * m.rate_scale);
         }
+        if !is_apart {
+            return;
+        }
+        m.suns.values.chunks_exact_mut(SUN).flat_map(|s| &mut s[3..]).for_each(|v| *v = v.max(0.0));
+        if step > 0 && step.is_multiple_of(SENT_EVERY) {
+            m.send_again();
+            self.ambients = m.ambients();
+        }
+        let skies = m.lights.values.chunks_exact(LIGHT);
+        self.ambients.iter_mut().zip(skies).for_each(|(a, sky)| a.sky.copy_from_slice(sky));
     }
 }
 
