@@ -94,9 +94,9 @@ fn an_interrupted_run_ends_as_if_it_had_not_been() {
     let train = |name: &str, stop_at: Option<u64>, resume: bool| {
         let at = dir.path().join(name);
         let mut folder = if resume { RunFolder::open(&at).unwrap().0 } else { RunFolder::create(&at, false).unwrap() };
-        let mut config = config(&data, 24);
-        config.run.log_every = 1;
-        // Interrupted while surfaces are learned, and between two times that suns are found.
+        let mut config = config(&data, 180);
+        (config.run.log_every, config.sampling.rays) = (1, 64);
+        // Interrupted while surfaces are learned, in the light's stage, and after what surfaces send was found anew there.
         (config.light.model, config.light.from, config.light.sun_cells) = ("sun".into(), 0.3, 32);
         let stop = AtomicBool::new(false);
         let mut logged = 0;
@@ -111,13 +111,16 @@ fn an_interrupted_run_ends_as_if_it_had_not_been() {
     };
     let (_, whole) = train("whole", None, false);
     assert!(train("parts", Some(4), false).0);
-    assert!(train("parts", Some(9), true).0);
+    assert!(train("parts", Some(90), true).0);
+    assert!(train("parts", Some(70), true).0);
     let (_, resumed) = train("parts", None, true);
     assert_eq!(whole.field.weights.values, resumed.field.weights.values);
     assert_eq!(whole.field.encoder.table().unwrap().values, resumed.field.encoder.table().unwrap().values);
     assert_eq!(whole.lights.values, resumed.lights.values);
     assert_eq!(whole.skies.values, resumed.skies.values);
     assert_eq!(whole.suns.values, resumed.suns.values);
+    assert_eq!(whole.sent, resumed.sent);
+    assert!(whole.sent != whole.sun_and_sky(), "lights go on following photographs");
     assert!(whole.around().is_some_and(|a| a.iter().all(|v| !v.is_empty())) && whole.around() == resumed.around());
     assert!(!whole.flat.is_empty() && whole.flat == resumed.flat);
 }
