@@ -230,6 +230,9 @@ fn wrong_requests_are_refused_in_one_line() {
     refused(at, &["turntable", "cube.obj", "--sun", "1,2"], &["--sun", "POWER"]);
     refused(at, &["turntable", "cube.stl"], &["cube.stl"]);
     refused(at, &["synth", "--size", "huge"], &["huge", "middle"]);
+    for light in ["--light", "--unseen-light"] {
+        refused(at, &["synth", light, "uniform"], &["--light", "--object", "street"]);
+    }
     refused(at, &["train", "nowhere", "-o", "run"], &["nowhere"]);
     refused(at, &["train"], &["capture"]);
     refused(at, &["eval", "."], &["run folder"]);

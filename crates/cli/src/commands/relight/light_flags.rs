@@ -5,10 +5,12 @@ use clap::Args;
 use diorama_pipelines::Result;
 use diorama_pipelines::relight::light::LightOptions;
 
+const DEFAULT: &str = "sky:35,140";
+
 #[derive(Args, Clone, Debug)]
 pub struct LightFlags {
     /// Environment map (.hdr, .exr, or .png and .jpg of a probe), spherical harmonics (.txt), sky:ELEVATION,ROTATION in degrees, or uniform
-    #[arg(long, default_value = "sky:35,140")]
+    #[arg(long, default_value = DEFAULT)]
     light: String,
     /// Turn of the light about the vertical in degrees, counterclockwise from above
     #[arg(long, default_value_t = 0.0, allow_hyphen_values = true)]
@@ -22,6 +24,11 @@ pub struct LightFlags {
 }
 
 impl LightFlags {
+    /// Whether the user said anything about light.
+    pub fn is_given(&self) -> bool {
+        self.light != DEFAULT || self.rotate != 0.0 || self.strength.is_some() || self.sun.is_some()
+    }
+
     /// The light as described.
     ///
     /// # Errors

@@ -13,6 +13,9 @@ use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
 use std::time::Instant;
 
+/// Light of an object's held-out views.
+const UNSEEN: &str = "sky:15,300";
+
 /// Generate a street photographed in several lights, or an object from all sides, with what is exact of them
 #[derive(Args, Clone, Debug)]
 #[command(
@@ -28,7 +31,7 @@ pub struct Synth {
     #[command(flatten)]
     light: LightFlags,
     /// Light of an object's held-out views besides their own, as --light
-    #[arg(long, default_value = "sky:15,300")]
+    #[arg(long, default_value = UNSEEN)]
     unseen_light: String,
     /// Photographs of an object show the light behind it and are opaque, as photographs without masks are
     #[arg(long, requires = "object")]
@@ -70,6 +73,9 @@ impl Verb for Synth {
         use_threads(self.threads)?;
         if let Some(object) = &self.object {
             return self.object(object);
+        }
+        if self.light.is_given() || self.unseen_light != UNSEEN {
+            return Err(usage("light: the street has lights of its own, as many as --lights says; only --object takes others".into()));
         }
         let mut options = SynthOptions::named(&self.size)?;
         (options.lights, options.seed) = (self.lights, self.seed);
