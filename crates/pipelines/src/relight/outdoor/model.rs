@@ -63,7 +63,7 @@ pub struct SceneModel {
     /// Times that surfaces were flattened, and the distances that are from this: `[N, 4]` of image, column, row, distance.
     pub flattened: u64,
     pub flat: Vec<f32>,
-    /// Suns and lights `[lights, 6 + 27]` in which surfaces sent light on when that was found last; empty: as they are.
+    /// Suns and lights `[lights, 6 + 27]` in which surfaces sent light on when that was found last, from the light's stage on.
     pub sent: Vec<f32>,
     /// What hides light and sends it on, from the light's stage on.
     pub surroundings: Option<Arc<Around>>,
@@ -315,13 +315,12 @@ impl SceneModel {
     /// Light of the sky and of surfaces in each learned light, where suns are apart.
     pub fn ambients(&self) -> Vec<Ambient> {
         let Some(around) = self.surroundings.as_ref().filter(|_| self.has_suns()) else { return Vec::new() };
-        let sent = if self.sent.is_empty() { self.sun_and_sky() } else { self.sent.clone() };
         let of = |(sent, sky): (&[f32], &[f32])| {
             let mut ambient = around.surfaces.light(&around.visibility, &sent[..SUN], &sent[SUN..]);
             ambient.sky = sky.to_vec();
             ambient
         };
-        sent.chunks_exact(SUN + LIGHT).zip(self.lights.values.chunks_exact(LIGHT)).map(of).collect()
+        self.sent.chunks_exact(SUN + LIGHT).zip(self.lights.values.chunks_exact(LIGHT)).map(of).collect()
     }
 
     /// Sun and light of each light, `[lights, 6 + 27]`.
@@ -373,6 +372,7 @@ impl SceneModel {
     pub fn begin_light(&mut self) -> Result<()> {
         self.field = fields::of_materials(&self.config, self.field.clone())?;
         self.stage = Stage::Light;
+        self.sent = self.sun_and_sky();
         Ok(())
     }
 
@@ -438,9 +438,9 @@ impl SceneModel {
             let visibility = Visibility::from_numbers(&solid, self.shaded_cube(), cells);
             let surfaces = Surfaces::from_numbers(&tensor(&mut c, "surfaces", file)?, &visibility);
             self.surroundings = Some(Arc::new(Around { visibility: Arc::new(visibility), surfaces }));
-            // Runs of before lights followed photographs have none.
-            let sent = c.take("sent").unwrap_or_default();
-            if !sent.is_empty() && sent.len() != (SUN + LIGHT) * self.light_count() {
+            // Runs of before lights followed photographs have none: their lights are as they were found.
+            let sent = c.take("sent").unwrap_or_else(|| self.sun_and_sky());
+            if sent.len() != (SUN + LIGHT) * self.light_count() {
                 return Err(PipelineError::Usage(format!(
                     "{}: sent has {} numbers for {} lights",
                     file.display(),

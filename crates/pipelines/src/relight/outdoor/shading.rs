@@ -10,7 +10,7 @@
 //! normal is that of the surfaces as they were learned, which the head is taught; with suns apart it bends from there to what the suns show.
 
 use super::sun::{BOUNCED, SUN, gray, level};
-use super::sunlit::{FAINT, LEFT, SHORTEST, Sunlit, arriving, direct, sunlit, surface, unhidden, unit};
+use super::sunlit::{FAINT, LEFT, SHORTEST, Sunlit, arriving, direct, facing, sunlit, surface, unhidden, unit};
 use super::visibility::{Ambient, Visibility, spread};
 use diorama_geom::color::{LUMINANCE, linear_from_srgb};
 use diorama_geom::glam::{DVec3, Vec3};
@@ -319,11 +319,9 @@ impl SceneLoss<'_> {
             sky_gradient(of_sky, k, &s.sky, &s.sky_basis, dc * (1.0 - opacity), share);
         }
         if let Some(l) = sunlit {
-            let (arrives, n) = (l.arrives(values), Vec3::from(normal));
-            let facing = (0..3).map(|a| normal[a] * l.sun[a]).sum::<f32>().max(0.0);
-            let ambient = l.ambient.at(n);
+            let (by_power, ambient) = (l.arrives(values) * facing(l.sun, &normal), l.ambient.at(Vec3::from(normal)));
             for k in 0..3 {
-                tables.suns[SUN * light_of + 3 + k] += d_white[k] * arrives * facing * (l.sun[3 + k] > 0.0) as u8 as f32;
+                tables.suns[SUN * light_of + 3 + k] += d_white[k] * by_power * (l.sun[3 + k] > 0.0) as u8 as f32;
                 if ambient[k] > 0.0 {
                     (0..9).for_each(|i| tables.lights[LIGHT * light_of + 3 * i + k] += d_white[k] * l.ambient.of_sky[i]);
                 }

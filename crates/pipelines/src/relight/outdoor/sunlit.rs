@@ -63,7 +63,12 @@ pub fn sunlit<'a>(
 
 /// Light of a sun that reaches a surface without shadows.
 pub(super) fn unhidden(sun: &[f32], normal: &[f32; 3]) -> Vec3 {
-    Vec3::from_slice(&sun[3..]) * (0..3).map(|a| normal[a] * sun[a]).sum::<f32>().max(0.0)
+    Vec3::from_slice(&sun[3..]) * facing(sun, normal)
+}
+
+/// Cosine between a normal and a sun; 0 behind.
+pub(super) fn facing(sun: &[f32], normal: &[f32; 3]) -> f32 {
+    (0..3).map(|a| normal[a] * sun[a]).sum::<f32>().max(0.0)
 }
 
 impl Sunlit<'_> {

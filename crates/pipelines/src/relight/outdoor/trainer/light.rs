@@ -82,7 +82,6 @@ impl Trainer<'_> {
         }
         (m.surroundings, self.normals) = (Some(Arc::new(Around { visibility: Arc::new(visibility), surfaces })), Some(normals));
         m.begin_light()?;
-        m.sent = m.sun_and_sky();
         self.ambients = m.ambients();
         (m.began, m.median) = (step, 0.1);
         let scene = m.scene();
