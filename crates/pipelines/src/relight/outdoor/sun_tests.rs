@@ -1,7 +1,7 @@
 //! Tests of the search for suns.
 
 use super::*;
-use crate::relight::outdoor::visibility::Ambient;
+use crate::relight::outdoor::visibility::{Ambient, Look};
 use diorama_engine::fields::DensityQuery;
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_geom::rng::Rng;
@@ -156,4 +156,47 @@ fn dark_things_before_a_place_do_not_take_its_sun() {
     let found = of_photograph(&shown, &surfaces, &visibility, &AtomicBool::new(false)).expect("no interrupt");
     let off = Vec3::from_slice(&found.sun).angle_between(sun).to_degrees();
     assert!(off < 5.0 && (found.sun[3] - 0.9).abs() < 0.2, "{off}° off: {found:?}");
+}
+
+/// Walls alone, which see the horizon and little of the zenith, under the CIE overcast sky: light from above must not be lost.
+#[test]
+fn an_overcast_sky_is_brightest_above_where_only_walls_show_it() {
+    let visibility = Visibility::of(&Tower, &Occupancy::new(64, 1, false), (0.0, 1.0), 64);
+    let at = |i: usize| {
+        let turn = i as f32 * 0.618 * std::f32::consts::TAU;
+        (Vec3::new(0.5 + 0.3 * turn.cos(), 0.5 + 0.3 * turn.sin(), 0.6), Vec3::new(turn.cos(), turn.sin(), 0.0))
+    };
+    let surfaces = Surfaces::new((0..500).map(at), vec![Vec3::ONE; 500], &visibility);
+    let mut overcast = [0.0; 27];
+    // Light over π of a radiance of 0.3 (1 + 2 sin h) / 3 in each channel.
+    (0..3).for_each(|k| (overcast[k], overcast[6 + k]) = (0.1 / 0.282_095, 0.2 / (1.5 * 0.488_603)));
+    let rng = Rng::new(5, 1);
+    let noise = |i: usize| 1.0 + 0.1 * rng.normal(i as u64);
+    let look = |(i, p): (usize, &Place)| {
+        let seen = noise(i) * p.of_sky(&overcast);
+        Lit { albedo: Vec3::ONE, seen, sent: Vec3::ZERO, trust: 1.0, slope: slope(seen, seen) }
+    };
+    let lit: Vec<Lit> = surfaces.points.iter().enumerate().map(look).collect();
+    let found = solve(&lit, &surfaces.points, &vec![0.0; lit.len()], Vec3::Z);
+    let (got, want) = (level(&found.sun, &found.sky), level(&[0.0; SUN], &overcast));
+    assert!((got / want - 1.0).abs().max_element() < 0.05, "{got} {want}");
+}
+
+/// A lit pavement and the dark wall that stands on it, in one cell.
+#[test]
+fn ground_and_wall_of_one_cell_send_their_own_light() {
+    let visibility = Visibility::of(&Tower, &Occupancy::new(64, 1, false), (0.0, 1.0), 64);
+    let point = Vec3::new(0.3, 0.3, 0.25);
+    let normals = [Vec3::Z, -Vec3::Y];
+    let surfaces = Surfaces::new((0..8).map(|i| (point, normals[i % 2])), vec![Vec3::ONE; 8], &visibility);
+    let lit: Vec<Vec3> = (0..8).map(|i| Vec3::splat([0.8, 0.1][i % 2])).collect();
+    let radiosity = surfaces.radiosity(&lit);
+    let from = |direction: Vec3| {
+        let look = Look { direction, facing: 1.0, passes: 0.0, open: 0.0, cell: visibility.cell_of(point) };
+        radiosity.toward(&look).x
+    };
+    let near = |a: f32, b: f32| (a - b).abs() < 1e-5;
+    assert!(near(from(-Vec3::Z), 0.8) && near(from(Vec3::Y), 0.1), "{} {}", from(-Vec3::Z), from(Vec3::Y));
+    assert!(near(from(Vec3::new(0.0, 0.6, -0.8)), 0.64 * 0.8 + 0.36 * 0.1));
+    assert!(near(radiosity.ground.x, 0.8), "the ground outside looks like what faces up: {}", radiosity.ground);
 }

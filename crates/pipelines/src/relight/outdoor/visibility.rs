@@ -9,6 +9,8 @@ use rayon::prelude::*;
 
 /// Cells per axis of the grid that holds what surfaces send.
 pub const OPEN_CELLS: usize = 64;
+/// Sides of a cell that send light of their own: ground and the wall that stands on it do not look alike.
+pub const SIDES: usize = 6;
 /// Cells per axis of the blocks that shadow rays skip where nothing is solid.
 const BLOCK: usize = 8;
 /// Share of a cell that must be opaque for it to be solid.
@@ -62,6 +64,7 @@ pub struct Look {
 /// What surfaces send, over π, by cell of `[OPEN_CELLS³]`, and the ground outside.
 #[derive(Clone)]
 pub struct Radiosity {
+    /// `[OPEN_CELLS³, SIDES]`, by the side that surfaces face ([`sides`]).
     pub cells: Vec<Vec3>,
     pub ground: Vec3,
 }
@@ -248,12 +251,30 @@ impl Visibility {
 impl Radiosity {
     /// That of surfaces that send nothing.
     pub fn dark() -> Radiosity {
-        Radiosity { cells: vec![Vec3::ZERO; OPEN_CELLS.pow(3)], ground: Vec3::ZERO }
+        Radiosity { cells: vec![Vec3::ZERO; SIDES * OPEN_CELLS.pow(3)], ground: Vec3::ZERO }
     }
 
-    pub fn of(&self, cell: u32) -> Vec3 {
-        if cell == GROUND { self.ground } else { self.cells[cell as usize] }
+    /// What a cell sends to where a look into it comes from.
+    pub fn toward(&self, look: &Look) -> Vec3 {
+        places(look).into_iter().map(|(place, share)| share * self.of(place)).sum()
     }
+
+    /// What a cell sends to one side, or the ground, of those of [`places`].
+    pub fn of(&self, place: u32) -> Vec3 {
+        if place == GROUND { self.ground } else { self.cells[place as usize] }
+    }
+}
+
+/// Sides of an ambient cube (McTaggart 2004), +x, −x, +y and so on, that a unit vector points to, and their shares, its squares.
+pub fn sides(v: Vec3) -> [(usize, f32); 3] {
+    let v = v.to_array();
+    std::array::from_fn(|a| (2 * a + (v[a] < 0.0) as usize, v[a] * v[a]))
+}
+
+/// Places of `[OPEN_CELLS³, SIDES]`, or [`GROUND`], that a look sees, and their shares.
+pub fn places(look: &Look) -> [(u32, f32); 3] {
+    let of = |(side, share)| if look.cell == GROUND { (GROUND, share) } else { (SIDES as u32 * look.cell + side as u32, share) };
+    sides(-look.direction).map(of)
 }
 
 impl Ambient {
@@ -262,7 +283,7 @@ impl Ambient {
         let mut out = Gathered { normal, open: 0.0, ..Gathered::NONE };
         let mut n = 0.0;
         for look in looks {
-            let mut radiance = (1.0 - look.open) * if look.open < 1.0 - SEEN { self.radiosity.of(look.cell) } else { Vec3::ZERO };
+            let mut radiance = (1.0 - look.open) * if look.open < 1.0 - SEEN { self.radiosity.toward(&look) } else { Vec3::ZERO };
             if look.open > 0.0 {
                 for ((r, s), of_sky) in radiances(look.direction).iter().zip(self.sky.chunks_exact(3)).zip(&mut out.of_sky) {
                     *of_sky += look.open * r;
@@ -405,7 +426,7 @@ mod tests {
         let v = corner();
         let (point, up) = (Vec3::new(0.47, 0.5, 0.25), Vec3::Z);
         let with = |cells: Vec3| {
-            let radiosity = Radiosity { cells: vec![cells; OPEN_CELLS.pow(3)], ground: Vec3::ZERO };
+            let radiosity = Radiosity { cells: vec![cells; SIDES * OPEN_CELLS.pow(3)], ground: Vec3::ZERO };
             Ambient { sky: vec![0.0; 27], radiosity }.gathered(up, v.looks(point, up, 2048, 0))
         };
         let (dark, lit) = (with(Vec3::ZERO), with(Vec3::new(1.0, 0.5, 0.0)));

@@ -5,9 +5,18 @@ use diorama_geom::glam::Vec3;
 
 /// Unknowns: sun, nine of the sky.
 const UNKNOWNS: usize = 10;
-/// Pull of the unknowns toward 0, per point: of the sun and the even sky, and of the sky's first and second band, as normals of few directions
-/// tell little of them.
-const RIDGE: [f64; 3] = [1e-4, 2e-3, 5e-3];
+/// Pull of the sun toward 0, per point.
+const SUN_RIDGE: f64 = 1e-4;
+/// Pull of the sky's bands toward those of a sky that is likely, however bright: normals of few directions tell little of them.
+const SKY_RIDGE: [f64; 3] = [5e-4, 1e-2, 2.5e-2];
+/// Pull of the sky toward 0.
+const SKY_LEAST: f64 = 1e-6;
+/// Bands of a sky's nine harmonics.
+const BAND: [usize; 9] = [0, 1, 1, 1, 2, 2, 2, 2, 2];
+/// Harmonics of light over π of skies whose radiance is even, and, where there is no sun, 1 + 2 sin h as that of the CIE overcast sky (Moon and
+/// Spencer 1942).
+const CLEAR: [f64; 9] = [1.0 / 0.282_095, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+const OVERCAST: [f64; 9] = [CLEAR[0], 0.0, 2.0 / (1.5 * 0.488_603), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
 
 /// Least squares for one direction, of which `sunlit` reaches each point.
 pub fn solve(points: &[Lit], places: &[Place], sunlit: &[f32], direction: Vec3) -> Fitted {
@@ -28,11 +37,11 @@ pub fn solve(points: &[Lit], places: &[Place], sunlit: &[f32], direction: Vec3) 
     let n = points.len().max(1) as f64;
     let mut found = Fitted { sun: [0.0; SUN], sky: [0.0; 27], error: squares / (3.0 * n) };
     found.sun[..3].copy_from_slice(&direction.to_array());
+    let likely = likely(sunlit.iter().all(|s| *s == 0.0));
     for (k, sums) in sums.iter_mut().enumerate() {
-        (0..UNKNOWNS).for_each(|i| {
-            sums[i][i] += n * RIDGE[[0, 0, 1, 1, 1, 2, 2, 2, 2, 2][i]];
-            (0..i).for_each(|j| sums[i][j] = sums[j][i]);
-        });
+        sums[0][0] += n * SUN_RIDGE;
+        (0..9).for_each(|i| (i..9).for_each(|j| sums[1 + i][1 + j] += n * likely[i][j]));
+        (0..UNKNOWNS).for_each(|i| (0..i).for_each(|j| sums[i][j] = sums[j][i]));
         // A sun that would take light away is left out.
         let all = without(sums, &[]);
         let x = if all[0] < 0.0 { without(sums, &[0]) } else { all };
@@ -44,6 +53,16 @@ pub fn solve(points: &[Lit], places: &[Place], sunlit: &[f32], direction: Vec3) 
         found.error -= explained / (3.0 * n);
     }
     found
+}
+
+/// Quadratic form that pulls a sky toward a multiple of another, whichever is nearest: `D − D m mᵀ D / mᵀ D m`, and a little toward 0.
+fn likely(is_overcast: bool) -> [[f64; 9]; 9] {
+    let other = if is_overcast { OVERCAST } else { CLEAR };
+    let pull = BAND.map(|band| SKY_RIDGE[band]);
+    let along: [f64; 9] = std::array::from_fn(|i| pull[i] * other[i]);
+    let all: f64 = along.iter().zip(other).map(|(a, m)| a * m).sum();
+    let own = |i: usize, j: usize| if i == j { pull[i] + SKY_LEAST } else { 0.0 };
+    std::array::from_fn(|i| std::array::from_fn(|j| own(i, j) - along[i] * along[j] / all))
 }
 
 /// Solution of symmetric equations in which some unknowns are 0, by elimination.

@@ -1,12 +1,14 @@
 //! Which lights have a sun. A sun that all photographs share can stand in for albedo, and one that hardly explains anything for shadows that are
 //! still in the albedos: each has to explain something of its own.
 
-use super::{Guess, SETTLING, Seen, Surfaces, explained, gray, guess, level, lit, misfit, settle, solve};
+use super::{Fitted, Guess, SETTLING, Seen, Surfaces, explained, gray, guess, level, lit, misfit, settle, solve};
 use crate::relight::outdoor::visibility::Visibility;
 use diorama_geom::glam::Vec3;
 
 /// Share of a level surface's light below which a sun may be one that is not there.
 const WEAK: f32 = 0.5;
+/// The same below which it is none: it would only make another shape of the sky likely.
+const FAINT: f32 = 0.05;
 /// Factor by which what is seen may be explained worse for every sun that is left out.
 const PER_SUN: f64 = 1.03;
 /// Times that lights settle once all suns are left out.
@@ -42,16 +44,16 @@ impl Selection<'_> {
 
     /// Without weak suns: an overcast sky gets one that explains shadows of other lights which are still in the albedos.
     fn dropped(&self, all: Told, go_on: &mut dyn FnMut() -> bool) -> Option<Told> {
-        let share =
-            |g: &Guess| g.fitted.sun[2] * gray(&g.fitted.sun[3..]) / gray(&level(&g.fitted.sun, &g.fitted.sky).to_array()).max(1e-6);
-        let mut weak: Vec<usize> = (0..all.guesses.len()).filter(|l| share(&all.guesses[*l]) < WEAK).collect();
-        weak.sort_by(|a, b| share(&all.guesses[*a]).total_cmp(&share(&all.guesses[*b])));
+        let share = |l: &usize| all.guesses[*l].sun_share();
+        let mut weak: Vec<usize> = (0..all.guesses.len()).filter(|l| share(l) < WEAK).collect();
+        weak.sort_by(|a, b| share(a).total_cmp(&share(b)));
+        let faint: Vec<usize> = weak.iter().copied().filter(|l| share(l) < FAINT).collect();
         let mut told = all;
         for l in weak {
             let mut without = told.guesses.clone();
             without[l].sunlit.fill(0.0);
             let without = self.settled(without, &told.surfaces, 1, go_on)?;
-            if without.score() <= told.score() {
+            if without.score() <= told.score() || faint.contains(&l) {
                 told = without;
             }
         }
@@ -75,7 +77,7 @@ impl Selection<'_> {
                 let mut with = told.guesses.clone();
                 with[l] = guess(self.seen, &told.surfaces, self.visibility, albedos, l, &told.guesses[l].sent, None);
                 let with = self.settled(with, &told.surfaces, 1, go_on)?;
-                if best.as_ref().is_none_or(|b| with.misfit < b.misfit) {
+                if with.guesses[l].sun_share() > FAINT && best.as_ref().is_none_or(|b| with.misfit < b.misfit) {
                     best = Some(with);
                 }
             }
@@ -104,6 +106,12 @@ impl Told {
 }
 
 impl Guess {
+    /// Share of a level surface's light that is the sun's.
+    fn sun_share(&self) -> f32 {
+        let Fitted { sun, sky, .. } = &self.fitted;
+        sun[2] * gray(&sun[3..]) / gray(&level(sun, sky).to_array()).max(1e-6)
+    }
+
     pub fn has_sun(&self) -> bool {
         self.fitted.sun[3..] != [0.0; 3]
     }

@@ -1,14 +1,19 @@
 //! Points of surfaces that light reaches from a sun, from the sky and from each other.
 
 use super::SUN;
-use crate::relight::outdoor::visibility::{Ambient, OPEN_CELLS, Radiosity, Visibility, radiances};
+use crate::relight::outdoor::visibility::{Ambient, OPEN_CELLS, Radiosity, SIDES, Visibility, places, radiances, sides};
 use diorama_geom::glam::Vec3;
 use rayon::prelude::*;
 
 /// Directions in which points of surfaces look.
 const LOOKS: usize = 128;
-/// Share of the points, the lowest, that the ground outside looks like.
-const LOWEST: f32 = 0.1;
+/// Share of the points, the lowest, among which the ground outside is looked for.
+const LOWEST: f32 = 0.25;
+/// Points that must face a side for their mean to stand for others, and of those of one cell.
+const FEW: f32 = 3.0;
+const FACING: f32 = 0.1;
+/// Side that faces up.
+const UP: usize = 4;
 /// Bounces of light between surfaces, where a light is given.
 const BOUNCES: usize = 4;
 
@@ -17,6 +22,26 @@ const BOUNCES: usize = 4;
 pub struct Surfaces {
     pub(super) points: Vec<Place>,
     pub albedos: Vec<Vec3>,
+    /// Height below which the lowest of them lie.
+    low: f32,
+}
+
+/// A mean of what is added.
+#[derive(Clone, Copy, Default)]
+struct Mean {
+    sum: Vec3,
+    weight: f32,
+}
+
+impl Mean {
+    fn add(&mut self, value: Vec3, weight: f32) {
+        (self.sum, self.weight) = (self.sum + weight * value, self.weight + weight);
+    }
+
+    /// The mean; something else where it is of no more than so much.
+    fn or(&self, least: f32, other: Vec3) -> Vec3 {
+        if self.weight > least { self.sum / self.weight } else { other }
+    }
 }
 
 /// A point and what does not depend on light.
@@ -29,7 +54,7 @@ pub(super) struct Place {
     pub(super) open: f32,
     /// Light that arrives for each of the sky's coefficients.
     pub(super) sky: [f32; 9],
-    /// Cells of surfaces that it sees, and the share of what they send that arrives.
+    /// Sides of cells that it sees, and the share of what they send that arrives.
     seen: Vec<(u32, f32)>,
     /// Share that small things leave of a sun whose traced ray passes.
     pub(super) share: f32,
@@ -39,7 +64,10 @@ impl Surfaces {
     /// Points with normals and albedos.
     pub fn new(points: impl Iterator<Item = (Vec3, Vec3)>, albedos: Vec<Vec3>, visibility: &Visibility) -> Surfaces {
         let points: Vec<(Vec3, Vec3)> = points.collect();
-        Surfaces { points: points.par_iter().map(|(point, normal)| Place::of(visibility, *point, *normal)).collect(), albedos }
+        let mut heights: Vec<f32> = points.iter().map(|(point, _)| point.z).collect();
+        heights.sort_by(f32::total_cmp);
+        let low = heights.get((LOWEST * heights.len() as f32) as usize).copied().unwrap_or(0.0);
+        Surfaces { points: points.par_iter().map(|(point, normal)| Place::of(visibility, *point, *normal)).collect(), albedos, low }
     }
 
     /// The same from [`Surfaces::numbers`].
@@ -67,30 +95,32 @@ impl Surfaces {
 
     /// What surfaces send of which each receives `irradiance`.
     pub(super) fn radiosity(&self, irradiance: &[Vec3]) -> Radiosity {
-        let mut sent: Vec<(Vec3, f32)> = vec![(Vec3::ZERO, 0.0); OPEN_CELLS.pow(3)];
-        let mut by_height = [(Vec3::ZERO, 0.0); OPEN_CELLS];
+        let mut cells = vec![Mean::default(); SIDES * OPEN_CELLS.pow(3)];
+        let mut by_height = [[Mean::default(); SIDES]; OPEN_CELLS];
+        let (mut all, mut low, mut ground) = (Mean::default(), Mean::default(), Mean::default());
         for ((p, a), e) in self.points.iter().zip(&self.albedos).zip(irradiance) {
-            for of in [&mut sent[p.cell as usize], &mut by_height[p.cell as usize / OPEN_CELLS.pow(2)]] {
-                *of = (of.0 + *a * *e, of.1 + 1.0);
+            let sent = *a * *e;
+            for (side, share) in sides(p.normal) {
+                cells[SIDES * p.cell as usize + side].add(sent, share);
+                by_height[p.cell as usize / OPEN_CELLS.pow(2)][side].add(sent, share);
+            }
+            all.add(sent, 1.0);
+            if p.point.z <= self.low {
+                low.add(sent, 1.0);
+                ground.add(sent, p.normal.z.max(0.0).powi(2));
             }
         }
-        // What no photograph shows looks like the rest at its height; the ground outside, like the lowest tenth.
-        let (mut ground, mut count) = (Vec3::ZERO, 0.0);
-        for (sum, n) in by_height {
-            if count < LOWEST * self.points.len() as f32 {
-                (ground, count) = (ground + sum, count + n);
-            }
-        }
-        let ground = ground / count.max(1.0);
-        let mut last = ground;
-        let by_height = by_height.map(|(sum, n)| {
-            if n > 0.0 {
-                last = sum / n;
-            }
+        // What no photograph shows looks like the rest at its height that faces the same side; the ground outside, like what is low and faces up.
+        let all = all.or(0.0, Vec3::ZERO);
+        let ground = ground.or(FEW, low.or(0.0, all));
+        let mut last = [all; SIDES];
+        last[UP] = ground;
+        let by_height = by_height.map(|sides| {
+            last = std::array::from_fn(|k| sides[k].or(FEW, last[k]));
             last
         });
-        let of_cell = |(i, (sum, n)): (usize, (Vec3, f32))| if n > 0.0 { sum / n } else { by_height[i / OPEN_CELLS.pow(2)] };
-        Radiosity { cells: sent.into_iter().enumerate().map(of_cell).collect(), ground }
+        let of_cell = |(i, m): (usize, Mean)| m.or(FACING, by_height[i / SIDES / OPEN_CELLS.pow(2)][i % SIDES]);
+        Radiosity { cells: cells.into_iter().enumerate().map(of_cell).collect(), ground }
     }
 
     /// What of the sky, and of surfaces that it and suns `[N, 6]` light, reaches any place.
@@ -118,7 +148,7 @@ impl Place {
             sky.iter_mut().zip(radiances(look.direction)).for_each(|(v, r)| *v += share * look.open * r);
             open += share * look.passes;
             if look.open < 1.0 {
-                seen.push((look.cell, share * (1.0 - look.open)));
+                seen.extend(places(&look).map(|(place, part)| (place, part * share * (1.0 - look.open))));
             }
         }
         seen.sort_by_key(|s| s.0);
@@ -132,7 +162,7 @@ impl Place {
 
     /// Light of surfaces that send so much.
     pub(super) fn sent(&self, radiosity: &Radiosity) -> Vec3 {
-        self.seen.iter().map(|(cell, share)| *share * radiosity.of(*cell)).sum()
+        self.seen.iter().map(|(place, share)| *share * radiosity.of(*place)).sum()
     }
 
     /// Light of sky and surfaces.
