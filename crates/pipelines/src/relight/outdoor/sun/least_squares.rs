@@ -1,6 +1,7 @@
 //! The light of surface points by linear least squares, once the direction of its sun is given.
 
 use super::{Fitted, Lit, Place, SUN};
+use crate::relight::outdoor::visibility::radiances;
 use diorama_geom::glam::Vec3;
 
 /// Unknowns: sun, nine of the sky.
@@ -13,10 +14,6 @@ const SKY_RIDGE: [f64; 3] = [5e-4, 1e-2, 2.5e-2];
 const SKY_LEAST: f64 = 1e-6;
 /// Bands of a sky's nine harmonics.
 const BAND: [usize; 9] = [0, 1, 1, 1, 2, 2, 2, 2, 2];
-/// Harmonics of light over π of skies whose radiance is even, and, where there is no sun, 1 + 2 sin h as that of the CIE overcast sky (Moon and
-/// Spencer 1942).
-const CLEAR: [f64; 9] = [1.0 / 0.282_095, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
-const OVERCAST: [f64; 9] = [CLEAR[0], 0.0, 2.0 / (1.5 * 0.488_603), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
 
 /// Least squares for one direction, of which `sunlit` reaches each point.
 pub fn solve(points: &[Lit], places: &[Place], sunlit: &[f32], direction: Vec3) -> Fitted {
@@ -55,9 +52,13 @@ pub fn solve(points: &[Lit], places: &[Place], sunlit: &[f32], direction: Vec3) 
     found
 }
 
-/// Quadratic form that pulls a sky toward a multiple of another, whichever is nearest: `D − D m mᵀ D / mᵀ D m`, and a little toward 0.
+/// Quadratic form that pulls a sky toward the nearest multiple of a likely one `m`: `D − D m mᵀ D / mᵀ D m`, and a little toward 0. Likely is an
+/// even radiance, or where there is no sun, 1 + 2 sin h as that of the CIE overcast sky (Moon and Spencer 1942).
 fn likely(is_overcast: bool) -> [[f64; 9]; 9] {
-    let other = if is_overcast { OVERCAST } else { CLEAR };
+    let of_zenith = radiances(Vec3::Z).map(f64::from);
+    let mut other = [0.0; 9];
+    other[0] = 1.0 / of_zenith[0];
+    other[2] = if is_overcast { 2.0 / of_zenith[2] } else { 0.0 };
     let pull = BAND.map(|band| SKY_RIDGE[band]);
     let along: [f64; 9] = std::array::from_fn(|i| pull[i] * other[i]);
     let all: f64 = along.iter().zip(other).map(|(a, m)| a * m).sum();

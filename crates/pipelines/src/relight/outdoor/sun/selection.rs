@@ -47,13 +47,12 @@ impl Selection<'_> {
         let share = |l: &usize| all.guesses[*l].sun_share();
         let mut weak: Vec<usize> = (0..all.guesses.len()).filter(|l| share(l) < WEAK).collect();
         weak.sort_by(|a, b| share(a).total_cmp(&share(b)));
-        let faint: Vec<usize> = weak.iter().copied().filter(|l| share(l) < FAINT).collect();
         let mut told = all;
         for l in weak {
             let mut without = told.guesses.clone();
             without[l].sunlit.fill(0.0);
             let without = self.settled(without, &told.surfaces, 1, go_on)?;
-            if without.score() <= told.score() || faint.contains(&l) {
+            if without.score() <= told.score() || told.guesses[l].sun_share() < FAINT {
                 told = without;
             }
         }
