@@ -18,9 +18,18 @@ const SOLID: f32 = 0.5;
 /// Optical depth of a solid cell, and beyond which nothing passes.
 const DEPTH: f32 = 2.0;
 const OPAQUE: f32 = 6.0;
-/// Cells above its surface at which what a ray meets begins to count, and farthest along the ray that this is.
-const LIFT: f32 = 1.0;
+/// Cells above its surface at which what a ray meets begins to count: the least, and more where surfaces are noisy; and how many times as far
+/// along the ray that is at most.
+const LIFTS: [f32; 3] = [1.0, 2.0, 3.0];
 const FARTHEST: f32 = 8.0;
+/// Cells within which a ray meets its own surface, and least cosine of it to the normal.
+const OWN: f32 = 3.0;
+const OWN_FACING: f32 = 0.1;
+/// Share of rays that may meet their own surface, as rough ones do, before rays begin higher; and then that may still do so.
+const ROUGH: f32 = 0.2;
+const SMOOTH: f32 = 0.05;
+/// Directions of these rays.
+const TRIED: usize = 64;
 /// Length of a step in cells.
 const STEP: f32 = 0.7;
 /// Bits in a number of a checkpoint.
@@ -47,6 +56,8 @@ pub struct Visibility {
     near: Vec<u64>,
     /// Whether something in a block, or next to it, is solid.
     blocks: Vec<bool>,
+    /// Of [`LIFTS`].
+    lift: f32,
 }
 
 /// What a surface sees in one direction.
@@ -146,7 +157,7 @@ impl Visibility {
                 near[c / 64] |= 1 << (c % 64);
             }
         }
-        Visibility { low, size, n, solid, near, blocks }
+        Visibility { low, size, n, solid, near, blocks, lift: LIFTS[0] }
     }
 
     fn cell(&self) -> f32 {
@@ -205,8 +216,50 @@ impl Visibility {
 
     /// Beginning in cells of a ray from a surface: on the ray, not beside it, where shadows would be shifted.
     fn lifted(&self, point: Vec3, normal: Vec3, direction: Vec3, facing: f32) -> Vec3 {
-        let along = (LIFT / facing.max(1e-3)).min(FARTHEST);
-        (point - self.low) / self.cell() + along * direction + (LIFT - along * facing) * normal
+        let along = (self.lift / facing.max(1e-3)).min(FARTHEST * self.lift);
+        (point - self.low) / self.cell() + along * direction + (self.lift - along * facing) * normal
+    }
+
+    /// Lets rays from surfaces, given by points and normals, begin as high as it takes: distances that are learned from few or small photographs
+    /// are off by more than a cell, and walls would shadow themselves. Where no height takes it, surfaces are rough, and rays begin low.
+    pub fn lift_from(&mut self, surfaces: &[(Vec3, Vec3)]) {
+        self.lift = LIFTS[0];
+        if self.own_hits(surfaces) <= ROUGH {
+            return;
+        }
+        for lift in LIFTS {
+            self.lift = lift;
+            if self.own_hits(surfaces) <= SMOOTH {
+                return;
+            }
+        }
+        self.lift = LIFTS[0];
+    }
+
+    /// Share of rays toward the sky that meet their own surface.
+    fn own_hits(&self, surfaces: &[(Vec3, Vec3)]) -> f32 {
+        let toward: Vec<Vec3> = (0..TRIED).map(|i| spread(i, TRIED).as_vec3()).collect();
+        let is_hit = |(i, (point, normal)): (usize, &(Vec3, Vec3))| {
+            let direction = toward[i % TRIED];
+            let facing = normal.dot(direction);
+            (direction.z > 0.0 && facing > OWN_FACING).then(|| {
+                let from = self.lifted(*point, *normal, direction, facing);
+                let (passes, first) = self.pass(from, direction);
+                passes < 0.5 && (first - from).length() < OWN
+            })
+        };
+        let hits: Vec<bool> = surfaces.par_iter().enumerate().filter_map(is_hit).collect();
+        hits.iter().filter(|h| **h).count() as f32 / hits.len().max(1) as f32
+    }
+
+    /// Cells above surfaces at which rays begin.
+    pub fn lift(&self) -> f32 {
+        self.lift
+    }
+
+    /// The same with rays that begin as many cells above surfaces.
+    pub fn lifted_by(self, lift: f32) -> Visibility {
+        Visibility { lift, ..self }
     }
 
     /// Share of the light from a direction that reaches a surface.
@@ -340,108 +393,5 @@ fn is_occupied(bits: &OccupancyBits, p: [f32; 3]) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn basis(n: Vec3) -> [f32; 9] {
-        sh_light::basis(n.as_dvec3()).map(|b| b as f32)
-    }
-
-    /// A plate at z = 0.25 and a wall on it at x = 0.5, each 0.1 thick.
-    struct Corner;
-
-    impl DensityQuery for Corner {
-        fn density(&self, model: &[f32], sigma: &mut [f32]) {
-            for (s, p) in sigma.iter_mut().zip(model.chunks_exact(3)) {
-                let is_plate = (0.15..0.25).contains(&p[2]);
-                let is_wall = (0.5..0.6).contains(&p[0]) && (0.25..0.75).contains(&p[2]);
-                *s = if is_plate || is_wall { 1000.0 } else { 0.0 };
-            }
-        }
-    }
-
-    fn corner() -> Visibility {
-        Visibility::of(&Corner, &Occupancy::new(64, 1, false), (0.0, 1.0), 64)
-    }
-
-    #[test]
-    fn the_wall_shadows_what_lies_behind_it() {
-        let (v, up) = (corner(), Vec3::Z);
-        let sun = Vec3::new(1.0, 0.0, 1.0).normalize();
-        // The shadow of a wall half as high as the cube reaches as far.
-        for (x, want) in [(0.05, 0.0), (0.2, 0.0), (0.42, 0.0), (0.7, 1.0), (0.9, 1.0)] {
-            let got = v.from_sun(Vec3::new(x, 0.5, 0.25), up, sun);
-            assert!((got - want).abs() < 0.05, "{x}: {got}");
-        }
-        let other = Vec3::new(-1.0, 0.0, 1.0).normalize();
-        assert!(v.from_sun(Vec3::new(0.2, 0.5, 0.25), up, other) > 0.95);
-        assert!(v.from_sun(Vec3::new(0.5, 0.5, 0.5), Vec3::NEG_X, other) > 0.95);
-    }
-
-    /// Coarse cells and a low sun: the edge of the shadow lies where the ray from the edge of the wall meets the plate.
-    #[test]
-    fn shadows_are_not_shifted() {
-        let (v, up) = (Visibility::of(&Corner, &Occupancy::new(16, 1, false), (0.0, 1.0), 16), Vec3::Z);
-        // Half as high as the cube, the wall ends a shadow 0.4 before it.
-        let sun = Vec3::new(1.0, 0.0, 1.25).normalize();
-        for (x, is_lit) in [(0.07, true), (0.13, false), (0.2, false)] {
-            let got = v.from_sun(Vec3::new(x, 0.5, 0.25), up, sun);
-            assert!(if is_lit { got > 0.6 } else { got < 0.25 }, "{x}: {got}");
-        }
-    }
-
-    #[test]
-    fn corners_are_less_open_than_the_plain() {
-        let v = corner();
-        let open = |point: Vec3, normal: Vec3| v.from_sky(point, normal, 512, 0);
-        let [far, near] = [0.05, 0.47].map(|x| open(Vec3::new(x, 0.5, 0.25), Vec3::Z));
-        // A wall of height h at distance d hides (1 − d / √(d² + h²)) / 2 of what a plain receives, if it is long.
-        assert!((far - 0.83).abs() < 0.1 && (near - 0.55).abs() < 0.12, "{far} {near}");
-        let side = open(Vec3::new(0.5, 0.5, 0.5), Vec3::NEG_X);
-        assert!((side - 0.72).abs() < 0.1, "{side}");
-    }
-
-    /// Open space under a sky of which the upper half is seen, before a ground that sends what the sky would.
-    #[test]
-    fn light_in_the_open_is_that_of_the_sky_and_changes_with_the_normal_as_it_does() {
-        let empty = Visibility::new(vec![0; 64], (0.0, 1.0), 16);
-        let mut sky = [0.0; 27];
-        (0..27).for_each(|i| sky[i] = [0.9, 0.2, 0.1][i % 3] * [1.0, -0.1, 0.3, 0.2, 0.04, -0.03, 0.05, 0.02, -0.06][i / 3]);
-        let ambient = Ambient { sky: sky.to_vec(), radiosity: Radiosity::dark() };
-        let normal = Vec3::new(0.1, -0.2, 1.0).normalize();
-        // Of directions below, which see the ground, few count for a surface that looks up.
-        let light = |n: Vec3| (0..9).map(|i| basis(n)[i] * Vec3::from_slice(&sky[3 * i..])).sum::<Vec3>();
-        let got = ambient.gathered(normal, empty.looks(Vec3::splat(0.5), normal, 8192, 1));
-        assert!((got.light - light(normal)).abs().max_element() < 0.03, "{} {}", got.light, light(normal));
-        for side in [Vec3::X, Vec3::Y] {
-            let turned = (normal + 0.05 * side).normalize();
-            let (want, by) = (light(turned) - light(normal), got.at(turned) - got.light);
-            assert!((want - by).abs().max_element() < 0.15 * want.abs().max_element() + 1e-3, "{want} {by}");
-        }
-        assert!(got.open > 0.97);
-    }
-
-    #[test]
-    fn what_hides_the_sky_sends_its_own_light() {
-        let v = corner();
-        let (point, up) = (Vec3::new(0.47, 0.5, 0.25), Vec3::Z);
-        let with = |cells: Vec3| {
-            let radiosity = Radiosity { cells: vec![cells; SIDES * OPEN_CELLS.pow(3)], ground: Vec3::ZERO };
-            Ambient { sky: vec![0.0; 27], radiosity }.gathered(up, v.looks(point, up, 2048, 0))
-        };
-        let (dark, lit) = (with(Vec3::ZERO), with(Vec3::new(1.0, 0.5, 0.0)));
-        assert_eq!(dark.light, Vec3::ZERO);
-        assert!((lit.light - (1.0 - lit.open) * Vec3::new(1.0, 0.5, 0.0)).abs().max_element() < 0.02, "{lit:?}");
-        // The wall stands at +x: a surface that turns there receives more of it.
-        assert!(lit.slope[0].x > 0.1 && lit.at(Vec3::new(0.1, 0.0, 0.995)).x > lit.light.x, "{lit:?}");
-    }
-
-    #[test]
-    fn solid_cells_survive_a_checkpoint() {
-        let v = corner();
-        let numbers = v.numbers();
-        assert_eq!(numbers.len(), numbers_len(64));
-        let back = Visibility::from_numbers(&numbers, (0.0, 1.0), 64);
-        assert!(back.solid == v.solid && v.solid.iter().any(|w| *w != 0));
-    }
-}
+#[path = "visibility_tests.rs"]
+mod tests;

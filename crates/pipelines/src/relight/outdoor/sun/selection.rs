@@ -9,8 +9,10 @@ use diorama_geom::glam::Vec3;
 const WEAK: f32 = 0.5;
 /// The same below which it is none: it would only make another shape of the sky likely.
 const FAINT: f32 = 0.05;
-/// Factor by which what is seen may be explained worse for every sun that is left out.
-const PER_SUN: f64 = 1.03;
+/// Factor by which what is seen may be explained worse for every weak sun that is left out, and every other: what few photographs show of a
+/// place is explained badly by any light, and a strong sun of some then explains little more of all.
+const PER_WEAK_SUN: f64 = 1.03;
+const PER_SUN: f64 = 1.01;
 /// Times that lights settle once all suns are left out.
 const WITHOUT: usize = 3;
 
@@ -99,8 +101,8 @@ impl Selection<'_> {
 impl Told {
     /// What is compared: less is better.
     fn score(&self) -> f64 {
-        let suns = self.guesses.iter().filter(|g| g.has_sun()).count();
-        self.misfit * PER_SUN.powi(suns as i32)
+        let price = |g: &Guess| if g.sun_share() < WEAK { PER_WEAK_SUN } else { PER_SUN };
+        self.misfit * self.guesses.iter().filter(|g| g.has_sun()).map(price).product::<f64>()
     }
 }
 

@@ -63,12 +63,13 @@ impl Trainer<'_> {
         progress(0.0);
         let m = &self.model;
         let normals = NormalMaps::of(m, &self.cameras);
-        let visibility = Visibility::of(&m.field, &m.occupancy, m.shaded_cube(), m.config.light.sun_cells);
+        let mut visibility = Visibility::of(&m.field, &m.occupancy, m.shaded_cube(), m.config.light.sun_cells);
         let seen = self.seen(&normals);
         if seen.is_empty() {
             let what = format!("after {step} steps, no surface is opaque: there is nothing to tell light from; give more --steps");
             return Err(PipelineError::Usage(what));
         }
+        visibility.lift_from(&seen.iter().map(|s| (s.point, s.normal)).collect::<Vec<_>>());
         let Some((fitted, surfaces)) = sun::tell_apart(&seen, &visibility, interrupt, &mut progress) else { return Ok(()) };
         let m = &mut self.model;
         let is_apart = m.config.light.has_sun();
