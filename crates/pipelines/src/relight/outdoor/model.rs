@@ -378,7 +378,7 @@ impl SceneModel {
 
     /// Everything that a checkpoint holds; `around` are the numbers of what stands around.
     pub fn entries<'a>(&'a mut self, around: &'a Option<[Vec<f32>; 2]>) -> (Vec<Entry<'a>>, HashMap<String, String>) {
-        let metadata = HashMap::from([
+        let mut metadata = HashMap::from([
             ("method".to_string(), "relight".to_string()),
             ("stage".into(), if self.stage == Stage::Light { "light" } else { "surfaces" }.into()),
             ("began".into(), self.began.to_string()),
@@ -389,8 +389,8 @@ impl SceneModel {
             ("samples_per_ray_bits".into(), self.samples_per_ray.to_bits().to_string()),
             ("median_bits".into(), self.median.to_bits().to_string()),
             ("rate_scale_bits".into(), self.rate_scale.to_bits().to_string()),
-            ("lift_bits".into(), self.surroundings.as_ref().map_or(1.0, |a| a.visibility.lift()).to_bits().to_string()),
         ]);
+        metadata.extend(self.surroundings.as_ref().map(|a| ("lift_bits".into(), a.visibility.lift().to_bits().to_string())));
         let tables = [&mut self.lights, &mut self.skies, &mut self.gains, &mut self.suns];
         let mut entries = param_state::entries(params(&mut self.field, &mut self.joint, tables));
         entries.extend([entry("occupancy", &self.occupancy.grid.density), entry("occupancy.fresh", &self.occupancy.grid.fresh)]);
@@ -436,9 +436,11 @@ impl SceneModel {
             if solid.len() != visibility::numbers_len(cells) {
                 return Err(PipelineError::Usage(format!("{}: solid does not have {cells} cells per axis", file.display())));
             }
+            let mut visibility = Visibility::from_numbers(&solid, self.shaded_cube(), cells);
             // Runs of before rays could begin higher have none.
-            let lift = if c.metadata.contains_key("lift_bits") { f32::from_bits(number(&c, "lift_bits", file)?) } else { 1.0 };
-            let visibility = Visibility::from_numbers(&solid, self.shaded_cube(), cells).lifted_by(lift);
+            if c.metadata.contains_key("lift_bits") {
+                visibility = visibility.lifted_by(f32::from_bits(number(&c, "lift_bits", file)?));
+            }
             let surfaces = Surfaces::from_numbers(&tensor(&mut c, "surfaces", file)?, &visibility);
             self.surroundings = Some(Arc::new(Around { visibility: Arc::new(visibility), surfaces }));
             // Runs of before lights followed photographs have none: their lights are as they were found.

@@ -22,8 +22,9 @@ const OPAQUE: f32 = 6.0;
 /// along the ray that is at most.
 const LIFTS: [f32; 3] = [1.0, 2.0, 3.0];
 const FARTHEST: f32 = 8.0;
-/// Cells within which a ray meets its own surface, and least cosine of it to the normal.
+/// Cells within which a ray meets its own surface, share of light that then does not pass, and least cosine of the ray to the normal.
 const OWN: f32 = 3.0;
+const OWN_HIDES: f32 = 0.5;
 const OWN_FACING: f32 = 0.1;
 /// Share of rays that may meet their own surface, as rough ones do, before rays begin higher; and then that may still do so.
 const ROUGH: f32 = 0.2;
@@ -216,24 +217,21 @@ impl Visibility {
 
     /// Beginning in cells of a ray from a surface: on the ray, not beside it, where shadows would be shifted.
     fn lifted(&self, point: Vec3, normal: Vec3, direction: Vec3, facing: f32) -> Vec3 {
-        let along = (self.lift / facing.max(1e-3)).min(FARTHEST * self.lift);
+        let along = self.lift * (1.0 / facing.max(1e-3)).min(FARTHEST);
         (point - self.low) / self.cell() + along * direction + (self.lift - along * facing) * normal
     }
 
     /// Lets rays from surfaces, given by points and normals, begin as high as it takes: distances that are learned from few or small photographs
     /// are off by more than a cell, and walls would shadow themselves. Where no height takes it, surfaces are rough, and rays begin low.
     pub fn lift_from(&mut self, surfaces: &[(Vec3, Vec3)]) {
-        self.lift = LIFTS[0];
-        if self.own_hits(surfaces) <= ROUGH {
-            return;
-        }
-        for lift in LIFTS {
+        let mut own_hits = |lift: f32| {
             self.lift = lift;
-            if self.own_hits(surfaces) <= SMOOTH {
-                return;
-            }
+            self.own_hits(surfaces)
+        };
+        let is_noisy = own_hits(LIFTS[0]) > ROUGH && LIFTS[1..].iter().any(|lift| own_hits(*lift) <= SMOOTH);
+        if !is_noisy {
+            self.lift = LIFTS[0];
         }
-        self.lift = LIFTS[0];
     }
 
     /// Share of rays toward the sky that meet their own surface.
@@ -245,7 +243,7 @@ impl Visibility {
             (direction.z > 0.0 && facing > OWN_FACING).then(|| {
                 let from = self.lifted(*point, *normal, direction, facing);
                 let (passes, first) = self.pass(from, direction);
-                passes < 0.5 && (first - from).length() < OWN
+                1.0 - passes > OWN_HIDES && (first - from).length() < OWN
             })
         };
         let hits: Vec<bool> = surfaces.par_iter().enumerate().filter_map(is_hit).collect();
