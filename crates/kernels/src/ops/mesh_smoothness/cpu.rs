@@ -59,15 +59,15 @@ pub fn relative_laplacian(
     parts.iter().sum::<f64>() / (3 * n).max(1) as f64
 }
 
-/// Value of the normal consistency, and `weight` times its gradient added to `d_positions`. Faces without area have no normal and no
-/// gradient.
+/// Value of the normal consistency up to creases of `crease`, and `weight` times its gradient added to `d_positions`. Faces without area
+/// have no normal and no gradient.
 ///
 /// # Shapes
 /// positions, d_positions: `[V, 3]`.
 ///
 /// # Panics
 /// When the shapes differ.
-pub fn normal_consistency(topology: &MeshTopology, positions: &[[f32; 3]], weight: f32, d_positions: &mut [[f32; 3]]) -> f64 {
+pub fn normal_consistency(topology: &MeshTopology, positions: &[[f32; 3]], crease: f32, weight: f32, d_positions: &mut [[f32; 3]]) -> f64 {
     assert!([positions.len(), d_positions.len()] == [topology.vertices(); 2], "normal consistency: vertices");
     let dot = |a: [f32; 3], b: [f32; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
     let place = |f: &[u32; 3]| f.map(|i| positions[i as usize]);
@@ -79,8 +79,12 @@ pub fn normal_consistency(topology: &MeshTopology, positions: &[[f32; 3]], weigh
         if length > MIN_AREA { (n.map(|v| v / length), 1.0 / length) } else { ([0.0; 3], 0.0) }
     };
     let normals: Vec<([f32; 3], f32)> = topology.faces().par_iter().with_min_len(CHUNK).map(normal).collect();
-    let bend = |[f, g]: &[u32; 2]| 1.0 - dot(normals[*f as usize].0, normals[*g as usize].0) as f64;
-    let parts: Vec<f64> = topology.pairs().par_chunks(CHUNK).map(|part| part.iter().map(bend).sum()).collect();
+    let bend = |f: usize, g: u32| 1.0 - dot(normals[f].0, normals[g as usize].0);
+    let cost = |[f, g]: &[u32; 2]| {
+        let b = bend(*f as usize, *g);
+        (b / (1.0 + b / crease)) as f64
+    };
+    let parts: Vec<f64> = topology.pairs().par_chunks(CHUNK).map(|part| part.iter().map(cost).sum()).collect();
     let pairs = topology.pairs().len().max(1);
     // Gradient of the cross product of each face's sides.
     let d_cross: Vec<[f32; 3]> = (0..normals.len())
@@ -90,7 +94,8 @@ pub fn normal_consistency(topology: &MeshTopology, positions: &[[f32; 3]], weigh
             let (n, inverse) = normals[f];
             let mut d = [0.0f32; 3];
             for g in topology.across()[f].iter().filter(|g| **g != u32::MAX) {
-                (0..3).for_each(|k| d[k] -= normals[*g as usize].0[k]);
+                let counts = 1.0 / (1.0 + bend(f, *g) / crease).powi(2);
+                (0..3).for_each(|k| d[k] -= counts * normals[*g as usize].0[k]);
             }
             let radial = dot(d, n);
             std::array::from_fn(|k| (d[k] - radial * n[k]) * inverse * weight / pairs as f32)

@@ -2,7 +2,8 @@
 //!
 //! - Relative uniform Laplacian (Hasselgren et al. 2021; nvdiffrec's second stage): `mean |δ_i(v) − δ_i(v⁰)|²` over vertices and axes, where
 //!   `δ_i(v) = mean_{j ∈ N(i)} v_j − v_i`. It is zero for the initial mesh `v⁰` and for all its translations.
-//! - Normal consistency: `mean (1 − cos θ)` over the edges with two faces, where θ is the angle between their normals.
+//! - Normal consistency: `mean ρ(1 − cos θ)` over the edges with two faces, where θ is the angle between their normals, and
+//!   `ρ(b) = b / (1 + b / c)` lets creases with `b` far beyond `c` be; `c = ∞` counts them all.
 
 pub mod cpu;
 pub mod reference;

@@ -38,8 +38,8 @@ pub fn relative_laplacian(faces: &[[u32; 3]], initial: &[Point], positions: &[Po
     (value, gradient)
 }
 
-/// Normal consistency and its gradient.
-pub fn normal_consistency(faces: &[[u32; 3]], positions: &[Point]) -> (f64, Vec<Point>) {
+/// Normal consistency up to creases of `crease` and its gradient.
+pub fn normal_consistency(faces: &[[u32; 3]], positions: &[Point], crease: f64) -> (f64, Vec<Point>) {
     let mut sides: BTreeMap<[u32; 2], Vec<usize>> = BTreeMap::new();
     for (i, f) in faces.iter().enumerate() {
         (0..3).for_each(|k| sides.entry([f[k].min(f[(k + 1) % 3]), f[k].max(f[(k + 1) % 3])]).or_default().push(i));
@@ -55,9 +55,11 @@ pub fn normal_consistency(faces: &[[u32; 3]], positions: &[Point]) -> (f64, Vec<
     let (mut value, mut gradient) = (0.0, vec![[0.0; 3]; positions.len()]);
     let share = 1.0 / pairs.len().max(1) as f64;
     for [f, g] in pairs {
-        value += share * (1.0 - dot(normal(f).0, normal(g).0));
+        let bend = 1.0 - dot(normal(f).0, normal(g).0);
+        value += share * bend / (1.0 + bend / crease);
+        let counts = (1.0 + bend / crease).powi(-2);
         for (own, other) in [(f, g), (g, f)] {
-            let ((n, length), d) = (normal(own), normal(other).0.map(|v| -share * v));
+            let ((n, length), d) = (normal(own), normal(other).0.map(|v| -share * counts * v));
             let d_cross: Point = std::array::from_fn(|k| (d[k] - dot(d, n) * n[k]) / length);
             let [a, b, c] = place(own);
             let (d_b, d_c) = (cross(sub(c, a), d_cross), cross(d_cross, sub(b, a)));

@@ -32,9 +32,11 @@ fn matches_the_reference() {
         let mut d = vec![[1.0; 3]; first.len()];
         let got = cpu::relative_laplacian(&topology, &cpu::laplacian(&topology, &first), &moved, 2.0, &mut d);
         check("laplacian", got, &d, reference::relative_laplacian(&faces, &points(&first), &points(&moved)));
-        let mut d = vec![[1.0; 3]; first.len()];
-        let got = cpu::normal_consistency(&topology, &moved, 2.0, &mut d);
-        check("normals", got, &d, reference::normal_consistency(&faces, &points(&moved)));
+        for crease in [f32::INFINITY, 0.05] {
+            let mut d = vec![[1.0; 3]; first.len()];
+            let got = cpu::normal_consistency(&topology, &moved, crease, 2.0, &mut d);
+            check("normals", got, &d, reference::normal_consistency(&faces, &points(&moved), crease as f64));
+        }
     }
 }
 
@@ -45,8 +47,11 @@ fn reference_gradients_match_central_differences() {
     let d = reference::relative_laplacian(&faces, &first, &moved).1;
     let of = |p: &[f64]| p.as_chunks::<3>().0.to_vec();
     assert_gradient("laplacian", d.as_flattened(), moved.as_flattened(), 1e-6, |p| reference::relative_laplacian(&faces, &first, &of(p)).0);
-    let d = reference::normal_consistency(&faces, &moved).1;
-    assert_gradient("normals", d.as_flattened(), moved.as_flattened(), 1e-6, |p| reference::normal_consistency(&faces, &of(p)).0);
+    for crease in [f64::INFINITY, 0.05] {
+        let d = reference::normal_consistency(&faces, &moved, crease).1;
+        let at = |p: &[f64]| reference::normal_consistency(&faces, &of(p), crease).0;
+        assert_gradient("normals", d.as_flattened(), moved.as_flattened(), 1e-6, at);
+    }
 }
 
 #[test]
@@ -58,17 +63,19 @@ fn flat_and_unmoved_meshes_cost_nothing() {
     assert!(cpu::relative_laplacian(&topology, &cpu::laplacian(&topology, &first), &shifted, 1.0, &mut d) < 1e-12);
     assert!(d.as_flattened().iter().all(|v| v.abs() < 1e-6));
     let flat: Vec<[f32; 3]> = first.iter().map(|p| [p[0], p[1], 0.0]).collect();
-    assert!(cpu::normal_consistency(&topology, &flat, 1.0, &mut d) < 1e-6);
-    // A right angle: 1 − cos 90°.
+    assert!(cpu::normal_consistency(&topology, &flat, 0.05, 1.0, &mut d) < 1e-6);
+    // A right angle, 1 − cos 90°, and what of it counts.
     let corner = [[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
     let topology = MeshTopology::new(4, &[[0, 1, 2], [1, 0, 3]]);
-    assert!((cpu::normal_consistency(&topology, &corner, 1.0, &mut [[0.0; 3]; 4]) - 1.0).abs() < 1e-6);
+    for (crease, counts) in [(f32::INFINITY, 1.0), (0.25, 0.2)] {
+        assert!((cpu::normal_consistency(&topology, &corner, crease, 1.0, &mut [[0.0; 3]; 4]) - counts).abs() < 1e-6);
+    }
 }
 
 #[test]
 fn faces_without_area_stay_finite() {
     let topology = MeshTopology::new(4, &[[0, 1, 2], [1, 0, 3]]);
     let mut d = [[0.0; 3]; 4];
-    let value = cpu::normal_consistency(&topology, &[[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 1.0]], 1.0, &mut d);
+    let value = cpu::normal_consistency(&topology, &[[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 1.0]], 0.05, 1.0, &mut d);
     assert!(value.is_finite() && d.as_flattened().iter().all(|v| v.is_finite()), "{}", wide(&d.concat())[0]);
 }

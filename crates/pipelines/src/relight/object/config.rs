@@ -98,7 +98,7 @@ pub struct LossConfig {
     pub color_entropy: f32,
     /// Bending of the mesh in the second stage against its first shape; falls to 0.
     pub laplacian: f32,
-    /// Angles between faces in the first stage.
+    /// Angles between faces in the first stage; those of creases count little.
     pub normal_consistency: f32,
 }
 

@@ -34,6 +34,8 @@ const JITTER: f32 = 0.03;
 const RAMP: f32 = 0.1;
 /// Share of the stage after which the sign-change loss has its last weight.
 const SETTLED: f32 = 0.25;
+/// Crease beyond which angles between faces count little, as 1 − cos 18°.
+const CREASE: f32 = 0.05;
 /// Weight of occlusion against none.
 const OCCLUSION: f32 = 0.001;
 
@@ -181,7 +183,7 @@ impl Topology {
         loss.regularizers += probe.finish_backward(config.loss.white_light);
         if config.loss.normal_consistency > 0.0 {
             let (topology, weight) = (MeshTopology::new(surface.positions.len(), &surface.faces), config.loss.normal_consistency);
-            let value = mesh_smoothness::cpu::normal_consistency(&topology, &surface.positions, weight, &mut d_vertices);
+            let value = mesh_smoothness::cpu::normal_consistency(&topology, &surface.positions, CREASE, weight, &mut d_vertices);
             loss.regularizers += weight as f64 * value;
         }
         let (mut d_positions, d_s) = (vec![[0.0; 3]; positions.len()], &mut self.distances.grads);
