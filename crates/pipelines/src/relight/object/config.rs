@@ -50,7 +50,7 @@ pub struct GridConfig {
     pub file: PathBuf,
     /// Half the edge of the box that holds the object, in units of the capture; auto: from the masks.
     pub scale: Auto,
-    /// First surface: `hull`, what all masks allow, or `random`.
+    /// First surface: `hull`, what all masks allow; `carved`, without what photographs do not agree on; or `random`.
     pub start: String,
 }
 
@@ -246,8 +246,8 @@ impl Configuration for Config {
         if !(4..=128).contains(&self.grid.cells) {
             return fault("grid.cells: must lie between 4 and 128");
         }
-        if !["hull", "random"].contains(&&self.grid.start[..]) {
-            return fault("grid.start: expected hull or random");
+        if !["hull", "carved", "random"].contains(&&self.grid.start[..]) {
+            return fault("grid.start: expected hull, carved or random");
         }
         if matches!(self.grid.scale, Auto::Is(s) if s <= 0.0) {
             return fault("grid.scale: must be above 0, or auto");

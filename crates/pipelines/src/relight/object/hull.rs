@@ -52,6 +52,11 @@ impl Silhouette {
         Some((across(0) * (1.0 - fy) + across(1) * fy) * q.z / self.camera.fx.min(self.camera.fy))
     }
 
+    /// Whether the photograph shows a point within so far of its mask's border, in units of the world.
+    pub fn has_border(&self, p: DVec3, width: f64) -> bool {
+        self.at(p).is_some_and(|d| d.abs() < width)
+    }
+
     /// Largest distance of a ray through the mask from a point.
     fn reach(&self, p: DVec3) -> f64 {
         let away = |(x, y): &(f64, f64)| (p - self.pose.translation).cross(self.pose.rotation * self.camera.direction(*x, *y)).length();
@@ -68,6 +73,19 @@ pub fn distance(silhouettes: &[Silhouette], p: DVec3) -> f64 {
         }
     }
     if least.is_finite() { least } else { -f64::MAX }
+}
+
+/// Whether a point lies in the hull.
+pub fn contains(silhouettes: &[Silhouette], p: DVec3) -> bool {
+    let mut is_shown = false;
+    for s in silhouettes {
+        match s.at(p) {
+            Some(d) if d <= 0.0 => return false,
+            Some(_) => is_shown = true,
+            None => {}
+        }
+    }
+    is_shown
 }
 
 /// Center and half size of the hull; none where it is empty.

@@ -1,6 +1,7 @@
 //! A run's model: the stage that it is in, and its checkpoints.
 
 use super::capture::{ObjectCapture, ObjectView};
+use super::carving::Carving;
 use super::config::Config;
 use super::placement::Placement;
 use super::probe::Probe;
@@ -14,6 +15,7 @@ use diorama_data::checkpoint::{self, Checkpoint, Entry};
 use diorama_data::{DataError, model_file};
 use diorama_engine::params::ParamSet;
 use diorama_engine::train::Origin;
+use diorama_geom::capture::Split;
 use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::{Mesh, Model};
 use diorama_kernels::ops::adam::Adam;
@@ -41,6 +43,19 @@ impl Stage {
     }
 }
 
+/// The surface that the first stage begins with.
+fn first_surface(config: &Config, capture: &ObjectCapture, bias: f32, notes: &mut Vec<String>) -> Result<Topology> {
+    let mut carving = None;
+    if config.grid.start == "carved" && config.topology_steps() > 0 {
+        let photos: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.photos[i]).collect();
+        carving = Carving::of(&photos, &capture.silhouettes, &capture.placement);
+        if carving.is_none() {
+            notes.push("the photographs agree on too little of the surface to carve it: the first surface is the hull of the masks".into());
+        }
+    }
+    Topology::new(config, &capture.silhouettes, &capture.placement, carving.as_ref(), bias)
+}
+
 /// The model of a run.
 pub struct ObjectModel {
     pub config: Config,
@@ -63,12 +78,13 @@ impl ObjectModel {
     /// # Errors
     /// When a given light or mesh cannot be read.
     pub fn new(config: Config, capture: &ObjectCapture) -> Result<ObjectModel> {
-        let (probe, notes) = first_probe(&config)?;
+        let (probe, mut notes) = first_probe(&config)?;
+        let first = first_surface(&config, capture, 0.0, &mut notes)?;
         let mut model = ObjectModel {
             probe,
             notes,
             placement: capture.placement,
-            stage: Stage::Topology(Box::new(Topology::new(&config, &capture.silhouettes, &capture.placement, 0.0)?)),
+            stage: Stage::Topology(Box::new(first)),
             origin: Origin::default(),
             rate_scale: 1.0,
             bias: 0.0,
@@ -86,7 +102,7 @@ impl ObjectModel {
     pub fn begin_again(&mut self, capture: &ObjectCapture, bias: f32, rate_scale: f32) -> Result<()> {
         self.probe = first_probe(&self.config)?.0;
         (self.bias, self.rate_scale, self.beginnings) = (bias, rate_scale, self.beginnings + 1);
-        self.stage = Stage::Topology(Box::new(Topology::new(&self.config, &capture.silhouettes, &self.placement, bias)?));
+        self.stage = Stage::Topology(Box::new(first_surface(&self.config, capture, bias, &mut self.notes)?));
         Ok(())
     }
 

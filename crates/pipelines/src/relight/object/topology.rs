@@ -2,6 +2,7 @@
 //! 2021, DMTet; Munkberg et al. 2022, nvdiffrec).
 
 use super::capture::{BOX_HALF, ObjectPhoto, ObjectView};
+use super::carving::Carving;
 use super::config::Config;
 use super::hull;
 use super::loss::{self, PictureLoss};
@@ -95,11 +96,17 @@ pub struct Topology {
 }
 
 impl Topology {
-    /// The surface to begin with; `bias` is added to all distances, in cells.
+    /// The surface to begin with: the hull without what is carved; `bias` is added to all distances, in cells.
     ///
     /// # Errors
     /// When the grid comes from a file that cannot be read.
-    pub fn new(config: &Config, silhouettes: &[hull::Silhouette], placement: &Placement, bias: f32) -> Result<Topology> {
+    pub fn new(
+        config: &Config,
+        silhouettes: &[hull::Silhouette],
+        placement: &Placement,
+        carving: Option<&Carving>,
+        bias: f32,
+    ) -> Result<Topology> {
         let grid = match config.grid.file.as_os_str().is_empty() {
             true => TetrahedralGrid::lattice(config.grid.cells, BOX_EDGE),
             false => TetrahedralGrid::new(tetrahedra_npz::read(&config.grid.file)?, BOX_EDGE),
@@ -110,7 +117,8 @@ impl Topology {
             _ => {
                 let at = |p: &[f32; 3]| {
                     let world = DVec3::from(p.map(f64::from)) * placement.scale + placement.center;
-                    let inside = hull::distance(silhouettes, world) / placement.scale / cell;
+                    let left = carving.map_or(NEAR, |c| c.distance(DVec3::from(p.map(f64::from))) * c.cell() / cell);
+                    let inside = left.min(hull::distance(silhouettes, world) / placement.scale / cell);
                     // The surface must be closed within the box.
                     let to_wall = p.iter().map(|v| BOX_HALF - v.abs() as f64).fold(f64::INFINITY, f64::min) / cell - 0.5;
                     inside.min(to_wall).clamp(-NEAR, NEAR) as f32
