@@ -97,8 +97,8 @@ fn limits() -> Limits {
     Limits { fma_gflops: fma_gflops(), read_gb_per_s: best(9, || probe::read_bandwidth(&buffer)) / 1e9 }
 }
 
-/// The best of many short tries: what interrupts a thread spoils few of them.
-fn fma_gflops() -> f64 {
+/// Multiply-add peak of this thread, the best of many short tries: what interrupts a thread spoils few of them.
+pub(super) fn fma_gflops() -> f64 {
     best(32, || probe::fma_peak(1 << 18)) / 1e9
 }
 

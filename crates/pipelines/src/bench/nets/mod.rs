@@ -5,7 +5,6 @@ mod networks;
 
 use crate::error::{PipelineError, Result};
 use diorama_kernels::gemm::Precision;
-use diorama_kernels::probe;
 use serde::Serialize;
 use std::time::Instant;
 
@@ -90,7 +89,7 @@ impl Wanted {
 /// When no layer and no network has one of the names.
 pub fn run(wanted: &Wanted, each: &mut dyn FnMut(Figures)) -> Result<NetsReport> {
     let threads = rayon::current_num_threads();
-    let peak_gflops = (0..5).map(|_| probe::fma_peak(1 << 22)).fold(0.0, f64::max) / 1e9;
+    let peak_gflops = super::ops::fma_gflops();
     let mut report = NetsReport { threads, peak_gflops, layers: Vec::new(), networks: Vec::new() };
     for layer in layers::ALL.iter().filter(|l| wanted.has(&l.label())) {
         report.layers.push(layer.measure(wanted, threads));

@@ -59,19 +59,18 @@ struct Shown {
 impl Carving {
     /// Carves the hull of photographs. None where they agree on so little that more than three tenths would be lost.
     pub fn of(photos: &[&ObjectPhoto], silhouettes: &[Silhouette], placement: &Placement) -> Option<Carving> {
-        let cells = cells(photos)?;
+        let cells = cells(photos);
         let world = |i: usize| center(cells, i) * placement.scale + placement.center;
         let solid: Vec<bool> = (0..cells.pow(3)).into_par_iter().map(|i| hull::contains(silhouettes, world(i))).collect();
-        let whole = solid.iter().filter(|s| **s).count();
+        let most = MOST * solid.iter().filter(|s| **s).count() as f64;
         let mut carving = Carving { cells, off: vec![false; solid.len()], solid };
         let width = BORDER * 2.0 * BOX_HALF / cells as f64 * placement.scale;
         let is_sure = |i: usize| silhouettes.iter().filter(|s| s.has_border(world(i), width)).count() >= SURE;
-        let taken = carving.carve(photos, &is_sure);
-        (taken as f64 <= MOST * whole as f64).then_some(carving)
+        carving.carve(photos, most as usize, &is_sure).then_some(carving)
     }
 
-    /// Takes off what photographs do not agree on, except for what is sure; returns how many cells.
-    fn carve(&mut self, photos: &[&ObjectPhoto], is_sure: &(dyn Fn(usize) -> bool + Sync)) -> usize {
+    /// Takes off what photographs do not agree on, except for what is sure. False once more than `most` cells would be off.
+    fn carve(&mut self, photos: &[&ObjectPhoto], most: usize, is_sure: &(dyn Fn(usize) -> bool + Sync)) -> bool {
         let mut pictures: Vec<Picture> = photos.par_iter().map(|p| Picture::new(p, self)).collect();
         let mut taken = 0;
         for _ in 0..ROUNDS {
@@ -80,14 +79,14 @@ impl Carving {
             shown.par_sort_by_key(|s| s.cell);
             let is_off = |of: &&[Shown]| is_inconsistent(of) && !is_sure(of[0].cell as usize);
             let off: Vec<usize> = shown.par_chunk_by(|a, b| a.cell == b.cell).filter(is_off).map(|of| of[0].cell as usize).collect();
-            if off.is_empty() {
+            taken += off.len();
+            if off.is_empty() || taken > most {
                 break;
             }
-            taken += off.len();
             off.into_iter().for_each(|i| (self.solid[i], self.off[i]) = (false, true));
             pictures.par_iter_mut().for_each(|p| p.look_again(self));
         }
-        taken
+        taken <= most
     }
 
     /// About the distance of a point from what was taken off, in cells up to 1; inside of it, down to −1.
@@ -230,10 +229,10 @@ fn center(cells: usize, i: usize) -> DVec3 {
 }
 
 /// Cells along an axis, by the mean width of a pixel at the box's center.
-fn cells(photos: &[&ObjectPhoto]) -> Option<usize> {
+fn cells(photos: &[&ObjectPhoto]) -> usize {
     let widths = photos.iter().map(|p| p.view.pose.translation.length() / p.view.camera.fx.min(p.view.camera.fy));
     let width = widths.sum::<f64>() / photos.len() as f64;
-    (width > 0.0).then(|| (2.0 * BOX_HALF / (PIXELS * width)).clamp(CELLS.0, CELLS.1) as usize)
+    (2.0 * BOX_HALF / (PIXELS * width)).clamp(CELLS.0, CELLS.1) as usize
 }
 
 #[cfg(test)]

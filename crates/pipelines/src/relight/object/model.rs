@@ -43,19 +43,6 @@ impl Stage {
     }
 }
 
-/// The surface that the first stage begins with.
-fn first_surface(config: &Config, capture: &ObjectCapture, bias: f32, notes: &mut Vec<String>) -> Result<Topology> {
-    let mut carving = None;
-    if config.grid.start == "carved" && config.topology_steps() > 0 {
-        let photos: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.photos[i]).collect();
-        carving = Carving::of(&photos, &capture.silhouettes, &capture.placement);
-        if carving.is_none() {
-            notes.push("the photographs agree on too little of the surface to carve it: the first surface is the hull of the masks".into());
-        }
-    }
-    Topology::new(config, &capture.silhouettes, &capture.placement, carving.as_ref(), bias)
-}
-
 /// The model of a run.
 pub struct ObjectModel {
     pub config: Config,
@@ -78,31 +65,66 @@ impl ObjectModel {
     /// # Errors
     /// When a given light or mesh cannot be read.
     pub fn new(config: Config, capture: &ObjectCapture) -> Result<ObjectModel> {
-        let (probe, mut notes) = first_probe(&config)?;
-        let first = first_surface(&config, capture, 0.0, &mut notes)?;
-        let mut model = ObjectModel {
+        let mut model = ObjectModel::empty(config, capture)?;
+        if model.config.topology_steps() == 0 && !model.config.base_mesh.as_os_str().is_empty() {
+            let mesh = base_mesh(&model.config.base_mesh, &model.placement)?;
+            model.stage = Stage::Textured(Box::new(Textured::new(&model.config, &mesh, None)));
+        } else {
+            model.begin(capture);
+        }
+        Ok(model)
+    }
+
+    /// The model of a checkpoint.
+    ///
+    /// # Errors
+    /// When a given light cannot be read, or the checkpoint is damaged.
+    pub fn restored(config: Config, capture: &ObjectCapture, c: Checkpoint, file: &Path) -> Result<ObjectModel> {
+        let mut model = ObjectModel::empty(config, capture)?;
+        model.restore(c, file)?;
+        Ok(model)
+    }
+
+    /// A model without a surface.
+    fn empty(config: Config, capture: &ObjectCapture) -> Result<ObjectModel> {
+        let (probe, notes) = first_probe(&config)?;
+        Ok(ObjectModel {
             probe,
             notes,
             placement: capture.placement,
-            stage: Stage::Topology(Box::new(first)),
+            stage: Stage::Topology(Box::new(Topology::new(&config)?)),
             origin: Origin::default(),
             rate_scale: 1.0,
             bias: 0.0,
             beginnings: 1,
             config,
-        };
-        if model.config.topology_steps() == 0 && !model.config.base_mesh.as_os_str().is_empty() {
-            let mesh = base_mesh(&model.config.base_mesh, &model.placement)?;
-            model.stage = Stage::Textured(Box::new(Textured::new(&model.config, &mesh, None)));
+        })
+    }
+
+    /// Finds the surface that the first stage begins with.
+    fn begin(&mut self, capture: &ObjectCapture) {
+        let Stage::Topology(first) = &mut self.stage else { return };
+        if self.config.grid.start == "random" {
+            return first.begin_random(self.config.seed, self.bias);
         }
-        Ok(model)
+        let mut carving = None;
+        if self.config.grid.start == "carved" {
+            let photos: Vec<_> = capture.indices(Split::Train).into_iter().map(|i| &capture.photos[i]).collect();
+            carving = Carving::of(&photos, &capture.silhouettes, &self.placement);
+            if carving.is_none() {
+                let why = "the photographs agree on too little of the surface to carve it";
+                self.notes.push(format!("{why}: the first surface is the hull of the masks"));
+            }
+        }
+        first.begin(&capture.silhouettes, &self.placement, carving.as_ref(), self.bias);
     }
 
     /// Begins the first stage again.
     pub fn begin_again(&mut self, capture: &ObjectCapture, bias: f32, rate_scale: f32) -> Result<()> {
         self.probe = first_probe(&self.config)?.0;
         (self.bias, self.rate_scale, self.beginnings) = (bias, rate_scale, self.beginnings + 1);
-        self.stage = Stage::Topology(Box::new(first_surface(&self.config, capture, bias, &mut self.notes)?));
+        self.stage = Stage::Topology(Box::new(Topology::new(&self.config)?));
+        self.begin(capture);
         Ok(())
     }
 
@@ -185,7 +207,7 @@ impl ObjectModel {
     ///
     /// # Errors
     /// When the checkpoint is of another method or shape.
-    pub fn restore(&mut self, mut c: Checkpoint, file: &Path) -> Result<()> {
+    fn restore(&mut self, mut c: Checkpoint, file: &Path) -> Result<()> {
         fn number<T: std::str::FromStr>(c: &Checkpoint, key: &str, file: &Path) -> Result<T> {
             let value = c.metadata.get(key).and_then(|v| v.parse().ok());
             value.ok_or_else(|| PipelineError::Usage(format!("{}: metadata {key} is missing or malformed", file.display())))

@@ -37,14 +37,16 @@ pub fn train(
     imported.notes.iter().for_each(|n| events(&Event::Note(n.clone())));
     let config = &if resume { with_kept_start(config.clone(), folder.path()) } else { config.clone() };
     let photographs = capture::load(config, imported)?;
-    let mut model = ObjectModel::new(config.clone(), &photographs)?;
+    let kept = if resume && checkpoint::exists(&folder.checkpoints()) { Some(checkpoint::load(&folder.checkpoints())?) } else { None };
+    let mut model = match kept {
+        Some((c, note)) => {
+            note.into_iter().for_each(|n| events(&Event::Note(n)));
+            ObjectModel::restored(config.clone(), &photographs, c, &checkpoint::latest(&folder.checkpoints()))?
+        }
+        None => ObjectModel::new(config.clone(), &photographs)?,
+    };
     std::mem::take(&mut model.notes).into_iter().for_each(|n| events(&Event::Note(n)));
     if resume {
-        if checkpoint::exists(&folder.checkpoints()) {
-            let (c, note) = checkpoint::load(&folder.checkpoints())?;
-            model.restore(c, &checkpoint::latest(&folder.checkpoints()))?;
-            note.into_iter().for_each(|n| events(&Event::Note(n)));
-        }
         folder.cut_metrics(model.origin.step)?;
     } else {
         folder.write_description(&model.config, imported)?;
@@ -105,8 +107,7 @@ pub fn load(run: &Path) -> Result<(ObjectModel, ObjectCapture, Vec<String>)> {
     let imported = kept_capture::read(run, None, &config.data.path)?;
     let (checkpoint, file, note) = folder::last_checkpoint(run)?;
     let photographs = capture::load(&config, &imported)?;
-    let mut model = ObjectModel::new(config, &photographs)?;
-    model.restore(checkpoint, &file)?;
+    let model = ObjectModel::restored(config, &photographs, checkpoint, &file)?;
     Ok((model, photographs, note.into_iter().collect()))
 }
 

@@ -96,42 +96,38 @@ pub struct Topology {
 }
 
 impl Topology {
-    /// The surface to begin with: the hull without what is carved; `bias` is added to all distances, in cells.
+    /// The model without a surface yet.
     ///
     /// # Errors
     /// When the grid comes from a file that cannot be read.
-    pub fn new(
-        config: &Config,
-        silhouettes: &[hull::Silhouette],
-        placement: &Placement,
-        carving: Option<&Carving>,
-        bias: f32,
-    ) -> Result<Topology> {
+    pub fn new(config: &Config) -> Result<Topology> {
         let grid = match config.grid.file.as_os_str().is_empty() {
             true => TetrahedralGrid::lattice(config.grid.cells, BOX_EDGE),
             false => TetrahedralGrid::new(tetrahedra_npz::read(&config.grid.file)?, BOX_EDGE),
         };
-        let cell = grid.cell as f64;
-        let mut distances = match config.grid.start.as_str() {
-            "random" => grid.random_distances(config.seed),
-            _ => {
-                let at = |p: &[f32; 3]| {
-                    let world = DVec3::from(p.map(f64::from)) * placement.scale + placement.center;
-                    let left = carving.map_or(NEAR, |c| c.distance(DVec3::from(p.map(f64::from))) * c.cell() / cell);
-                    let inside = left.min(hull::distance(silhouettes, world) / placement.scale / cell);
-                    // The surface must be closed within the box.
-                    let to_wall = p.iter().map(|v| BOX_HALF - v.abs() as f64).fold(f64::INFINITY, f64::min) / cell - 0.5;
-                    inside.min(to_wall).clamp(-NEAR, NEAR) as f32
-                };
-                grid.rest.par_iter().map(at).collect()
-            }
-        };
-        distances.iter_mut().for_each(|d| *d += bias);
         let adam = Adam { rate: config.optim.shape_rate, beta2: 0.999, epsilon: 1e-8, ..Adam::default() };
-        let offsets = ParamGroup::dense("offsets", vec![0.0; 3 * grid.vertices()], adam);
-        let limits = SurfaceLimits::of(&grid);
-        let material = Material::new(config);
-        Ok(Topology { limits, distances: ParamGroup::dense("distances", distances, adam), offsets, grid, material })
+        let zeros = |name, n: usize| ParamGroup::dense(name, vec![0.0; n], adam);
+        let (distances, offsets) = (zeros("distances", grid.vertices()), zeros("offsets", 3 * grid.vertices()));
+        Ok(Topology { limits: SurfaceLimits::of(&grid), distances, offsets, grid, material: Material::new(config) })
+    }
+
+    /// Gives it a random surface; `bias` is added to all distances, in cells.
+    pub fn begin_random(&mut self, seed: u64, bias: f32) {
+        self.distances.values = self.grid.random_distances(seed).iter().map(|d| d + bias).collect();
+    }
+
+    /// Gives it the hull of the masks, without what is carved off; `bias` is added to all distances, in cells.
+    pub fn begin(&mut self, silhouettes: &[hull::Silhouette], placement: &Placement, carving: Option<&Carving>, bias: f32) {
+        let cell = self.grid.cell as f64;
+        let at = |p: &[f32; 3]| {
+            let p = DVec3::from(p.map(f64::from));
+            let hull = hull::distance(silhouettes, p * placement.scale + placement.center) / placement.scale / cell;
+            let left = carving.map_or(NEAR, |c| c.distance(p) * c.cell() / cell);
+            // The surface must be closed within the box.
+            let to_wall = (BOX_HALF - p.abs().max_element()) / cell - 0.5;
+            hull.min(left).min(to_wall).clamp(-NEAR, NEAR) as f32 + bias
+        };
+        self.distances.values = self.grid.rest.par_iter().map(at).collect();
     }
 
     fn positions(&self) -> Vec<[f32; 3]> {

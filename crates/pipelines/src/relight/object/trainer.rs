@@ -131,11 +131,13 @@ impl Trainee for Trainer<'_> {
             return Ok(None);
         }
         self.recovered = true;
-        let mut fresh = ObjectModel::new(self.model.config.clone(), &self.capture)?;
-        if checkpoint::exists(self.checkpoints) {
+        let config = self.model.config.clone();
+        let mut fresh = if checkpoint::exists(self.checkpoints) {
             let (c, _) = checkpoint::load(self.checkpoints)?;
-            fresh.restore(c, &checkpoint::latest(self.checkpoints))?;
-        }
+            ObjectModel::restored(config, &self.capture, c, &checkpoint::latest(self.checkpoints))?
+        } else {
+            ObjectModel::new(config, &self.capture)?
+        };
         fresh.rate_scale = 0.3 * self.model.rate_scale;
         self.model = fresh;
         Ok(Some((self.model.origin.step, "the loss was not finite; the rate is lowered".into())))
