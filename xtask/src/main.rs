@@ -148,7 +148,7 @@ fn ci() -> bool {
         ok &= step(level, libraries_at(level));
     }
     ok &= step("examples", examples::run());
-    ok &= step("fuzz", fuzz("20000"));
+    ok &= step("fuzz", fuzz("5000"));
     ok &= step("docs", cargo(&["doc", "--release", "--workspace", "--no-deps"]));
     for (tool, args) in [("deny", &["deny", "check", "licenses", "bans", "sources"][..]), ("typos", &["typos"][..])] {
         if installed(tool) {

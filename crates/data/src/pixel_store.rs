@@ -23,6 +23,7 @@ const LARGEST: f32 = 65504.0;
 
 /// Pixels of some frames, four values each: RGB and alpha (opaque if the photograph has none). Colors are sRGB, except in
 /// [`PixelFormat::Half`], which holds linear light.
+#[derive(Clone)]
 pub struct PixelStore {
     values: Values,
     format: PixelFormat,
@@ -37,6 +38,7 @@ pub struct PixelStore {
 }
 
 /// Values of pixels, four each.
+#[derive(Clone)]
 enum Values {
     Bytes(Vec<u8>),
     Words(Vec<u16>),

@@ -4,6 +4,7 @@ use super::{Buffer, Gpu, GpuError};
 use crate::api::Api;
 use cubecl::prelude::CubeElement;
 use diorama_testkit::compare_proven;
+use std::time::Instant;
 
 /// Largest error allowed, relative to the value plus the root mean square of all.
 pub const TOLERANCE: f64 = 1e-3;
@@ -19,17 +20,21 @@ pub struct Row {
     pub error: f64,
     /// Reason of a failure; `None` if the comparison passed.
     pub fault: Option<String>,
+    /// Since the line before, or since the table was begun.
+    pub seconds: f64,
 }
 
 /// The table so far.
 pub struct Table<'a> {
     gpu: &'a Gpu,
+    /// When the last line was added.
+    last: Instant,
     pub rows: Vec<Row>,
 }
 
 impl<'a> Table<'a> {
     pub fn new(gpu: &'a Gpu) -> Self {
-        Table { gpu, rows: Vec::new() }
+        Table { gpu, last: Instant::now(), rows: Vec::new() }
     }
 
     /// Adds a line with its outcome: the largest relative error, or the reason of a failure.
@@ -38,7 +43,8 @@ impl<'a> Table<'a> {
             Ok(e) => (e, None),
             Err(e) => (f64::INFINITY, Some(e)),
         };
-        self.rows.push(Row { op, result, shape, error, fault });
+        let seconds = std::mem::replace(&mut self.last, Instant::now()).elapsed().as_secs_f64();
+        self.rows.push(Row { op, result, shape, error, fault, seconds });
     }
 
     /// Compares numbers within [`TOLERANCE`], and shows that a wrong one would be noticed.

@@ -14,6 +14,8 @@ pub struct Line {
     /// Largest error over value plus root mean square; null where it failed.
     pub error: Option<f64>,
     pub fault: Option<String>,
+    /// Time that the comparison took, with the reference and the building of kernels.
+    pub seconds: f64,
 }
 
 /// Result of a check.
@@ -47,23 +49,32 @@ pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
     let gpu = Gpu::open(device.parse().map_err(PipelineError::Usage)?).map_err(to_pipeline_error)?;
     let mut rows = check::run(&gpu).map_err(to_pipeline_error)?;
     rows.extend(diorama_engine::on_gpu::check::run(&gpu).map_err(to_pipeline_error)?);
-    let line =
-        |r: check::Row| Line { op: r.op, result: r.result, shape: r.shape, error: r.error.is_finite().then_some(r.error), fault: r.fault };
+    let line = |r: check::Row| Line {
+        op: r.op,
+        result: r.result,
+        shape: r.shape,
+        error: r.error.is_finite().then_some(r.error),
+        fault: r.fault,
+        seconds: r.seconds,
+    };
     let mut lines: Vec<Line> = rows.into_iter().map(line).collect();
     let mut cases = vec![("loss per step", "f32", &[][..])];
     if tensor_element(&gpu).is_some() {
         cases.push(("loss, tensor cores", "auto", &[]));
     }
-    cases.push(("d cameras", "f32", &["camera.refine=true"]));
-    cases.push(("d cameras, focal", "f32", &["camera.refine=true", "camera.refine_focal=true"]));
-    cases.push(("loss, drawn by error", "f32", &["sampling.error_map=true"]));
-    cases.push(("loss, distortion", "f32", &["loss.distortion=0.01", "background=learned"]));
+    // Distances are found once, for the first case: that takes longer than the steps.
+    cases.push(("d cameras", "f32", &["loss.depth=0", "camera.refine=true"]));
+    cases.push(("d cameras, focal", "f32", &["loss.depth=0", "camera.refine=true", "camera.refine_focal=true"]));
+    cases.push(("loss, drawn by error", "f32", &["loss.depth=0", "sampling.error_map=true"]));
+    cases.push(("loss, distortion", "f32", &["loss.depth=0", "loss.distortion=0.01", "background=learned"]));
+    // Software takes a second for a step.
+    let training = Training::new(device, if gpu.software { FEW_STEPS } else { STEPS }, data)?;
     for (result, precision, changes) in cases {
-        lines.extend(training(device, data, Method::Ngp, result, precision, changes)?);
+        lines.extend(training.compare(Method::Ngp, result, precision, changes)?);
     }
     for (method, result) in [(Method::Nerf, "loss, nerf"), (Method::Mlp, "loss, mlp"), (Method::Baseline, "loss, baseline")] {
-        let small = ["sampling.rays=16", "sampling.samples=12", "sampling.importance=12"];
-        lines.extend(training(device, data, method, result, "f32", &small)?);
+        let small = ["loss.depth=0", "sampling.rays=16", "sampling.samples=12", "sampling.importance=12"];
+        lines.extend(training.compare(method, result, "f32", &small)?);
     }
     Ok(Report {
         device: gpu.api.name(),
@@ -76,9 +87,11 @@ pub fn run(device: &str, data: Option<&Path>) -> Result<Report> {
     })
 }
 
-/// Steps over which losses are compared.
+/// Steps over which losses are compared, and on software that stands for a device.
 #[cfg(feature = "gpu")]
 const STEPS: u64 = 50;
+#[cfg(feature = "gpu")]
+const FEW_STEPS: u64 = 16;
 /// The same of wide networks, which the CPU takes long for.
 #[cfg(feature = "gpu")]
 const WIDE_STEPS: u64 = 10;
@@ -91,67 +104,78 @@ const CAMERAS_APART: [f64; 2] = [0.02, 0.4];
 #[cfg(feature = "gpu")]
 const APART: [f64; 2] = [0.02, 0.05];
 
-/// Small steps of the standard recipe on the device in the given precision, and on the CPU in f32, with the same
-/// rays: by default on the still life.
+/// Small steps of the standard recipe on a device and on the CPU.
 #[cfg(feature = "gpu")]
-fn training(
-    device: &str,
-    data: Option<&Path>,
-    method: Method,
-    result: &'static str,
-    precision: &str,
-    changes: &[&str],
-) -> Result<Vec<Line>> {
-    use crate::object::config::Config;
-    use crate::object::{quickstart, recipe};
-    let refines = changes.contains(&"camera.refine=true");
-    let steps = match method {
-        Method::Ngp if refines => 1,
-        Method::Ngp => STEPS,
-        _ => WIDE_STEPS,
-    };
-    let most = APART[(precision != "f32") as usize];
-    let scratch = std::env::temp_dir().join(format!("diorama-check-{}", std::process::id()));
-    let folder = data.unwrap_or(&scratch);
-    let mut c = Config::new(method, folder.into());
-    let name = match data {
-        Some(d) => d.display().to_string(),
-        None => {
-            quickstart::write_capture(&scratch, 24, 64)?;
-            "still life".into()
+struct Training<'a> {
+    device: &'a str,
+    steps: u64,
+    name: String,
+    data: crate::object::config::DataConfig,
+    loaded: crate::object::recipe::Loaded,
+}
+
+#[cfg(feature = "gpu")]
+impl Training<'_> {
+    /// On photographs of a capture at a quarter of their size, or of the still life.
+    fn new<'a>(device: &'a str, steps: u64, data: Option<&Path>) -> Result<Training<'a>> {
+        use crate::object::{config::Config, quickstart, recipe};
+        let scratch = std::env::temp_dir().join(format!("diorama-check-{}", std::process::id()));
+        let mut c = Config::new(Method::Ngp, data.unwrap_or(&scratch).into());
+        (c.device, c.data.split) = ("cpu".into(), "every:8".into());
+        c.data.downscale = if data.is_some() { 4 } else { 1 };
+        let loaded = match data {
+            Some(_) => recipe::Loaded::new(&c),
+            None => quickstart::write_capture(&scratch, 24, 64).and_then(|_| recipe::Loaded::new(&c)),
+        };
+        if data.is_none() {
+            // What cannot be removed from a scratch folder stays there.
+            let _ = std::fs::remove_dir_all(&scratch);
         }
-    };
-    c.data.split = "every:8".into();
-    c.data.downscale = if data.is_some() { 4 } else { 1 };
-    c.run.log_every = 1;
-    (c.sampling.rays, c.sampling.batch_samples, c.sampling.occupancy_points) = (64, 4096, 8192);
-    for (key, value) in changes.iter().filter_map(|c| c.split_once('=')) {
-        c.set(key, value)?;
+        let name = data.map_or_else(|| "still life".into(), |d| d.display().to_string());
+        Ok(Training { device, steps, name, data: c.data, loaded: loaded? })
     }
-    let mut of = |device: &str| {
-        c.device = device.into();
-        c.field.precision = if device == "cpu" { "f32" } else { precision }.into();
-        recipe::begin(&c, steps)
-    };
-    let curves = of("cpu").and_then(|cpu| Ok((cpu, of(device)?)));
-    if data.is_none() {
-        // What cannot be removed from a scratch folder stays there.
-        let _ = std::fs::remove_dir_all(&scratch);
+
+    /// Both losses with the same rays, in the given precision on the device and in f32 on the CPU.
+    fn compare(&self, method: Method, result: &'static str, precision: &str, changes: &[&str]) -> Result<Vec<Line>> {
+        use crate::object::config::Config;
+        use crate::object::recipe;
+        let begin = std::time::Instant::now();
+        let refines = changes.contains(&"camera.refine=true");
+        let steps = match method {
+            Method::Ngp if refines => 1,
+            Method::Ngp => self.steps,
+            _ => WIDE_STEPS,
+        };
+        let most = APART[(precision != "f32") as usize];
+        let mut c = Config::new(method, self.data.path.clone());
+        (c.data, c.run.log_every) = (self.data.clone(), 1);
+        (c.sampling.rays, c.sampling.batch_samples, c.sampling.occupancy_points) = (64, 4096, 8192);
+        for (key, value) in changes.iter().filter_map(|c| c.split_once('=')) {
+            c.set(key, value)?;
+        }
+        let mut of = |device: &str| {
+            c.device = device.into();
+            c.field.precision = if device == "cpu" { "f32" } else { precision }.into();
+            recipe::begin(&c, steps, &self.loaded)
+        };
+        let (cpu, gpu) = (of("cpu")?, of(self.device)?);
+        let seconds = begin.elapsed().as_secs_f64();
+        let shape = format!("{steps} step{}, {}", if steps == 1 { "" } else { "s" }, self.name);
+        let line = |result, error: f64, most: f64| {
+            let right = error <= most;
+            let fault = (!right).then(|| format!("{:.2} % off, {:.0} % is allowed", 100.0 * error, 100.0 * most));
+            let error = (right && error.is_finite()).then_some(error);
+            Line { op: "training", result, shape: shape.clone(), error, fault, seconds }
+        };
+        if let (Some(a), Some(b)) = (&cpu.cameras, &gpu.cameras) {
+            let energy = |v: &mut dyn Iterator<Item = f32>| v.map(|x| (x * x) as f64).sum::<f64>().sqrt();
+            let apart = |i: usize| energy(&mut a[i].iter().zip(&b[i]).map(|(a, b)| a - b)) / energy(&mut a[i].iter().copied());
+            let first = Line { seconds: 0.0, ..line("cameras' first step", apart(0), CAMERAS_APART[1]) };
+            return Ok(vec![line(result, apart(1), CAMERAS_APART[0]), first]);
+        }
+        let apart = cpu.losses.iter().zip(&gpu.losses).map(|(a, b)| (b / a - 1.0).abs());
+        Ok(vec![line(result, apart.fold(0.0, |a: f64, e| if e.is_nan() { e } else { a.max(e) }), most)])
     }
-    let (cpu, gpu) = curves?;
-    let shape = format!("{steps} step{}, {name}", if steps == 1 { "" } else { "s" });
-    let line = |result, error: f64, most: f64| {
-        let right = error <= most;
-        let fault = (!right).then(|| format!("{:.2} % off, {:.0} % is allowed", 100.0 * error, 100.0 * most));
-        Line { op: "training", result, shape: shape.clone(), error: (right && error.is_finite()).then_some(error), fault }
-    };
-    if let (Some(a), Some(b)) = (&cpu.cameras, &gpu.cameras) {
-        let energy = |v: &mut dyn Iterator<Item = f32>| v.map(|x| (x * x) as f64).sum::<f64>().sqrt();
-        let apart = |i: usize| energy(&mut a[i].iter().zip(&b[i]).map(|(a, b)| a - b)) / energy(&mut a[i].iter().copied());
-        return Ok(vec![line(result, apart(1), CAMERAS_APART[0]), line("cameras' first step", apart(0), CAMERAS_APART[1])]);
-    }
-    let apart = cpu.losses.iter().zip(&gpu.losses).map(|(a, b)| (b / a - 1.0).abs());
-    Ok(vec![line(result, apart.fold(0.0, |a: f64, e| if e.is_nan() { e } else { a.max(e) }), most)])
 }
 
 /// This build has no GPU kernels.

@@ -163,9 +163,31 @@ pub struct Beginning {
     pub cameras: Option<[Vec<f32>; 2]>,
 }
 
-/// Trains the first `steps` steps, from cameras a little wrong where they are refined; writes nothing.
-pub fn begin(config: &Config, steps: u64) -> Result<Beginning> {
-    let mut trainer = scratch_trainer(config, true)?;
+/// A capture with its training pixels, from which several runs may begin.
+pub struct Loaded {
+    capture: Capture,
+    pixels: PixelStore,
+}
+
+impl Loaded {
+    /// Reads what a configuration's `data` names.
+    ///
+    /// # Errors
+    /// When the capture or a photograph cannot be read, or when the device cannot be opened.
+    pub fn new(config: &Config) -> Result<Loaded> {
+        let capture = load_capture(config)?;
+        let (pixels, _) = load_pixels(&resolved(config, &capture)?, &capture, &Device::open(&config.device)?)?;
+        Ok(Loaded { capture, pixels })
+    }
+}
+
+/// Trains the first `steps` steps on what was loaded with the same `data`, from cameras a little wrong where they are refined; writes
+/// nothing.
+///
+/// # Errors
+/// When the device cannot be opened or fails.
+pub fn begin(config: &Config, steps: u64, loaded: &Loaded) -> Result<Beginning> {
+    let mut trainer = scratch_trainer(config, true, Loaded { capture: loaded.capture.clone(), pixels: loaded.pixels.clone() })?;
     let from = trainer.model.corrections.as_ref().map(|g| g.values.clone()).unwrap_or_default();
     let losses = (0..steps).map(|step| Ok(trainer.step(step, step as f64 / steps as f64)?.loss)).collect::<Result<_>>()?;
     if trainer.model.corrections.is_some() {
@@ -178,7 +200,7 @@ pub fn begin(config: &Config, steps: u64) -> Result<Beginning> {
 
 /// Measures the stages of a step: `warmup` steps, then `steps` measured ones; writes nothing.
 pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> {
-    let mut trainer = scratch_trainer(config, false)?;
+    let mut trainer = scratch_trainer(config, false, Loaded::new(config)?)?;
     for step in 0..warmup {
         trainer.step(step, 0.0)?;
     }
@@ -217,14 +239,12 @@ pub fn profile(config: &Config, warmup: u64, steps: u64) -> Result<TrainReport> 
 const WRONG: f32 = 0.01;
 
 /// A trainer whose run is not kept.
-fn scratch_trainer(config: &Config, wrong_cameras: bool) -> Result<Trainer<'static>> {
-    let capture = load_capture(config)?;
+fn scratch_trainer(config: &Config, wrong_cameras: bool, Loaded { capture, pixels }: Loaded) -> Result<Trainer<'static>> {
     let config = &resolved(config, &capture)?;
     let device = Device::open(&config.device)?;
-    let (store, _) = load_pixels(config, &capture, &device)?;
-    let has_alpha = store.has_alpha;
+    let has_alpha = pixels.has_alpha;
     let mut model = ObjectModel::new(config.clone(), capture, has_alpha)?;
-    let mut photographs = StoredPhotographs::new(store);
+    let mut photographs = StoredPhotographs::new(pixels);
     let (observations, _) = observations::find(&mut model, &photographs, &AtomicBool::new(false), &mut |_| {});
     let (mut model, _) = settle_exposure(model, &mut photographs, &observations)?;
     if let (true, Some(group)) = (wrong_cameras, &mut model.corrections) {

@@ -47,7 +47,12 @@ fn spoilt(at: &[u64]) -> (std::result::Result<Summary, RunError<PipelineError>>,
     for (k, v) in [("field.log2_size", "10"), ("sampling.rays", "64"), ("sampling.occupancy_points", "512"), ("device", "cpu")] {
         c.set(k, v).unwrap();
     }
-    let mut s = Spoilt { trainer: scratch_trainer(&c, false).unwrap(), at: at.to_vec(), losses: Vec::new(), starts: Vec::new() };
+    let mut s = Spoilt {
+        trainer: scratch_trainer(&c, false, Loaded::new(&c).unwrap()).unwrap(),
+        at: at.to_vec(),
+        losses: Vec::new(),
+        starts: Vec::new(),
+    };
     let options = RunOptions { steps: Some(6), ..run_options(&c) };
     let end = train::run(&options, Default::default(), &mut s, &AtomicBool::new(false), &mut |_| {});
     (end, s)
@@ -90,7 +95,7 @@ fn unbounded() -> Trainer<'static> {
     ] {
         c.set(k, v).unwrap();
     }
-    scratch_trainer(&c, false).unwrap()
+    scratch_trainer(&c, false, Loaded::new(&c).unwrap()).unwrap()
 }
 
 /// A point before the middle of frame 1's picture, seen by frames 0 (held out), 1, 2 and 3.

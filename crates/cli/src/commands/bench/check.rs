@@ -4,6 +4,7 @@ use crate::commands::{Outcome, Verb};
 use clap::Args;
 use diorama_pipelines::bench;
 use diorama_pipelines::{PipelineError, Result};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// Compare every op on a GPU with its f64 reference; exit code 1 if one differs
@@ -38,6 +39,7 @@ impl Verb for Check {
             }
             let atomics = if r.native_atomics { "native f32 atomics" } else { "f32 atomics by exchange" };
             let kind = if r.software { "software" } else { "hardware" };
+            println!("longest: {}", longest(&r.lines).join(", "));
             println!(
                 "{} ({}, {kind}, {atomics}): {} of {} pass in {:.1} s",
                 r.device,
@@ -52,4 +54,13 @@ impl Verb for Check {
         }
         Ok(Outcome::Done)
     }
+}
+
+/// The ops that took longest, each with its time.
+fn longest(lines: &[bench::check::Line]) -> Vec<String> {
+    let mut seconds: BTreeMap<&str, f64> = BTreeMap::new();
+    lines.iter().for_each(|l| *seconds.entry(l.op).or_default() += l.seconds);
+    let mut all: Vec<(&str, f64)> = seconds.into_iter().collect();
+    all.sort_by(|a, b| b.1.total_cmp(&a.1));
+    all.iter().take(8).map(|(op, s)| format!("{op} {s:.0} s")).collect()
 }

@@ -169,7 +169,7 @@ impl Config {
             seed: 0,
             base_mesh: PathBuf::new(),
             data: DataConfig { path, downscale: 1, split: "file".into() },
-            grid: GridConfig { cells: pick(8, 26), file: PathBuf::new(), scale: Auto::Auto, start: "hull".into() },
+            grid: GridConfig { cells: pick(8, 26), file: PathBuf::new(), scale: Auto::Auto, start: "carved".into() },
             material: MaterialConfig {
                 levels: pick(8, 16),
                 log2_size: pick(14, 19) as u32,
