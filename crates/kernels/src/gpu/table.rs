@@ -20,7 +20,7 @@ pub struct Row {
     pub error: f64,
     /// Reason of a failure; `None` if the comparison passed.
     pub fault: Option<String>,
-    /// Since the line before, or since the table was begun.
+    /// Time since the line before, or since the table was begun.
     pub seconds: f64,
 }
 

@@ -181,11 +181,11 @@ impl Loaded {
     }
 }
 
-/// Trains the first `steps` steps on what was loaded with the same `data`, from cameras a little wrong where they are refined; writes
-/// nothing.
+/// Trains the first `steps` steps on what was loaded with the same `data` and `seed`, from cameras a little wrong where they are refined;
+/// writes nothing.
 ///
 /// # Errors
-/// When the device cannot be opened or fails.
+/// When the configuration makes no sense, or when the device cannot be opened or fails.
 pub fn begin(config: &Config, steps: u64, loaded: &Loaded) -> Result<Beginning> {
     let mut trainer = scratch_trainer(config, true, Loaded { capture: loaded.capture.clone(), pixels: loaded.pixels.clone() })?;
     let from = trainer.model.corrections.as_ref().map(|g| g.values.clone()).unwrap_or_default();

@@ -56,7 +56,7 @@ impl Verb for Check {
     }
 }
 
-/// The ops that took longest, each with its time.
+/// Up to eight ops that took longest, each with its time.
 fn longest(lines: &[bench::check::Line]) -> Vec<String> {
     let mut seconds: BTreeMap<&str, f64> = BTreeMap::new();
     lines.iter().for_each(|l| *seconds.entry(l.op).or_default() += l.seconds);

@@ -50,7 +50,7 @@ pub struct GridConfig {
     pub file: PathBuf,
     /// Half the edge of the box that holds the object, in units of the capture; auto: from the masks.
     pub scale: Auto,
-    /// First surface: `hull`, what all masks allow; `carved`, without what photographs do not agree on; or `random`.
+    /// First surface: `carved`, what all masks allow without what photographs do not agree on; `hull`, with it; or `random`.
     pub start: String,
 }
 

@@ -12,6 +12,8 @@ const TRAINED: f64 = 4.0 * NUMBER;
 const TETRAHEDRON: f64 = 120.0;
 const PIXEL: f64 = 1500.0;
 const RAY: f64 = 8.0;
+/// Bytes of a pixel while the first surface is carved: its color, the cell that it shows, and what it shows of that.
+const CARVED: f64 = 64.0;
 /// Vertices of a surface over the squared number of cells, and rays of each that lie above it.
 const VERTICES: f64 = 12.0;
 const RAYS: f64 = 768.0;
@@ -38,8 +40,11 @@ pub fn check(config: &Config, photographs: usize, pixels: usize, available: Opti
     let Some(available) = available else { return Ok(()) };
     let kept = photographs as f64 * pixels as f64 * 5.0 * NUMBER;
     let [topology, textured, traced] = stages(config, pixels);
+    let is_carved = config.grid.start == "carved" && config.topology_steps() > 0;
+    let carving = if is_carved { photographs as f64 * pixels as f64 * CARVED } else { 0.0 };
     let asked = [
         ("the photographs", 0.0, "reduce them with --set data.downscale=2".to_string()),
+        ("the first surface (carving)", carving, "use --set grid.start=hull".into()),
         ("the first stage (tetrahedra)", topology, format!("use --set grid.cells={}", (config.grid.cells / 2).max(4))),
         ("the second stage (textures)", textured, format!("use --texture {}", (config.material.texture / 2).max(64))),
         ("the third stage (traced light)", if config.run.traced_steps > 0 { traced } else { 0.0 }, "leave out --mc".into()),
@@ -79,6 +84,9 @@ mod tests {
         assert!(e.contains("second stage") && e.contains("--texture 4096"), "{e}");
         (config.grid.cells, config.material.texture, config.material.levels, config.run.traced_steps) = (30, 512, 1, 10);
         config.run.samples = 1;
+        let e = refusal(&config, 60, 280);
+        assert!(e.contains("carving") && e.contains("grid.start=hull"), "{e}");
+        config.grid.start = "hull".into();
         let e = refusal(&config, 60, 280);
         assert!(e.contains("third stage") && e.contains("--mc"), "{e}");
     }

@@ -3,8 +3,8 @@
 //!
 //! Munkberg et al. 2022, "Extracting Triangular 3D Models, Materials, and Lighting From Images", from their equations: [`topology`] finds a
 //! surface on a tetrahedral grid with a material by position, [`textured`] refines it as a mesh with textures; both are drawn by [`raster`],
-//! lit by [`probe`], and compared by [`loss`]. Shapes begin with the hull of the masks ([`hull`]), on
-//! request without what photographs do not agree on ([`carving`]).
+//! lit by [`probe`], and compared by [`loss`]. Shapes begin with the hull of the masks ([`hull`])
+//! without what photographs do not agree on ([`carving`]).
 //! A third stage (`traced`, on request) traces shadows and light between surfaces, and tells light from base color.
 //!
 //! Adam does not depend on the scale of gradients, so the factors of gradients that others give (64 for light, ⅛ for hash tables) are left out.

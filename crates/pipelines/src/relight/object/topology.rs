@@ -122,7 +122,8 @@ impl Topology {
         let at = |p: &[f32; 3]| {
             let p = DVec3::from(p.map(f64::from));
             let hull = hull::distance(silhouettes, p * placement.scale + placement.center) / placement.scale / cell;
-            let left = carving.map_or(NEAR, |c| c.distance(p) * c.cell() / cell);
+            // Far from what was taken off, nothing but the hull limits it: a cell of carving may be a small part of one here.
+            let left = carving.map(|c| (c.distance(p), c.cell() / cell)).map_or(NEAR, |(d, size)| if d < 1.0 { d * size } else { NEAR });
             // The surface must be closed within the box.
             let to_wall = (BOX_HALF - p.abs().max_element()) / cell - 0.5;
             hull.min(left).min(to_wall).clamp(-NEAR, NEAR) as f32 + bias

@@ -117,7 +117,7 @@ impl Trainee for Trainer<'_> {
         if let Some((step, fault)) = self.fault.take() {
             let m = &mut self.model;
             if m.beginnings >= BEGINNINGS {
-                let cure = "check that masks and poses belong together, or lower optim.shape_rate";
+                let cure = "check that masks and poses belong together, lower optim.shape_rate, or try --set grid.start=hull";
                 let before = m.beginnings - 1;
                 return Err(PipelineError::Usage(format!("step {step}: {fault}, and did so {before} times before: {cure}")));
             }
