@@ -89,7 +89,7 @@ fn gpu_check(devices: &str) -> bool {
     if !step("build", built) {
         return false;
     }
-    // Training is compared on a real capture if there is one, by the default build alone: it takes a minute longer than the still life.
+    // Training is compared on a real capture if there is one, by the default build alone: finding distances takes longer there than on the still life.
     let fox = std::env::var("DIORAMA_TEST_DATA").map(|d| format!("{d}/fox")).unwrap_or_default();
     let mut ok = true;
     for device in devices.split(',') {
