@@ -95,7 +95,7 @@ fn an_interrupted_run_ends_as_if_it_had_not_been() {
         let at = dir.path().join(name);
         let mut folder = if resume { RunFolder::open(&at).unwrap().0 } else { RunFolder::create(&at, false).unwrap() };
         let mut config = config(&data, 180);
-        (config.run.log_every, config.sampling.rays) = (1, 64);
+        (config.run.log_every, config.sampling.rays) = (1, 16);
         // Interrupted while surfaces are learned, in the light's stage, and after what surfaces send was found anew there.
         (config.light.model, config.light.from, config.light.sun_cells) = ("sun".into(), 0.3, 32);
         let stop = AtomicBool::new(false);
@@ -132,7 +132,9 @@ fn a_trained_place_is_scored_and_its_layers_are_rendered() {
     generate(&data, 10, (32, 24));
     let mut folder = RunFolder::create(&run, false).unwrap();
     let mut losses = Vec::new();
-    recipe::train(&config(&data, 200), &mut folder, false, None, &AtomicBool::new(false), &mut |e| {
+    let mut config = config(&data, 200);
+    config.sampling.rays = 96;
+    recipe::train(&config, &mut folder, false, None, &AtomicBool::new(false), &mut |e| {
         if let Event::Progress { loss, .. } = e {
             losses.push(*loss);
         }

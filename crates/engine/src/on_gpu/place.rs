@@ -4,7 +4,10 @@ use super::shape::Shape;
 use crate::samplers::placement::Placement;
 use diorama_kernels::gpu::{Buffer, Gpu, GpuError, Rows};
 use diorama_kernels::ops::composite::gpu::GpuPacked;
+use diorama_kernels::ops::field_step::gpu::GpuNet;
+use diorama_kernels::ops::march::MarchConfig;
 use diorama_kernels::ops::march::gpu::{self as march, GpuOccupancy, GpuRays};
+use diorama_kernels::ops::prune::Pruning;
 use diorama_kernels::ops::prune::gpu as prune;
 use diorama_kernels::ops::strata::gpu as strata;
 
@@ -56,7 +59,11 @@ pub struct MarchTrace {
     pub cut: Buffer<u32>,
     /// Share of light that passes all samples of a ray, dropped or not, `[R]`.
     pub light: Buffer,
-    /// All samples that were marched, their cells and their densities.
+    pub waves: Vec<Met>,
+}
+
+/// All samples that a wave marched to, their cells and their densities.
+pub struct Met {
     pub rows: Rows,
     pub cells: Buffer<u32>,
     pub sigma: Buffer,
@@ -76,18 +83,7 @@ pub fn place(
     coarse: &mut dyn FnMut(&GpuPacked) -> Result<Buffer, GpuError>,
 ) -> Result<GpuSamples, GpuError> {
     let packed = match placement {
-        Placement::Occupancy { march: config, pruning } => {
-            let marched = march::march(gpu, on.grid.expect("an occupancy grid"), on.rays, config, on.room.0);
-            // All samples in occupied cells: their densities decide which stay.
-            let (points, features) = on.field.encode(gpu, on.rays, &marched.packed);
-            let (net, rows) = (&on.field.shape.net, marched.packed.rows());
-            let sigma = net.density(gpu, on.field.weights, &features, &rows);
-            let pruned = prune::prune(gpu, &marched.packed, &sigma, pruning, &marched.cut, on.room.1);
-            let (points, features) = (pruned.take(gpu, &points, 3), net.take(gpu, &pruned, &features));
-            let march = MarchTrace { cut: marched.cut, light: pruned.light, rows, cells: marched.cells, sigma };
-            let marched = marched.whole;
-            return Ok(GpuSamples { packed: pruned.packed, points, features, marched, march: Some(march) });
-        }
+        Placement::Occupancy { march: config, pruning } => return Ok(in_waves(gpu, config, pruning, on)),
         Placement::Stratified { samples, noise } => strata::stratified(gpu, &on.rays.near_far, *samples, noise.map(|rng| (rng, on.first))),
         Placement::Hierarchical { samples, more, noise } => {
             let guide = strata::stratified(gpu, &on.rays.near_far, *samples, noise.map(|[rng, _]| (rng, on.first)));
@@ -97,4 +93,81 @@ pub fn place(
     };
     let (points, features) = on.field.encode(gpu, on.rays, &packed);
     Ok(GpuSamples { marched: packed.offsets.clone(), packed, points, features, march: None })
+}
+
+/// Samples per ray of the waves in which rays advance; a last one takes what is left. Rays that have met opaque matter end with their wave.
+const WAVES: [usize; 2] = [32, 64];
+
+/// Samples in occupied cells that their densities do not drop.
+fn in_waves(gpu: &Gpu, config: &MarchConfig, pruning: &Pruning, on: &PlaceOn) -> GpuSamples {
+    let (grid, net) = (on.grid.expect("an occupancy grid"), &on.field.shape.net);
+    let mut all: Option<(GpuSamples, MarchTrace)> = None;
+    let (mut left, mut ahead) = (None, config.max_samples);
+    for size in sizes(config.max_samples, pruning) {
+        let rays = left.as_ref().unwrap_or(on.rays);
+        let marched = march::march(gpu, grid, rays, &MarchConfig { max_samples: size, ..*config }, on.room.0);
+        // All samples in occupied cells: their densities decide which stay.
+        let (points, features) = on.field.encode(gpu, rays, &marched.packed);
+        let rows = marched.packed.rows();
+        let sigma = net.density(gpu, on.field.weights, &features, &rows);
+        let light = all.as_ref().map(|(_, trace)| &trace.light);
+        let pruned = prune::prune(gpu, &marched.packed, (&sigma, light), pruning, &marched.cut, on.room.1);
+        let (points, features) = (pruned.take(gpu, &points, 3), net.take(gpu, &pruned, &features));
+        ahead -= size;
+        left = (ahead > 0).then(|| march::go_on(gpu, rays, &marched, &pruned.light, pruning.stop, size));
+        let trace = MarchTrace { cut: marched.cut, light: pruned.light, waves: vec![Met { rows, cells: marched.cells, sigma }] };
+        let wave = GpuSamples { packed: pruned.packed, points, features, marched: marched.whole, march: None };
+        all = Some(match all {
+            Some(before) => joined(gpu, net, before, (wave, trace), on.room.1),
+            None => (wave, trace),
+        });
+    }
+    let (samples, trace) = all.expect("a wave");
+    GpuSamples { march: Some(trace), ..samples }
+}
+
+/// Samples per ray of each wave. Where no ray ends early, one wave takes all.
+fn sizes(most: usize, pruning: &Pruning) -> Vec<usize> {
+    let mut left = most;
+    let mut out = Vec::new();
+    for size in WAVES {
+        if pruning.stop > 0.0 && size < left {
+            out.push(size);
+            left -= size;
+        }
+    }
+    out.push(left);
+    out
+}
+
+/// The samples of a further wave behind those of the waves before.
+fn joined(
+    gpu: &Gpu,
+    net: &GpuNet,
+    (first, mut before): (GpuSamples, MarchTrace),
+    (second, wave): (GpuSamples, MarchTrace),
+    room: usize,
+) -> (GpuSamples, MarchTrace) {
+    let cut = gpu.either(&before.cut, &wave.cut);
+    let joined = prune::join(gpu, &first.packed, &second.packed, &cut, room);
+    let points = joined.take(gpu, [&first.points, &second.points], 3);
+    let features = net.join(gpu, &joined, [&first.features, &second.features]);
+    let marched = prune::sum(gpu, &first.marched, &second.marched);
+    before.waves.extend(wave.waves);
+    let samples = GpuSamples { packed: joined.packed, points, features, marched, march: None };
+    (samples, MarchTrace { cut, light: wave.light, waves: before.waves })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn waves_take_all_samples() {
+        let pruning = |stop| Pruning { stop, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 };
+        assert_eq!(sizes(1024, &pruning(1e-4)), [32, 64, 928]);
+        assert_eq!(sizes(40, &pruning(1e-4)), [32, 8]);
+        assert_eq!(sizes(32, &pruning(1e-4)), [32]);
+        assert_eq!(sizes(1024, &pruning(0.0)), [1024]);
+    }
 }

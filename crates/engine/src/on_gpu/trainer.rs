@@ -392,7 +392,7 @@ impl GpuTrainer {
         let samples = place::place(at.gpu, &s.placement, &on, &mut train_coarse)?;
         let left_out = match (&samples.march, grid) {
             (Some(m), Some(grid)) => {
-                grid.record(at.gpu, &m.rows, &m.cells, &m.sigma);
+                m.waves.iter().for_each(|w| grid.record(at.gpu, &w.rows, &w.cells, &w.sigma));
                 at.gpu.either(&r.drawn.left_out, &m.cut)
             }
             _ => r.drawn.left_out.clone(),

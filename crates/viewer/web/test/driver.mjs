@@ -7,7 +7,11 @@ import path from "node:path";
 export const [diorama, run, pictures] = process.argv.slice(2);
 const ownPicture = path.join(path.dirname(diorama), "examples", "own_picture");
 
-export const until = async (what, f, seconds = 60) => {
+/** Seconds that a busy machine may take for anything that a check waits for. */
+const patience = 240;
+
+/** Waits until `f` returns something. */
+export const until = async (what, f, seconds = patience) => {
   for (const end = Date.now() + seconds * 1000; Date.now() < end; await new Promise((r) => setTimeout(r, 50))) {
     const v = await f();
     if (v) return v;
@@ -43,9 +47,9 @@ export const viewer = (what, port = 0, ...flags) => listening(diorama, ["view", 
 /** Starts the example source of `crates/viewer/examples`. */
 export const standIn = () => listening(ownPicture, []);
 
-/** Starts training with a viewer on the capture of the run; returns its address and a function that stops it. */
+/** Starts training with a viewer on the capture of the run, longer than any check takes; returns its address and a function that stops it. */
 export async function training(out) {
-  const flags = ["--seconds", "60", "--view", "--port", "0", "--device", "cpu", "--set", "field.log2_size=15"];
+  const flags = ["--steps", "100000", "--view", "--port", "0", "--device", "cpu", "--set", "field.log2_size=15"];
   const child = spawn(diorama, ["train", path.join(run, "capture"), "-o", out, ...flags], { stdio: ["ignore", "ignore", "pipe"] });
   let said = "";
   child.stderr.on("data", (d) => (said += d));
@@ -78,6 +82,7 @@ export const requests = [];
 export class Page {
   static async open(browser, address, { options = {}, mayComplain = false, route } = {}) {
     const context = await browser.newContext({ viewport: { width: 1000, height: 700 }, colorScheme: "dark", ...options });
+    context.setDefaultTimeout(1000 * patience);
     const page = await context.newPage();
     if (!mayComplain) page.on("console", (m) => m.type() === "error" && complaints.push(m.text()));
     page.on("pageerror", (e) => complaints.push(String(e)));

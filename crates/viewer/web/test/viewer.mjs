@@ -180,7 +180,7 @@ async function exporting(p, apart) {
   await page.fill("#resolution", "64");
   await page.click("#export");
   check("a mesh in the making shows how far it is", (await p.shown("#export-progress")) && (await page.isDisabled("#export")));
-  await until("a mesh in the page", async () => (await p.data("mesh")) === "shown", 180);
+  await until("a mesh in the page", async () => (await p.data("mesh")) === "shown");
   await p.settled();
   await p.shot("mesh");
   const glb = readFileSync(path.join(run, "mesh.glb"));
@@ -209,7 +209,7 @@ async function live(browser) {
   const step = async () => Number((await p.data("step")) ?? 0);
   const early = await until("a step", step);
   const seen = await p.views();
-  const later = await until("later steps", async () => (await step()) > early + 50 && (await step()));
+  const later = await until("later steps", async () => (await step()) > early + 20 && (await step()));
   await until("views without a touch", async () => (await p.views()) > seen + 2);
   await until("held-out pixels", async () => /\d+\.\d+ dB/.test(await p.text("dd[data-figure=val_psnr]").catch(() => "")));
   check("training shows held-out beside training PSNR, and how many views are behind fog", (await p.data("fog")) !== undefined);

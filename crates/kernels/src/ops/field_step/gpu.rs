@@ -8,7 +8,7 @@ use crate::ops::fused_mlp::gpu::{self as mlp, columns};
 use crate::ops::fused_mlp::{Head, Mlp, reference};
 use crate::ops::linear::gpu as linear;
 use crate::ops::linear::reference::{activate, slope};
-use crate::ops::prune::gpu::Pruned;
+use crate::ops::prune::gpu::{Joined, Pruned};
 use cubecl::prelude::*;
 use diorama_geom::rng::Rng;
 
@@ -87,6 +87,12 @@ impl GpuNet {
     pub fn take(&self, gpu: &Gpu, pruned: &Pruned, features: &Buffer) -> Buffer {
         let width = self.net.mlp.input_widths[0];
         if self.in_levels() { pruned.take_levels(gpu, features, width, self.per_level) } else { pruned.take(gpu, features, width) }
+    }
+
+    /// Features of the samples of two marches.
+    pub fn join(&self, gpu: &Gpu, joined: &Joined, of: [&Buffer; 2]) -> Buffer {
+        let width = self.net.mlp.input_widths[0];
+        if self.in_levels() { joined.take_levels(gpu, of, width, self.per_level) } else { joined.take(gpu, of, width) }
     }
 
     /// Densities `[S]` of features as the network reads them.

@@ -125,6 +125,23 @@ pub fn march(gpu: &Gpu, grid: &GpuOccupancy, rays: &GpuRays, config: &MarchConfi
     GpuMarched { packed: GpuPacked { offsets, t, dt }, whole, cells, cut }
 }
 
+/// The same rays from where a march of `size` samples at most left those that may go on: that took so many, and of whose light at least
+/// `stop` is left. The others have no length.
+pub fn go_on(gpu: &Gpu, rays: &GpuRays, marched: &GpuMarched, light: &Buffer, stop: f32, size: usize) -> GpuRays {
+    let (n, p) = (rays.jitter.len(), &marched.packed);
+    let (s, near_far) = (p.t.len(), gpu.empty(2 * n));
+    launch!(
+        gpu,
+        resume,
+        n,
+        [rays.near_far => 2 * n, p.offsets => n + 1, p.t => s, p.dt => s, light => n, near_far => 2 * n],
+        n as u32,
+        size as u32,
+        stop,
+    );
+    GpuRays { origins: rays.origins.clone(), dirs: rays.dirs.clone(), near_far, jitter: rays.jitter.clone(), resumed: true }
+}
+
 /// Offsets limited to the capacity, so that no reader exceeds it; rays that lose samples are marked in `cut`.
 pub(crate) fn bounded(gpu: &Gpu, offsets: &Buffer<u32>, cut: &Buffer<u32>, capacity: usize) -> Buffer<u32> {
     let n = offsets.len();
@@ -289,6 +306,23 @@ fn march_rays(
     if comptime!(!write) {
         counts[r] = count;
     }
+}
+
+#[cube(launch_unchecked)]
+fn resume(near_far: &[f32], offsets: &[u32], t: &[f32], dt: &[f32], light: &[f32], out: &mut [f32], rays: u32, size: u32, stop: f32) {
+    let r = ABSOLUTE_POS;
+    if r >= rays as usize {
+        terminate!();
+    }
+    let far = near_far[r * 2 + 1];
+    let mut near = far;
+    // A ray that was cut took fewer.
+    if offsets[r + 1] - offsets[r] == size && light[r] >= stop {
+        let last = offsets[r + 1] as usize - 1;
+        near = t[last] + dt[last];
+    }
+    out[r * 2] = near;
+    out[r * 2 + 1] = far;
 }
 
 /// [`MarchConfig::step`].

@@ -6,7 +6,7 @@ use super::{gpu as on_gpu, reference};
 use crate::ops::composite::cases::{Scene, scene};
 #[cfg(feature = "gpu")]
 use crate::{
-    gpu::{Gpu, GpuError, table::Table},
+    gpu::{Buffer, Gpu, GpuError, table::Table},
     ops::composite::gpu::GpuPacked,
 };
 use diorama_testkit::random_unit;
@@ -30,11 +30,11 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     for (rays, scene) in cases() {
         let packed = scene.packed();
         let want = reference::prune(&PRUNING, &packed, &scene.sigma);
-        let (p, rows, kept) = (GpuPacked::upload(gpu, &packed), random(scene.t.len() * 5, 6), &want.kept);
+        let (p, rows_of_five, kept) = (GpuPacked::upload(gpu, &packed), random(scene.t.len() * 5, 6), &want.kept);
         for capacity in [kept.len() + 10, kept.len() / 2] {
             let shape = format!("R={rays} room {capacity}");
             let (sigma, cut) = (gpu.upload(&scene.sigma), gpu.zeros(rays));
-            let pruned = on_gpu::prune(gpu, &p, &sigma, &PRUNING, &cut, capacity);
+            let pruned = on_gpu::prune(gpu, &p, (&sigma, None), &PRUNING, &cut, capacity);
             let bounded: Vec<u32> = want.offsets.iter().map(|o| (*o).min(capacity as u32)).collect();
             let lost: Vec<u32> = want.offsets[1..].iter().map(|o| (*o > capacity as u32) as u32).collect();
             table.close("prune", "densities", &shape, &sigma, &wide(&want.sigma))?;
@@ -45,10 +45,55 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             let take =
                 |v: &[f32], width: usize| -> Vec<f64> { kept[..n].iter().flat_map(|i| wide(&v[i * width..(i + 1) * width])).collect() };
             let live = |all: Vec<f32>, width: usize| gpu.upload(&all[..n * width]);
-            let (t, five) = (gpu.read(&pruned.packed.t)?, gpu.read(&pruned.take(gpu, &gpu.upload(&rows), 5))?);
+            let (t, five) = (gpu.read(&pruned.packed.t)?, gpu.read(&pruned.take(gpu, &gpu.upload(&rows_of_five), 5))?);
             table.close("prune", "starts", &shape, &live(t, 1), &take(&scene.t, 1))?;
-            table.close("prune", "rows", &shape, &live(five, 5), &take(&rows, 5))?;
+            table.close("prune", "rows", &shape, &live(five, 5), &take(&rows_of_five, 5))?;
+            // The same in two parts of each ray.
+            let cut = gpu.zeros(rays);
+            let (joined, light, five) = in_parts(gpu, &scene, &rows_of_five, &cut, capacity)?;
+            table.close("prune", "light of parts", &shape, &light, &want.light)?;
+            table.equal("prune", "offsets of parts", &shape, &joined.packed.offsets, &bounded)?;
+            table.equal("prune", "rays cut of parts", &shape, &cut, &lost)?;
+            let (t, dt) = (gpu.read(&joined.packed.t)?, gpu.read(&joined.packed.dt)?);
+            table.close("prune", "starts of parts", &shape, &live(t, 1), &take(&scene.t, 1))?;
+            table.close("prune", "lengths of parts", &shape, &live(dt, 1), &take(&scene.dt, 1))?;
+            table.close("prune", "rows of parts", &shape, &live(gpu.read(&five)?, 5), &take(&rows_of_five, 5))?;
         }
     }
     Ok(())
+}
+
+/// Prunes the first samples of each ray, then the others with the light that is left, and joins what stays.
+#[cfg(feature = "gpu")]
+fn in_parts(
+    gpu: &Gpu,
+    scene: &Scene,
+    rows: &[f32],
+    cut: &Buffer<u32>,
+    capacity: usize,
+) -> Result<(on_gpu::Joined, Buffer, Buffer), GpuError> {
+    const FIRST: u32 = 4;
+    let mut parts = [const { (Vec::new(), Vec::new()) }; 2];
+    parts.iter_mut().for_each(|(offsets, _)| offsets.push(0u32));
+    for w in scene.offsets.windows(2) {
+        let middle = (w[0] + FIRST).min(w[1]);
+        for ((offsets, samples), range) in parts.iter_mut().zip([w[0]..middle, middle..w[1]]) {
+            samples.extend(range.map(|i| i as usize));
+            offsets.push(samples.len() as u32);
+        }
+    }
+    let mut before: Option<Buffer> = None;
+    let mut kept = Vec::new();
+    for (offsets, samples) in &parts {
+        let of = |v: &[f32]| gpu.upload(&samples.iter().map(|i| v[*i]).collect::<Vec<_>>());
+        let packed = GpuPacked { offsets: gpu.upload(offsets), t: of(&scene.t), dt: of(&scene.dt) };
+        let own: Vec<f32> = samples.iter().flat_map(|i| rows[5 * i..5 * (i + 1)].to_vec()).collect();
+        let pruned = on_gpu::prune(gpu, &packed, (&of(&scene.sigma), before.as_ref()), &PRUNING, cut, capacity);
+        let five = pruned.take(gpu, &gpu.upload(&own), 5);
+        before = Some(pruned.light);
+        kept.push((pruned.packed, five));
+    }
+    let joined = on_gpu::join(gpu, &kept[0].0, &kept[1].0, cut, capacity);
+    let five = joined.take(gpu, [&kept[0].1, &kept[1].1], 5);
+    Ok((joined, before.expect("two parts"), five))
 }

@@ -1,11 +1,15 @@
 //! One unit per ray, in two passes: the first decides which samples stay, the second packs them where a scan of their counts puts them.
 
+mod join;
+
 use super::Pruning;
 use crate::gpu::{Buffer, Gpu, launch};
 use crate::ops::composite::gpu::GpuPacked;
 use crate::ops::march::gpu::bounded;
 use crate::ops::scan;
 use cubecl::prelude::*;
+
+pub use join::{Joined, join, sum};
 
 /// The samples that stay.
 pub struct Pruned {
@@ -17,9 +21,18 @@ pub struct Pruned {
 }
 
 /// Keeps what [`Pruning`] leaves of samples with densities `[S]`, as many as `capacity` holds; rays that lose others
-/// for want of room are marked in `cut`. Densities that no light reaches become −1.
-pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: &Pruning, cut: &Buffer<u32>, capacity: usize) -> Pruned {
+/// for want of room are marked in `cut`. Densities that no light reaches become −1. `before`: share of light `[R]` that reaches the
+/// first sample of each ray; all of it if there is none.
+pub fn prune(
+    gpu: &Gpu,
+    p: &GpuPacked,
+    (sigma, before): (&Buffer, Option<&Buffer>),
+    limits: &Pruning,
+    cut: &Buffer<u32>,
+    capacity: usize,
+) -> Pruned {
     let (n, s) = (p.rays(), p.t.len());
+    let lights = before.map_or_else(|| gpu.empty(0), |b| b.clone());
     let counts = gpu.empty(n);
     let (kept, light) = (gpu.empty(s), gpu.empty(n));
     // Finite also after multiplication by a length.
@@ -28,12 +41,13 @@ pub fn prune(gpu: &Gpu, p: &GpuPacked, sigma: &Buffer, limits: &Pruning, cut: &B
         gpu,
         mark_kept,
         n,
-        [p.offsets => n + 1, p.dt => s, sigma => s, kept => s, counts => n, light => n],
+        [p.offsets => n + 1, p.dt => s, lights => lights.len(), sigma => s, kept => s, counts => n, light => n],
         n as u32,
         limits.stop,
         limits.min_alpha,
         thin,
         limits.min_weight,
+        before.is_some(),
     );
     let whole = scan::gpu::exclusive(gpu, &counts);
     let offsets = bounded(gpu, &whole, cut, capacity);
@@ -91,6 +105,7 @@ impl Pruned {
 fn mark_kept(
     offsets: &[u32],
     dt: &[f32],
+    before: &[f32],
     sigma: &mut [f32],
     kept: &mut [u32],
     counts: &mut [u32],
@@ -100,12 +115,16 @@ fn mark_kept(
     min_alpha: f32,
     thin: f32,
     min_weight: f32,
+    #[comptime] resumed: bool,
 ) {
     let r = ABSOLUTE_POS;
     if r >= rays as usize {
         terminate!();
     }
     let mut light = 1.0f32;
+    if comptime!(resumed) {
+        light = before[r];
+    }
     let mut count = 0u32;
     for i in offsets[r] as usize..offsets[r + 1] as usize {
         let mut stays = 0u32;
