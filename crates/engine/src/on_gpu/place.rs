@@ -95,8 +95,9 @@ pub fn place(
     Ok(GpuSamples { marched: packed.offsets.clone(), packed, points, features, march: None })
 }
 
-/// Samples per ray of the waves in which rays advance; a last one takes what is left. Rays that have met opaque matter end with their wave.
-const WAVES: [usize; 2] = [32, 64];
+/// Samples per ray of a first wave; a second one takes what is left of the rays that have met no opaque matter by then. More waves cost more
+/// in launches than they save.
+const FIRST_WAVE: usize = 32;
 
 /// Samples in occupied cells that their densities do not drop.
 fn in_waves(gpu: &Gpu, config: &MarchConfig, pruning: &Pruning, on: &PlaceOn) -> GpuSamples {
@@ -128,16 +129,7 @@ fn in_waves(gpu: &Gpu, config: &MarchConfig, pruning: &Pruning, on: &PlaceOn) ->
 
 /// Samples per ray of each wave. Where no ray ends early, one wave takes all.
 fn sizes(most: usize, pruning: &Pruning) -> Vec<usize> {
-    let mut left = most;
-    let mut out = Vec::new();
-    for size in WAVES {
-        if pruning.stop > 0.0 && size < left {
-            out.push(size);
-            left -= size;
-        }
-    }
-    out.push(left);
-    out
+    if pruning.stop > 0.0 && most > FIRST_WAVE { vec![FIRST_WAVE, most - FIRST_WAVE] } else { vec![most] }
 }
 
 /// The samples of a further wave behind those of the waves before.
@@ -165,7 +157,7 @@ mod tests {
     #[test]
     fn waves_take_all_samples() {
         let pruning = |stop| Pruning { stop, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 };
-        assert_eq!(sizes(1024, &pruning(1e-4)), [32, 64, 928]);
+        assert_eq!(sizes(1024, &pruning(1e-4)), [32, 992]);
         assert_eq!(sizes(40, &pruning(1e-4)), [32, 8]);
         assert_eq!(sizes(32, &pruning(1e-4)), [32]);
         assert_eq!(sizes(1024, &pruning(0.0)), [1024]);
