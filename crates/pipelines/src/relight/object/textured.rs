@@ -36,6 +36,8 @@ const VERTEX_LEVEL: f32 = 1.0;
 /// Points of a view whose colors are compared, and the width within which colors attract each other.
 const COMPARED: usize = 2048;
 const ENTROPY_WIDTH: f32 = 0.15;
+/// Samples per pixel and side of pictures to be looked at or scored, at least: patterns have edges.
+const SHOWN: usize = 4;
 /// Stream of random numbers of pictures that are not trained on.
 const PICTURE: u64 = 36;
 
@@ -186,13 +188,13 @@ impl Textured {
 
     /// The picture `[H, W, 4]` of a view, linear light times opacity, and that of the base color.
     pub fn picture(&self, view: &ObjectView, probe: &Probe) -> [Vec<f32>; 2] {
-        let drawn = self.drawn();
-        let fine = view.finer(self.samples);
+        let (drawn, samples) = (self.drawn(), self.samples.max(SHOWN));
+        let fine = view.finer(samples);
         let looked = self.look(&fine, &drawn);
         let values = self.lookup(&drawn, &looked.uv, &looked.level);
         let around = self.light(&drawn, probe);
         let lit = looked.shade(&values, probe, self.around(around.as_ref(), Rng::new(0, PICTURE)));
-        [&lit.shaded.color, &lit.kd].map(|c| means(&looked.surface.picture(&drawn.shape(self), c).rgba, view.size(), self.samples))
+        [&lit.shaded.color, &lit.kd].map(|c| means(&looked.surface.picture(&drawn.shape(self), c).rgba, view.size(), samples))
     }
 
     /// Lets the textures' optimizer begin anew.
