@@ -75,11 +75,8 @@ fn every_method_trains_renders_and_exports_there() {
             assert!(if device == "cpu" { drew == "cpu" } else { drew.ends_with(&format!("({device})")) }, "{device}: {drew} drew");
             report["psnr"].as_f64().unwrap()
         };
-        // Views of the other methods are compared by `bench check`.
-        if ["ngp", "nerf"].contains(&method) {
-            let (there, here) = (scores(&device), scores("cpu"));
-            assert!((there - here).abs() < 0.02, "{method}: {there} dB there, {here} dB here");
-        }
+        let (there, here) = (scores(&device), scores("cpu"));
+        assert!((there - here).abs() < 0.02, "{method}: {there} dB there, {here} dB here");
         // The CPU continues from the full state: parameters, corrections, errors.
         let end = json(diorama(&["train", "-o", run, "--resume", "--device", "cpu", "--steps", "3", "--json"]));
         assert_eq!((end["device"].as_str(), end["steps"].as_u64()), (Some("cpu"), Some(3)), "{method}: {end}");

@@ -47,7 +47,8 @@ pub struct GpuSamples {
     /// In the field's space, `[S, 3]`.
     pub points: Buffer,
     pub features: Buffer,
-    /// Offsets of all samples that were marched, had there been room for them, `[R + 1]`.
+    /// Offsets of all samples that were marched, had there been room for them, `[R + 1]`. Rays that a first wave has no room for do not go
+    /// on: there, at least so many.
     pub marched: Buffer<u32>,
     /// Where an occupancy grid placed them.
     pub march: Option<MarchTrace>,
@@ -59,6 +60,7 @@ pub struct MarchTrace {
     pub cut: Buffer<u32>,
     /// Share of light that passes all samples of a ray, dropped or not, `[R]`.
     pub light: Buffer,
+    /// What was met, wave by wave.
     pub waves: Vec<Met>,
 }
 
@@ -95,36 +97,49 @@ pub fn place(
     Ok(GpuSamples { marched: packed.offsets.clone(), packed, points, features, march: None })
 }
 
-/// Samples per ray of a first wave; a second one takes what is left of the rays that have met no opaque matter by then. More waves cost more
-/// in launches than they save.
+/// Samples per ray of a first wave; a second one takes what is left of the rays that have met no opaque matter by then. A third one gained
+/// nothing in training.
 const FIRST_WAVE: usize = 32;
 
 /// Samples in occupied cells that their densities do not drop.
 fn in_waves(gpu: &Gpu, config: &MarchConfig, pruning: &Pruning, on: &PlaceOn) -> GpuSamples {
-    let (grid, net) = (on.grid.expect("an occupancy grid"), &on.field.shape.net);
     let mut all: Option<(GpuSamples, MarchTrace)> = None;
     let (mut left, mut ahead) = (None, config.max_samples);
     for size in sizes(config.max_samples, pruning) {
-        let rays = left.as_ref().unwrap_or(on.rays);
-        let marched = march::march(gpu, grid, rays, &MarchConfig { max_samples: size, ..*config }, on.room.0);
-        // All samples in occupied cells: their densities decide which stay.
-        let (points, features) = on.field.encode(gpu, rays, &marched.packed);
-        let rows = marched.packed.rows();
-        let sigma = net.density(gpu, on.field.weights, &features, &rows);
-        let light = all.as_ref().map(|(_, trace)| &trace.light);
-        let pruned = prune::prune(gpu, &marched.packed, (&sigma, light), pruning, &marched.cut, on.room.1);
-        let (points, features) = (pruned.take(gpu, &points, 3), net.take(gpu, &pruned, &features));
         ahead -= size;
-        left = (ahead > 0).then(|| march::go_on(gpu, rays, &marched, &pruned.light, pruning.stop, size));
-        let trace = MarchTrace { cut: marched.cut, light: pruned.light, waves: vec![Met { rows, cells: marched.cells, sigma }] };
-        let wave = GpuSamples { packed: pruned.packed, points, features, marched: marched.whole, march: None };
+        let (rays, light) = (left.as_ref().unwrap_or(on.rays), all.as_ref().map(|(_, trace)| &trace.light));
+        let config = MarchConfig { max_samples: size, ..*config };
+        let (samples, trace, further) = wave(gpu, on, (rays, light), &config, pruning, ahead > 0);
+        left = further;
         all = Some(match all {
-            Some(before) => joined(gpu, net, before, (wave, trace), on.room.1),
-            None => (wave, trace),
+            Some(before) => joined(gpu, &on.field.shape.net, before, (samples, trace), on.room.1),
+            None => (samples, trace),
         });
     }
     let (samples, trace) = all.expect("a wave");
     GpuSamples { march: Some(trace), ..samples }
+}
+
+/// Samples of a wave that stay of rays with the light that reaches them, all of it in the first wave; and the rays that go on, if asked for.
+fn wave(
+    gpu: &Gpu,
+    on: &PlaceOn,
+    (rays, light): (&GpuRays, Option<&Buffer>),
+    config: &MarchConfig,
+    pruning: &Pruning,
+    goes_on: bool,
+) -> (GpuSamples, MarchTrace, Option<GpuRays>) {
+    let (grid, net) = (on.grid.expect("an occupancy grid"), &on.field.shape.net);
+    let marched = march::march(gpu, grid, rays, config, on.room.0);
+    // All samples in occupied cells: their densities decide which stay.
+    let (points, features) = on.field.encode(gpu, rays, &marched.packed);
+    let rows = marched.packed.rows();
+    let sigma = net.density(gpu, on.field.weights, &features, &rows);
+    let pruned = prune::prune(gpu, &marched.packed, (&sigma, light), pruning, &marched.cut, on.room.1);
+    let further = goes_on.then(|| march::go_on(gpu, rays, &marched, &pruned.light, pruning.stop, config.max_samples));
+    let (points, features) = (pruned.take(gpu, &points, 3), net.take(gpu, &pruned, &features));
+    let trace = MarchTrace { cut: marched.cut, light: pruned.light, waves: vec![Met { rows, cells: marched.cells, sigma }] };
+    (GpuSamples { packed: pruned.packed, points, features, marched: marched.whole, march: None }, trace, further)
 }
 
 /// Samples per ray of each wave. Where no ray ends early, one wave takes all.

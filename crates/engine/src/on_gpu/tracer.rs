@@ -140,7 +140,7 @@ impl GpuTracer {
         Ok(out)
     }
 
-    /// Rays `first..first + n` of a batch; how many samples were marched to, had there been room for them. Without room for all of them
+    /// Rays `first..first + n` of a batch; how many samples were marched to, or more, had there been room for them. Without room for all of them
     /// the rays are not added to `out`, unless `last_resort`.
     fn part(
         &self,
@@ -196,7 +196,7 @@ impl GpuTracer {
             let room = ((n as f32 * expected / FILL) as usize).next_power_of_two().clamp(LEAST_ROOM.min(self.room), self.room);
             let last_resort = n == 1 && room == self.room;
             let needed = self.part(batch, (first, n), (room, last_resort), placement, appearance, out)?;
-            // Of a part that found no room it is known what that part needs.
+            // Of a part that found no room it is known what that part needs at least.
             let is_done = needed <= room || last_resort;
             let floor = if is_done { FORGET * expected } else { 0.0 };
             self.per_ray.store((needed as f32 / n as f32).max(floor).max(1.0).to_bits(), Relaxed);

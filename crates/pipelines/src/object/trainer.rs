@@ -70,7 +70,7 @@ pub(super) struct Trainer<'a> {
     pub marched: u64,
     /// Rays that did not lose samples for want of room.
     pub whole: u64,
-    /// Samples per ray that a device marched to when it was asked last, without regard to room; 0: not asked yet.
+    /// Samples per ray that a device marched to when it was asked last, without regard to the room of the last wave; 0: not asked yet.
     marched_per_ray: f64,
     /// Rays that were trained on before this part of the run.
     began: u64,

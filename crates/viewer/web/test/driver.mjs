@@ -54,7 +54,7 @@ export async function training(out) {
   let said = "";
   child.stderr.on("data", (d) => (said += d));
   const ended = new Promise((r) => child.on("exit", r));
-  const stop = () => (ends.delete(stop), child.kill("SIGINT"), ended);
+  const stop = () => (ends.delete(stop), child.kill("SIGINT"), setTimeout(() => child.kill("SIGKILL"), 1000 * patience).unref(), ended);
   ends.add(stop);
   return { address: await until("the address", () => said.match(/view: (http\S+)/)?.[1]), stop };
 }

@@ -159,6 +159,17 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         table.equal("march", "rays cut", &shape, &marched.cut, &cut)?;
         let bounded: Vec<u32> = got.offsets.iter().map(|o| (*o).min(half as u32)).collect();
         table.equal("march", "bounded offsets", &shape, &packed.offsets, &bounded)?;
+        // Rays without light, or that took fewer samples than the first one, as do those that were cut, end.
+        let light: Vec<f32> = (0..n).map(|r| if r % 2 == 0 { 0.9 } else { 0.5 }).collect();
+        let (size, t, dt) = (bounded.get(1).map_or(1, |end| *end as usize), gpu.read(&packed.t)?, gpu.read(&packed.dt)?);
+        let near_far = (0..n).flat_map(|r| {
+            let (first, last) = (bounded[r] as usize, bounded[r + 1] as usize);
+            let far = rays.near_far[2 * r + 1];
+            let near = if last - first == size && light[r] >= 0.9 { t[last - 1] + dt[last - 1] } else { far };
+            [near as f64, far as f64]
+        });
+        let left = on_gpu::go_on(gpu, &on, &marched, &gpu.upload(&light), 0.9, size);
+        table.close("march", "rays that go on", &shape, &left.near_far, &near_far.collect::<Vec<_>>())?;
         let kept = *bounded.last().expect("R + 1 offsets") as usize;
         let same = gpu.read(&packed.t)?[..kept] == got.t[..kept];
         let outcome = if same { Ok(0.0) } else { Err("other samples than with room for all".into()) };

@@ -50,7 +50,7 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
             table.close("prune", "rows", &shape, &live(five, 5), &take(&rows_of_five, 5))?;
             // The same in two parts of each ray.
             let cut = gpu.zeros(rays);
-            let (joined, light, five) = in_parts(gpu, &scene, &rows_of_five, &cut, capacity)?;
+            let (joined, light, five) = in_parts(gpu, table, &scene, &rows_of_five, &cut, capacity)?;
             table.close("prune", "light of parts", &shape, &light, &want.light)?;
             table.equal("prune", "offsets of parts", &shape, &joined.packed.offsets, &bounded)?;
             table.equal("prune", "rays cut of parts", &shape, &cut, &lost)?;
@@ -67,6 +67,7 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
 #[cfg(feature = "gpu")]
 fn in_parts(
     gpu: &Gpu,
+    table: &mut Table,
     scene: &Scene,
     rows: &[f32],
     cut: &Buffer<u32>,
@@ -82,13 +83,17 @@ fn in_parts(
             offsets.push(samples.len() as u32);
         }
     }
+    let hidden = wide(&reference::prune(&PRUNING, &scene.packed(), &scene.sigma).sigma);
     let mut before: Option<Buffer> = None;
     let mut kept = Vec::new();
     for (offsets, samples) in &parts {
         let of = |v: &[f32]| gpu.upload(&samples.iter().map(|i| v[*i]).collect::<Vec<_>>());
         let packed = GpuPacked { offsets: gpu.upload(offsets), t: of(&scene.t), dt: of(&scene.dt) };
         let own: Vec<f32> = samples.iter().flat_map(|i| rows[5 * i..5 * (i + 1)].to_vec()).collect();
-        let pruned = on_gpu::prune(gpu, &packed, (&of(&scene.sigma), before.as_ref()), &PRUNING, cut, capacity);
+        let sigma = of(&scene.sigma);
+        let pruned = on_gpu::prune(gpu, &packed, (&sigma, before.as_ref()), &PRUNING, cut, capacity);
+        let want: Vec<f64> = samples.iter().map(|i| hidden[*i]).collect();
+        table.close("prune", "densities of a part", &format!("R={} room {capacity}", offsets.len() - 1), &sigma, &want)?;
         let five = pruned.take(gpu, &gpu.upload(&own), 5);
         before = Some(pruned.light);
         kept.push((pruned.packed, five));

@@ -22,7 +22,7 @@ pub struct Pruned {
 
 /// Keeps what [`Pruning`] leaves of samples with densities `[S]`, as many as `capacity` holds; rays that lose others
 /// for want of room are marked in `cut`. Densities that no light reaches become −1. `before`: share of light `[R]` that reaches the
-/// first sample of each ray; all of it if there is none.
+/// first sample of each ray, all of it without `before`.
 pub fn prune(
     gpu: &Gpu,
     p: &GpuPacked,
@@ -32,7 +32,7 @@ pub fn prune(
     capacity: usize,
 ) -> Pruned {
     let (n, s) = (p.rays(), p.t.len());
-    let lights = before.map_or_else(|| gpu.empty(0), |b| b.clone());
+    let arriving = before.map_or_else(|| gpu.empty(0), |b| b.clone());
     let counts = gpu.empty(n);
     let (kept, light) = (gpu.empty(s), gpu.empty(n));
     // Finite also after multiplication by a length.
@@ -41,7 +41,7 @@ pub fn prune(
         gpu,
         mark_kept,
         n,
-        [p.offsets => n + 1, p.dt => s, lights => lights.len(), sigma => s, kept => s, counts => n, light => n],
+        [p.offsets => n + 1, p.dt => s, arriving => arriving.len(), sigma => s, kept => s, counts => n, light => n],
         n as u32,
         limits.stop,
         limits.min_alpha,

@@ -8,7 +8,7 @@ use diorama_geom::rng::Rng;
 use diorama_kernels::ops::ray_triangles::Ray;
 use rayon::prelude::*;
 
-/// Rays of a pixel, whatever samples it has.
+/// Rays of a pixel in training, whatever samples it has.
 const RAYS: usize = 8;
 /// Distance from the surface at which they begin, in object space.
 const OFFSET: f32 = 1e-3;

@@ -37,7 +37,7 @@ const VERTEX_LEVEL: f32 = 1.0;
 const COMPARED: usize = 2048;
 const ENTROPY_WIDTH: f32 = 0.15;
 /// Samples per pixel and side of pictures to be looked at or scored, at least: patterns have edges.
-const SHOWN: usize = 4;
+pub const SHOWN: usize = 4;
 /// Stream of random numbers of pictures that are not trained on.
 const PICTURE: u64 = 36;
 
