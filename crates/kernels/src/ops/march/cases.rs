@@ -8,7 +8,6 @@ use crate::ops::composite::cases::{Scene, scene};
 use crate::{
     gpu::{Gpu, GpuError, table::Table},
     ops::composite::gpu::GpuPacked,
-    ops::prune,
 };
 #[cfg(feature = "gpu")]
 use diorama_testkit::wide;
@@ -149,8 +148,6 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         table.row("march", "samples", shape.clone(), compare_rays(&got, &want));
         let places = gpu.read(&on_gpu::positions(gpu, &on, packed, Space::Model))?;
         table.row("march", "positions", shape.clone(), compare_places(&got, &rays, &places));
-        let again = in_waves(gpu, &occupancy, &on, &config, capacity)?;
-        table.row("march", "samples of two waves", shape.clone(), compare_rays(&again, &want));
         // With room for half of them, offsets must stop there and what fits must be the same.
         let half = capacity / 2;
         let marched = on_gpu::march(gpu, &occupancy, &on, &config, half);
@@ -176,34 +173,6 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
         table.row("march", "bounded samples", shape, outcome);
     }
     Ok(())
-}
-
-/// The same march in two waves, between which no ray ends for want of light.
-#[cfg(feature = "gpu")]
-fn in_waves(
-    gpu: &Gpu,
-    grid: &on_gpu::GpuOccupancy,
-    rays: &on_gpu::GpuRays,
-    config: &MarchConfig,
-    capacity: usize,
-) -> Result<Marched, GpuError> {
-    const FIRST: usize = 7;
-    let first = on_gpu::march(gpu, grid, rays, &MarchConfig { max_samples: FIRST, ..*config }, capacity);
-    let light = gpu.upload(&vec![1.0f32; rays.jitter.len()]);
-    let left = on_gpu::go_on(gpu, rays, &first, &light, 1.0, FIRST);
-    let second = on_gpu::march(gpu, grid, &left, &MarchConfig { max_samples: config.max_samples - FIRST, ..*config }, capacity);
-    let joined = prune::gpu::join(gpu, &first.packed, &second.packed, &first.cut, capacity);
-    let mut of = Vec::new();
-    for wave in [&first, &second] {
-        of.push((gpu.read(&wave.packed.offsets)?, gpu.read(&wave.cells)?));
-    }
-    let of_ray = |r: usize| of.iter().flat_map(move |(offsets, cells)| cells[offsets[r] as usize..offsets[r + 1] as usize].to_vec());
-    Ok(Marched {
-        offsets: gpu.read(&joined.packed.offsets)?,
-        t: gpu.read(&joined.packed.t)?,
-        dt: gpu.read(&joined.packed.dt)?,
-        cells: (0..rays.jitter.len()).flat_map(of_ray).collect(),
-    })
 }
 
 /// Fails unless samples are placed at the middles of their intervals.

@@ -8,6 +8,7 @@ use crate::ops::composite::cases::{Scene, scene};
 use crate::{
     gpu::{Buffer, Gpu, GpuError, table::Table},
     ops::composite::gpu::GpuPacked,
+    ops::march::{self, cases as marches},
 };
 use diorama_testkit::random_unit;
 #[cfg(feature = "gpu")]
@@ -27,6 +28,7 @@ pub fn cases() -> [(usize, Scene); 4] {
 
 #[cfg(feature = "gpu")]
 pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    check_waves(gpu, table)?;
     for (rays, scene) in cases() {
         let packed = scene.packed();
         let want = reference::prune(&PRUNING, &packed, &scene.sigma);
@@ -63,6 +65,47 @@ pub fn check(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
     Ok(())
 }
 
+/// The same march in two waves, between which no ray ends for want of light.
+#[cfg(feature = "gpu")]
+fn in_waves(
+    gpu: &Gpu,
+    grid: &march::gpu::GpuOccupancy,
+    rays: &march::gpu::GpuRays,
+    config: &march::MarchConfig,
+    capacity: usize,
+) -> Result<march::Marched, GpuError> {
+    const FIRST: usize = 7;
+    let first = march::gpu::march(gpu, grid, rays, &march::MarchConfig { max_samples: FIRST, ..*config }, capacity);
+    let light = gpu.upload(&vec![1.0f32; rays.jitter.len()]);
+    let left = march::gpu::go_on(gpu, rays, &first, &light, 1.0, FIRST);
+    let second = march::gpu::march(gpu, grid, &left, &march::MarchConfig { max_samples: config.max_samples - FIRST, ..*config }, capacity);
+    let joined = on_gpu::join(gpu, &first.packed, &second.packed, &first.cut, capacity);
+    let mut of = Vec::new();
+    for wave in [&first, &second] {
+        of.push((gpu.read(&wave.packed.offsets)?, gpu.read(&wave.cells)?));
+    }
+    let of_ray = |r: usize| of.iter().flat_map(move |(offsets, cells)| cells[offsets[r] as usize..offsets[r + 1] as usize].to_vec());
+    Ok(march::Marched {
+        offsets: gpu.read(&joined.packed.offsets)?,
+        t: gpu.read(&joined.packed.t)?,
+        dt: gpu.read(&joined.packed.dt)?,
+        cells: (0..rays.jitter.len()).flat_map(of_ray).collect(),
+    })
+}
+
+#[cfg(feature = "gpu")]
+fn check_waves(gpu: &Gpu, table: &mut Table) -> Result<(), GpuError> {
+    for marches::Case { grid, config, rays } in marches::cases() {
+        let (r, n) = (rays.view(), rays.jitter.len());
+        let want = march::reference::march(&grid, &r, &config);
+        let (on, occupancy) = (march::gpu::GpuRays::upload(gpu, &r), march::gpu::GpuOccupancy::upload(gpu, &grid));
+        let got = in_waves(gpu, &occupancy, &on, &config, want.t.len() + 500)?;
+        let shape = format!("R={n} cascades={} unbounded={}", grid.cascades, config.unbounded);
+        table.row("prune", "samples of two waves", shape, marches::compare_rays(&got, &want));
+    }
+    Ok(())
+}
+
 /// Prunes the first samples of each ray, then the others with the light that is left, and joins what stays.
 #[cfg(feature = "gpu")]
 fn in_parts(
@@ -93,7 +136,7 @@ fn in_parts(
         let sigma = of(&scene.sigma);
         let pruned = on_gpu::prune(gpu, &packed, (&sigma, before.as_ref()), &PRUNING, cut, capacity);
         let want: Vec<f64> = samples.iter().map(|i| hidden[*i]).collect();
-        table.close("prune", "densities of a part", &format!("R={} room {capacity}", offsets.len() - 1), &sigma, &want)?;
+        table.close("prune", "densities of a part", format!("R={} room {capacity}", offsets.len() - 1), &sigma, &want)?;
         let five = pruned.take(gpu, &gpu.upload(&own), 5);
         before = Some(pruned.light);
         kept.push((pruned.packed, five));

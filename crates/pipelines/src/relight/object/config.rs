@@ -5,6 +5,8 @@ use crate::run::config::{self, Auto, Configuration};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
+/// Samples per pixel and side of pictures to be looked at or scored: patterns have edges.
+pub const SHOWN: usize = 4;
 /// Numbers of a texel: base color; occlusion, roughness, metalness; normal in tangent space.
 pub const CHANNELS: usize = 9;
 

@@ -1,7 +1,6 @@
 //! Memory that training needs, estimated before it begins, so that a size too large is refused at once.
 
-use super::config::{CHANNELS, Config};
-use super::textured::SHOWN;
+use super::config::{CHANNELS, Config, SHOWN};
 use crate::error::{PipelineError, Result};
 use crate::run::memory::size;
 

@@ -2,7 +2,7 @@
 
 use super::albedo_entropy;
 use super::capture::ObjectView;
-use super::config::{CHANNELS, Config};
+use super::config::{CHANNELS, Config, SHOWN};
 use super::loss;
 use super::material::{self, Material};
 use super::pixel_means::{means, means_backward};
@@ -36,8 +36,6 @@ const VERTEX_LEVEL: f32 = 1.0;
 /// Points of a view whose colors are compared, and the width within which colors attract each other.
 const COMPARED: usize = 2048;
 const ENTROPY_WIDTH: f32 = 0.15;
-/// Samples per pixel and side of pictures to be looked at or scored, at least: patterns have edges.
-pub const SHOWN: usize = 4;
 /// Stream of random numbers of pictures that are not trained on.
 const PICTURE: u64 = 36;
 
