@@ -1,6 +1,6 @@
 //! Memory that training needs, estimated before it begins, so that a size too large is refused at once.
 
-use super::config::{CHANNELS, Config, SHOWN};
+use super::config::{CHANNELS, Config};
 use crate::error::{PipelineError, Result};
 use crate::run::memory::size;
 
@@ -23,8 +23,7 @@ fn stages(config: &Config, pixels: usize) -> [f64; 3] {
     let cells = config.grid.cells as f64;
     let m = &config.material;
     let views = config.run.batch as f64 * pixels as f64 * PIXEL;
-    let shown = (SHOWN * SHOWN) as f64 * pixels as f64 * PIXEL;
-    let fine = ((config.run.samples * config.run.samples) as f64 * views).max(shown);
+    let fine = (config.run.samples * config.run.samples) as f64 * views;
     let table = m.levels as f64 * 2.0 * (1u64 << m.log2_size) as f64 * TRAINED;
     let topology = 12.0 * cells.powi(3) * TETRAHEDRON + 2.0 * cells.powi(3) * 7.0 * TRAINED + table + views;
     // Copies of the textures with their coarser levels: looked up, their gradient, and that of one view.
