@@ -103,20 +103,18 @@ const FIRST_WAVE: usize = 32;
 
 /// Samples in occupied cells that their densities do not drop.
 fn in_waves(gpu: &Gpu, config: &MarchConfig, pruning: &Pruning, on: &PlaceOn) -> GpuSamples {
-    let mut all: Option<(GpuSamples, MarchTrace)> = None;
-    let (mut left, mut ahead) = (None, config.max_samples);
-    for size in sizes(config.max_samples, pruning) {
-        ahead -= size;
-        let (rays, light) = (left.as_ref().unwrap_or(on.rays), all.as_ref().map(|(_, trace)| &trace.light));
-        let config = MarchConfig { max_samples: size, ..*config };
-        let (samples, trace, further) = wave(gpu, on, (rays, light), &config, pruning, ahead > 0);
-        left = further;
-        all = Some(match all {
-            Some(before) => joined(gpu, &on.field.shape.net, before, (samples, trace), on.room.1),
-            None => (samples, trace),
-        });
-    }
-    let (samples, trace) = all.expect("a wave");
+    // Where no ray ends early, one wave takes all.
+    let first = if pruning.stop > 0.0 { FIRST_WAVE.min(config.max_samples) } else { config.max_samples };
+    let rest = config.max_samples - first;
+    let of = |max_samples: usize| MarchConfig { max_samples, ..*config };
+    let (samples, trace, left) = wave(gpu, on, (on.rays, None), &of(first), pruning, rest > 0);
+    let (samples, trace) = match left {
+        Some(left) => {
+            let (behind, met, _) = wave(gpu, on, (&left, Some(&trace.light)), &of(rest), pruning, false);
+            joined(gpu, &on.field.shape.net, (samples, trace), (behind, met), on.room.1)
+        }
+        None => (samples, trace),
+    };
     GpuSamples { march: Some(trace), ..samples }
 }
 
@@ -142,12 +140,7 @@ fn wave(
     (GpuSamples { packed: pruned.packed, points, features, marched: marched.whole, march: None }, trace, further)
 }
 
-/// Samples per ray of each wave. Where no ray ends early, one wave takes all.
-fn sizes(most: usize, pruning: &Pruning) -> Vec<usize> {
-    if pruning.stop > 0.0 && most > FIRST_WAVE { vec![FIRST_WAVE, most - FIRST_WAVE] } else { vec![most] }
-}
-
-/// The samples of a further wave behind those of the waves before.
+/// The samples of a second wave behind those of the first.
 fn joined(
     gpu: &Gpu,
     net: &GpuNet,
@@ -163,18 +156,4 @@ fn joined(
     before.waves.extend(wave.waves);
     let samples = GpuSamples { packed: joined.packed, points, features, marched, march: None };
     (samples, MarchTrace { cut, light: wave.light, waves: before.waves })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn waves_take_all_samples() {
-        let pruning = |stop| Pruning { stop, min_alpha: 0.0, thin: 0.0, min_weight: 0.0 };
-        assert_eq!(sizes(1024, &pruning(1e-4)), [32, 992]);
-        assert_eq!(sizes(40, &pruning(1e-4)), [32, 8]);
-        assert_eq!(sizes(32, &pruning(1e-4)), [32]);
-        assert_eq!(sizes(1024, &pruning(0.0)), [1024]);
-    }
 }

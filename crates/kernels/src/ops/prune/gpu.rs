@@ -9,6 +9,7 @@ use crate::ops::march::gpu::bounded;
 use crate::ops::scan;
 use cubecl::prelude::*;
 
+use join::gather;
 pub use join::{Joined, join, sum};
 
 /// The samples that stay.
@@ -83,21 +84,8 @@ impl Pruned {
     }
 
     fn taken(&self, gpu: &Gpu, all: &Buffer, width: usize, per_level: usize) -> Buffer {
-        let (rows, samples) = (self.packed.rows(), all.len() / width);
-        let n = rows.most * width;
-        let out = gpu.empty(n);
-        launch!(
-            gpu,
-            gather_kept,
-            n,
-            [rows.live => rows.at + 1, self.source => rows.most, all => samples * width, out => n],
-            rows.place(),
-            samples as u32,
-            rows.most as u32,
-            width as u32,
-            per_level as u32,
-        );
-        out
+        let samples = all.len() / width;
+        gather(gpu, &self.packed.rows(), (&self.source, samples), [all, &gpu.empty(0)], width, per_level)
     }
 }
 
@@ -171,17 +159,4 @@ fn compact(
             next += 1;
         }
     }
-}
-
-#[cube(launch_unchecked)]
-fn gather_kept(live: &[u32], source: &[u32], all: &[f32], out: &mut [f32], at: u32, samples: u32, most: u32, width: u32, per_level: u32) {
-    let i = ABSOLUTE_POS;
-    let f = per_level as usize;
-    let per = live[at as usize] as usize * f;
-    if per == 0 || i >= per * (width as usize / f) {
-        terminate!();
-    }
-    let level = i / per;
-    let row = i % per / f;
-    out[(level * most as usize + row) * f + i % f] = all[(level * samples as usize + source[row] as usize) * f + i % f];
 }

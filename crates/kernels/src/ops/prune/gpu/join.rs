@@ -64,30 +64,36 @@ impl Joined {
     }
 
     /// Features `[L, capacity, F]` of both, of those of each `[L, S, F]`, for `width` = `L F`.
-    pub fn take_levels(&self, gpu: &Gpu, [first, second]: [&Buffer; 2], width: usize, per_level: usize) -> Buffer {
-        let rows: Rows = self.packed.rows();
-        let n = rows.most * width;
-        let out = gpu.empty(n);
-        launch!(
-            gpu,
-            gather_both,
-            n,
-            [
-                rows.live => rows.at + 1,
-                self.source => rows.most,
-                first => first.len(),
-                second => second.len(),
-                out => n,
-            ],
-            rows.place(),
-            self.split as u32,
-            (second.len() / width) as u32,
-            rows.most as u32,
-            width as u32,
-            per_level as u32,
-        );
-        out
+    pub fn take_levels(&self, gpu: &Gpu, of: [&Buffer; 2], width: usize, per_level: usize) -> Buffer {
+        gather(gpu, &self.packed.rows(), (&self.source, self.split), of, width, per_level)
     }
+}
+
+/// Features `[L, capacity, F]` that `source` picks from those of a first `[L, split, F]`, and behind them of a second `[L, S, F]`, for `width` =
+/// `L F`.
+pub(super) fn gather(
+    gpu: &Gpu,
+    rows: &Rows,
+    (source, split): (&Buffer<u32>, usize),
+    [first, second]: [&Buffer; 2],
+    width: usize,
+    per_level: usize,
+) -> Buffer {
+    let (n, more) = (rows.most * width, second.len() / width);
+    let out = gpu.empty(n);
+    launch!(
+        gpu,
+        gather_both,
+        n,
+        [rows.live => rows.at + 1, source => rows.most, first => split * width, second => more * width, out => n],
+        rows.place(),
+        split as u32,
+        more as u32,
+        rows.most as u32,
+        width as u32,
+        per_level as u32,
+    );
+    out
 }
 
 #[cube(launch_unchecked)]
