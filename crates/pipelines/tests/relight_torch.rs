@@ -13,7 +13,7 @@ use diorama_pipelines::relight::outdoor::stepper::{Stepper, sphere_rays};
 use std::path::Path;
 use std::process::Command;
 
-const RAYS: usize = 24;
+const RAYS: usize = 12;
 /// Of networks and lights.
 const RATES: [f32; 2] = [4e-5, 1e-3];
 const VIEWS: usize = 6;
