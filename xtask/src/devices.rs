@@ -1,6 +1,6 @@
 //! Comparisons of every op on a device with its reference.
 
-use crate::{PROGRAM, cargo, step};
+use crate::{PROGRAMS, cargo, step};
 use std::process::{Command, Stdio};
 
 /// Compares every op on each device, of several separated by commas, with its reference: in the default build by `diorama bench check`, which
@@ -15,7 +15,7 @@ pub fn check(devices: &str) -> bool {
 
 /// Devices of the default build.
 fn check_native(devices: &[&str]) -> bool {
-    if !step("build", cargo(&PROGRAM)) {
+    if !step("build", cargo(&PROGRAMS)) {
         return false;
     }
     // Training is compared on a real capture if there is one.

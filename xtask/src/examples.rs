@@ -35,7 +35,7 @@ const TIME_LIMIT: Duration = Duration::from_secs(180);
 /// Builds all examples and runs those in the list; returns whether all succeeded.
 pub fn run() -> bool {
     let mut breaches = check(&sources(Path::new("crates")));
-    let built = crate::cargo(&["build", "--release", "--quiet", "--workspace", "--examples"]);
+    let built = crate::cargo(&crate::PROGRAMS);
     if !built {
         breaches.push("the examples do not build".into());
     }

@@ -54,14 +54,14 @@ fn has_avx512() -> bool {
     false
 }
 
-/// Runs every parser with mutated inputs. Built with the whole workspace, so that the test build is reused.
+/// Runs every parser with mutated inputs.
 fn fuzz(runs: &str) -> bool {
-    let built = cargo(&["build", "--release", "--quiet", "--workspace", "--bin", "diorama-fuzz"]);
-    built && Command::new("target/release/diorama-fuzz").arg(runs).status().is_ok_and(|s| s.success())
+    cargo(&PROGRAMS) && Command::new("target/release/diorama-fuzz").arg(runs).status().is_ok_and(|s| s.success())
 }
 
-/// Builds the program with the whole workspace, as its tests do: one package alone selects other features of dependencies and rebuilds them.
-const PROGRAM: [&str; 5] = ["build", "--release", "--workspace", "--bin", "diorama"];
+/// Builds all programs and examples out of what the tests were built from: one package alone, or programs without examples, which need what
+/// tests need, select other features of dependencies and rebuild them.
+const PROGRAMS: [&str; 5] = ["build", "--release", "--workspace", "--bins", "--examples"];
 
 /// Everything that must pass before a change lands.
 fn ci() -> bool {
@@ -117,8 +117,7 @@ fn viewer_check() -> bool {
     let run = std::env::temp_dir().join(format!("diorama-viewer-check-{}", std::process::id()));
     let diorama = "target/release/diorama";
     // The page is also tested with a source whose layers and controls no run has.
-    let made = cargo(&PROGRAM)
-        && cargo(&["build", "--release", "--workspace", "--example", "own_picture"])
+    let made = cargo(&PROGRAMS)
         && Command::new(diorama)
             .args(["quickstart", "--seconds", "6", "--out"])
             .arg(&run)
