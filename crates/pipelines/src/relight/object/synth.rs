@@ -28,6 +28,10 @@ const BOUNCES: u32 = 6;
 /// Rows of a map that a sun is drawn into.
 const SUN_ROWS: usize = 512;
 
+/// Views that are metered, and the share of their pixels that one exposure of all leaves clipped: a color that is clipped is unknown.
+const METERED: usize = 12;
+const CLIPPED: f64 = 0.02;
+
 /// What is generated.
 #[derive(Clone, Debug)]
 pub struct ObjectSynth {
@@ -109,7 +113,7 @@ pub fn generate(
     }
     let cameras = cameras(options, 0.5 * (low + high), 0.5 * (high - low).length());
     let mut scene = Scene::new(&model, &lights[0]);
-    let lights: Vec<_> = lights.into_iter().map(|l| exposed(&mut scene, l, &cameras[0])).collect();
+    let lights: Vec<_> = lights.into_iter().map(|l| exposed(&mut scene, l, &cameras)).collect();
     let mut made = ObjectSynthesized { photographs: 0, held_out: 0, triangles: model.face_count(), interrupted: false, notes };
     let (mut frames, mut views) = ([Vec::new(), Vec::new()], Vec::new());
     for (v, (camera, pose)) in cameras.iter().enumerate() {
@@ -161,8 +165,8 @@ fn cameras(options: &ObjectSynth, center: DVec3, radius: f64) -> Vec<(Camera, Po
     (0..options.views).map(pose).collect()
 }
 
-/// A light as one map, scaled such that the brightest twentieth of a view is nearly white.
-fn exposed(scene: &mut Scene, light: Daylight, (camera, pose): &(Camera, Pose)) -> Daylight {
+/// A light as one map, scaled to one exposure of all photographs: [`CLIPPED`] of the object's pixels are brighter than white in any channel.
+fn exposed(scene: &mut Scene, light: Daylight, cameras: &[(Camera, Pose)]) -> Daylight {
     let environment = match light.sun {
         None => light.environment,
         Some(sun) => {
@@ -173,11 +177,23 @@ fn exposed(scene: &mut Scene, light: Daylight, (camera, pose): &(Camera, Pose)) 
     };
     let light = Daylight::of(environment);
     scene.set_light(&light);
-    let view = View { camera: *camera, world_from_camera: *pose, lens: None };
-    let mut film = Film::new(camera);
-    cpu::render(scene, &view, &Settings { bounces: BOUNCES, shows_light: false, ..Settings::default() }, 16, &mut film);
-    let stops = picture::automatic_exposure(&film.image(|p| [p.color[0], p.color[1], p.color[2], p.opacity]));
-    light.turned(0.0, stops.exp2())
+    let mut brightest = Vec::new();
+    for (camera, pose) in cameras.iter().step_by(cameras.len().div_ceil(METERED)) {
+        let view = View { camera: *camera, world_from_camera: *pose, lens: None };
+        let mut film = Film::new(camera);
+        cpu::render(scene, &view, &Settings { bounces: BOUNCES, shows_light: false, ..Settings::default() }, 16, &mut film);
+        denoise::cpu::run(&mut film);
+        let pixels = film.image(|p| [p.color[0], p.color[1], p.color[2], p.opacity]);
+        brightest.extend(pixels.data.as_chunks::<4>().0.iter().filter(|p| p[3] > 0.5).map(|p| p[0].max(p[1]).max(p[2]) / p[3]));
+    }
+    light.turned(0.0, gain(&mut brightest))
+}
+
+/// Gain that leaves [`CLIPPED`] of the values above 1.
+fn gain(values: &mut [f32]) -> f64 {
+    let Some(last) = values.len().checked_sub(1) else { return 1.0 };
+    let (_, white, _) = values.select_nth_unstable_by(((1.0 - CLIPPED) * last as f64).round() as usize, f32::total_cmp);
+    if *white > 0.0 { 1.0 / *white as f64 } else { 1.0 }
 }
 
 /// A view by its number, with the light behind the object where it is shown.
@@ -205,4 +221,18 @@ fn frame(name: &str, camera: &Camera, pose: &Pose) -> serde_json::Value {
         "transform_matrix": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
         "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_exposure_leaves_a_fiftieth_of_the_pixels_clipped() {
+        let values: Vec<f32> = (1..=1000).map(|i| 0.004 * i as f32).collect();
+        let by = gain(&mut values.clone());
+        let clipped = values.iter().filter(|v| **v as f64 * by > 1.0 + 1e-6).count();
+        assert!((19..=21).contains(&clipped), "{clipped} at {by}");
+        assert_eq!((gain(&mut [0.0; 5]), gain(&mut [])), (1.0, 1.0));
+    }
 }

@@ -31,6 +31,8 @@ const NEAR: (f32, f32) = (2.0, 0.02);
 /// Steps over which rates rise.
 const WARMUP: f32 = 100.0;
 const OCCLUSION: f32 = 0.001;
+/// How much brighter than white base colors may become before the third stage finds the light: only their ratios are known until then.
+const HEADROOM: f32 = 4.0;
 /// Level at which vertices read their color.
 const VERTEX_LEVEL: f32 = 1.0;
 /// Points of a view whose colors are compared, and the width within which colors attract each other.
@@ -83,6 +85,8 @@ pub struct Textured {
     pub positions: ParamGroup,
     pub texels: ParamGroup,
     color: [f32; 2],
+    /// Factor of the largest base color until the third stage.
+    headroom: f32,
     /// Samples per pixel and axis.
     samples: usize,
     /// Third stage: what the surface casts onto itself. The mesh no longer moves then.
@@ -128,6 +132,7 @@ impl Textured {
             texels: ParamGroup::dense("texels", texels, adam(config.optim.texture_rate)),
             layout,
             color: config.material.color,
+            headroom: if config.run.traced_steps > 0 && config.light.fixed.as_os_str().is_empty() { HEADROOM } else { 1.0 },
             samples: config.run.samples,
             surroundings: None,
         }
@@ -263,7 +268,8 @@ impl Textured {
 
     /// Keeps texels where materials are.
     fn clamp(&mut self) {
-        let ([low, high], most_occluded) = (self.color, if self.surroundings.is_some() { 0.0 } else { 1.0 });
+        let [low, high] = self.color;
+        let (high, most_occluded) = if self.surroundings.is_some() { (high, 0.0) } else { (high * self.headroom, 1.0) };
         self.texels.values.as_chunks_mut::<CHANNELS>().0.par_iter_mut().with_min_len(4096).for_each(|t| {
             t[..3].iter_mut().for_each(|v| *v = v.clamp(low, high));
             t[3] = t[3].clamp(0.0, most_occluded);

@@ -5,7 +5,7 @@ use super::albedo_entropy::{self, Sighting};
 use super::capture::ObjectCapture;
 use super::config::{CHANNELS, Config};
 use super::gloss::{self, Gloss};
-use super::metal::{METAL, Metal};
+use super::metal::{Classifier, Metal};
 use super::probe::{self, Probe};
 use super::surroundings::Surroundings;
 use super::textured::Textured;
@@ -13,7 +13,7 @@ use super::transport::{dot, unit};
 use diorama_geom::capture::Split;
 use diorama_geom::mesh::{cross, sub};
 use diorama_kernels::ops::vertex_normals;
-use diorama_mesh::bake;
+use diorama_mesh::bake::{self, Texels};
 
 /// Roughness to begin with.
 const ROUGHNESS: f32 = 0.5;
@@ -23,6 +23,8 @@ const LEFT: f32 = 0.1;
 /// Largest base color to begin with, and least light.
 const BRIGHTEST: f32 = 0.95;
 const DARK: f32 = 1e-3;
+/// Share of the light that may fall on base colors that are too bright, as they are wrong.
+const WRONG: f32 = 0.01;
 /// Least light of the second stage that the third begins with, over its mean.
 const DIMMEST: f32 = 0.1;
 
@@ -36,59 +38,91 @@ pub fn surroundings(m: &Textured, config: &Config) -> Surroundings {
 pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: &mut Probe) {
     let around = surroundings(m, config);
     probe.update();
-    let mut flat = m.mesh();
-    flat.normals = m.smooth_normals();
     let size = config.material.texture;
-    let texels = bake::texels(&flat, size);
-    let before = probe.diffuse(texels.normals.as_flattened());
-    let metal = metal_of(m);
-    let (gloss, of_metal) = find_light(m, config, capture, (&around, probe, &metal));
+    let sent = Sent::of(m, size, probe);
+    let (gloss, of_metal) = find_light(m, config, capture, (&around, probe, &metal_of(m)));
     let roughness = gloss.as_ref().map_or(ROUGHNESS, |g| g.roughness);
-    let mirrored = gloss.map_or_else(|| vec![[0.0; 3]; m.places().len()], |g| g.mirrored);
+    let mut mirrored = gloss.map_or_else(|| vec![[0.0; 3]; m.places().len()], |g| g.mirrored);
+    let tells = Classifier::of(m.texels.values.as_chunks().0);
     let kept: Vec<([f32; CHANNELS], bool)> =
-        m.texels.values.as_chunks().0.iter().map(|t: &[f32; CHANNELS]| (*t, of_metal.is_some() && t[5] > METAL)).collect();
-    let of_metal = of_metal.unwrap_or([1.0; 3]);
+        m.texels.values.as_chunks().0.iter().map(|t| (*t, of_metal.is_some() && tells.is_metal(t))).collect();
+    let mut of_metal = of_metal.unwrap_or([1.0; 3]);
+    if !probe.group.frozen {
+        // No surface sends more than it receives.
+        let by = excess(&sent.colors(m, &around, probe, &mirrored));
+        probe.scale(by);
+        (0..3).for_each(|k| mirrored.iter_mut().for_each(|m| m[k] *= by[k]));
+        (0..3).for_each(|k| of_metal[k] /= by[k]);
+    }
     // Two rounds: light between surfaces depends on their colors.
-    let sent: Vec<[f32; 3]> = texels
-        .index
-        .iter()
-        .zip(before.as_chunks::<3>().0)
-        .map(|(i, d)| {
-            let t = &m.texels.values[*i as usize * CHANNELS..][..CHANNELS];
-            std::array::from_fn(|k| t[k] * (1.0 - t[5]) * (1.0 - t[3]) * d[k])
-        })
-        .collect();
     for _ in 0..2 {
-        let drawn = m.drawn();
-        let lit = around.light(probe, &m.vertex_colors(&drawn));
-        let colors: Vec<[f32; 3]> = (0..sent.len())
-            .map(|i| {
-                let corners = m.layout.faces[texels.face[i] as usize].map(|v| v as usize);
-                let weights = place(texels.positions[i], corners.map(|v| m.places()[v]));
-                let mix = |of: &dyn Fn(usize) -> f32| (0..3).map(|c| weights[c] * of(corners[c])).sum::<f32>();
-                std::array::from_fn(|k| {
-                    let (light, gloss) = (mix(&|v| lit.diffuse(v)[k]), mix(&|v| mirrored[v][k]));
-                    ((sent[i][k] - gloss).max(LEFT * sent[i][k]) / light.max(DARK)).min(BRIGHTEST)
-                })
-            })
-            .collect();
-        let spread = bake::spread(&texels, &colors, size);
+        let colors: Vec<[f32; 3]> = sent.colors(m, &around, probe, &mirrored).iter().map(|(c, _)| c.map(|c| c.min(BRIGHTEST))).collect();
+        let spread = bake::spread(&sent.texels, &colors, size);
         for ((t, c), (before, is_metal)) in m.texels.values.as_chunks_mut::<CHANNELS>().0.iter_mut().zip(&spread).zip(&kept) {
             let color = if *is_metal { std::array::from_fn(|k| (of_metal[k] * before[k]).min(BRIGHTEST)) } else { *c };
             t[..3].copy_from_slice(&color);
-            t[3..6].copy_from_slice(&if *is_metal { [0.0, before[4], before[5]] } else { [0.0, roughness, 0.0] });
+            t[3..6].copy_from_slice(&if *is_metal { [0.0, before[4], 1.0] } else { [0.0, roughness, 0.0] });
         }
     }
     m.forget_steps();
     m.surroundings = Some(Box::new(around));
 }
 
+/// What texels of the second stage send diffusely, in its light.
+struct Sent {
+    texels: Texels,
+    colors: Vec<[f32; 3]>,
+}
+
+impl Sent {
+    fn of(m: &Textured, size: usize, probe: &Probe) -> Sent {
+        let mut flat = m.mesh();
+        flat.normals = m.smooth_normals();
+        let texels = bake::texels(&flat, size);
+        let light = probe.diffuse(texels.normals.as_flattened());
+        let color = |(i, light): (&u32, &[f32; 3])| {
+            let t = &m.texels.values[*i as usize * CHANNELS..][..CHANNELS];
+            std::array::from_fn(|k| t[k] * (1.0 - t[5]) * (1.0 - t[3]) * light[k])
+        };
+        let colors = texels.index.iter().zip(light.as_chunks::<3>().0).map(color).collect();
+        Sent { texels, colors }
+    }
+
+    /// Base colors of the texels, not bounded, and the light on them, when vertices mirror some of what is sent `[V]`.
+    fn colors(&self, m: &Textured, around: &Surroundings, probe: &Probe, mirrored: &[[f32; 3]]) -> Vec<([f32; 3], [f32; 3])> {
+        let lit = around.light(probe, &m.vertex_colors(&m.drawn()));
+        let color = |(i, sent): (usize, &[f32; 3])| {
+            let corners = m.layout.faces[self.texels.face[i] as usize].map(|v| v as usize);
+            let weights = place(self.texels.positions[i], corners.map(|v| m.places()[v]));
+            let mix = |of: &dyn Fn(usize) -> f32| (0..3).map(|c| weights[c] * of(corners[c])).sum::<f32>();
+            let light: [f32; 3] = std::array::from_fn(|k| mix(&|v| lit.diffuse(v)[k]).max(DARK));
+            (std::array::from_fn(|k| (sent[k] - mix(&|v| mirrored[v][k])).max(LEFT * sent[k]) / light[k]), light)
+        };
+        self.colors.iter().enumerate().map(color).collect()
+    }
+}
+
+/// Factors of the light by channel under which all but a few of the base colors, given with the light on them, are possible.
+fn excess(colors: &[([f32; 3], [f32; 3])]) -> [f32; 3] {
+    [0, 1, 2].map(|k| {
+        let mut all: Vec<(f32, f32)> = colors.iter().map(|(c, light)| (c[k], light[k])).collect();
+        all.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let mut left = WRONG * all.iter().map(|c| c.1).sum::<f32>();
+        let brightest = all.iter().find(|c| {
+            left -= c.1;
+            left < 0.0
+        });
+        brightest.map_or(1.0, |c| (c.0 / BRIGHTEST).max(1.0))
+    })
+}
+
 /// What the second stage classifies as metal.
 fn metal_of(m: &Textured) -> Metal {
     let values = m.at_vertices(&m.drawn());
     let texels = || values.as_chunks::<CHANNELS>().0.iter();
+    let tells = Classifier::of(m.texels.values.as_chunks().0);
     Metal {
-        is_metal: texels().map(|t| t[5] > METAL).collect(),
+        is_metal: texels().map(|t| tells.is_metal(t)).collect(),
         colors: texels().map(|t| [t[0], t[1], t[2]]).collect(),
         roughness: texels().map(|t| t[4]).collect(),
     }
@@ -155,4 +189,21 @@ fn place(p: [f32; 3], [a, b, c]: [[f32; 3]; 3]) -> [f32; 3] {
     let (v, w) = (dot(cross(ap, ac), n) / area, dot(cross(ab, ap), n) / area);
     let [v, w] = [v.clamp(0.0, 1.0), w.clamp(0.0, 1.0)];
     [(1.0 - v - w).max(0.0), v, w]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn light_becomes_as_bright_as_the_brightest_color_needs() {
+        // A hundredth of the light falls on noise, much of the surface is in the dark.
+        let lit = |c: [f32; 3]| (c, [1.0; 3]);
+        let mut colors: Vec<_> = (0..1000).map(|i| lit([0.5 + 0.9 * i as f32 / 1000.0, 0.3, 0.1])).collect();
+        colors.extend((0..8).map(|_| lit([40.0; 3])));
+        colors.extend((0..500).map(|_| ([9.0; 3], [1e-3; 3])));
+        let by = excess(&colors);
+        assert!((by[0] - 1.4 / BRIGHTEST).abs() < 0.02 && by[1..] == [1.0; 2], "{by:?}");
+        assert_eq!(excess(&[]), [1.0; 3]);
+    }
 }
