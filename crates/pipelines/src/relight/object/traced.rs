@@ -24,7 +24,7 @@ const LEFT: f32 = 0.1;
 const BRIGHTEST: f32 = 0.95;
 const DARK: f32 = 1e-3;
 /// Share of the light that may fall on base colors that are too bright, as they are wrong.
-const WRONG: f32 = 0.01;
+const WRONG: f32 = 0.05;
 /// Least light of the second stage that the third begins with, over its mean.
 const DIMMEST: f32 = 0.1;
 
@@ -197,13 +197,13 @@ mod tests {
 
     #[test]
     fn light_becomes_as_bright_as_the_brightest_color_needs() {
-        // A hundredth of the light falls on noise, much of the surface is in the dark.
+        // Some light falls on noise, much of the surface is in the dark.
         let lit = |c: [f32; 3]| (c, [1.0; 3]);
-        let mut colors: Vec<_> = (0..1000).map(|i| lit([0.5 + 0.9 * i as f32 / 1000.0, 0.3, 0.1])).collect();
-        colors.extend((0..8).map(|_| lit([40.0; 3])));
+        let mut colors: Vec<_> = (0..1000).map(|i| lit([0.5 + (i / 100) as f32 / 10.0, 0.3, 0.1])).collect();
+        colors.extend((0..30).map(|_| lit([40.0; 3])));
         colors.extend((0..500).map(|_| ([9.0; 3], [1e-3; 3])));
         let by = excess(&colors);
-        assert!((by[0] - 1.4 / BRIGHTEST).abs() < 0.02 && by[1..] == [1.0; 2], "{by:?}");
+        assert!((by[0] - 1.4 / BRIGHTEST).abs() < 0.01 && by[1..] == [1.0; 2], "{by:?}");
         assert_eq!(excess(&[]), [1.0; 3]);
     }
 }
