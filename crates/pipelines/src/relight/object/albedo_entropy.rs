@@ -88,6 +88,7 @@ fn sample(photo: &ObjectPhoto, p: [f32; 3]) -> Option<[f32; 3]> {
     corners.iter().all(|c| c[3] > 0.99).then(|| std::array::from_fn(|k| (0..4).map(|i| weights[i] * corners[i][k]).sum()))
 }
 
+/// Luminance of a linear color.
 pub fn luminance(c: [f32; 3]) -> f32 {
     0.2126 * c[0] + 0.7152 * c[1] + 0.0722 * c[2]
 }

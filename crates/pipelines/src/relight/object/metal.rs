@@ -19,7 +19,6 @@ const BRIGHT: f32 = 0.5;
 const LEAST: usize = 100;
 /// Share of the brightest base colors that may exceed those of any metal, as they are wrong.
 const WRONG: f32 = 0.1;
-
 /// Largest factor of a base color, and halvings of the interval in which it is looked for.
 const LARGEST: f32 = 8.0;
 const HALVINGS: usize = 20;

@@ -40,10 +40,10 @@ pub fn begin(m: &mut Textured, config: &Config, capture: &ObjectCapture, probe: 
     probe.update();
     let size = config.material.texture;
     let sent = Sent::of(m, size, probe);
-    let (gloss, of_metal) = find_light(m, config, capture, (&around, probe, &metal_of(m)));
+    let tells = Classifier::of(m.texels.values.as_chunks().0);
+    let (gloss, of_metal) = find_light(m, config, capture, (&around, probe, &metal_of(m, &tells)));
     let roughness = gloss.as_ref().map_or(ROUGHNESS, |g| g.roughness);
     let mut mirrored = gloss.map_or_else(|| vec![[0.0; 3]; m.places().len()], |g| g.mirrored);
-    let tells = Classifier::of(m.texels.values.as_chunks().0);
     let kept: Vec<([f32; CHANNELS], bool)> =
         m.texels.values.as_chunks().0.iter().map(|t| (*t, of_metal.is_some() && tells.is_metal(t))).collect();
     let mut of_metal = of_metal.unwrap_or([1.0; 3]);
@@ -117,10 +117,9 @@ fn excess(colors: &[([f32; 3], [f32; 3])]) -> [f32; 3] {
 }
 
 /// What the second stage classifies as metal.
-fn metal_of(m: &Textured) -> Metal {
+fn metal_of(m: &Textured, tells: &Classifier) -> Metal {
     let values = m.at_vertices(&m.drawn());
     let texels = || values.as_chunks::<CHANNELS>().0.iter();
-    let tells = Classifier::of(m.texels.values.as_chunks().0);
     Metal {
         is_metal: texels().map(|t| tells.is_metal(t)).collect(),
         colors: texels().map(|t| [t[0], t[1], t[2]]).collect(),
