@@ -188,7 +188,7 @@ impl Config {
                 color_smoothness: 0.3,
                 white_light: 0.005,
                 color_entropy: 0.02,
-                laplacian: 3e3,
+                laplacian: 1e3,
                 normal_consistency: 0.0,
             },
             optim: OptimConfig {
@@ -198,7 +198,7 @@ impl Config {
                 light_rate: 0.1,
                 texture_rate: 0.01,
                 traced_light_rate: 0.01,
-                vertex_rate: 0.001,
+                vertex_rate: 0.003,
                 final_scale: 0.1,
             },
             run: RunConfig {
@@ -206,7 +206,7 @@ impl Config {
                 texture_steps: pick(100, 3000) as u64,
                 traced_steps: 0,
                 batch: 1,
-                samples: pick(1, 2),
+                samples: pick(1, 3),
                 log_every: pick(20, 50) as u64,
                 save_every_seconds: 60.0,
             },

@@ -46,6 +46,8 @@ pub struct SurfaceGradient<'a> {
     /// Of unit normals.
     pub normal: &'a [f32],
     pub position: Option<&'a [f32]>,
+    /// Of barycentrics, of all pixels `[H, W, 2]`, through what else was interpolated.
+    pub barycentric: Option<&'a [f32]>,
 }
 
 impl Surface {
@@ -112,8 +114,8 @@ impl Surface {
         self.covered.iter().flat_map(|p| all[*p as usize * width..(*p as usize + 1) * width].iter().copied()).collect()
     }
 
-    /// Gradient of attributes `[V′, A]` for that of [`Surface::interpolate`].
-    pub fn interpolate_backward(&self, attributes: &[f32], width: usize, faces: &[[u32; 3]], d: &[f32]) -> Vec<f32> {
+    /// Gradients of attributes `[V′, A]` and of barycentrics `[H, W, 2]` for that of [`Surface::interpolate`].
+    pub fn interpolate_backward(&self, attributes: &[f32], width: usize, faces: &[[u32; 3]], d: &[f32]) -> [Vec<f32>; 2] {
         let pixels = self.raster.ids.len();
         let s = Interpolate { images: 1, pixels, vertices: attributes.len() / width, attributes: width, per_image: false };
         let mut d_values = vec![0.0; pixels * width];
@@ -123,7 +125,7 @@ impl Surface {
         let (mut out, mut d_uv) = (vec![0.0; attributes.len()], vec![0.0; self.raster.uv.len()]);
         let at = Pixels { ids: &self.raster.ids, uv: &self.raster.uv };
         interpolate::cpu::backward(&s, attributes, faces, at, &d_values, &mut out, &mut d_uv);
-        out
+        [out, d_uv]
     }
 
     /// Screen derivatives of the first `chosen` of such attributes at the covered pixels, `[P, chosen, 2]`.
@@ -207,6 +209,9 @@ impl Surface {
         let at = Pixels { ids: &self.raster.ids, uv: &self.raster.uv };
         let s = interpolation(&r, ATTRIBUTES);
         interpolate::cpu::backward(&s, &self.attributes, shape.faces, at, &d_values, &mut d_attributes, &mut d_uv);
+        if let Some(d) = d.barycentric {
+            d_uv.par_iter_mut().zip(d).with_min_len(4096).for_each(|(to, d)| *to += d);
+        }
         let mut through = vec![0.0; self.clip.len()];
         let up = Upstream { uv: Some(&d_uv), ..Upstream::default() };
         rasterize::backward(&r, &self.clip, shape.faces, &self.raster, &up, &mut through);

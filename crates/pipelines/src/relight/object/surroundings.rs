@@ -109,7 +109,7 @@ impl Surroundings {
     /// Adds the gradient of the vertices' shares `[V, 6]` for that of [`Seen::share`].
     pub fn seen_backward(&self, lit: &LitVertices, surface: &Surface, d_share: &[f32], into: &mut [f32]) {
         let d: Vec<f32> = d_share.as_chunks::<3>().0.iter().flat_map(|d| [d[0], d[1], d[2], 0.0, 0.0, 0.0]).collect();
-        let out = surface.interpolate_backward(&lit.attributes, ATTRIBUTES, &self.faces, &d);
+        let [out, _] = surface.interpolate_backward(&lit.attributes, ATTRIBUTES, &self.faces, &d);
         into.iter_mut().zip(&out).for_each(|(i, o)| *i += o);
     }
 

@@ -189,6 +189,15 @@ impl Textured {
         out
     }
 
+    /// Gradient of barycentrics `[H, W, 2]` for that of [`Textured::lookup`]: as the surface moves, its texture moves in the picture.
+    fn texture_backward(&self, drawn: &Drawn, looked: &Looked, d_values: &[f32]) -> Vec<f32> {
+        let (mut d_uv, mut d_level) = (vec![0.0; looked.uv.len()], vec![0.0; looked.level.len()]);
+        texture::cpu::backward_coordinates(&self.texture, &drawn.mipped, &looked.uv, &looked.level, d_values, &mut d_uv, &mut d_level);
+        let d: Vec<f32> = d_uv.as_chunks::<2>().0.iter().flat_map(|d| [d[0], d[1], 0.0, 0.0, 0.0, 0.0]).collect();
+        let [_, d_barycentric] = looked.surface.interpolate_backward(&drawn.attributes, ATTRIBUTES, &self.layout.uv_faces, &d);
+        d_barycentric
+    }
+
     /// The picture `[H, W, 4]` of a view, linear light times opacity, and that of the base color.
     pub fn picture(&self, view: &ObjectView, probe: &Probe) -> [Vec<f32>; 2] {
         let (drawn, samples) = (self.drawn(), self.samples.max(SHOWN));
@@ -321,6 +330,7 @@ impl Textured {
             d[3] += occlusion;
             loss.regularizers += (occlusion * lit.ks[3 * i]) as f64;
         }
+        let moves = self.surroundings.is_none().then(|| self.texture_backward(drawn, looked, &d_values));
         // Charts end anywhere on the surface: neighbors in the picture are near each other, neighbors in the texture need not be.
         let near = surface.neighbors((NEAR.0 * self.samples as f32, NEAR.1), SPARSITY * self.samples, Rng::new(rng.bits(1), 1));
         let color = |i: usize| values[i * CHANNELS..][..3].iter().copied();
@@ -332,12 +342,14 @@ impl Textured {
         let mut d_texels = vec![0.0; gradient.texels.len()];
         texture::cpu::backward_texels(&self.texture, &looked.uv, &looked.level, &d_values, &mut d_texels);
         gradient.texels.par_iter_mut().zip(&d_texels).with_min_len(4096).for_each(|(g, d)| *g += d);
-        let d = SurfaceGradient { normal: &d_smooth, position: None };
+        let Some(moves) = moves else { return };
+        let d = SurfaceGradient { normal: &d_smooth, position: None, barycentric: Some(&moves) };
         surface.backward(&photo.view.finer(self.samples), &shape, &d, d_clip, &mut gradient.positions);
     }
 }
 
 struct Gradient {
+    /// Until the third stage.
     positions: Vec<[f32; 3]>,
     texels: Vec<f32>,
     /// Of the vertices' shares of light, in the third stage.
@@ -457,3 +469,7 @@ fn unit(v: [f32; 3]) -> [f32; 3] {
     let l = (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt().max(1e-20);
     v.map(|v| v / l)
 }
+
+#[cfg(test)]
+#[path = "textured_tests.rs"]
+mod tests;

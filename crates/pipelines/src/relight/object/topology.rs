@@ -252,7 +252,7 @@ impl Topology {
             loss.regularizers += (occlusion * values.ks[3 * i]) as f64;
         }
         let d_points = self.material.backward(&values, &d_kd, &d_ks);
-        let gradient = SurfaceGradient { normal: &d_normal, position: Some(&d_points[..3 * n]) };
+        let gradient = SurfaceGradient { normal: &d_normal, position: Some(&d_points[..3 * n]), barycentric: None };
         surface.backward(&photo.view, shape, &gradient, d_clip, d_vertices);
     }
 }
