@@ -193,8 +193,7 @@ impl Textured {
     fn texture_backward(&self, drawn: &Drawn, looked: &Looked, d_values: &[f32]) -> Vec<f32> {
         let (mut d_uv, mut d_level) = (vec![0.0; looked.uv.len()], vec![0.0; looked.level.len()]);
         texture::cpu::backward_coordinates(&self.texture, &drawn.mipped, &looked.uv, &looked.level, d_values, &mut d_uv, &mut d_level);
-        let d: Vec<f32> = d_uv.as_chunks::<2>().0.iter().flat_map(|d| [d[0], d[1], 0.0, 0.0, 0.0, 0.0]).collect();
-        let [_, d_barycentric] = looked.surface.interpolate_backward(&drawn.attributes, ATTRIBUTES, &self.layout.uv_faces, &d);
+        let [_, d_barycentric] = looked.surface.interpolate_backward(self.layout.uvs.as_flattened(), 2, &self.layout.uv_faces, &d_uv);
         d_barycentric
     }
 
