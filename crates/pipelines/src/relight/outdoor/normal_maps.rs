@@ -2,7 +2,8 @@
 //!
 //! Seen by a camera, the inverse depth of a plane is linear in the image, `1/z = a x + b y + c`, and its normal is along `(a, b, c)`. Fits are
 //! robust, so that what stands before or behind does not count. Where a plane along one of the place's main directions, which are those that
-//! most fits agree on, explains the distances as well, it is taken instead: it has less freedom to follow noise.
+//! most fits agree on, explains the distances as well, it is taken instead: it has less freedom to follow noise. Level ground is told by its
+//! height, as its distances are too noisy for a plane.
 
 use super::config::Stage;
 use super::model::SceneModel;
@@ -12,7 +13,10 @@ use diorama_engine::samplers::pixels::Observation;
 use diorama_geom::Image;
 use diorama_geom::glam::{DMat3, DVec3, Vec3};
 use diorama_kernels::ops::ray_generation::PosedCamera;
+use levels::{Levels, Sight};
 use rayon::prelude::*;
+
+mod levels;
 
 /// Pixels along the longer side at most, and pixels of all maps together.
 const LONGEST: u32 = 320;
@@ -113,7 +117,9 @@ impl NormalMaps {
         let seen: Vec<Seen> = shown.iter().map(|c| Seen::of(model, c)).collect();
         let free: Vec<Vec<Option<Plane>>> = seen.iter().map(Seen::free_planes).collect();
         let main = main_directions(&seen, &free);
-        let maps = seen.iter().zip(&free).map(|(s, f)| s.map(f, &main));
+        let every = seen.iter().map(|s| s.rays.len()).sum::<usize>().div_ceil(SAMPLED).max(1);
+        let levels = Levels::of(seen.iter().flat_map(|s| (0..s.rays.len()).filter_map(|i| s.sight(i))).step_by(every));
+        let maps = seen.iter().zip(&free).map(|(s, f)| s.map(f, &main, &levels));
         NormalMaps { maps: maps.collect(), of }
     }
 
@@ -174,6 +180,14 @@ impl Seen {
         let inverse = (0..w * h).map(inverse).collect();
         let rays = rays.iter().map(|r| *r / r.z).collect();
         Seen { width: w, height: h, camera: *small, depth: view.depth, to_model: small.pose.rotation, rays, inverse }
+    }
+
+    /// The ray of a pixel that shows a surface.
+    fn sight(&self, i: usize) -> Option<Sight> {
+        let (ray, length) = (self.rays[i], self.rays[i].length());
+        let sight =
+            || Sight { eye: self.camera.pose.translation.z, down: -(self.to_model * ray).z / length, distance: length / self.inverse[i] };
+        (self.inverse[i] > 0.0).then(sight)
     }
 
     /// Rays and inverse depths around a pixel, and how many there would be in a full window.
@@ -271,13 +285,14 @@ impl Seen {
         upright.all(|p| p.support < LESS * level.support).then_some(level)
     }
 
-    /// The normals, each of the free plane or of one along a main direction.
-    fn map(&self, free: &[Option<Plane>], main: &[Vec3]) -> Map {
+    /// The normals, each of level ground, of the free plane or of one along a main direction.
+    fn map(&self, free: &[Option<Plane>], main: &[Vec3], levels: &Levels) -> Map {
         let main: Vec<DVec3> = main.iter().map(|m| self.to_model.transpose() * m.as_dvec3()).collect();
         let up = self.to_model.transpose() * DVec3::Z;
         let of = |i: usize| {
-            if self.inverse[i] <= 0.0 {
-                return (Vec3::ZERO, 0.0);
+            let Some(sight) = self.sight(i) else { return (Vec3::ZERO, 0.0) };
+            if let Some(distance) = levels.distance(&sight) {
+                return (Vec3::Z, distance as f32);
             }
             let (near, all) = self.window(i);
             let along = main.iter().filter_map(|m| self.plane_along(i, &near, *m, APART));
