@@ -48,8 +48,14 @@ const SURE: usize = 2;
 const SETTLING: usize = 15;
 /// Every so many of these, light from surfaces is found anew.
 const SENT_AGAIN: usize = 3;
-/// Difference in sRGB beyond which points count less and less.
+/// Difference in sRGB beyond which points count less and less where lights are compared, and where they are found.
 const TRUSTED: f32 = 0.15;
+const EXPLAINED: f32 = 0.4;
+/// Weight of what a mistaken shadow would explain: a surface darker than where the sun shines, or brighter than where it does not. As if these
+/// were noise, suns would be weak, and skies would shine in their place.
+const DOUBTED: f32 = 0.05;
+/// Least cosine between a normal and a sun at which there may be its shadow.
+const GRAZING: f32 = 0.02;
 /// How much the color of a point counts that no photograph in a light shows.
 const UNSHOWN: f32 = 0.03;
 /// How much a point tells of lights that lies on no plane.
@@ -118,6 +124,17 @@ impl Guess {
     /// Irradiance over π of a point.
     fn irradiance(&self, i: usize, place: &Place) -> Vec3 {
         self.sunlit[i] * Vec3::from_slice(&self.fitted.sun[3..]) + place.of_sky(&self.fitted.sky).max(Vec3::ZERO) + self.sent[i]
+    }
+
+    /// How much a point counts that should look like `got`: less where its traced shadow may be mistaken.
+    fn believed(&self, i: usize, place: &Place, got: Vec3, seen: Vec3) -> f32 {
+        let facing = place.facing(Vec3::from_slice(&self.fitted.sun));
+        if !self.has_sun() || facing < GRAZING {
+            return 1.0;
+        }
+        let reach = (self.sunlit[i] / facing).clamp(0.0, 1.0);
+        let is_darker = (seen - got).dot(LUMINANCE.into()) < 0.0;
+        1.0 - (1.0 - DOUBTED) * if is_darker { reach } else { 1.0 - reach }
     }
 }
 
@@ -224,7 +241,7 @@ fn settle(seen: &[Seen], surfaces: &mut Surfaces, guesses: &mut [Guess], times: 
         surfaces.albedos = explained(seen, surfaces, guesses, None);
         set_scale(guesses, &mut surfaces.albedos);
         let refit = |(l, g): (usize, &mut Guess)| {
-            let trusted = lit(seen, &surfaces.albedos, l, &g.sent, Some((g, TRUSTED)), &surfaces.points);
+            let trusted = lit(seen, &surfaces.albedos, l, &g.sent, Some((g, EXPLAINED)), &surfaces.points);
             g.fitted = solve(&trusted, &surfaces.points, &g.sunlit, Vec3::from_slice(&g.fitted.sun));
             if k % SENT_AGAIN == 0 {
                 let irradiance: Vec<Vec3> = surfaces.points.iter().enumerate().map(|(i, p)| g.irradiance(i, p)).collect();
@@ -245,8 +262,10 @@ fn misfit(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess]) -> f64 {
     let (mut sum, mut total) = (0.0, 1e-9);
     for (i, s) in seen.iter().enumerate() {
         for (l, (g, c)) in guesses.iter().zip(&s.colors).enumerate() {
-            let weight = s.counts(l) as f64;
-            sum += weight * (1.0 - trust(surfaces.albedos[i] * g.irradiance(i, &surfaces.points[i]), *c, TRUSTED).sqrt()) as f64;
+            let place = &surfaces.points[i];
+            let got = surfaces.albedos[i] * g.irradiance(i, place);
+            let weight = (s.counts(l) * g.believed(i, place, got, *c)) as f64;
+            sum += weight * (1.0 - trust(got, *c, TRUSTED).sqrt()) as f64;
             total += weight;
         }
     }
@@ -259,7 +278,7 @@ fn lit(seen: &[Seen], albedos: &[Vec3], light: usize, sent: &[Vec3], by: Option<
         let (albedo, color) = (albedos[i], s.colors[light]);
         let (got, trust) = by.map_or((color, 1.0), |(g, trusted)| {
             let got = albedo * g.irradiance(i, &places[i]);
-            (got, trust(got, color, trusted))
+            (got, trust(got, color, trusted) * g.believed(i, &places[i], got, color))
         });
         Lit { albedo, seen: color, sent: sent[i], trust: trust * s.tells(light), slope: slope(got, color) }
     };
@@ -277,8 +296,10 @@ fn explained(seen: &[Seen], surfaces: &Surfaces, guesses: &[Guess], left_out: Op
             if left_out == Some(l) && !is_only {
                 continue;
             }
-            let white = g.irradiance(i, &surfaces.points[i]);
-            let weight = slope(*c, *c).powf(2.0) * trust(before * white, *c, TRUSTED) * s.counts(l);
+            let place = &surfaces.points[i];
+            let white = g.irradiance(i, place);
+            let trusted = trust(before * white, *c, EXPLAINED) * g.believed(i, place, before * white, *c);
+            let weight = slope(*c, *c).powf(2.0) * trusted * s.counts(l);
             (a, b) = (a + weight * white * *c, b + weight * white * white);
         }
         (a / b).max(Vec3::ZERO)

@@ -76,6 +76,35 @@ fn suns_are_told_apart_and_an_overcast_sky_has_none() {
 }
 
 #[test]
+fn mistaken_shadows_do_not_make_suns_weak() {
+    let visibility = Visibility::of(&Tower, &Occupancy::new(64, 1, false), (0.0, 1.0), 64);
+    let places: Vec<(Vec3, Vec3, Vec3)> = places(2000).collect();
+    let surfaces = Surfaces::new(places.iter().map(|p| (p.0, p.1)), places.iter().map(|p| p.2).collect(), &visibility);
+    let sky: Vec<f32> = ShLight::uniform([0.2, 0.25, 0.35]).0.iter().flatten().map(|v| *v as f32).collect();
+    let towards = [Vec3::new(0.7, -0.5, 0.6), Vec3::new(-0.6, -0.6, 0.5), Vec3::new(0.1, -0.8, 0.9)].map(Vec3::normalize);
+    let suns = towards.map(|d| [d.x, d.y, d.z, 0.9, 0.8, 0.6]).into_iter().chain([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]);
+    let lights: Vec<([f32; SUN], Ambient)> = suns.map(|s| (s, surfaces.light(&visibility, &s, &sky))).collect();
+    let rng = Rng::new(6, 6);
+    let look = |(i, (place, (point, normal, albedo))): (usize, (&Place, &(Vec3, Vec3, Vec3)))| {
+        let color = |(l, (sun, ambient)): (usize, &([f32; SUN], Ambient))| {
+            // Things that no ray finds shade a third of what is in the sun.
+            let is_shaded = rng.uniform((8 * i + l) as u64) < 0.33;
+            let direct = place.sunlit(&visibility, Vec3::from_slice(sun)) * Vec3::from_slice(&sun[3..]);
+            *albedo * (if is_shaded { Vec3::ZERO } else { direct } + place.ambient(ambient))
+        };
+        let colors = lights.iter().enumerate().map(color).collect();
+        Seen { point: *point, normal: *normal, colors, shown: vec![true; lights.len()], is_flat: true }
+    };
+    let seen: Vec<Seen> = surfaces.points.iter().zip(&places).enumerate().map(look).collect();
+    let (found, _) = tell_apart(&seen, &visibility, &AtomicBool::new(false), &mut |_| {}).unwrap();
+    let share = |sun: &[f32], sky: &[f32]| sun[2] * gray(&sun[3..]) / gray(&level(sun, sky).to_array());
+    for (found, (sun, _)) in found.iter().zip(&lights) {
+        let (got, want) = (share(&found.sun, &found.sky), share(sun, &sky));
+        assert!((got - want).abs() < 0.08, "of the light of a level surface, {got} are the sun's instead of {want}");
+    }
+}
+
+#[test]
 fn the_sun_is_found_where_it_stands() {
     let visibility = Visibility::of(&Tower, &Occupancy::new(64, 1, false), (0.0, 1.0), 64);
     let (sun, power) = (Vec3::new(0.5, -0.6, 0.7).normalize(), Vec3::new(0.9, 0.8, 0.6));

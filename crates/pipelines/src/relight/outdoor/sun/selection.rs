@@ -11,7 +11,7 @@ const WEAK: f32 = 0.5;
 const FAINT: f32 = 0.05;
 /// Factor by which what is seen may be explained worse for every weak sun that is left out, and every other: what few photographs show of a
 /// place is explained badly by any light, and a strong sun of some then explains little more of all.
-const PER_WEAK_SUN: f64 = 1.03;
+const PER_WEAK_SUN: f64 = 1.1;
 const PER_SUN: f64 = 1.01;
 /// Times that lights settle once all suns are left out.
 const WITHOUT: usize = 3;

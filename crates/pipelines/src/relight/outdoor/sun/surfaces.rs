@@ -170,8 +170,13 @@ impl Place {
         self.of_sky(&ambient.sky).max(Vec3::ZERO) + self.sent(&ambient.radiosity)
     }
 
+    /// Cosine between the normal and a direction.
+    pub(super) fn facing(&self, toward: Vec3) -> f32 {
+        self.normal.dot(toward)
+    }
+
     pub(super) fn sunlit(&self, visibility: &Visibility, toward: Vec3) -> f32 {
-        let facing = self.normal.dot(toward);
+        let facing = self.facing(toward);
         if facing > 0.0 { self.share * facing * visibility.from_sun(self.point, self.normal, toward) } else { 0.0 }
     }
 
