@@ -349,9 +349,10 @@ impl SceneLoss<'_> {
                 let (value, slope) = huber(off, TRACED_WIDTH);
                 loss += (share * w.shadow * value) as f64;
                 d_values[3] += share * w.shadow * slope;
-                let (off, part) = (values[LEFT] - values[3], share * w.traced * l.reach[0]);
-                loss += (part * off * off) as f64;
-                d_values[LEFT] += 2.0 * part * off;
+                // The median: shade that no ray found must not darken what is in the sun.
+                let ((value, slope), part) = (huber(values[LEFT] - values[3], TRACED_WIDTH), share * w.traced * l.reach[0]);
+                loss += (part * value) as f64;
+                d_values[LEFT] += part * slope;
             }
         } else {
             let (want, weight) = ray.traced.map_or((1.0, w.shadow), |t| (t, w.traced));
