@@ -28,9 +28,10 @@ use std::time::Instant;
 /// Most training cameras that visibility is tested with.
 const CAMERAS: usize = 240;
 /// Cameras and pixels along the longer side of the views that tell the extent of the scene; shares of the points left out on either side,
-/// and the margin around the rest.
+/// and the margin around the rest. Beyond a second share, the extent grows by no more than so much of what lies between.
 const EXTENT: (usize, u32) = (48, 40);
 const STRAYS: f64 = 0.01;
+const OUTER: (f64, f64) = (0.05, 0.5);
 const MARGIN: f64 = 0.1;
 /// Fewest points that tell an extent.
 const FEWEST: usize = 100;
@@ -206,8 +207,13 @@ fn grid(field: &SurfaceField, frames: &[&Frame], o: &MeshOptions) -> Result<Grid
     let side = |k: usize| {
         let mut v: Vec<f64> = points.iter().map(|p| p[k]).collect();
         v.sort_by(f64::total_cmp);
-        let strays = (v.len() as f64 * STRAYS) as usize;
-        (v[strays], v[v.len() - 1 - strays])
+        let within = |share: f64| {
+            let left_out = (v.len() as f64 * share) as usize;
+            (v[left_out], v[v.len() - 1 - left_out])
+        };
+        let ((low, high), (inner_low, inner_high)) = (within(STRAYS), within(OUTER.0));
+        let most = OUTER.1 * (inner_high - inner_low);
+        (low.max(inner_low - most), high.min(inner_high + most))
     };
     let sides = [side(0), side(1), side(2)];
     let margin = MARGIN * sides.iter().map(|(a, b)| b - a).fold(1e-6, f64::max);
