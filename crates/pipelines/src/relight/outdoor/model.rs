@@ -5,7 +5,7 @@ use super::fields;
 use super::joint::{self, Joint};
 use super::shading::{LIGHT, SKY};
 use super::sun::{SUN, Surfaces};
-use super::visibility::{self, Ambient, Visibility};
+use super::visibility::{Ambient, Visibility};
 use crate::error::{PipelineError, Result};
 use crate::run::param_state::{self, entry};
 use diorama_data::checkpoint::{Checkpoint, Entry};
@@ -279,7 +279,7 @@ impl SceneModel {
         }
     }
 
-    /// Numbers of what stands around, as a checkpoint keeps them: solid cells, surfaces.
+    /// Numbers of what stands around, as a checkpoint keeps them: cells that hide light, surfaces.
     pub fn around(&self) -> Option<[Vec<f32>; 2]> {
         self.surroundings.as_ref().map(|a| [a.visibility.numbers(), a.surfaces.numbers()])
     }
@@ -395,7 +395,7 @@ impl SceneModel {
         let mut entries = param_state::entries(params(&mut self.field, &mut self.joint, tables));
         entries.extend([entry("occupancy", &self.occupancy.grid.density), entry("occupancy.fresh", &self.occupancy.grid.fresh)]);
         entries.extend([entry("flat", &self.flat), entry("sent", &self.sent)]);
-        entries.extend(around.iter().flat_map(|a| ["solid", "surfaces"].into_iter().zip(a)).map(|(name, v)| entry(name, v)));
+        entries.extend(around.iter().flat_map(|a| ["cells", "surfaces"].into_iter().zip(a)).map(|(name, v)| entry(name, v)));
         (entries, metadata)
     }
 
@@ -431,12 +431,15 @@ impl SceneModel {
             joint.anneal(&mut self.field, self.origin.step);
         }
         if is_light {
-            let solid = tensor(&mut c, "solid", file)?;
-            let cells = self.config.light.sun_cells;
-            if solid.len() != visibility::numbers_len(cells) {
-                return Err(PipelineError::Usage(format!("{}: solid does not have {cells} cells per axis", file.display())));
-            }
-            let mut visibility = Visibility::from_numbers(&solid, self.shaded_cube(), cells);
+            let (cube, cells) = (self.shaded_cube(), self.config.light.sun_cells);
+            // Runs of before cells had depths knew which are solid.
+            let found = match c.take("solid") {
+                Some(bits) => Visibility::from_bits(&bits, cube, cells),
+                None => Visibility::from_numbers(&tensor(&mut c, "cells", file)?, cube, cells),
+            };
+            let Some(mut visibility) = found else {
+                return Err(PipelineError::Usage(format!("{}: what hides light does not have {cells} cells per axis", file.display())));
+            };
             // Runs of before rays could begin higher have none.
             if c.metadata.contains_key("lift_bits") {
                 visibility = visibility.lifted_by(f32::from_bits(number(&c, "lift_bits", file)?));

@@ -37,6 +37,8 @@ const BRIGHTEST: f32 = 0.9;
 const SOLID: f32 = 0.5;
 /// Difference from the traced shadow up to which the square counts.
 const TRACED_WIDTH: f32 = 0.1;
+/// Quantile that is learned of what arrives from suns whose traced rays pass.
+const QUANTILE: f32 = 0.7;
 /// Value in sRGB from which a photograph may be clipped.
 const CLIPPED: f32 = 0.99;
 /// Natural logarithm of the linear colors of two pixels up to which they look alike, and color below which that says nothing.
@@ -349,8 +351,10 @@ impl SceneLoss<'_> {
                 let (value, slope) = huber(off, TRACED_WIDTH);
                 loss += (share * w.shadow * value) as f64;
                 d_values[3] += share * w.shadow * slope;
-                // The median: shade that no ray found must not darken what is in the sun.
-                let ((value, slope), part) = (huber(values[LEFT] - values[3], TRACED_WIDTH), share * w.traced * l.reach[0]);
+                // A high quantile: shade that no ray found must not darken what is in another sun.
+                let (value, slope) = huber(values[LEFT] - values[3], TRACED_WIDTH);
+                let side = if slope < 0.0 { 2.0 * QUANTILE } else { 2.0 * (1.0 - QUANTILE) };
+                let part = share * w.traced * l.reach[0] * side;
                 loss += (part * value) as f64;
                 d_values[LEFT] += part * slope;
             }

@@ -4,20 +4,16 @@ use diorama_engine::fields::DensityQuery;
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
-use diorama_kernels::ops::march::OccupancyBits;
 use rayon::prelude::*;
+
+mod cells;
+
+use cells::Cells;
 
 /// Cells per axis of the grid that holds what surfaces send.
 pub const OPEN_CELLS: usize = 64;
 /// Sides of a cell that send light of their own: ground and the wall that stands on it do not look alike.
 pub const SIDES: usize = 6;
-/// Cells per axis of the blocks that shadow rays skip where nothing is solid.
-const BLOCK: usize = 8;
-/// Share of a cell that must be opaque for it to be solid.
-const SOLID: f32 = 0.5;
-/// Optical depth of a solid cell, and beyond which nothing passes.
-const DEPTH: f32 = 2.0;
-const OPAQUE: f32 = 6.0;
 /// Cells above its surface at which what a ray meets begins to count: the least, and more where surfaces are noisy; and how many times as far
 /// along the ray that is at most.
 const LIFTS: [f32; 3] = [1.0, 2.0, 3.0];
@@ -26,15 +22,11 @@ const FARTHEST: f32 = 8.0;
 const OWN: f32 = 3.0;
 const OWN_HIDES: f32 = 0.5;
 const OWN_FACING: f32 = 0.1;
-/// Share of rays that may meet their own surface, as rough ones do, before rays begin higher; and then that may still do so.
-const ROUGH: f32 = 0.2;
-const SMOOTH: f32 = 0.05;
+/// Share of rays that may meet their own surface, and share of those that do from the lowest beginning that may be left at the highest.
+const SMOOTH: f32 = 0.08;
+const HELPED: f32 = 0.5;
 /// Directions of these rays.
 const TRIED: usize = 64;
-/// Length of a step in cells.
-const STEP: f32 = 0.7;
-/// Bits in a number of a checkpoint.
-const PACKED: usize = 16;
 /// Share of the light of a direction from which surfaces in it matter.
 const SEEN: f32 = 0.05;
 /// Turn between directions in which points look, and least cosines of them to the normal, and of those by which light changes with the normal.
@@ -46,17 +38,9 @@ pub const GROUND: u32 = u32::MAX;
 /// From irradiance over π to radiance, by band of the spherical harmonics.
 const RADIANCE: [f32; 9] = [1.0, 1.5, 1.5, 1.5, 4.0, 4.0, 4.0, 4.0, 4.0];
 
-/// Solid cells `[n³]` of a cube in model space, x fastest, and what is seen between them.
+/// What hides light, and where rays from surfaces begin.
 pub struct Visibility {
-    low: f32,
-    size: f32,
-    n: usize,
-    /// One bit per cell.
-    solid: Vec<u64>,
-    /// The same of cells from whose center on to the next centers something is solid.
-    near: Vec<u64>,
-    /// Whether something in a block, or next to it, is solid.
-    blocks: Vec<bool>,
+    cells: Cells,
     /// Of [`LIFTS`].
     lift: f32,
 }
@@ -101,137 +85,48 @@ pub struct Gathered {
     pub open: f32,
 }
 
-/// Length of [`Visibility::numbers`] for `n` cells per axis.
-pub fn numbers_len(n: usize) -> usize {
-    n.pow(3).div_ceil(PACKED)
-}
-
 impl Visibility {
-    /// Cells of a cube (lowest corner and edge) in which a field is dense and its occupancy grid agrees.
-    pub fn of(field: &dyn DensityQuery, occupancy: &Occupancy, (low, size): (f32, f32), n: usize) -> Visibility {
-        let cell = size / n as f32;
-        let mut solid = vec![0u64; n.pow(3).div_ceil(64)];
-        for z in 0..n {
-            let at = |i: usize| [i % n, i / n, z].map(|k| low + (k as f32 + 0.5) * cell);
-            let live: Vec<usize> = (0..n * n).into_par_iter().filter(|i| is_occupied(occupancy.bits(), at(*i))).collect();
-            let corner = |p: [f32; 3], k: usize| [0, 1, 2].map(|a| p[a] + cell * (0.5 * (k >> a & 1) as f32 - 0.25));
-            let points: Vec<f32> = live.iter().flat_map(|i| (0..8).map(move |k| (*i, k))).flat_map(|(i, k)| corner(at(i), k)).collect();
-            let mut sigma = vec![0.0; points.len() / 3];
-            field.density(&points, &mut sigma);
-            for (i, s) in live.iter().zip(sigma.chunks_exact(8)) {
-                let opaque = s.iter().map(|s| 1.0 - (-s * cell).exp()).sum::<f32>() / 8.0;
-                let at = z * n * n + i;
-                solid[at / 64] |= ((opaque > SOLID) as u64) << (at % 64);
-            }
-        }
-        Visibility::new(solid, (low, size), n)
+    /// What a field holds in a cube (lowest corner and edge) where its occupancy grid agrees, in `n` cells per axis.
+    pub fn of(field: &dyn DensityQuery, occupancy: &Occupancy, cube: (f32, f32), n: usize) -> Visibility {
+        Visibility::new(Cells::of(field, occupancy, cube, n))
     }
 
-    /// The same from [`Visibility::numbers`].
-    pub fn from_numbers(numbers: &[f32], cube: (f32, f32), n: usize) -> Visibility {
-        let mut solid = vec![0u64; n.pow(3).div_ceil(64)];
-        numbers.iter().enumerate().for_each(|(i, v)| solid[PACKED * i / 64] |= (*v as u64) << (PACKED * i % 64));
-        Visibility::new(solid, cube, n)
+    /// The same from [`Visibility::numbers`]; none where these are not of `n` cells per axis.
+    pub fn from_numbers(numbers: &[f32], cube: (f32, f32), n: usize) -> Option<Visibility> {
+        Cells::from_numbers(numbers, cube, n).map(Visibility::new)
     }
 
-    /// Solid cells as numbers that a checkpoint keeps, 16 to each.
+    /// Of runs that knew only solid and empty cells.
+    pub fn from_bits(numbers: &[f32], cube: (f32, f32), n: usize) -> Option<Visibility> {
+        Cells::from_bits(numbers, cube, n).map(Visibility::new)
+    }
+
+    /// Cells as numbers that a checkpoint keeps.
     pub fn numbers(&self) -> Vec<f32> {
-        (0..numbers_len(self.n)).map(|i| (self.solid[PACKED * i / 64] >> (PACKED * i % 64) & 0xffff) as f32).collect()
+        self.cells.numbers()
     }
 
-    fn new(solid: Vec<u64>, (low, size): (f32, f32), n: usize) -> Visibility {
-        let edge = n.div_ceil(BLOCK);
-        let (mut blocks, mut near) = (vec![false; edge.pow(3)], vec![0u64; solid.len()]);
-        let set = solid
-            .iter()
-            .enumerate()
-            .filter(|w| *w.1 != 0)
-            .flat_map(|(w, bits)| (0..64).filter(move |b| bits >> b & 1 == 1).map(move |b| 64 * w + b));
-        for i in set {
-            let at = [i % n, i / n % n, i / n / n];
-            // Interpolation reaches one cell far.
-            for k in 0..8 {
-                let b = [0, 1, 2].map(|a| (if k >> a & 1 == 0 { at[a].saturating_sub(1) } else { (at[a] + 1).min(n - 1) }) / BLOCK);
-                blocks[(b[2] * edge + b[1]) * edge + b[0]] = true;
-                let c = [0, 1, 2].map(|a| at[a].saturating_sub(k >> a & 1));
-                let c = (c[2] * n + c[1]) * n + c[0];
-                near[c / 64] |= 1 << (c % 64);
-            }
-        }
-        Visibility { low, size, n, solid, near, blocks, lift: LIFTS[0] }
-    }
-
-    fn cell(&self) -> f32 {
-        self.size / self.n as f32
-    }
-
-    fn is_solid(&self, i: usize) -> bool {
-        self.solid[i / 64] >> (i % 64) & 1 == 1
-    }
-
-    /// How solid a point is, 0 to 1, interpolated between the centers of cells; `at` is in cells.
-    fn solidity(&self, at: Vec3) -> f32 {
-        let p = at - 0.5;
-        let (base, f) = (p.floor(), p - p.floor());
-        let n = self.n as i32;
-        let at = [base.x, base.y, base.z].map(|v| v.max(0.0) as usize);
-        let at = (at[2] * self.n + at[1]) * self.n + at[0];
-        if self.near[at / 64] >> (at % 64) & 1 == 0 {
-            return 0.0;
-        }
-        let get = |k: i32| {
-            let q = [base.x as i32 + (k & 1), base.y as i32 + (k >> 1 & 1), base.z as i32 + (k >> 2)].map(|v| v.clamp(0, n - 1));
-            self.is_solid(((q[2] * n + q[1]) * n + q[0]) as usize) as u8 as f32
-        };
-        let along = |k: i32| get(k) * (1.0 - f.x) + get(k + 1) * f.x;
-        (along(0) * (1.0 - f.y) + along(2) * f.y) * (1.0 - f.z) + (along(4) * (1.0 - f.y) + along(6) * f.y) * f.z
-    }
-
-    /// Share of light that passes from a point in cells toward a direction, and where it first meets something.
-    fn pass(&self, from: Vec3, dir: Vec3) -> (f32, Vec3) {
-        let (edge, n) = (self.n.div_ceil(BLOCK), self.n as f32);
-        let (mut at, mut depth, mut first) = (from, 0.0, None);
-        while at.min_element() >= 0.0 && at.max_element() < n {
-            let b = [at.x, at.y, at.z].map(|v| v as usize / BLOCK);
-            if self.blocks[(b[2] * edge + b[1]) * edge + b[0]] {
-                let more = STEP * DEPTH * self.solidity(at);
-                if more > 0.0 {
-                    first = first.or(Some(at));
-                }
-                depth += more;
-                if depth > OPAQUE {
-                    return (0.0, first.unwrap_or(at));
-                }
-                at += dir * STEP;
-                continue;
-            }
-            // To the block's far side.
-            let low = Vec3::from(b.map(|v| (v * BLOCK) as f32));
-            let far = Vec3::select(dir.cmpgt(Vec3::ZERO), low + BLOCK as f32, low);
-            let t = (far - at) / dir;
-            let leave = [t.x, t.y, t.z].into_iter().filter(|t| t.is_finite()).fold(f32::INFINITY, f32::min);
-            at += dir * (leave.max(0.0) + 0.01);
-        }
-        ((-depth).exp(), first.unwrap_or(at))
+    fn new(cells: Cells) -> Visibility {
+        Visibility { cells, lift: LIFTS[0] }
     }
 
     /// Beginning in cells of a ray from a surface: on the ray, not beside it, where shadows would be shifted.
     fn lifted(&self, point: Vec3, normal: Vec3, direction: Vec3, facing: f32) -> Vec3 {
         let along = self.lift * (1.0 / facing.max(1e-3)).min(FARTHEST);
-        (point - self.low) / self.cell() + along * direction + (self.lift - along * facing) * normal
+        self.cells.at(point) + along * direction + (self.lift - along * facing) * normal
     }
 
     /// Lets rays from surfaces, given by points and normals, begin as high as it takes: distances that are learned from few or small photographs
-    /// are off by more than a cell, and walls would shadow themselves. Where no height takes it, surfaces are rough, and rays begin low.
+    /// are off by more than a cell, and walls would shadow themselves. Where that helps little, surfaces are rough, and rays begin low.
     pub fn lift_from(&mut self, surfaces: &[(Vec3, Vec3)]) {
-        let mut own_hits = |lift: f32| {
+        let hits = LIFTS.map(|lift| {
             self.lift = lift;
             self.own_hits(surfaces)
-        };
-        let is_noisy = own_hits(LIFTS[0]) > ROUGH && LIFTS[1..].iter().any(|lift| own_hits(*lift) <= SMOOTH);
-        if !is_noisy {
-            self.lift = LIFTS[0];
-        }
+        });
+        let is_enough = |i: &usize| hits[*i] <= SMOOTH;
+        let highest = LIFTS.len() - 1;
+        let helps = hits[highest] <= HELPED * hits[0];
+        self.lift = LIFTS[(0..LIFTS.len()).find(is_enough).unwrap_or(if helps { highest } else { 0 })];
     }
 
     /// Share of rays toward the sky that meet their own surface.
@@ -242,7 +137,7 @@ impl Visibility {
             let facing = normal.dot(direction);
             (direction.z > 0.0 && facing > OWN_FACING).then(|| {
                 let from = self.lifted(*point, *normal, direction, facing);
-                let (passes, first) = self.pass(from, direction);
+                let (passes, first) = self.cells.pass(from, direction);
                 1.0 - passes > OWN_HIDES && (first - from).length() < OWN
             })
         };
@@ -262,7 +157,7 @@ impl Visibility {
 
     /// Share of the light from a direction that reaches a surface.
     pub fn from_sun(&self, point: Vec3, normal: Vec3, direction: Vec3) -> f32 {
-        self.pass(self.lifted(point, normal, direction, normal.dot(direction).max(0.0)), direction).0
+        self.cells.pass(self.lifted(point, normal, direction, normal.dot(direction).max(0.0)), direction).0
     }
 
     /// What a surface sees in `n` directions whose density is the cosine over π; which they are depends on the point and a seed.
@@ -270,13 +165,13 @@ impl Visibility {
         let (a, b) = normal.any_orthonormal_pair();
         let bits = point.to_array().iter().fold(seed ^ 0x9e37_79b9, |h, v| (h ^ v.to_bits()).wrapping_mul(0x85eb_ca6b).rotate_left(13));
         let (turn, shift) = ((bits & 0xffff) as f32 / 65_536.0, (bits >> 16) as f32 / 65_536.0);
-        let edge = self.n as f32 / OPEN_CELLS as f32;
+        let edge = self.cells.n as f32 / OPEN_CELLS as f32;
         (0..n).map(move |i| {
             let square = (i as f32 + shift) / n as f32;
             let (y, x) = (std::f32::consts::TAU * (turn + i as f32 * GOLDEN)).sin_cos();
             let facing = (1.0 - square).max(LEAST_FACING * LEAST_FACING).sqrt();
             let direction = square.sqrt() * (x * a + y * b) + facing * normal;
-            let (passes, first) = self.pass(self.lifted(point, normal, direction, facing), direction);
+            let (passes, first) = self.cells.pass(self.lifted(point, normal, direction, facing), direction);
             let (open, cell) = if passes > SEEN && direction.z < 0.0 { (0.0, GROUND) } else { (passes, self.open_cell(first / edge)) };
             Look { direction, facing, passes, open, cell }
         })
@@ -295,7 +190,7 @@ impl Visibility {
 
     /// The cell of `[OPEN_CELLS³]` in which a point of model space lies.
     pub fn cell_of(&self, point: Vec3) -> u32 {
-        self.open_cell((point - self.low) * (OPEN_CELLS as f32 / self.size))
+        self.open_cell((point - self.cells.low) * (OPEN_CELLS as f32 / self.cells.size))
     }
 }
 
@@ -374,20 +269,6 @@ pub fn spread(i: usize, n: usize) -> DVec3 {
     let z = 1.0 - 2.0 * (i as f64 + 0.5) / n as f64;
     let (r, turn) = ((1.0 - z * z).sqrt(), i as f64 * 2.399_963_229_728_653);
     DVec3::new(r * turn.cos(), r * turn.sin(), z)
-}
-
-/// Whether an occupancy grid holds a point to be occupied.
-fn is_occupied(bits: &OccupancyBits, p: [f32; 3]) -> bool {
-    let n = bits.resolution;
-    for c in 0..bits.cascades {
-        let (low, size) = OccupancyBits::cube(c);
-        let at = p.map(|v| (v - low) / size);
-        if at.iter().all(|v| (0.0..1.0).contains(v)) {
-            let [x, y, z] = at.map(|v| (v * n as f32) as usize);
-            return bits.get(((c * n + z) * n + y) * n + x);
-        }
-    }
-    false
 }
 
 #[cfg(test)]
