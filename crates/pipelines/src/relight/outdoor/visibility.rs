@@ -119,14 +119,17 @@ impl Visibility {
     /// Lets rays from surfaces, given by points and normals, begin as high as it takes: distances that are learned from few or small photographs
     /// are off by more than a cell, and walls would shadow themselves. Where that helps little, surfaces are rough, and rays begin low.
     pub fn lift_from(&mut self, surfaces: &[(Vec3, Vec3)]) {
-        let hits = LIFTS.map(|lift| {
+        let mut hits = [0.0; LIFTS.len()];
+        for (hits, lift) in hits.iter_mut().zip(LIFTS) {
             self.lift = lift;
-            self.own_hits(surfaces)
-        });
-        let is_enough = |i: &usize| hits[*i] <= SMOOTH;
-        let highest = LIFTS.len() - 1;
-        let helps = hits[highest] <= HELPED * hits[0];
-        self.lift = LIFTS[(0..LIFTS.len()).find(is_enough).unwrap_or(if helps { highest } else { 0 })];
+            *hits = self.own_hits(surfaces);
+            if *hits <= SMOOTH {
+                return;
+            }
+        }
+        if hits[LIFTS.len() - 1] > HELPED * hits[0] {
+            self.lift = LIFTS[0];
+        }
     }
 
     /// Share of rays toward the sky that meet their own surface.

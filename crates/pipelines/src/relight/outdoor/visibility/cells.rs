@@ -68,6 +68,7 @@ impl Cells {
 
     /// The same from [`Cells::numbers`]; none where these are not of `n` cells per axis.
     pub fn from_numbers(numbers: &[f32], cube: (f32, f32), n: usize) -> Option<Cells> {
+        let (_, numbers) = numbers.split_first().filter(|(first, _)| **first == n as f32)?;
         let mut cells = Cells::empty(cube, n);
         for block in numbers.chunks(1 + IN_BLOCK / PACKED) {
             let place = cells.places.get_mut(block[0] as usize).filter(|p| block.len() == 1 + IN_BLOCK / PACKED && **p == NOWHERE)?;
@@ -86,14 +87,14 @@ impl Cells {
         (numbers.len() == n.pow(3).div_ceil(BITS)).then(|| cells.finished())
     }
 
-    /// The blocks that are kept as numbers of a checkpoint, `[blocks, 257]`: which block, then its cells, two to a number.
+    /// Cells per axis and the blocks that are kept as numbers of a checkpoint, `1 + [blocks, 257]`: which block, then its cells, two to a number.
     pub fn numbers(&self) -> Vec<f32> {
         let kept = self.places.iter().enumerate().filter(|(_, p)| **p != NOWHERE);
         let of = |(b, p): (usize, &u32)| {
             let cells = self.depths[IN_BLOCK * *p as usize..][..IN_BLOCK].chunks_exact(PACKED);
             std::iter::once(b as f32).chain(cells.map(|c| u16::from_le_bytes([c[0], c[1]]) as f32))
         };
-        kept.flat_map(of).collect()
+        std::iter::once(self.n as f32).chain(kept.flat_map(of)).collect()
     }
 
     /// A block of a cell, and the cell's index in it.
@@ -132,14 +133,9 @@ impl Cells {
         self
     }
 
-    /// Edge of a cell.
-    pub fn edge(&self) -> f32 {
-        self.size / self.n as f32
-    }
-
     /// A point of model space in cells.
     pub fn at(&self, point: Vec3) -> Vec3 {
-        (point - self.low) / self.edge()
+        (point - self.low) * (self.n as f32 / self.size)
     }
 
     /// Optical depth of a cell's edge at a point, interpolated between the centers of cells; `at` is in cells.
@@ -228,7 +224,8 @@ mod tests {
             assert_eq!(back.depth(center), cells.depth(center));
         }
         assert!(Cells::from_numbers(&numbers[..300], (-1.0, 2.0), 20).is_none());
-        assert!(Cells::from_numbers(&numbers, (-1.0, 2.0), 9).is_none());
+        // As many blocks per axis, and more.
+        assert!([24, 40].into_iter().all(|n| Cells::from_numbers(&numbers, (-1.0, 2.0), n).is_none()));
     }
 
     #[test]
