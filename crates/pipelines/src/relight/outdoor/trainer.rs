@@ -33,29 +33,28 @@ const SKY_RAYS: usize = 4000;
 const HIGHEST: usize = 10;
 /// Steps during which an occupancy sample stands for a block of cells, and that block's edge.
 const OCCUPANCY_WARMUP: (u64, usize) = (256, 2);
-/// Steps between which the number of rays grows to what is wanted, and their number at most.
-const BATCH_RAMP: (u64, u64) = (256, 1024);
+/// Factor of the wanted samples in the first steps, their number and their share of the surfaces' stage at most, and most rays of a step:
+/// what is thin is found then or never, as space that is taken for empty is not looked at again.
+const FIRST: (f64, u64, f32) = (8.0, 400, 0.15);
 const MOST_RAYS: usize = 16_384;
 /// How much longer a march's steps are at first, and until which step.
 const MARCH_RAMP: (f32, u64) = (16.0, 1024);
 /// Steps in which the distortion's weight grows.
 const DISTORTION_RAMP: u64 = 2000;
-/// Times that surfaces are flattened in their stage, and pixels that then tell distances.
-const FLATTENED: u64 = 3;
-const FLAT_PIXELS: usize = 100_000;
 /// Steps before robust weights begin, and normals bend.
 const SETTLED: u64 = 200;
 
 mod at_once;
+mod distances;
 mod light;
 
 /// A model in training.
 pub(super) struct Trainer<'a> {
     pub model: SceneModel,
     photographs: StoredPhotographs,
-    /// Pixels of known distance: those that were given, then those of flat surfaces.
+    /// Pixels of known distance: those that were given, and those that are observed.
+    given: Vec<Observation>,
     observations: Vec<Observation>,
-    given: usize,
     cameras: Vec<PosedCamera>,
     device: Device,
     batch: RayBatch,
@@ -83,7 +82,7 @@ impl<'a> Trainer<'a> {
     pub fn new(
         mut model: SceneModel,
         photographs: StoredPhotographs,
-        observations: Vec<Observation>,
+        given: Vec<Observation>,
         checkpoints: &'a Path,
     ) -> Result<Trainer<'a>> {
         let (cameras, scene) = (model.cameras(), model.scene());
@@ -95,12 +94,11 @@ impl<'a> Trainer<'a> {
         let mut device = Device::cpu(None);
         let occupancy = Some(&mut model.occupancy);
         device.begin(&Trainees { occupancy, ..Trainees::of(&mut model.field) }, scene, None)?;
-        let given = observations.len();
         let mut trainer = Trainer {
             model,
             photographs,
-            observations,
             given,
+            observations: Vec::new(),
             cameras,
             device,
             batch: RayBatch::default(),
@@ -111,30 +109,8 @@ impl<'a> Trainer<'a> {
             ambients,
             stepper: Stepper::default(),
         };
-        trainer.observe_flat();
+        trainer.observe();
         Ok(trainer)
-    }
-
-    /// Flattens what is nearly flat if that is due: from then on, distances to planes through the surfaces are observed.
-    fn flatten(&mut self, share: f32, events: &mut dyn FnMut(&Event)) {
-        let due = (share * (FLATTENED + 1) as f32) as u64;
-        if due.min(FLATTENED) <= self.model.flattened || self.model.config.loss.depth == 0.0 {
-            return;
-        }
-        self.model.flattened = due;
-        events(&Event::Preparing { what: "flattening surfaces", share: due as f64 / FLATTENED as f64 });
-        let flat = NormalMaps::of_some(&self.model, &self.cameras, due as usize).observations(FLAT_PIXELS);
-        self.model.flat = flat.iter().flat_map(|o| [o.image as f32, o.x as f32, o.y as f32, o.distance]).collect();
-        self.observe_flat();
-    }
-
-    fn observe_flat(&mut self) {
-        self.observations.truncate(self.given);
-        let near = self.model.config.sampling.near;
-        let flat = self.model.flat.chunks_exact(4).filter(|f| f[3] > near);
-        let observed = flat.map(|f| Observation { image: f[0] as u32, x: f[1] as u32, y: f[2] as u32, distance: f[3] });
-        let photographs = &self.photographs;
-        self.observations.extend(observed.filter(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y)));
     }
 
     /// Shows the model in the viewer.
@@ -142,21 +118,21 @@ impl<'a> Trainer<'a> {
         self.view.into_iter().for_each(|v| v.show_model(self.model.for_rendering()));
     }
 
-    /// Rays of a step: as many as give about the wanted number of samples, fewer at first.
-    fn rays(&self, step: u64) -> usize {
+    /// Rays of a step at a share of the surfaces' stage: as many as give about the wanted number of samples, more at first.
+    fn rays(&self, step: u64, share: f32) -> usize {
         let s = &self.model.config.sampling;
         if s.rays > 0 {
             return s.rays;
         }
-        let (from, until) = BATCH_RAMP;
-        let grown = step.saturating_sub(from) as f64 / (until - from) as f64;
-        let n = s.batch_samples as f64 * (0.25 + 0.75 * grown.min(1.0)) / self.model.samples_per_ray.max(1.0);
+        let (more, steps, at_most) = FIRST;
+        let factor = if step < steps && share < at_most { more } else { 1.0 };
+        let n = factor * s.batch_samples as f64 / self.model.samples_per_ray.max(1.0);
         (n as usize).clamp(64, MOST_RAYS).next_multiple_of(64)
     }
 
-    /// Fills the batch with random training pixels.
+    /// Fills the batch with random training pixels, of the light's stage.
     fn draw(&mut self, step: u64) {
-        let rays = self.rays(step);
+        let rays = self.rays(step, 1.0);
         let m = &self.model;
         let rng = Rng::new(m.config.seed, PIXELS);
         let (near, cube) = (m.config.sampling.near, m.cube());
@@ -205,10 +181,10 @@ impl Trainer<'_> {
         let terms = Terms {
             color: ColorLoss::Huber(m.config.loss.huber),
             distortion: m.config.loss.distortion * (step as f32 / DISTORTION_RAMP as f32).min(1.0),
-            depth: m.config.loss.depth,
+            depth: if self.observations.is_empty() { 0.0 } else { m.config.loss.depth },
             alpha: 0.0,
         };
-        let rays = RaySource::Photographs { count: self.rays(step), rng: of(PIXELS) };
+        let rays = RaySource::Photographs { count: self.rays(step, share), rng: of(PIXELS) };
         let placement = Placement::Occupancy { march, pruning: m.pruning() };
         let described = Step {
             backdrop: Backdrop::Random(of(BACKGROUND)),
@@ -345,7 +321,7 @@ impl Trainee for Trainer<'_> {
         }
         fresh.rate_scale = 0.3 * self.model.rate_scale;
         self.model = fresh;
-        self.observe_flat();
+        self.observe();
         self.ambients = self.model.ambients();
         self.normals = surface_normals(&self.model, &self.cameras);
         Ok(Some((self.model.origin.step, "the loss was not finite; the rate is lowered".into())))

@@ -1,0 +1,71 @@
+//! Distances that are taken as observed in the surfaces' stage: of planes through what is learned by then, and of what comparing photographs tells.
+
+use super::super::normal_maps::NormalMaps;
+use super::Trainer;
+use diorama_engine::fields::FieldBuffers;
+use diorama_engine::renderers::volume::{Quality, Tracer};
+use diorama_engine::samplers::RayBatch;
+use diorama_engine::samplers::pixels::{self, Observation, PixelSource};
+use diorama_engine::train::Event;
+
+/// Times that surfaces are flattened in their stage, and pixels that then tell distances.
+const FLATTENED: u64 = 3;
+const FLAT_PIXELS: usize = 100_000;
+/// Error of a color over the median from which a pixel shows something else than the surface that is found there.
+const EXPLAINED: f32 = 2.5;
+
+impl Trainer<'_> {
+    /// Flattens what is nearly flat if that is due: from then on, distances to planes through the surfaces are observed, and those that
+    /// were given. Neither is where a photograph shows another color than the surface found there: something thin stands before it, which
+    /// would never be learned. For the same reason, nothing is observed before surfaces are flattened first.
+    pub(super) fn flatten(&mut self, share: f32, events: &mut dyn FnMut(&Event)) {
+        let due = (share * (FLATTENED + 1) as f32) as u64;
+        if due.min(FLATTENED) <= self.model.flattened || self.model.config.loss.depth == 0.0 {
+            return;
+        }
+        self.model.flattened = due;
+        events(&Event::Preparing { what: "flattening surfaces", share: due as f64 / FLATTENED as f64 });
+        let mut all = NormalMaps::of_some(&self.model, &self.cameras, due as usize).observations(FLAT_PIXELS);
+        all.extend(&self.given);
+        let errors = self.errors(&all);
+        let mut sorted = errors.clone();
+        let median = if sorted.is_empty() { 0.0 } else { *sorted.select_nth_unstable_by(errors.len() / 2, f32::total_cmp).1 };
+        let explained = all.iter().zip(&errors).filter(|(_, e)| **e <= EXPLAINED * median).map(|(o, _)| o);
+        self.model.flat = explained.flat_map(|o| [o.image as f32, o.x as f32, o.y as f32, o.distance]).collect();
+        self.observe();
+    }
+
+    /// Greatest difference, over the channels, between what is learned and the photographs at pixels; after the image, whose order is that
+    /// of the first of its pixels.
+    fn errors(&self, pixels: &[Observation]) -> Vec<f32> {
+        let (m, mut errors) = (&self.model, vec![0.0; pixels.len()]);
+        let mut order: Vec<usize> = (0..pixels.len()).collect();
+        order.sort_by_key(|i| pixels[*i].image);
+        let (mut batch, mut buffers) = (RayBatch::default(), FieldBuffers::default());
+        for of_image in order.chunk_by(|a, b| pixels[*a].image == pixels[*b].image) {
+            let image = pixels[of_image[0]].image;
+            batch.resize(of_image.len());
+            for (r, i) in of_image.iter().enumerate() {
+                (batch.images[r], batch.jitter[r]) = (image, 0.5);
+                batch.pixels[2 * r..2 * r + 2].copy_from_slice(&[pixels[*i].x, pixels[*i].y].map(|v| v as f32 + 0.5));
+            }
+            pixels::rays(&self.cameras, m.config.sampling.near, m.cube(), &mut batch);
+            let tracer = Tracer { appearance: Some(image), ..m.tracer(Quality::Full) };
+            let traced = tracer.trace_layers(&mut batch, &[], &mut buffers);
+            for (color, i) in traced.rgb.chunks_exact(3).zip(of_image) {
+                let shown = self.photographs.rgba(image as usize, pixels[*i].x, pixels[*i].y);
+                errors[*i] = color.iter().zip(shown).map(|(c, s)| (c - s).abs()).fold(0.0, f32::max);
+            }
+        }
+        errors
+    }
+
+    /// Observes the model's distances.
+    pub(super) fn observe(&mut self) {
+        let near = self.model.config.sampling.near;
+        let known = self.model.flat.chunks_exact(4).filter(|f| f[3] > near);
+        let observed = known.map(|f| Observation { image: f[0] as u32, x: f[1] as u32, y: f[2] as u32, distance: f[3] });
+        let photographs = &self.photographs;
+        self.observations = observed.filter(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y)).collect();
+    }
+}
