@@ -227,7 +227,7 @@ pub fn color(values: &[f32], opacity: f32, dir: &[f32], light: &[f32], sky: &[f3
     let rgb = std::array::from_fn(|k| values[k] * irradiance[k] + (1.0 - opacity) * s.sky[k].max(0.0));
     let shadow = match sunlit {
         Some(_) if opacity < FAINT => 1.0,
-        Some(l) => arriving(l.sun, [l.arrives(values), l.reach[1]], &s.normal, s.lit, Vec3::ZERO),
+        Some(l) => l.share(&s.normal, values, light, s.lit),
         None => values[3],
     };
     RayColor { rgb, irradiance, shadow }
@@ -347,14 +347,14 @@ impl SceneLoss<'_> {
             d_values[LEFT] += 2.0 * share * w.shadow * off;
             // Of what faces no sun, photographs tell nothing.
             if ray.opacity > SOLID && unhidden(l.sun, &ray.normal) != Vec3::ZERO {
-                let off = values[3] - (1.0 - ray.opacity * (1.0 - l.reach[0]));
+                let off = values[3] - (1.0 - ray.opacity * (1.0 - l.reach));
                 let (value, slope) = huber(off, TRACED_WIDTH);
                 loss += (share * w.shadow * value) as f64;
                 d_values[3] += share * w.shadow * slope;
                 // A high quantile: shade that no ray found must not darken what is in another sun.
                 let (value, slope) = huber(values[LEFT] - values[3], TRACED_WIDTH);
                 let side = if slope < 0.0 { 2.0 * QUANTILE } else { 2.0 * (1.0 - QUANTILE) };
-                let part = share * w.traced * l.reach[0] * side;
+                let part = share * w.traced * l.reach * side;
                 loss += (part * value) as f64;
                 d_values[LEFT] += part * slope;
             }

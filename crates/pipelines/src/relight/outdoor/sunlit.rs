@@ -11,11 +11,11 @@ pub const FAINT: f32 = 0.05;
 /// Length below which a vector has no direction.
 pub(super) const SHORTEST: f32 = 1e-12;
 
-/// Sun of a surface point, the shares of its light and the sky's that reach the point, and light from sky and surfaces.
+/// Sun of a surface point, the share of its light that reaches the point, and light from sky and surfaces.
 #[derive(Clone, Copy)]
 pub struct Sunlit<'a> {
     pub sun: &'a [f32],
-    pub reach: [f32; 2],
+    pub reach: f32,
     /// Whether it is the sun of a light of training.
     pub is_learned: bool,
     pub ambient: Gathered,
@@ -47,7 +47,7 @@ pub fn sunlit<'a>(
 ) -> Sunlit<'a> {
     let (sun, lamps) = suns.split_at(SUN);
     match surface(normal, hit, origin, dir) {
-        None => Sunlit { sun, reach: [1.0; 2], is_learned, ambient: Gathered::NONE, of_lamps: Vec3::ZERO },
+        None => Sunlit { sun, reach: 1.0, is_learned, ambient: Gathered::NONE, of_lamps: Vec3::ZERO },
         Some(at) => {
             let from_lamp = |lamp: &[f32]| {
                 let facing = at.1.dot(Vec3::from_slice(lamp));
@@ -56,7 +56,7 @@ pub fn sunlit<'a>(
             };
             let of_lamps = lamps.chunks_exact(SUN).map(from_lamp).sum();
             let ambient = ambient.gathered(at.1, visibility.looks(at.0, at.1, looks, seed));
-            Sunlit { sun, reach: [direct(visibility, sun, at), ambient.open], is_learned, ambient, of_lamps }
+            Sunlit { sun, reach: direct(visibility, sun, at), is_learned, ambient, of_lamps }
         }
     }
 }
@@ -80,7 +80,15 @@ impl Sunlit<'_> {
 
     /// Share of the sun's light that arrives.
     pub(super) fn arrives(&self, values: &[f32]) -> f32 {
-        if self.is_learned { values[3] } else { self.reach[0] * values[LEFT] }
+        if self.is_learned { values[3] } else { self.reach * values[LEFT] }
+    }
+
+    /// Share of the light of the sun and of a sky `[9, 3]` that arrives; `lit` is that of the whole sky.
+    pub(super) fn share(&self, normal: &[f32; 3], values: &[f32], sky: &[f32], lit: [f32; 3]) -> f32 {
+        let (direct, lit) = (unhidden(self.sun, normal), Vec3::from(lit).max(Vec3::ZERO));
+        let of_sky: Vec3 = self.ambient.of_sky.iter().zip(sky.chunks_exact(3)).map(|(b, s)| *b * Vec3::from_slice(s)).sum();
+        let all = gray(&(direct + lit).to_array()).max(1e-6);
+        (gray(&(self.arrives(values) * direct + of_sky.max(Vec3::ZERO)).to_array()) / all).clamp(0.0, 1.0)
     }
 
     /// Gradient of [`Sunlit::received`] by the normal, for gradients `d` by its channels; lamps have none.

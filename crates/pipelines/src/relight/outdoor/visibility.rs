@@ -81,8 +81,6 @@ pub struct Gathered {
     pub of_sky: [f32; 9],
     /// Derivatives with respect to the normal's axes.
     pub slope: [Vec3; 3],
-    /// Share of an even sky's light that arrives.
-    pub open: f32,
 }
 
 impl Visibility {
@@ -229,7 +227,7 @@ pub fn places(look: &Look) -> [(u32, f32); 3] {
 impl Ambient {
     /// Light that arrives from where a surface looks.
     pub fn gathered(&self, normal: Vec3, looks: impl Iterator<Item = Look>) -> Gathered {
-        let mut out = Gathered { normal, open: 0.0, ..Gathered::NONE };
+        let mut out = Gathered { normal, ..Gathered::NONE };
         let mut n = 0.0;
         for look in looks {
             let mut radiance = (1.0 - look.open) * if look.open < 1.0 - SEEN { self.radiosity.toward(&look) } else { Vec3::ZERO };
@@ -240,19 +238,17 @@ impl Ambient {
                 }
             }
             out.light += radiance;
-            out.open += look.passes;
             let by = radiance / look.facing.max(LEAST_SLOPING);
             out.slope = [0, 1, 2].map(|k| out.slope[k] + look.direction[k] * by);
             n += 1.0;
         }
-        let (light, open) = (out.light / n, out.open / n);
-        Gathered { light, open, of_sky: out.of_sky.map(|v| v / n), slope: out.slope.map(|s| s / n), ..out }
+        Gathered { light: out.light / n, of_sky: out.of_sky.map(|v| v / n), slope: out.slope.map(|s| s / n), ..out }
     }
 }
 
 impl Gathered {
     /// Of a place that nothing reaches.
-    pub const NONE: Gathered = Gathered { normal: Vec3::Z, light: Vec3::ZERO, of_sky: [0.0; 9], slope: [Vec3::ZERO; 3], open: 1.0 };
+    pub const NONE: Gathered = Gathered { normal: Vec3::Z, light: Vec3::ZERO, of_sky: [0.0; 9], slope: [Vec3::ZERO; 3] };
 
     /// Irradiance over π for a normal near the surface's.
     pub fn at(&self, normal: Vec3) -> Vec3 {

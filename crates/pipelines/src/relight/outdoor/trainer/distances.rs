@@ -28,10 +28,8 @@ impl Trainer<'_> {
         let mut all = NormalMaps::of_some(&self.model, &self.cameras, due as usize).observations(FLAT_PIXELS);
         all.extend(&self.given);
         let errors = self.errors(&all);
-        let mut sorted = errors.clone();
-        let median = if sorted.is_empty() { 0.0 } else { *sorted.select_nth_unstable_by(errors.len() / 2, f32::total_cmp).1 };
-        let explained = all.iter().zip(&errors).filter(|(_, e)| **e <= EXPLAINED * median).map(|(o, _)| o);
-        self.model.flat = explained.flat_map(|o| [o.image as f32, o.x as f32, o.y as f32, o.distance]).collect();
+        let explained = explained(&all, &errors);
+        self.model.flat = explained.iter().flat_map(|o| [o.image as f32, o.x as f32, o.y as f32, o.distance]).collect();
         self.observe();
     }
 
@@ -67,5 +65,27 @@ impl Trainer<'_> {
         let observed = known.map(|f| Observation { image: f[0] as u32, x: f[1] as u32, y: f[2] as u32, distance: f[3] });
         let photographs = &self.photographs;
         self.observations = observed.filter(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y)).collect();
+    }
+}
+
+/// Pixels whose error is not far above the median.
+fn explained(pixels: &[Observation], errors: &[f32]) -> Vec<Observation> {
+    let mut sorted = errors.to_vec();
+    sorted.sort_by(f32::total_cmp);
+    let most = sorted.get(errors.len() / 2).map_or(0.0, |median| EXPLAINED * median);
+    pixels.iter().zip(errors).filter(|(_, e)| **e <= most).map(|(o, _)| *o).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_of_another_color_than_the_surface_tell_no_distance() {
+        let pixels: Vec<Observation> = (0..7).map(|x| Observation { image: 0, x, y: 0, distance: 1.0 }).collect();
+        let kept = explained(&pixels, &[0.02, 0.04, 0.3, 0.01, 0.04, 0.09, 0.11]);
+        assert_eq!(kept.iter().map(|o| o.x).collect::<Vec<_>>(), [0, 1, 3, 4, 5]);
+        assert_eq!(explained(&pixels, &[0.0; 7]).len(), 7, "what is learned exactly");
+        assert!(explained(&[], &[]).is_empty());
     }
 }
