@@ -227,7 +227,7 @@ pub fn color(values: &[f32], opacity: f32, dir: &[f32], light: &[f32], sky: &[f3
     let rgb = std::array::from_fn(|k| values[k] * irradiance[k] + (1.0 - opacity) * s.sky[k].max(0.0));
     let shadow = match sunlit {
         Some(_) if opacity < FAINT => 1.0,
-        Some(l) => l.share(&s.normal, values, light, s.lit),
+        Some(l) => arriving(l.sun, l.arrives(values), &s.normal, s.lit, l.ambient.from_sky(light)),
         None => values[3],
     };
     RayColor { rgb, irradiance, shadow }
@@ -271,8 +271,9 @@ impl SceneLoss<'_> {
         let normal = self.normal(r, out);
         let hit = surface(&normal, (out.opacity[r], out.depth[r]), &t.origins[at.clone()], &self.dirs[at])?;
         let lit = irradiance(sky, &sh_light::basis(DVec3::from(normal.map(f64::from))));
-        let reach = [direct(t.visibility, sun, hit), t.visibility.from_sky(hit.0, hit.1, LOOKS, t.seed)];
-        Some(arriving(sun, reach, &normal, lit, BOUNCED * level(sun, sky)))
+        let open = t.visibility.from_sky(hit.0, hit.1, LOOKS, t.seed);
+        let soft = open * Vec3::from(lit).max(Vec3::ZERO) + (1.0 - open) * BOUNCED * level(sun, sky);
+        Some(arriving(sun, direct(t.visibility, sun, hit), &normal, lit, soft))
     }
 
     /// One ray: its loss; adds gradients. `share` is its part of the sum. Returns the loss, the squared error and the largest error.

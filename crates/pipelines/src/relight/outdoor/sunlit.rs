@@ -83,14 +83,6 @@ impl Sunlit<'_> {
         if self.is_learned { values[3] } else { self.reach * values[LEFT] }
     }
 
-    /// Share of the light of the sun and of a sky `[9, 3]` that arrives; `lit` is that of the whole sky.
-    pub(super) fn share(&self, normal: &[f32; 3], values: &[f32], sky: &[f32], lit: [f32; 3]) -> f32 {
-        let (direct, lit) = (unhidden(self.sun, normal), Vec3::from(lit).max(Vec3::ZERO));
-        let of_sky: Vec3 = self.ambient.of_sky.iter().zip(sky.chunks_exact(3)).map(|(b, s)| *b * Vec3::from_slice(s)).sum();
-        let all = gray(&(direct + lit).to_array()).max(1e-6);
-        (gray(&(self.arrives(values) * direct + of_sky.max(Vec3::ZERO)).to_array()) / all).clamp(0.0, 1.0)
-    }
-
     /// Gradient of [`Sunlit::received`] by the normal, for gradients `d` by its channels; lamps have none.
     pub(super) fn by_normal(&self, normal: &[f32; 3], values: &[f32], d: Vec3) -> [f32; 3] {
         let n = Vec3::from(*normal);
@@ -101,11 +93,12 @@ impl Sunlit<'_> {
     }
 }
 
-/// Share of the light of a sun and a sky that reaches a surface; `lit` is that of the whole sky, `sent` what surfaces send where they hide it.
-pub(super) fn arriving(sun: &[f32], reach: [f32; 2], normal: &[f32; 3], lit: [f32; 3], sent: Vec3) -> f32 {
-    let (direct, sky) = (unhidden(sun, normal), Vec3::from(lit).max(Vec3::ZERO));
-    let all = gray(&(direct + sky).to_array()).max(1e-6);
-    (gray(&(reach[0] * direct + reach[1] * sky + (1.0 - reach[1]) * sent).to_array()) / all).clamp(0.0, 1.0)
+/// Share of the light of a sun and a sky that reaches a surface, of which so much of the sun's and `soft` arrives; `lit` is the light of the
+/// whole sky.
+pub(super) fn arriving(sun: &[f32], reach: f32, normal: &[f32; 3], lit: [f32; 3], soft: Vec3) -> f32 {
+    let direct = unhidden(sun, normal);
+    let all = gray(&(direct + Vec3::from(lit).max(Vec3::ZERO)).to_array()).max(1e-6);
+    (gray(&(reach * direct + soft).to_array()) / all).clamp(0.0, 1.0)
 }
 
 /// What the shadow's head reads of a sun apart: its direction; zeros where there is none.

@@ -118,21 +118,19 @@ impl<'a> Trainer<'a> {
         self.view.into_iter().for_each(|v| v.show_model(self.model.for_rendering()));
     }
 
-    /// Rays of a step at a share of the surfaces' stage: as many as give about the wanted number of samples, more at first.
-    fn rays(&self, step: u64, share: f32) -> usize {
+    /// Rays of a step: as many as give about the wanted number of samples, times a factor.
+    fn rays(&self, factor: f64) -> usize {
         let s = &self.model.config.sampling;
         if s.rays > 0 {
             return s.rays;
         }
-        let (more, steps, at_most) = FIRST;
-        let factor = if step < steps && share < at_most { more } else { 1.0 };
         let n = factor * s.batch_samples as f64 / self.model.samples_per_ray.max(1.0);
         (n as usize).clamp(64, MOST_RAYS).next_multiple_of(64)
     }
 
-    /// Fills the batch with random training pixels, of the light's stage.
-    fn draw(&mut self, step: u64) {
-        let rays = self.rays(step, 1.0);
+    /// Fills the batch with random training pixels.
+    fn draw(&mut self) {
+        let rays = self.rays(1.0);
         let m = &self.model;
         let rng = Rng::new(m.config.seed, PIXELS);
         let (near, cube) = (m.config.sampling.near, m.cube());
@@ -184,7 +182,9 @@ impl Trainer<'_> {
             depth: if self.observations.is_empty() { 0.0 } else { m.config.loss.depth },
             alpha: 0.0,
         };
-        let rays = RaySource::Photographs { count: self.rays(step, share), rng: of(PIXELS) };
+        let (more, steps, at_most) = FIRST;
+        let count = self.rays(if step < steps && share < at_most { more } else { 1.0 });
+        let rays = RaySource::Photographs { count, rng: of(PIXELS) };
         let placement = Placement::Occupancy { march, pruning: m.pruning() };
         let described = Step {
             backdrop: Backdrop::Random(of(BACKGROUND)),

@@ -250,6 +250,11 @@ impl Gathered {
     /// Of a place that nothing reaches.
     pub const NONE: Gathered = Gathered { normal: Vec3::Z, light: Vec3::ZERO, of_sky: [0.0; 9], slope: [Vec3::ZERO; 3] };
 
+    /// What arrives from a sky `[9, 3]` alone.
+    pub fn from_sky(&self, sky: &[f32]) -> Vec3 {
+        self.of_sky.iter().zip(sky.chunks_exact(3)).map(|(b, s)| *b * Vec3::from_slice(s)).sum::<Vec3>().max(Vec3::ZERO)
+    }
+
     /// Irradiance over π for a normal near the surface's.
     pub fn at(&self, normal: Vec3) -> Vec3 {
         let turned = normal - self.normal;

@@ -27,14 +27,14 @@ impl Trainer<'_> {
         events(&Event::Preparing { what: "flattening surfaces", share: due as f64 / FLATTENED as f64 });
         let mut all = NormalMaps::of_some(&self.model, &self.cameras, due as usize).observations(FLAT_PIXELS);
         all.extend(&self.given);
+        all.retain(|o| self.is_stored(o));
         let errors = self.errors(&all);
         let explained = explained(&all, &errors);
         self.model.flat = explained.iter().flat_map(|o| [o.image as f32, o.x as f32, o.y as f32, o.distance]).collect();
         self.observe();
     }
 
-    /// Greatest difference, over the channels, between what is learned and the photographs at pixels; after the image, whose order is that
-    /// of the first of its pixels.
+    /// Greatest difference, over the channels, between what is learned and the photographs at each of these pixels.
     fn errors(&self, pixels: &[Observation]) -> Vec<f32> {
         let (m, mut errors) = (&self.model, vec![0.0; pixels.len()]);
         let mut order: Vec<usize> = (0..pixels.len()).collect();
@@ -63,8 +63,12 @@ impl Trainer<'_> {
         let near = self.model.config.sampling.near;
         let known = self.model.flat.chunks_exact(4).filter(|f| f[3] > near);
         let observed = known.map(|f| Observation { image: f[0] as u32, x: f[1] as u32, y: f[2] as u32, distance: f[3] });
-        let photographs = &self.photographs;
-        self.observations = observed.filter(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y)).collect();
+        self.observations = observed.filter(|o| self.is_stored(o)).collect();
+    }
+
+    /// Whether memory holds the pixel itself, and not another one in its place.
+    fn is_stored(&self, o: &Observation) -> bool {
+        self.photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y)
     }
 }
 

@@ -194,7 +194,7 @@ impl Trainer<'_> {
 
     /// One step of the light's stage.
     pub(super) fn relight(&mut self, step: u64, share: f32) -> Result<StepReport> {
-        self.draw(step);
+        self.draw();
         let c = self.model.config.clone();
         if c.loss.retinex > 0.0 {
             self.pair();
