@@ -1,11 +1,15 @@
 //! Compares every op on a device with its f64 reference, forward and backward, on the cases of `ops/<op>/cases.rs`.
 
+use crate::device::Api;
 use crate::gpu::{Gpu, GpuError};
 use crate::ops::{
     adam, composite, depth_loss, distortion, error_map, field_step, frequency, fused_mlp, grid_sample, hash_grid, linear, march,
     marching_cubes, marching_tetrahedra, occupancy_update, path_trace, photometric_loss, pixel_draw, pixel_gather, pool, prune, ray_aabb,
     ray_generation, ray_triangles, resample, sample_pdf, scan, spherical_harmonics, ssim, strata, triangle_wave, trilinear_corner_grid,
 };
+
+use std::process::ExitCode;
+use std::time::Instant;
 
 pub use crate::gpu::table::{Row, TOLERANCE, Table};
 
@@ -53,4 +57,27 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
         check(gpu, &mut table)?;
     }
     Ok(table.rows)
+}
+
+/// Body of a program that runs cases on the device which its argument names, and prints what is wrong; `run` may refuse a device. Fails unless
+/// all results are right.
+pub fn main(of: &str, run: impl Fn(&Gpu) -> Result<Vec<Row>, String>) -> ExitCode {
+    let name = std::env::args().nth(1).unwrap_or_default();
+    let begin = Instant::now();
+    let open = || Gpu::open(name.parse::<Api>()?).map_err(|e| e.to_string());
+    let (gpu, rows) = match open().and_then(|gpu| run(&gpu).map(|rows| (gpu, rows))) {
+        Ok(done) => done,
+        Err(e) => {
+            eprintln!("{e}");
+            return ExitCode::from(2);
+        }
+    };
+    for row in &rows {
+        if let Some(fault) = &row.fault {
+            println!("WRONG {} {} ({}): {fault}", row.op, row.result, row.shape);
+        }
+    }
+    let right = rows.iter().filter(|r| r.fault.is_none()).count();
+    println!("{right} of {} right in {of} on {name} ({}) in {:.0} s", rows.len(), gpu.name, begin.elapsed().as_secs_f64());
+    if right == rows.len() && right > 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }

@@ -14,7 +14,7 @@ const CHUNK: usize = 1 << 14;
 #[derive(Clone, Debug)]
 pub(super) enum Gradient {
     Cpu(Values),
-    Device(Tensor<1>),
+    Device(Box<Tensor<1>>),
 }
 
 /// The gradients of one step; `None` for parameters that are frozen, statistics, or did not take part.
@@ -35,7 +35,11 @@ impl Gradients {
                 Tensor::<1>::from_dispatch(leaf).grad_remove(&mut found)
             });
             values.push(gradient.map(|g| {
-                if p.is_on_cpu() { Gradient::Cpu(param::values_of(g.into_dispatch())) } else { Gradient::Device(g.reshape([p.len()])) }
+                if p.is_on_cpu() {
+                    Gradient::Cpu(param::values_of(g.into_dispatch()))
+                } else {
+                    Gradient::Device(Box::new(g.reshape([p.len()])))
+                }
             }));
         });
         Gradients { values, scale: 1.0, limit: f32::INFINITY }
@@ -56,7 +60,7 @@ impl Gradients {
                     sums::forward(x, y, false, &mut out);
                     Some(Gradient::Cpu(out.freeze()))
                 }
-                (Some(Gradient::Device(x)), Some(Gradient::Device(y))) => Some(Gradient::Device(x.clone() + y.clone())),
+                (Some(Gradient::Device(x)), Some(Gradient::Device(y))) => Some(Gradient::Device(Box::new(*x.clone() + *y.clone()))),
                 (None, Some(y)) => Some(y.clone()),
                 (_, None) => continue,
                 _ => unreachable!("a weight is in one place"),
@@ -69,7 +73,7 @@ impl Gradients {
     pub fn get(&self, i: usize) -> Option<Values> {
         self.values[i].as_ref().map(|g| match g {
             Gradient::Cpu(v) => v.clone(),
-            Gradient::Device(t) => param::values_of(t.clone().into_dispatch()),
+            Gradient::Device(t) => param::values_of((**t).clone().into_dispatch()),
         })
     }
 
@@ -91,7 +95,7 @@ impl Gradients {
         let of = |g: &Gradient| -> f64 {
             let v = match g {
                 Gradient::Cpu(v) => v,
-                Gradient::Device(t) => return crate::read_values((t.clone() * t.clone()).sum())[0] as f64,
+                Gradient::Device(t) => return crate::read_values((*t.clone() * *t.clone()).sum())[0] as f64,
             };
             let parts: Vec<f64> = v.par_chunks(CHUNK).map(|c| c.iter().map(|g| (*g as f64) * (*g as f64)).sum()).collect();
             parts.iter().sum()

@@ -134,7 +134,7 @@ impl Optimizer {
             let step = weight_step::Step { rule, rate: rate * m.rate_scale, weight_decay: m.weight_decay, t, scale, limit };
             match g {
                 Gradient::Cpu(g) => p.write(|w| cpu::step(&step, w, &mut m.first, &mut m.second, g)),
-                Gradient::Device(g) => p.replace(|w| on_device::step(&step, w, &mut m.device, g.clone())),
+                Gradient::Device(g) => p.replace(|w| on_device::step(&step, w, &mut m.device, (**g).clone())),
             }
         });
         drop(gradients);
