@@ -2,7 +2,7 @@
 
 use super::config::{Config, Stage};
 use super::model::SceneModel;
-use super::trainer::Trainer;
+use super::trainer::{Given, Trainer};
 use super::viewing::RunView;
 use crate::error::{PipelineError, Result};
 use crate::run::photographs::StoredPhotographs;
@@ -120,22 +120,18 @@ fn check_memory(config: &Config, capture: &Capture) -> Result<()> {
 }
 
 /// Pixels whose distance comparing photographs tells, and where that is left open, how near matter may be.
-fn observations(
-    model: &mut SceneModel,
-    photographs: &StoredPhotographs,
-    interrupt: &AtomicBool,
-    events: &mut dyn FnMut(&Event),
-) -> Vec<Observation> {
-    let (distance, mut found) = (model.capture.viewing_distance(), Vec::new());
+fn observations(model: &mut SceneModel, photographs: &StoredPhotographs, interrupt: &AtomicBool, events: &mut dyn FnMut(&Event)) -> Given {
+    let (distance, mut found, mut are_sparse_points) = (model.capture.viewing_distance(), Vec::new(), false);
     if model.config.loss.depth > 0.0 {
         let reduction = Reduction::Times(model.config.data.downscale);
         found = sparse_points::observe(&model.capture, &model.train, reduction, model.model_from_world.scale);
-        let from = if found.len() < sparse_points::ENOUGH {
+        are_sparse_points = found.len() >= sparse_points::ENOUGH;
+        let from = if are_sparse_points {
+            "by sparse points"
+        } else {
             events(&Event::Note(format!("comparing {} photographs with their neighbors to find distances", model.train.len())));
             found = stereo::observe(photographs, &model.cameras(), &model.light_of, distance, interrupt);
             "by comparing photographs"
-        } else {
-            "by sparse points"
         };
         // The distance of what glass mirrors is none of its own, and the sky has none.
         let is_surface = |o: &Observation| {
@@ -146,7 +142,7 @@ fn observations(
         events(&Event::Note(format!("the distance of {} pixels was found {from} (--set loss.depth=0: do not use it)", found.len())));
     }
     nearest::settle(&mut model.config.sampling.near, &mut found, distance);
-    found
+    Given { pixels: found, are_sparse_points }
 }
 
 /// The capture that a configuration names.

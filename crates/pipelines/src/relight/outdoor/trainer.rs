@@ -48,12 +48,14 @@ mod at_once;
 mod distances;
 mod light;
 
+pub(super) use distances::Given;
+
 /// A model in training.
 pub(super) struct Trainer<'a> {
     pub model: SceneModel,
     photographs: StoredPhotographs,
     /// Pixels of known distance: those that were given, and those that are observed.
-    given: Vec<Observation>,
+    given: Given,
     observations: Vec<Observation>,
     cameras: Vec<PosedCamera>,
     device: Device,
@@ -79,12 +81,7 @@ struct Drawn {
 }
 
 impl<'a> Trainer<'a> {
-    pub fn new(
-        mut model: SceneModel,
-        photographs: StoredPhotographs,
-        given: Vec<Observation>,
-        checkpoints: &'a Path,
-    ) -> Result<Trainer<'a>> {
+    pub fn new(mut model: SceneModel, photographs: StoredPhotographs, given: Given, checkpoints: &'a Path) -> Result<Trainer<'a>> {
         let (cameras, scene) = (model.cameras(), model.scene());
         if model.origin.step == 0 {
             first_skies(&mut model, &photographs, &cameras);

@@ -14,10 +14,17 @@ const FLAT_PIXELS: usize = 100_000;
 /// Error of a color over the median from which a pixel shows something else than the surface that is found there.
 const EXPLAINED: f32 = 2.5;
 
+/// Pixels whose distance is known before anything is learned.
+pub(in super::super) struct Given {
+    pub pixels: Vec<Observation>,
+    /// Whether they show points that many photographs agree on; else photographs were compared.
+    pub are_sparse_points: bool,
+}
+
 impl Trainer<'_> {
     /// Flattens what is nearly flat if that is due: from then on, distances to planes through the surfaces are observed, and those that
     /// were given. Neither is where a photograph shows another color than the surface found there: something thin stands before it, which
-    /// would never be learned. For the same reason, nothing is observed before surfaces are flattened first.
+    /// would never be learned. For the same reason, only sparse points are observed before surfaces are flattened first.
     pub(super) fn flatten(&mut self, share: f32, events: &mut dyn FnMut(&Event)) {
         let due = (share * (FLATTENED + 1) as f32) as u64;
         if due.min(FLATTENED) <= self.model.flattened || self.model.config.loss.depth == 0.0 {
@@ -26,7 +33,9 @@ impl Trainer<'_> {
         self.model.flattened = due;
         events(&Event::Preparing { what: "flattening surfaces", share: due as f64 / FLATTENED as f64 });
         let mut all = NormalMaps::of_some(&self.model, &self.cameras, due as usize).observations(FLAT_PIXELS);
-        all.extend(&self.given);
+        if !self.given.are_sparse_points {
+            all.extend(&self.given.pixels);
+        }
         all.retain(|o| self.is_stored(o));
         let errors = self.errors(&all);
         let explained = explained(&all, &errors);
@@ -58,12 +67,13 @@ impl Trainer<'_> {
         errors
     }
 
-    /// Observes the model's distances.
+    /// Observes the model's distances, and sparse points: many photographs agree on each, and few photographs find surfaces by them alone.
     pub(super) fn observe(&mut self) {
         let near = self.model.config.sampling.near;
         let known = self.model.flat.chunks_exact(4).filter(|f| f[3] > near);
         let observed = known.map(|f| Observation { image: f[0] as u32, x: f[1] as u32, y: f[2] as u32, distance: f[3] });
-        self.observations = observed.filter(|o| self.is_stored(o)).collect();
+        let sparse = self.given.pixels.iter().filter(|_| self.given.are_sparse_points).copied();
+        self.observations = sparse.chain(observed).filter(|o| self.is_stored(o)).collect();
     }
 
     /// Whether memory holds the pixel itself, and not another one in its place.
