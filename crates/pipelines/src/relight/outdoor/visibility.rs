@@ -4,6 +4,7 @@ use diorama_engine::fields::DensityQuery;
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_geom::glam::{DVec3, Vec3};
 use diorama_geom::sh_light;
+use diorama_kernels::ops::ray_generation::PosedCamera;
 use rayon::prelude::*;
 
 mod cells;
@@ -106,6 +107,11 @@ impl Visibility {
 
     fn new(cells: Cells) -> Visibility {
         Visibility { cells, lift: LIFTS[0] }
+    }
+
+    /// Without what none of these cameras' pictures could show: nothing tells what is there, and it would cast shadows all the same.
+    pub fn within(self, cameras: &[PosedCamera]) -> Visibility {
+        Visibility { cells: self.cells.retain(|p| cameras.iter().any(|c| c.frames(p.as_dvec3()))), ..self }
     }
 
     /// Beginning in cells of a ray from a surface: on the ray, not beside it, where shadows would be shifted.

@@ -112,6 +112,24 @@ impl Cells {
         self.depths[IN_BLOCK * self.places[block] as usize + i] = (255.0 * (depth / DEEPEST).min(1.0)).ceil() as u8;
     }
 
+    /// Without the cells whose centers, in model space, are not to be kept.
+    pub fn retain(mut self, keeps: impl Fn(Vec3) -> bool + Sync) -> Cells {
+        let (low, edge, cell) = (self.low, self.n.div_ceil(BLOCK), self.size / self.n as f32);
+        let mut corners = vec![[0; 3]; self.depths.len() / IN_BLOCK];
+        for (b, place) in self.places.iter().enumerate().filter(|(_, p)| **p != NOWHERE) {
+            corners[*place as usize] = [b % edge, b / edge % edge, b / edge / edge].map(|v| v * BLOCK);
+        }
+        self.depths.par_chunks_exact_mut(IN_BLOCK).zip(corners).for_each(|(cells, [x, y, z])| {
+            for (i, depth) in cells.iter_mut().enumerate().filter(|(_, d)| **d > 0) {
+                let at = [x + i % BLOCK, y + i / BLOCK % BLOCK, z + i / BLOCK / BLOCK].map(|v| low + cell * (v as f32 + 0.5));
+                *depth *= keeps(Vec3::from(at)) as u8;
+            }
+        });
+        self.near.fill(0);
+        self.blocks.fill(false);
+        self.finished()
+    }
+
     /// With what rays skip by.
     fn finished(mut self) -> Cells {
         let (n, edge) = (self.n, self.n.div_ceil(BLOCK));
@@ -226,6 +244,24 @@ mod tests {
         assert!(Cells::from_numbers(&numbers[..300], (-1.0, 2.0), 20).is_none());
         // As many blocks per axis, and more.
         assert!([24, 40].into_iter().all(|n| Cells::from_numbers(&numbers, (-1.0, 2.0), n).is_none()));
+    }
+
+    #[test]
+    fn cells_that_are_not_kept_let_light_through() {
+        let at = [[2, 3, 4], [2, 3, 15], [12, 3, 15]];
+        let of = |at: &[[usize; 3]]| {
+            let mut cells = Cells::empty((-1.0, 2.0), 20);
+            at.iter().for_each(|at| cells.set(*at, 2.0));
+            cells.finished()
+        };
+        // Centers are at −1 + 0.1 (i + ½).
+        let kept = of(&at).retain(|p| (p - Vec3::new(-0.75, -0.65, -0.55)).length() > 1e-3);
+        let want = of(&at[1..]);
+        assert_eq!((&kept.near, &kept.blocks), (&want.near, &want.blocks));
+        let along = |cells: &Cells, z: f32| cells.pass(Vec3::new(2.5, 0.1, z), Vec3::Y).0;
+        assert_eq!(along(&kept, 4.5), 1.0);
+        assert_eq!(along(&kept, 15.5), along(&want, 15.5));
+        assert!(along(&want, 15.5) < 0.3);
     }
 
     #[test]
