@@ -5,7 +5,7 @@ use super::joint;
 use super::model::SceneModel;
 use super::shading::{self, NORMAL, RayColor, SUNLIT_CHANNELS};
 use super::sun::{SUN, gray};
-use super::sunlit::{LEFT, sun_code, sunlit};
+use super::sunlit::{LEFT, passing, sun_code, sunlit};
 use super::visibility::Ambient;
 use crate::error::Result;
 use crate::run::memory;
@@ -144,7 +144,7 @@ pub struct SceneView {
     /// Of unit length.
     pub normal: Image,
     pub shadow: Image,
-    /// Share that small things leave of a sun whose traced ray passes, where suns are apart.
+    /// Share that arrives of an unknown sun whose traced ray passes, where suns are apart.
     pub share: Image,
     /// Light that a white surface would send, shadow included.
     pub irradiance: Image,
@@ -246,7 +246,7 @@ impl SceneModel {
                 out.irradiance.data[3 * i + k] = color.irradiance[k];
             }
             out.shadow.data[i] = color.shadow;
-            out.share.data[i] = v[LEFT];
+            out.share.data[i] = passing(&v);
         }
         out
     }

@@ -6,6 +6,9 @@ use diorama_geom::glam::Vec3;
 
 /// Channel of the share that is left of a sun whose traced ray passes.
 pub const LEFT: usize = 7;
+/// Share of a sun that no photograph has which arrives where its traced ray passes: at least, and more the more is left. What takes light from the
+/// suns of photographs often takes none from another, and what takes none from them may take some of another's.
+pub(super) const ARRIVES: [f32; 2] = [0.27, 0.63];
 /// Opacity below which a ray shows no surface.
 pub const FAINT: f32 = 0.05;
 /// Length below which a vector has no direction.
@@ -74,13 +77,13 @@ pub(super) fn facing(sun: &[f32], normal: &[f32; 3]) -> f32 {
 impl Sunlit<'_> {
     /// Light that a white surface sends where the field says these values.
     pub(super) fn received(&self, normal: &[f32; 3], values: &[f32]) -> Vec3 {
-        let of_lamps = if self.is_learned { Vec3::ZERO } else { values[LEFT] * self.of_lamps };
+        let of_lamps = if self.is_learned { Vec3::ZERO } else { passing(values) * self.of_lamps };
         self.arrives(values) * unhidden(self.sun, normal) + of_lamps + self.ambient.at(Vec3::from(*normal))
     }
 
     /// Share of the sun's light that arrives.
     pub(super) fn arrives(&self, values: &[f32]) -> f32 {
-        if self.is_learned { values[3] } else { self.reach * values[LEFT] }
+        if self.is_learned { values[3] } else { self.reach * passing(values) }
     }
 
     /// Gradient of [`Sunlit::received`] by the normal, for gradients `d` by its channels; lamps have none.
@@ -91,6 +94,11 @@ impl Sunlit<'_> {
         let d = Vec3::select(self.ambient.at(n).cmpgt(Vec3::ZERO), d, Vec3::ZERO);
         (of_sun * toward + Vec3::from(self.ambient.slope.map(|s| s.dot(d)))).to_array()
     }
+}
+
+/// Share of an unknown sun's light that arrives where its traced ray passes.
+pub(super) fn passing(values: &[f32]) -> f32 {
+    ARRIVES[0] + ARRIVES[1] * values[LEFT]
 }
 
 /// Share of the light of a sun and a sky that reaches a surface, of which so much of the sun's and `soft` arrives; `lit` is the light of the

@@ -56,7 +56,7 @@ pub(super) struct Place {
     pub(super) sky: [f32; 9],
     /// Sides of cells that it sees, and the share of what they send that arrives.
     seen: Vec<(u32, f32)>,
-    /// Share that small things leave of a sun whose traced ray passes.
+    /// Share that arrives of a sun whose traced ray passes.
     pub(super) share: f32,
 }
 
