@@ -90,6 +90,15 @@ impl Environment {
         Environment::from_fn(height, |_| radiance)
     }
 
+    /// The same above level, diffuse ground with an albedo, which it lights: below the horizon, `albedo E / π`.
+    pub fn above_ground(&self, albedo: f64) -> Environment {
+        let mut ground = [0.0; 3];
+        self.for_each_pixel(|d, solid_angle, radiance| {
+            (0..3).for_each(|k| ground[k] += albedo / PI * solid_angle * d.z.max(0.0) * radiance[k])
+        });
+        Environment::from_fn(self.image.height, |d| if d.z < 0.0 { ground } else { self.radiance(d) })
+    }
+
     pub fn image(&self) -> &Image {
         &self.image
     }
@@ -222,6 +231,18 @@ fn direction_of(uv: DVec2) -> DVec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn ground_sends_what_it_receives_from_above() {
+        let sky =
+            Environment { turn: 0.4, strength: 2.0, ..Environment::from_fn(64, |d| [1.0, if d.z > 0.0 { 0.5 + d.x } else { 9.0 }, 0.0]) };
+        let whole = sky.above_ground(0.3);
+        for (d, want) in [(DVec3::new(0.6, 0.0, -0.8), [0.6, 0.3, 0.0]), (DVec3::NEG_Z, [0.6, 0.3, 0.0])] {
+            (0..3).for_each(|k| assert!((whole.radiance(d)[k] - want[k]).abs() < 1e-3, "{:?}", whole.radiance(d)));
+        }
+        let up = DVec3::new(0.36, 0.48, 0.8);
+        (0..3).for_each(|k| assert!((whole.radiance(up)[k] - sky.radiance(up)[k]).abs() < 1e-2));
+    }
 
     #[test]
     fn lamps_and_the_rest_are_the_whole_light() {
