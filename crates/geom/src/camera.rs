@@ -140,6 +140,14 @@ impl Camera {
     }
 }
 
+impl Camera {
+    /// Whether the picture shows a point, in camera coordinates, if nothing stands before it.
+    pub fn shows(&self, x_in_camera: DVec3) -> bool {
+        let at = self.project(x_in_camera);
+        at.is_some_and(|p| (0.0..self.width as f64).contains(&p.x) && (0.0..self.height as f64).contains(&p.y))
+    }
+}
+
 impl Lens {
     /// Ideal to distorted normalized coordinates. For a fisheye the ideal coordinates are
     /// `θ (cos φ, sin φ)`, for the others `(X/Z, Y/Z)`.
@@ -224,6 +232,15 @@ mod tests {
             Lens::Fov { omega: 0.8 },
             Lens::Equirectangular,
         ]
+    }
+
+    #[test]
+    fn a_picture_shows_what_lies_along_its_rays_alone() {
+        let camera = Camera::pinhole(40, 30, 1.0);
+        let along = |x: f64, y: f64| 3.0 * camera.direction(x, y);
+        assert!([(0.5, 0.5), (20.0, 29.5), (39.5, 1.0)].iter().all(|(x, y)| camera.shows(along(*x, *y))));
+        assert!([(-1.0, 1.0), (41.0, 1.0), (1.0, -1.0), (1.0, 31.0)].iter().all(|(x, y)| !camera.shows(along(*x, *y))));
+        assert!(!camera.shows(-along(20.0, 15.0)), "behind it");
     }
 
     #[test]

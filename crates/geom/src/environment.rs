@@ -90,7 +90,7 @@ impl Environment {
         Environment::from_fn(height, |_| radiance)
     }
 
-    /// The same above level, diffuse ground with an albedo, which it lights: below the horizon, `albedo E / π`.
+    /// This light above the horizon, and below it the radiance `albedo E / π` of level, diffuse ground that it lights.
     pub fn above_ground(&self, albedo: f64) -> Environment {
         let mut ground = [0.0; 3];
         self.for_each_pixel(|d, solid_angle, radiance| {

@@ -59,16 +59,16 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
     Ok(table.rows)
 }
 
-/// Body of a program that runs cases on the device which its argument names, and prints what is wrong; `run` may refuse a device. Fails unless
-/// all results are right.
-pub fn main(of: &str, run: impl Fn(&Gpu) -> Result<Vec<Row>, String>) -> ExitCode {
+/// Main function of a program that runs cases on the device which its argument names, and prints what is wrong. Fails unless all results are
+/// right; exits with 2 where the device cannot be opened, or the cases cannot run on it.
+pub fn main(title: &str, cases: impl Fn(&Gpu) -> Result<Vec<Row>, String>) -> ExitCode {
     let name = std::env::args().nth(1).unwrap_or_default();
     let begin = Instant::now();
     let open = || Gpu::open(name.parse::<Api>()?).map_err(|e| e.to_string());
-    let (gpu, rows) = match open().and_then(|gpu| run(&gpu).map(|rows| (gpu, rows))) {
+    let (gpu, rows) = match open().and_then(|gpu| cases(&gpu).map(|rows| (gpu, rows))) {
         Ok(done) => done,
         Err(e) => {
-            eprintln!("{e}");
+            eprintln!("device {name}: {e}");
             return ExitCode::from(2);
         }
     };
@@ -78,6 +78,6 @@ pub fn main(of: &str, run: impl Fn(&Gpu) -> Result<Vec<Row>, String>) -> ExitCod
         }
     }
     let right = rows.iter().filter(|r| r.fault.is_none()).count();
-    println!("{right} of {} right in {of} on {name} ({}) in {:.0} s", rows.len(), gpu.name, begin.elapsed().as_secs_f64());
+    println!("{right} of {} right in {title} on {name} ({}) in {:.0} s", rows.len(), gpu.name, begin.elapsed().as_secs_f64());
     if right == rows.len() && right > 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
 }

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 /// Numbers of which one sum is made at a time; fixed, so that sums do not depend on threads.
 const CHUNK: usize = 1 << 14;
 
-/// A gradient where its weight is.
+/// A gradient where its weight is. A tensor is large beside values, hence the box.
 #[derive(Clone, Debug)]
 pub(super) enum Gradient {
     Cpu(Values),
@@ -60,7 +60,7 @@ impl Gradients {
                     sums::forward(x, y, false, &mut out);
                     Some(Gradient::Cpu(out.freeze()))
                 }
-                (Some(Gradient::Device(x)), Some(Gradient::Device(y))) => Some(Gradient::Device(Box::new(*x.clone() + *y.clone()))),
+                (Some(Gradient::Device(x)), Some(Gradient::Device(y))) => Some(Gradient::Device(Box::new((**x).clone() + (**y).clone()))),
                 (None, Some(y)) => Some(y.clone()),
                 (_, None) => continue,
                 _ => unreachable!("a weight is in one place"),
@@ -95,7 +95,7 @@ impl Gradients {
         let of = |g: &Gradient| -> f64 {
             let v = match g {
                 Gradient::Cpu(v) => v,
-                Gradient::Device(t) => return crate::read_values((*t.clone() * *t.clone()).sum())[0] as f64,
+                Gradient::Device(t) => return crate::read_values(((**t).clone() * (**t).clone()).sum())[0] as f64,
             };
             let parts: Vec<f64> = v.par_chunks(CHUNK).map(|c| c.iter().map(|g| (*g as f64) * (*g as f64)).sum()).collect();
             parts.iter().sum()

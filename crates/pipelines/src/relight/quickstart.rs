@@ -12,7 +12,7 @@ use super::outdoor::{self, model::SceneModel};
 use super::path_tracer::PathTracer;
 use super::scenario::{self, Scenario, ScenarioOptions};
 use super::synth::{self, Place, SynthOptions};
-use super::{picture, scene_file};
+use super::{picture, scene_file, truth};
 use crate::error::{PipelineError, Result};
 use crate::run::RunFolder;
 use crate::run::config::Configuration;
@@ -200,8 +200,8 @@ impl Quickstart<'_> {
         if out.join("transforms_train.json").exists() {
             return Ok(true);
         }
-        let light = |name: &str| -> Result<LightOptions> {
-            let above = environment::read(&self.light(name))?.environment.above_ground(GROUND);
+        let above_ground = |name: &str| -> Result<LightOptions> {
+            let above = environment::read(&truth::light_file(&self.at("street"), name))?.environment.above_ground(GROUND);
             let file = self.at(&format!("chair-{name}.hdr"));
             environment::save_hdr(&file, &above)?;
             Ok(LightOptions::of(Source::File(file)))
@@ -211,8 +211,8 @@ impl Quickstart<'_> {
             views: self.o.chair_views,
             size: self.o.chair_size,
             samples: 48,
-            light: light("veiled")?,
-            unseen: light("unseen")?,
+            light: above_ground("veiled")?,
+            unseen: above_ground("unseen")?,
             shows_light: false,
             seed: 0,
         };
@@ -285,7 +285,7 @@ impl Quickstart<'_> {
             site: None,
             object: Some(chair.to_path_buf()),
             frame: None,
-            hdri: Some(self.light("unseen")),
+            hdri: Some(truth::light_file(&self.at("street"), "unseen")),
             rotate_deg: 0.0,
             scale: None,
             size: COMPOSED_SIZE,
@@ -304,11 +304,6 @@ impl Quickstart<'_> {
         let said = "the mesh of the trained street has no level, free ground; the picture shows the generated street instead";
         self.notes.push(said.into());
         Ok(scenario::prepare(self.folder, &scenario, &options, true, self.stop)?.0)
-    }
-
-    /// Map of a light of the street that no photograph to train on has.
-    fn light(&self, name: &str) -> PathBuf {
-        self.at("street").join("truth").join(format!("{name}.hdr"))
     }
 }
 

@@ -28,12 +28,6 @@ pub struct PosedCamera {
 }
 
 impl PosedCamera {
-    /// Whether its picture shows a point if nothing stands before it.
-    pub fn frames(&self, point: DVec3) -> bool {
-        let at = self.camera.project(self.pose.inverse().point(point));
-        at.is_some_and(|p| (0.0..self.camera.width as f64).contains(&p.x) && (0.0..self.camera.height as f64).contains(&p.y))
-    }
-
     /// The camera with a correction applied.
     pub fn corrected(&self, d: &[f64; CORRECTION]) -> PosedCamera {
         let turn = diorama_geom::transform::rotation_from_axis_angle(DVec3::new(d[3], d[4], d[5]));

@@ -103,7 +103,7 @@ pub struct LightConfig {
     pub model: String,
     /// Share of the steps in which surfaces are learned, before light is told apart.
     pub from: f32,
-    /// Cells per axis in which surfaces are solid or not.
+    /// Cells per axis of the optical depths that cast shadows.
     pub sun_cells: usize,
 }
 
@@ -125,7 +125,7 @@ pub struct LossConfig {
     pub negative: f32,
     /// Spread of a ray's weights (Barron et al. 2022), from nothing at first to this while coarse surfaces are found.
     pub distortion: f32,
-    /// Light that ends away from the distance that comparing photographs tells.
+    /// Light that ends away from the distance that sparse points, planes or comparing photographs tell.
     pub depth: f32,
     /// Brightest twentieth of the albedo beyond a luminance of 0.9.
     pub gauge: f32,

@@ -119,26 +119,28 @@ fn check_memory(config: &Config, capture: &Capture) -> Result<()> {
     memory::require("the occupancy grid", photographs + 2 * 16 * table + 9 * cells, "use --set sampling.occupancy_resolution=128")
 }
 
-/// Pixels whose distance comparing photographs tells, and where that is left open, how near matter may be.
+/// Pixels whose distance sparse points tell, or comparing photographs where these are few, and where that is left open, how near matter may be.
 fn observations(model: &mut SceneModel, photographs: &StoredPhotographs, interrupt: &AtomicBool, events: &mut dyn FnMut(&Event)) -> Given {
     let (distance, mut found, mut are_sparse_points) = (model.capture.viewing_distance(), Vec::new(), false);
     if model.config.loss.depth > 0.0 {
         let reduction = Reduction::Times(model.config.data.downscale);
+        // The distance of what glass mirrors is none of its own, and the sky has none.
+        let is_surface = |o: &Observation| {
+            let image = o.image as usize;
+            let is_stored = photographs.snap(image, o.x, o.y) == (o.x, o.y);
+            is_stored && !photographs.store().is_glass(image, o.x, o.y) && photographs.rgba(image, o.x, o.y)[3] > 0.5
+        };
         found = sparse_points::observe(&model.capture, &model.train, reduction, model.model_from_world.scale);
+        found.retain(is_surface);
         are_sparse_points = found.len() >= sparse_points::ENOUGH;
         let from = if are_sparse_points {
             "by sparse points"
         } else {
             events(&Event::Note(format!("comparing {} photographs with their neighbors to find distances", model.train.len())));
             found = stereo::observe(photographs, &model.cameras(), &model.light_of, distance, interrupt);
+            found.retain(is_surface);
             "by comparing photographs"
         };
-        // The distance of what glass mirrors is none of its own, and the sky has none.
-        let is_surface = |o: &Observation| {
-            let image = o.image as usize;
-            !photographs.store().is_glass(image, o.x, o.y) && photographs.rgba(image, o.x, o.y)[3] > 0.5
-        };
-        found.retain(|o| photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y) && is_surface(o));
         events(&Event::Note(format!("the distance of {} pixels was found {from} (--set loss.depth=0: do not use it)", found.len())));
     }
     nearest::settle(&mut model.config.sampling.near, &mut found, distance);

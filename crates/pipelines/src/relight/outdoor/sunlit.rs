@@ -6,8 +6,9 @@ use diorama_geom::glam::Vec3;
 
 /// Channel of the share that is left of a sun whose traced ray passes.
 pub const LEFT: usize = 7;
-/// Share of a sun that no photograph has which arrives where its traced ray passes: at least, and more the more is left. What takes light from the
-/// suns of photographs often takes none from another, and what takes none from them may take some of another's.
+/// Share of a sun that no photograph has which arrives where its traced ray passes, `a + b LEFT`. What takes light from the suns of photographs
+/// often takes none from another, and what takes none from theirs may take some of another's. Least squares in sRGB under the sun apart of
+/// generated streets, of 64×48, 160×90 and 320×180 pixels alike.
 pub(super) const ARRIVES: [f32; 2] = [0.27, 0.63];
 /// Opacity below which a ray shows no surface.
 pub const FAINT: f32 = 0.05;

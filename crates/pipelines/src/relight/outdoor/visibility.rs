@@ -1,4 +1,4 @@
-//! Which light reaches the learned surfaces: shadows of a sun through cells that are solid, and what points see around them, sky or surfaces.
+//! Which light reaches the learned surfaces: shadows of a sun through cells with optical depths, and what points see around them, sky or surfaces.
 
 use diorama_engine::fields::DensityQuery;
 use diorama_engine::samplers::occupancy::Occupancy;
@@ -87,7 +87,14 @@ pub struct Gathered {
 impl Visibility {
     /// What a field holds in a cube (lowest corner and edge) where its occupancy grid agrees, in `n` cells per axis.
     pub fn of(field: &dyn DensityQuery, occupancy: &Occupancy, cube: (f32, f32), n: usize) -> Visibility {
-        Visibility::new(Cells::of(field, occupancy, cube, n))
+        Visibility::new(Cells::of(field, occupancy, cube, n, &|_| true))
+    }
+
+    /// The same without what no camera's picture shows: no photograph tells what is there, and it would cast shadows all the same.
+    pub fn within(field: &dyn DensityQuery, occupancy: &Occupancy, cube: (f32, f32), n: usize, cameras: &[PosedCamera]) -> Visibility {
+        let inverse: Vec<_> = cameras.iter().map(|c| (c.pose.inverse(), c.camera)).collect();
+        let is_shown = |p: [f32; 3]| inverse.iter().any(|(pose, camera)| camera.shows(pose.point(DVec3::from(p.map(f64::from)))));
+        Visibility::new(Cells::of(field, occupancy, cube, n, &is_shown))
     }
 
     /// The same from [`Visibility::numbers`]; none where these are not of `n` cells per axis.
@@ -107,11 +114,6 @@ impl Visibility {
 
     fn new(cells: Cells) -> Visibility {
         Visibility { cells, lift: LIFTS[0] }
-    }
-
-    /// Without what none of these cameras' pictures could show: nothing tells what is there, and it would cast shadows all the same.
-    pub fn within(self, cameras: &[PosedCamera]) -> Visibility {
-        Visibility { cells: self.cells.retain(|p| cameras.iter().any(|c| c.frames(p.as_dvec3()))), ..self }
     }
 
     /// Beginning in cells of a ray from a surface: on the ray, not beside it, where shadows would be shifted.

@@ -1,6 +1,8 @@
 //! Tests of what hides the light.
 
 use super::*;
+use diorama_geom::glam::DMat3;
+use diorama_geom::{Camera, Pose};
 
 fn basis(n: Vec3) -> [f32; 9] {
     sh_light::basis(n.as_dvec3()).map(|b| b as f32)
@@ -35,6 +37,24 @@ fn the_wall_shadows_what_lies_behind_it() {
     let other = Vec3::new(-1.0, 0.0, 1.0).normalize();
     assert!(v.from_sun(Vec3::new(0.2, 0.5, 0.25), up, other) > 0.95);
     assert!(v.from_sun(Vec3::new(0.5, 0.5, 0.5), Vec3::NEG_X, other) > 0.95);
+}
+
+/// Cameras look down on a part of the plate.
+#[test]
+fn what_no_photograph_shows_casts_no_shadow() {
+    let (field, occupancy, up) = (Corner, Occupancy::new(64, 1, false), Vec3::Z);
+    let looking_down = |x: f64| {
+        let pose = Pose { rotation: DMat3::from_cols(DVec3::X, DVec3::NEG_Y, DVec3::NEG_Z), translation: DVec3::new(x, 0.5, 2.0) };
+        // At the wall's foot, 1.75 below, the picture is half as wide as the cube.
+        PosedCamera { camera: Camera::pinhole(40, 120, 2.0 * (0.25f64 / 1.75).atan()), pose }
+    };
+    let sun = Vec3::new(1.0, 0.0, 1.0).normalize();
+    let lit = |cameras: &[PosedCamera]| {
+        let v = Visibility::within(&field, &occupancy, (0.0, 1.0), 64, cameras);
+        v.from_sun(Vec3::new(0.2, 0.5, 0.25), up, sun)
+    };
+    assert!(lit(&[looking_down(0.1)]) > 0.95, "nothing shows the wall");
+    assert!(lit(&[looking_down(0.1), looking_down(0.55)]) < 0.05, "one picture shows it");
 }
 
 /// Rays of true surfaces begin close to them; where distances are off by more than a cell, so high that surfaces do not shadow themselves.

@@ -20,7 +20,7 @@ pub struct Shown {
     pub point: Vec3,
     pub normal: Vec3,
     pub albedo: Vec3,
-    /// Share that small things leave of a sun whose traced ray passes.
+    /// Share that arrives of a sun whose traced ray passes.
     pub share: f32,
     /// Linear.
     pub color: Vec3,

@@ -1,4 +1,5 @@
-//! Distances that are taken as observed in the surfaces' stage: of planes through what is learned by then, and of what comparing photographs tells.
+//! Distances that are taken as observed in the surfaces' stage: of sparse points, of planes through what is learned by then, and of what
+//! comparing photographs tells.
 
 use super::super::normal_maps::NormalMaps;
 use super::Trainer;
@@ -23,8 +24,8 @@ pub(in super::super) struct Given {
 
 impl Trainer<'_> {
     /// Flattens what is nearly flat if that is due: from then on, distances to planes through the surfaces are observed, and those that
-    /// were given. Neither is where a photograph shows another color than the surface found there: something thin stands before it, which
-    /// would never be learned. For the same reason, only sparse points are observed before surfaces are flattened first.
+    /// comparing photographs tells; not where a photograph shows another color than the surface found there: something thin stands before it,
+    /// which would never be learned. For the same reason, neither is observed before surfaces are flattened first.
     pub(super) fn flatten(&mut self, share: f32, events: &mut dyn FnMut(&Event)) {
         let due = (share * (FLATTENED + 1) as f32) as u64;
         if due.min(FLATTENED) <= self.model.flattened || self.model.config.loss.depth == 0.0 {
@@ -67,19 +68,26 @@ impl Trainer<'_> {
         errors
     }
 
-    /// Observes the model's distances, and sparse points: many photographs agree on each, and few photographs find surfaces by them alone.
+    /// Observes sparse points and the model's distances.
     pub(super) fn observe(&mut self) {
-        let near = self.model.config.sampling.near;
-        let known = self.model.flat.chunks_exact(4).filter(|f| f[3] > near);
-        let observed = known.map(|f| Observation { image: f[0] as u32, x: f[1] as u32, y: f[2] as u32, distance: f[3] });
-        let sparse = self.given.pixels.iter().filter(|_| self.given.are_sparse_points).copied();
-        self.observations = sparse.chain(observed).filter(|o| self.is_stored(o)).collect();
+        let mut all = observed(&self.given, &self.model.flat, self.model.config.sampling.near);
+        all.retain(|o| self.is_stored(o));
+        self.observations = all;
     }
 
     /// Whether memory holds the pixel itself, and not another one in its place.
     fn is_stored(&self, o: &Observation) -> bool {
         self.photographs.snap(o.image as usize, o.x, o.y) == (o.x, o.y)
     }
+}
+
+/// What is observed: the model's `flat` distances `[N, 4]` beyond `near`, and from the first step on sparse points, without which few photographs
+/// do not find the surfaces.
+fn observed(given: &Given, flat: &[f32], near: f32) -> Vec<Observation> {
+    let sparse: &[Observation] = if given.are_sparse_points { &given.pixels } else { &[] };
+    let known = flat.chunks_exact(4).filter(|f| f[3] > near);
+    let flat = known.map(|f| Observation { image: f[0] as u32, x: f[1] as u32, y: f[2] as u32, distance: f[3] });
+    sparse.iter().copied().chain(flat).collect()
 }
 
 /// Pixels whose error is not far above the median.
@@ -93,6 +101,20 @@ fn explained(pixels: &[Observation], errors: &[f32]) -> Vec<Observation> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn sparse_points_are_observed_from_the_first_step_and_compared_photographs_are_not() {
+        let pixels = vec![Observation { image: 1, x: 2, y: 3, distance: 4.0 }];
+        let distances = |are_sparse_points: bool, flat: &[f32]| -> Vec<f32> {
+            let given = Given { pixels: pixels.clone(), are_sparse_points };
+            observed(&given, flat, 0.5).iter().map(|o| o.distance).collect()
+        };
+        let flat = [0.0, 1.0, 2.0, 3.0, 0.0, 1.0, 3.0, 0.4];
+        assert_eq!(distances(true, &[]), [4.0]);
+        assert_eq!(distances(false, &[]), [0.0; 0]);
+        assert_eq!(distances(true, &flat), [4.0, 3.0]);
+        assert_eq!(distances(false, &flat), [3.0], "what stands nearer than rays begin is not observed");
+    }
 
     #[test]
     fn pixels_of_another_color_than_the_surface_tell_no_distance() {

@@ -63,7 +63,8 @@ impl Trainer<'_> {
         progress(0.0);
         let m = &self.model;
         let normals = NormalMaps::of(m, &self.cameras);
-        let mut visibility = Visibility::of(&m.field, &m.occupancy, m.shaded_cube(), m.config.light.sun_cells).within(&self.cameras);
+        let (cube, cells) = (m.shaded_cube(), m.config.light.sun_cells);
+        let mut visibility = Visibility::within(&m.field, &m.occupancy, cube, cells, &self.cameras);
         let seen = self.seen(&normals);
         if seen.is_empty() {
             let what = format!("after {step} steps, no surface is opaque: there is nothing to tell light from; give more --steps");

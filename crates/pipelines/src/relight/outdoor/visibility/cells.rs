@@ -39,13 +39,19 @@ pub struct Cells {
 }
 
 impl Cells {
-    /// Of a field where its occupancy grid agrees, in a cube given by its lowest corner and edge.
-    pub fn of(field: &dyn DensityQuery, occupancy: &Occupancy, (low, size): (f32, f32), n: usize) -> Cells {
+    /// Of a field where its occupancy grid agrees and something may be, in a cube given by its lowest corner and edge.
+    pub fn of(
+        field: &dyn DensityQuery,
+        occupancy: &Occupancy,
+        (low, size): (f32, f32),
+        n: usize,
+        may_be: &(dyn Fn([f32; 3]) -> bool + Sync),
+    ) -> Cells {
         let cell = size / n as f32;
         let mut cells = Cells::empty((low, size), n);
         for z in 0..n {
             let at = |i: usize| [i % n, i / n, z].map(|k| low + (k as f32 + 0.5) * cell);
-            let live: Vec<usize> = (0..n * n).into_par_iter().filter(|i| is_occupied(occupancy.bits(), at(*i))).collect();
+            let live: Vec<usize> = (0..n * n).into_par_iter().filter(|i| is_occupied(occupancy.bits(), at(*i)) && may_be(at(*i))).collect();
             let corner = |p: [f32; 3], k: usize| [0, 1, 2].map(|a| p[a] + cell * (0.5 * (k >> a & 1) as f32 - 0.25));
             let points: Vec<f32> = live.iter().flat_map(|i| (0..8).map(move |k| (*i, k))).flat_map(|(i, k)| corner(at(i), k)).collect();
             let mut sigma = vec![0.0; points.len() / 3];
@@ -110,24 +116,6 @@ impl Cells {
             self.depths.resize(self.depths.len() + IN_BLOCK, 0);
         }
         self.depths[IN_BLOCK * self.places[block] as usize + i] = (255.0 * (depth / DEEPEST).min(1.0)).ceil() as u8;
-    }
-
-    /// Without the cells whose centers, in model space, are not to be kept.
-    pub fn retain(mut self, keeps: impl Fn(Vec3) -> bool + Sync) -> Cells {
-        let (low, edge, cell) = (self.low, self.n.div_ceil(BLOCK), self.size / self.n as f32);
-        let mut corners = vec![[0; 3]; self.depths.len() / IN_BLOCK];
-        for (b, place) in self.places.iter().enumerate().filter(|(_, p)| **p != NOWHERE) {
-            corners[*place as usize] = [b % edge, b / edge % edge, b / edge / edge].map(|v| v * BLOCK);
-        }
-        self.depths.par_chunks_exact_mut(IN_BLOCK).zip(corners).for_each(|(cells, [x, y, z])| {
-            for (i, depth) in cells.iter_mut().enumerate().filter(|(_, d)| **d > 0) {
-                let at = [x + i % BLOCK, y + i / BLOCK % BLOCK, z + i / BLOCK / BLOCK].map(|v| low + cell * (v as f32 + 0.5));
-                *depth *= keeps(Vec3::from(at)) as u8;
-            }
-        });
-        self.near.fill(0);
-        self.blocks.fill(false);
-        self.finished()
     }
 
     /// With what rays skip by.
@@ -247,24 +235,6 @@ mod tests {
     }
 
     #[test]
-    fn cells_that_are_not_kept_let_light_through() {
-        let at = [[2, 3, 4], [2, 3, 15], [12, 3, 15]];
-        let of = |at: &[[usize; 3]]| {
-            let mut cells = Cells::empty((-1.0, 2.0), 20);
-            at.iter().for_each(|at| cells.set(*at, 2.0));
-            cells.finished()
-        };
-        // Centers are at −1 + 0.1 (i + ½).
-        let kept = of(&at).retain(|p| (p - Vec3::new(-0.75, -0.65, -0.55)).length() > 1e-3);
-        let want = of(&at[1..]);
-        assert_eq!((&kept.near, &kept.blocks), (&want.near, &want.blocks));
-        let along = |cells: &Cells, z: f32| cells.pass(Vec3::new(2.5, 0.1, z), Vec3::Y).0;
-        assert_eq!(along(&kept, 4.5), 1.0);
-        assert_eq!(along(&kept, 15.5), along(&want, 15.5));
-        assert!(along(&want, 15.5) < 0.3);
-    }
-
-    #[test]
     fn bits_of_former_runs_are_solid_cells() {
         let mut bits = vec![0.0; 16usize.pow(3) / BITS];
         bits[(5 * 16 + 4) * 16 / BITS] = 8.0;
@@ -285,7 +255,7 @@ mod tests {
                 }
             }
         }
-        let cells = Cells::of(&Haze, &Occupancy::new(16, 1, false), (0.0, 1.0), 16);
+        let cells = Cells::of(&Haze, &Occupancy::new(16, 1, false), (0.0, 1.0), 16, &|_| true);
         let (passes, meets) = cells.pass(Vec3::new(8.0, 8.0, 0.1), Vec3::Z);
         assert!((passes - (-0.7f32).exp()).abs() < 0.03, "{passes}");
         assert!((meets.z - 12.0).abs() < 2.0, "half is gone at the far end: {meets}");
