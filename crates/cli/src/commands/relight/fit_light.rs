@@ -27,7 +27,7 @@ pub struct FitLight {
     /// Part of the photograph that is fitted; the rest is scored: all, left, right, or x0,y0,x1,y1 in pixels
     #[arg(long, default_value = "all")]
     region: String,
-    /// Fit and score surfaces that no other photograph shows, too
+    /// Fit and score surfaces that fewer than two training photographs show, too
     #[arg(long)]
     all_surfaces: bool,
     /// Nine rows of spherical harmonics and perhaps a sun, for --light of the other commands
