@@ -119,11 +119,7 @@ fn seen_points(model: &ObjectModel) -> Vec<Seen> {
     let tracer = model.tracer(Quality::Fast);
     let mut points: Vec<Seen> = frames.iter().flat_map(|f| surfaces(model, &tracer, f, VIEW_PX)).collect();
     for p in &mut points {
-        let in_view = |f: &&&diorama_geom::Frame| {
-            let (w, h) = (f.camera.width as f64, f.camera.height as f64);
-            let q = f.world_from_camera.inverse().point(p.position);
-            f.camera.project(q).is_some_and(|px| (0.0..w).contains(&px.x) && (0.0..h).contains(&px.y))
-        };
+        let in_view = |f: &&&diorama_geom::Frame| f.camera.shows(f.world_from_camera.inverse().point(p.position));
         p.cameras = frames.iter().filter(in_view).count();
     }
     points

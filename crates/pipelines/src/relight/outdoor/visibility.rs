@@ -85,12 +85,14 @@ pub struct Gathered {
 }
 
 impl Visibility {
-    /// What a field holds in a cube (lowest corner and edge) where its occupancy grid agrees, in `n` cells per axis.
+    /// What a field holds in a cube (lowest corner and edge) where its occupancy grid agrees, in `n` cells per axis, wherever it is.
+    #[cfg(test)]
     pub fn of(field: &dyn DensityQuery, occupancy: &Occupancy, cube: (f32, f32), n: usize) -> Visibility {
         Visibility::new(Cells::of(field, occupancy, cube, n, &|_| true))
     }
 
-    /// The same without what no camera's picture shows: no photograph tells what is there, and it would cast shadows all the same.
+    /// What a field holds in a cube (lowest corner and edge) where its occupancy grid agrees and a camera's picture shows it, in `n` cells per
+    /// axis: of the rest, no photograph tells what is there, and it would cast shadows all the same.
     pub fn within(field: &dyn DensityQuery, occupancy: &Occupancy, cube: (f32, f32), n: usize, cameras: &[PosedCamera]) -> Visibility {
         let inverse: Vec<_> = cameras.iter().map(|c| (c.pose.inverse(), c.camera)).collect();
         let is_shown = |p: [f32; 3]| inverse.iter().any(|(pose, camera)| camera.shows(pose.point(DVec3::from(p.map(f64::from)))));
