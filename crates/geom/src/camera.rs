@@ -138,9 +138,7 @@ impl Camera {
         };
         Some(DVec2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy))
     }
-}
 
-impl Camera {
     /// Whether the picture shows a point, in camera coordinates, if nothing stands before it.
     pub fn shows(&self, x_in_camera: DVec3) -> bool {
         let at = self.project(x_in_camera);

@@ -92,11 +92,18 @@ impl Environment {
 
     /// This light above the horizon, and below it the radiance `albedo E / π` of level, diffuse ground that it lights.
     pub fn above_ground(&self, albedo: f64) -> Environment {
-        let mut ground = [0.0; 3];
-        self.for_each_pixel(|d, solid_angle, radiance| {
-            (0..3).for_each(|k| ground[k] += albedo / PI * solid_angle * d.z.max(0.0) * radiance[k])
-        });
+        let ground = self.irradiance(DVec3::Z).map(|e| albedo / PI * e);
         Environment::from_fn(self.image.height, |d| if d.z < 0.0 { ground } else { self.radiance(d) })
+    }
+
+    /// Irradiance of a surface without shadows, by its normal.
+    pub fn irradiance(&self, normal: DVec3) -> [f64; 3] {
+        let mut sum = [0.0; 3];
+        self.for_each_pixel(|d, solid_angle, radiance| {
+            let weight = solid_angle * d.dot(normal).max(0.0);
+            (0..3).for_each(|k| sum[k] += weight * radiance[k]);
+        });
+        sum
     }
 
     pub fn image(&self) -> &Image {

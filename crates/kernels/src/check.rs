@@ -62,7 +62,10 @@ pub fn run(gpu: &Gpu) -> Result<Vec<Row>, GpuError> {
 /// Main function of a program that runs cases on the device which its argument names, and prints what is wrong. Fails unless all results are
 /// right; exits with 2 where the device cannot be opened, or the cases cannot run on it.
 pub fn main(title: &str, cases: impl Fn(&Gpu) -> Result<Vec<Row>, String>) -> ExitCode {
-    let name = std::env::args().nth(1).unwrap_or_default();
+    let Some(name) = std::env::args().nth(1) else {
+        eprintln!("give the device to check, for example vulkan");
+        return ExitCode::from(2);
+    };
     let begin = Instant::now();
     let open = || Gpu::open(name.parse::<Api>()?).map_err(|e| e.to_string());
     let (gpu, rows) = match open().and_then(|gpu| cases(&gpu).map(|rows| (gpu, rows))) {

@@ -196,11 +196,7 @@ fn light(index: usize) -> Daylight {
 
 /// Irradiance of a surface without shadows.
 pub fn irradiance(light: &Daylight, normal: DVec3) -> [f64; 3] {
-    let mut sum = [0.0; 3];
-    light.environment.for_each_pixel(|d, solid_angle, radiance| {
-        let weight = solid_angle * d.dot(normal).max(0.0);
-        (0..3).for_each(|k| sum[k] += weight * radiance[k]);
-    });
+    let mut sum = light.environment.irradiance(normal);
     if let Some(sun) = light.sun {
         (0..3).for_each(|k| sum[k] += sun.irradiance[k] * sun.direction.dot(normal).max(0.0));
     }
