@@ -74,7 +74,31 @@ pub struct SceneBox {
     pub aabb_scale: u32,
 }
 
+/// Share of the visible points on either side of an axis that need not be in the inner cube of [`SceneBox::holding`], how much larger than the
+/// points that cube is, and the edge of its outer cube at most.
+const OUTLIERS: f64 = 0.1;
+const MARGIN: f64 = 1.01;
+const MOST_SCALE: u32 = 8;
+
 impl SceneBox {
+    /// The box whose inner cube holds cameras and most of the points that they see, and whose outer cube all of these, as far as it may be so
+    /// large.
+    pub fn holding(eyes: &[DVec3], seen: &[DVec3]) -> SceneBox {
+        let range = |axis: usize| -> (f64, f64) {
+            let mut along: Vec<f64> = seen.iter().map(|p| p[axis]).collect();
+            along.sort_by(f64::total_cmp);
+            let at = |share: f64| along.get((share * (along.len().max(1) - 1) as f64) as usize).copied();
+            let fold = |first: Option<f64>, of: fn(f64, f64) -> f64| eyes.iter().map(|p| p[axis]).chain(first).reduce(of).unwrap_or(0.0);
+            (fold(at(OUTLIERS), f64::min), fold(at(1.0 - OUTLIERS), f64::max))
+        };
+        let [(x0, x1), (y0, y1), (z0, z1)] = [range(0), range(1), range(2)];
+        let (low, high) = (DVec3::new(x0, y0, z0), DVec3::new(x1, y1, z1));
+        let (center, half) = (0.5 * (low + high), 0.5 * MARGIN * (high - low).max_element());
+        let farthest = seen.iter().map(|p| (*p - center).abs().max_element()).fold(half, f64::max);
+        let aabb_scale = ((farthest / half).min(MOST_SCALE as f64).ceil().max(1.0) as u32).next_power_of_two();
+        SceneBox { center, half, aabb_scale }
+    }
+
     /// Transform to model space, in which the inner cube is `[0, 1]³`.
     pub fn model_from_world(&self) -> Similarity {
         let scale = 0.5 / self.half;

@@ -6,6 +6,7 @@ use super::truth::{self, LightTruth, Truth, ViewTruth};
 use crate::error::{PipelineError, Result};
 use diorama_data::masks::{GLASS_CLASS, SKY_CLASS, STATIC_CLASS};
 use diorama_data::{DataError, atomic, photo};
+use diorama_geom::capture::SceneBox;
 use diorama_geom::color::{luminance, srgb_from_linear};
 use diorama_geom::daylight::Daylight;
 use diorama_geom::environment::Environment;
@@ -27,10 +28,8 @@ const EXPOSED: f64 = 1.1;
 const CANDIDATES: usize = 40;
 /// Least distance in meters of what the center of a view shows.
 const NEAREST: f64 = 5.0;
-/// Pixels of each view, share of the visible points on either side of an axis, and edge of the outer cube at most, by which the cubes are chosen.
+/// Pixels of each view by which the scene's cubes are chosen.
 const PROBED: (u32, u32) = (24, 18);
-const OUTLIERS: f64 = 0.1;
-const MOST_SCALE: u32 = 8;
 /// Bounces of light.
 const BOUNCES: u32 = 6;
 /// Rays of a pixel along an axis by which masks are decided.
@@ -343,20 +342,9 @@ fn capture(frames: Vec<serde_json::Value>, scene: &Scene, viewpoints: &[Viewpoin
         let view = View { camera: camera.resized(PROBED.0, PROBED.1), world_from_camera: *pose, lens: None };
         seen.extend(cpu::first_hits(scene, &view, true).into_iter().flatten().map(|h| h.position));
     }
-    let standing = || viewpoints.iter().map(|p| p.pose.translation);
-    let range = |axis: usize| -> (f64, f64) {
-        let mut along: Vec<f64> = seen.iter().map(|p| p[axis]).collect();
-        along.sort_by(f64::total_cmp);
-        let at = |share: f64| along.get((share * (along.len().max(1) - 1) as f64) as usize).copied();
-        let fold = |first: Option<f64>, of: fn(f64, f64) -> f64| standing().map(|p| p[axis]).chain(first).reduce(of).unwrap_or(0.0);
-        (fold(at(OUTLIERS), f64::min), fold(at(1.0 - OUTLIERS), f64::max))
-    };
-    let [(x0, x1), (y0, y1), (z0, z1)] = [range(0), range(1), range(2)];
-    let (low, high) = (DVec3::new(x0, y0, z0), DVec3::new(x1, y1, z1));
-    let (center, half) = (0.5 * (low + high), 0.505 * (high - low).max_element());
-    let farthest = seen.iter().map(|p| (*p - center).abs().max_element()).fold(half, f64::max);
-    let aabb_scale = (farthest / half).min(MOST_SCALE as f64).ceil().max(1.0) as u32;
-    let scale = 0.5 / half;
-    let offset = DVec3::splat(0.5) - scale * center;
-    json!({ "aabb_scale": aabb_scale.next_power_of_two(), "scale": scale, "offset": [offset.x, offset.y, offset.z], "mask_meaning": "classes", "frames": frames })
+    let eyes: Vec<DVec3> = viewpoints.iter().map(|p| p.pose.translation).collect();
+    let cube = SceneBox::holding(&eyes, &seen);
+    let scale = 0.5 / cube.half;
+    let offset = DVec3::splat(0.5) - scale * cube.center;
+    json!({ "aabb_scale": cube.aabb_scale, "scale": scale, "offset": [offset.x, offset.y, offset.z], "mask_meaning": "classes", "frames": frames })
 }
