@@ -2,6 +2,7 @@
 
 use crate::surface::Surface;
 use crate::textures::Tile;
+use diorama_geom::ImageU8;
 use diorama_geom::glam::{DAffine3, DVec3};
 use diorama_geom::model::{Instance, Material, Model, Opacity, Part, Texture, Wrap};
 
@@ -75,6 +76,13 @@ impl ModelBuilder {
             ..Material::default()
         };
         self.material(material, tile_m)
+    }
+
+    /// Adds a material that shows an RGB image once, with texture coordinates from 0 to 1.
+    pub fn pictured(&mut self, name: &str, image: &ImageU8, roughness: f32) -> Finish {
+        self.model.textures.push(Texture { image: image.clone(), wrap: [Wrap::Clamp; 2] });
+        let texture = Some(self.model.textures.len() - 1);
+        self.material(Material { name: name.into(), base_color_texture: texture, roughness, ..Material::default() }, 1.0)
     }
 
     /// Adds the same material in another color, which multiplies the texture's.

@@ -3,6 +3,7 @@
 //! - [`still_life`] is the capture of `diorama quickstart`; [`ray_caster`] has the shapes, textures and the renderer for scenes of your own.
 //! - [`hills`] is a surface with exact distances and floaters, to measure meshing.
 //! - [`street`], [`chair`] and [`still_life_model`] are triangle meshes with metallic-roughness materials, for a path tracer to light.
+//! - [`signs`] are places whose boards carry writing that the caller paints.
 //!
 //! ```
 //! use diorama_scenes::still_life;
@@ -24,6 +25,7 @@ mod assembly;
 pub mod chair;
 pub mod hills;
 pub mod ray_caster;
+pub mod signs;
 pub mod still_life;
 pub mod still_life_model;
 pub mod street;
