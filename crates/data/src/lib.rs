@@ -89,6 +89,7 @@ pub mod sparse_ply;
 pub mod splat_ply;
 pub mod split;
 pub mod tetrahedra_npz;
+pub mod text_labels;
 pub mod tfevents;
 pub mod transforms_json;
 pub mod usdz;
