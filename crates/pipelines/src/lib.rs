@@ -57,6 +57,7 @@ pub mod error;
 pub mod object;
 pub mod relight;
 pub mod run;
+pub mod text;
 
 pub use application::Application;
 pub use error::{PipelineError, Result};

@@ -18,6 +18,7 @@ mod process;
 mod quickstart;
 mod relight;
 mod render;
+mod text;
 mod train;
 mod view;
 
@@ -76,6 +77,8 @@ pub enum Command {
     #[command(subcommand)]
     Relight(relight::Relight),
     #[command(subcommand)]
+    Text(text::Text),
+    #[command(subcommand)]
     Bench(bench::Bench),
 }
 
@@ -96,6 +99,7 @@ impl Command {
             Command::Completions(v) => v,
             Command::Man(v) => v,
             Command::Relight(noun) => noun.verb(),
+            Command::Text(noun) => noun.verb(),
             Command::Bench(noun) => noun.verb(),
         }
     }

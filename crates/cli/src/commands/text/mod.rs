@@ -1,0 +1,21 @@
+//! `diorama text`: a group of commands.
+
+mod make_scenes;
+
+use super::Verb;
+use clap::Subcommand;
+
+/// Turn scenes with writing into labelled images
+#[derive(Subcommand)]
+pub enum Text {
+    MakeScenes(make_scenes::MakeScenes),
+}
+
+impl Text {
+    /// The chosen command.
+    pub fn verb(&self) -> &dyn Verb {
+        match self {
+            Text::MakeScenes(v) => v,
+        }
+    }
+}

@@ -1,0 +1,9 @@
+//! Application *text*: one filmed scene with writing becomes labelled images with other words, cameras and weather (Cui et al. 2024).
+//!
+//! [`make_scenes`] photographs generated scenes with exact ground truth; [`lettering`] sets and draws writing.
+
+pub mod lettering;
+pub mod make_scenes;
+pub mod regions;
+pub mod truth;
+mod words;
