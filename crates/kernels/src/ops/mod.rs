@@ -43,6 +43,7 @@ pub mod ray_aabb;
 pub mod ray_generation;
 pub mod ray_triangles;
 pub mod resample;
+pub mod s3im;
 pub mod sample_pdf;
 pub mod scan;
 pub mod sign_change_loss;
