@@ -2,8 +2,10 @@
 //!
 //! [`make_scenes`] photographs generated scenes with exact ground truth; [`lettering`] sets and draws writing.
 
+pub mod camera;
 pub mod lettering;
 pub mod make_scenes;
+pub mod pose_clusters;
 pub mod regions;
 pub mod truth;
 mod words;
