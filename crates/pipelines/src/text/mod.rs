@@ -7,5 +7,6 @@ pub mod lettering;
 pub mod make_scenes;
 pub mod pose_clusters;
 pub mod regions;
+pub mod surface;
 pub mod truth;
 mod words;
