@@ -48,6 +48,7 @@ pub const PARSERS: &[Parser] = &[
     Parser { name: "environment", run: models::environment, seeds: models::environment_seeds },
     Parser { name: "sh_text", run: models::sh_text, seeds: models::sh_seeds },
     Parser { name: "osr_matrix", run: models::osr_matrix, seeds: models::osr_seeds },
+    Parser { name: "text_labels", run: models::text_labels, seeds: models::text_label_seeds },
     Parser { name: "session_list", run: models::session_list, seeds: models::session_seeds },
 ];
 

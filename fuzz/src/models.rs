@@ -2,7 +2,7 @@
 
 use crate::file;
 use diorama_data::gltf::{self, WriteOptions};
-use diorama_data::{environment, model_file, nerf_osr, obj, photo, sessions, sh_text};
+use diorama_data::{environment, model_file, nerf_osr, obj, photo, sessions, sh_text, text_labels};
 use diorama_geom::environment::Environment;
 use diorama_geom::glam::{DAffine3, DVec3};
 use diorama_geom::model::{Instance, Material, Model, Opacity, Texture, Wrap};
@@ -154,4 +154,27 @@ pub fn session_list(data: &[u8]) {
 
 pub fn session_seeds() -> Vec<Vec<u8>> {
     vec![b"# names\na.jpg noon\nb c.jpg, dusk\r\n".to_vec(), b"alone\n".to_vec()]
+}
+
+/// Labels of writing: as our own lines, then in each foreign format.
+pub fn text_labels(data: &[u8]) {
+    let Ok(text) = std::str::from_utf8(data) else { return };
+    if let Ok(images) = text_labels::parse(text) {
+        assert!(images.iter().flat_map(|i| &i.regions).all(|r| r.polygon.len() > 2));
+    }
+    for format in text_labels::Format::ALL {
+        let _ = text_labels::count(format, text);
+    }
+}
+
+pub fn text_label_seeds() -> Vec<Vec<u8>> {
+    [
+        r#"{"image":"a.png","regions":[{"id":0,"polygon":[[0,0],[4,0],[4,2],[0,2]],"transcription":"A","kind":"custom","ignore":true}]}"#,
+        r#"{"imagePath":"a.png","shapes":[{"label":"A","points":[[0,0],[4,2]],"group_id":1,"shape_type":"rectangle"}]}"#,
+        "a.png\t[{\"transcription\":\"A\",\"points\":[[0,0],[4,0],[4,2],[0,2]],\"difficult\":true}]\n",
+        "1 2 3 4 \"A, b\"\n",
+        "\u{feff}0,0,4,0,4,2,0,2,Latin,A, b\r\n",
+    ]
+    .map(|s| s.as_bytes().to_vec())
+    .to_vec()
 }

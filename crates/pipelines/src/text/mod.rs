@@ -2,6 +2,7 @@
 //!
 //! [`make_scenes`] photographs generated scenes with exact ground truth; [`lettering`] sets and draws writing.
 
+pub mod annotate;
 pub mod camera;
 pub mod lettering;
 pub mod make_scenes;

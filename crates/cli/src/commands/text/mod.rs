@@ -1,5 +1,6 @@
 //! `diorama text`: a group of commands.
 
+mod annotate;
 mod make_scenes;
 
 use super::Verb;
@@ -8,6 +9,7 @@ use clap::Subcommand;
 /// Turn scenes with writing into labelled images
 #[derive(Subcommand)]
 pub enum Text {
+    Annotate(annotate::Annotate),
     MakeScenes(make_scenes::MakeScenes),
 }
 
@@ -15,6 +17,7 @@ impl Text {
     /// The chosen command.
     pub fn verb(&self) -> &dyn Verb {
         match self {
+            Text::Annotate(v) => v,
             Text::MakeScenes(v) => v,
         }
     }

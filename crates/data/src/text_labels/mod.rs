@@ -4,10 +4,15 @@
 //! Polygons are in pixels, clockwise from the upper left in reading order; one `id` is the same region in all images. The transcription
 //! `###` means that nobody can read it.
 
+mod formats;
+
 use crate::atomic;
 use crate::error::{DataError, Result, read};
 use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
 use std::path::Path;
+
+pub use formats::{Format, Known, count, import};
 
 /// Transcription of what is not to be read.
 pub const UNREADABLE: &str = "###";
@@ -59,11 +64,31 @@ pub enum Kind {
 /// transcriptions.
 pub fn load(path: &Path) -> Result<Vec<LabelledImage>> {
     let bytes = read(path, LIMIT)?;
-    let text = std::str::from_utf8(&bytes).map_err(|e| {
-        let line = 1 + bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count();
-        DataError::input(path, format!("line {line}: not UTF-8 at byte {}; save it as UTF-8", e.valid_up_to()))
-    })?;
+    let text = utf8(&bytes).map_err(|e| DataError::input(path, e))?;
     parse(text).map_err(|message| DataError::input(path, message))
+}
+
+/// The text of a file, or where it is none.
+fn utf8(bytes: &[u8]) -> std::result::Result<&str, String> {
+    std::str::from_utf8(bytes).map_err(|e| {
+        let line = 1 + bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count();
+        format!("line {line}: not UTF-8 at byte {}; save it as UTF-8", e.valid_up_to())
+    })
+}
+
+/// Keeps what the region of an id says and where it is said first.
+///
+/// # Errors
+/// When the id said something else before.
+fn known_texts(known: &mut HashMap<u32, (String, String)>, id: u32, text: &str, at: &str) -> std::result::Result<(), String> {
+    if text == UNREADABLE {
+        return Ok(());
+    }
+    let (said, first) = known.entry(id).or_insert_with(|| (text.into(), at.into()));
+    if said != text {
+        return Err(format!("{at}: region {id} is {text:?}, at {first} it is {said:?}; one id is one text"));
+    }
+    Ok(())
 }
 
 /// The labels of a text.
@@ -72,20 +97,13 @@ pub fn load(path: &Path) -> Result<Vec<LabelledImage>> {
 /// As [`load`].
 pub fn parse(text: &str) -> std::result::Result<Vec<LabelledImage>, String> {
     let mut out: Vec<LabelledImage> = Vec::new();
-    let mut known: std::collections::HashMap<u32, (String, usize)> = std::collections::HashMap::new();
+    let mut known = HashMap::new();
     for (n, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty()) {
-        let at = n + 1;
-        let image: LabelledImage = serde_json::from_str(line).map_err(|e| format!("line {at}: {e}; expected a line such as {EXAMPLE}"))?;
+        let at = format!("line {}", n + 1);
+        let image: LabelledImage = serde_json::from_str(line).map_err(|e| format!("{at}: {e}; expected a line such as {EXAMPLE}"))?;
         for region in &image.regions {
-            check(&region.polygon).map_err(|e| format!("line {at}: region {}: {e}", region.id))?;
-            if region.transcription == UNREADABLE {
-                continue;
-            }
-            let (said, first) = known.entry(region.id).or_insert_with(|| (region.transcription.clone(), at));
-            if *said != region.transcription {
-                let now = &region.transcription;
-                return Err(format!("line {at}: region {} is {now:?}, on line {first} it is {said:?}; one id is one text", region.id));
-            }
+            check(&region.polygon).map_err(|e| format!("{at}: region {}: {e}", region.id))?;
+            known_texts(&mut known, region.id, &region.transcription, &at)?;
         }
         out.push(image);
     }
@@ -169,7 +187,7 @@ mod tests {
         for (text, expected) in [
             (format!("{good}\n{}", line("[[0,0],[4,0]]", "A")), "line 2: region 3: 2 corners; a polygon has at least 3"),
             (line("[[0,0],[4,2],[4,0],[0,2]]", "A"), "line 1: region 3: the side after vertex 0 crosses the side after vertex 2"),
-            (format!("{good}\n\n{}", line("[[0,0],[4,0],[4,2],[0,2]]", "B")), "line 3: region 3 is \"B\", on line 1 it is \"A\""),
+            (format!("{good}\n\n{}", line("[[0,0],[4,0],[4,2],[0,2]]", "B")), "line 3: region 3 is \"B\", at line 1 it is \"A\""),
             (line("[[0,0],[4,0],[4,2],[0,\"x\"]]", "A"), "expected a line such as {\"image\""),
             ("{\"image\":\"a.png\"}".into(), "missing field `regions`"),
             ("{\"image\":\"a.png\",\"regions\":[]}".into(), "holds no region; label at least one"),
