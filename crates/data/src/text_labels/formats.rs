@@ -13,7 +13,7 @@
 use super::{Kind, LIMIT, LabelledImage, LabelledRegion, UNREADABLE, check, known_texts};
 use crate::error::{DataError, Result, read};
 use serde::Deserialize;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
 /// Formats that are read.
@@ -47,7 +47,7 @@ impl Format {
 }
 
 /// A region as a file says it.
-struct Said {
+struct ParsedRegion {
     id: Option<u32>,
     polygon: Vec<[f64; 2]>,
     transcription: String,
@@ -58,10 +58,10 @@ struct Said {
 }
 
 /// An image as a file says it.
-struct SaidImage {
+struct ParsedImage {
     file: PathBuf,
     image: String,
-    regions: Vec<Said>,
+    regions: Vec<ParsedRegion>,
 }
 
 /// An image that labels may belong to.
@@ -85,12 +85,13 @@ pub fn import(format: Format, path: &Path, known: &[Known]) -> Result<Vec<Labell
         let images = super::utf8(&bytes).and_then(|text| said_in(format, &file, text));
         said.extend(images.map_err(|e| DataError::input(&file, e))?);
     }
-    let mut next = said.iter().flat_map(|i| &i.regions).filter_map(|r| r.id).max().map_or(0, |id| id + 1);
+    let most = said.iter().flat_map(|i| &i.regions).filter_map(|r| r.id).max();
+    let mut next = most.map_or(Some(0), |id| id.checked_add(1));
     let mut ids: HashMap<(String, usize), u32> = HashMap::new();
-    let (mut out, mut texts) = (Vec::new(), HashMap::new());
+    let (mut out, mut texts) = (BTreeMap::<String, (Vec<LabelledRegion>, HashMap<String, usize>)>::new(), HashMap::new());
     for image in said.into_iter().filter(|i| !i.regions.is_empty()) {
-        let at = of(&image, known)?;
-        let (mut counts, mut regions) = (HashMap::<String, usize>::new(), Vec::new());
+        let at = match_image(&image, known)?;
+        let (regions, counts) = out.entry(at.path.clone()).or_default();
         for region in image.regions {
             let wrong = |e: String| DataError::input(&image.file, format!("{}: {e}", region.at));
             check(&region.polygon).map_err(wrong)?;
@@ -98,28 +99,33 @@ pub fn import(format: Format, path: &Path, known: &[Known]) -> Result<Vec<Labell
             let is_read = region.transcription != UNREADABLE && !region.transcription.is_empty();
             let count = counts.entry(region.transcription.clone()).or_default();
             *count += 1;
-            let mut new = || {
-                next += 1;
-                next - 1
-            };
-            let id = match region.id {
+            let known_id = if is_read { ids.get(&(region.transcription.clone(), *count)).copied() } else { None };
+            let id = match region.id.or(known_id) {
                 Some(id) => id,
-                None if is_read => *ids.entry((region.transcription.clone(), *count)).or_insert_with(new),
-                None => new(),
+                None => {
+                    let new = next.ok_or_else(|| wrong("an id is as large as ids can be; use smaller ones".into()))?;
+                    next = new.checked_add(1);
+                    new
+                }
             };
-            let transcription = if is_read { region.transcription } else { UNREADABLE.into() };
-            known_texts(&mut texts, id, &transcription, &region.at).map_err(|e| DataError::input(&image.file, e))?;
+            if is_read && region.id.is_none() {
+                ids.insert((region.transcription.clone(), *count), id);
+            }
+            if regions.iter().any(|r| r.id == id) {
+                return Err(wrong(format!("region {id} is labelled twice in {}; give each region an id of its own", at.path)));
+            }
+            let transcription = if is_read { region.transcription.clone() } else { UNREADABLE.into() };
+            let place = format!("{}, {}", image.file.file_name().unwrap_or_default().to_string_lossy(), region.at);
+            known_texts(&mut texts, id, &transcription, &place).map_err(|e| DataError::input(&image.file, e))?;
             let ignore = region.is_difficult || !is_read;
             let polygon = clockwise(region.polygon);
             regions.push(LabelledRegion { id, polygon, transcription, script: region.script, kind: Kind::Text, ignore });
         }
-        out.push(LabelledImage { image: at.path.clone(), regions });
     }
     if out.is_empty() {
         return Err(DataError::input(path, format!("holds no label of the format {}", format.name())));
     }
-    out.sort_by(|a, b| a.image.cmp(&b.image));
-    Ok(out)
+    Ok(out.into_iter().map(|(image, (regions, _))| LabelledImage { image, regions }).collect())
 }
 
 /// Regions that a text of a format lists.
@@ -131,7 +137,7 @@ pub fn count(format: Format, text: &str) -> std::result::Result<usize, String> {
 }
 
 /// What a file says.
-fn said_in(format: Format, file: &Path, text: &str) -> std::result::Result<Vec<SaidImage>, String> {
+fn said_in(format: Format, file: &Path, text: &str) -> std::result::Result<Vec<ParsedImage>, String> {
     match format {
         Format::Labelme => labelme(file, text),
         Format::Ppocr => ppocr(file, text),
@@ -167,20 +173,25 @@ fn files(format: Format, path: &Path) -> Result<Vec<PathBuf>> {
 }
 
 /// The capture's image that labels name: by its path, its file name, or its name without an extension.
-fn of<'k>(image: &SaidImage, known: &'k [Known]) -> Result<&'k Known> {
+fn match_image<'k>(image: &ParsedImage, known: &'k [Known]) -> Result<&'k Known> {
     let name = |p: &str| p.rsplit(['/', '\\']).next().unwrap_or(p).to_string();
     let stem = |p: &str| Path::new(&name(p)).file_stem().unwrap_or_default().to_string_lossy().into_owned();
-    let by = |same: &dyn Fn(&Known) -> bool| known.iter().find(|k| same(k));
-    let found = by(&|k| k.path == image.image)
-        .or_else(|| by(&|k| name(&k.path) == name(&image.image)))
-        .or_else(|| by(&|k| stem(&k.path) == stem(&image.image)));
-    found.ok_or_else(|| {
-        let example = known.first().map_or("none", |k| &k.path[..]);
-        DataError::input(
-            &image.file,
-            format!("labels {:?}, which is no photograph of the capture; those are like {example:?}", image.image),
-        )
-    })
+    let said = &image.image;
+    let rules: [&dyn Fn(&Known) -> bool; 4] =
+        [&|k| k.path == *said, &|k| name(&k.path) == name(said), &|k| stem(&k.path) == *said, &|k| stem(&k.path) == stem(said)];
+    for rule in rules {
+        match known.iter().filter(|k| rule(k)).collect::<Vec<_>>()[..] {
+            [] => (),
+            [one] => return Ok(one),
+            [a, b, ..] => {
+                let message = format!("labels {said:?}, which may be {:?} or {:?}; name the photograph by its path", a.path, b.path);
+                return Err(DataError::input(&image.file, message));
+            }
+        }
+    }
+    let example = known.first().map_or("none", |k| &k.path[..]);
+    let message = format!("labels {said:?}, which is no photograph of the capture; those are like {example:?}");
+    Err(DataError::input(&image.file, message))
 }
 
 /// Whether all corners are in the image, up to a pixel.
@@ -218,7 +229,7 @@ struct LabelmeShape {
     shape_type: Option<String>,
 }
 
-fn labelme(file: &Path, text: &str) -> std::result::Result<Vec<SaidImage>, String> {
+fn labelme(file: &Path, text: &str) -> std::result::Result<Vec<ParsedImage>, String> {
     let read: LabelmeFile = serde_json::from_str(text).map_err(|e| format!("{e}; expected labelme's imagePath and shapes"))?;
     let mut regions = Vec::new();
     for (k, shape) in read.shapes.into_iter().enumerate() {
@@ -231,9 +242,9 @@ fn labelme(file: &Path, text: &str) -> std::result::Result<Vec<SaidImage>, Strin
             (kind, _) => return Err(format!("shape {k} is a {kind} of {} points; expected polygons or rectangles", shape.points.len())),
         };
         let at = format!("shape {k}");
-        regions.push(Said { id: shape.group_id, polygon, transcription: shape.label, script: None, is_difficult: false, at });
+        regions.push(ParsedRegion { id: shape.group_id, polygon, transcription: shape.label, script: None, is_difficult: false, at });
     }
-    Ok(vec![SaidImage { file: file.into(), image: read.image_path, regions }])
+    Ok(vec![ParsedImage { file: file.into(), image: read.image_path, regions }])
 }
 
 #[derive(Deserialize)]
@@ -244,14 +255,14 @@ struct PpocrRegion {
     difficult: bool,
 }
 
-fn ppocr(file: &Path, text: &str) -> std::result::Result<Vec<SaidImage>, String> {
+fn ppocr(file: &Path, text: &str) -> std::result::Result<Vec<ParsedImage>, String> {
     let expected = r#"expected PATH, a tab and [{"transcription": "TEXT", "points": [[x, y], …]}]"#;
     let mut out = Vec::new();
     for (n, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty()) {
         let at = format!("line {}", n + 1);
         let (image, list) = line.split_once('\t').ok_or_else(|| format!("{at}: no tab; {expected}"))?;
         let list: Vec<PpocrRegion> = serde_json::from_str(list).map_err(|e| format!("{at}: {e}; {expected}"))?;
-        let said = |(k, r): (usize, PpocrRegion)| Said {
+        let said = |(k, r): (usize, PpocrRegion)| ParsedRegion {
             id: None,
             polygon: r.points,
             transcription: r.transcription,
@@ -260,13 +271,13 @@ fn ppocr(file: &Path, text: &str) -> std::result::Result<Vec<SaidImage>, String>
             at: format!("{at}, region {k}"),
         };
         let regions = list.into_iter().enumerate().map(said).collect();
-        out.push(SaidImage { file: file.into(), image: image.into(), regions });
+        out.push(ParsedImage { file: file.into(), image: image.into(), regions });
     }
     Ok(out)
 }
 
 /// The formats of ICDAR, a region per line.
-fn lines(format: Format, file: &Path, text: &str) -> std::result::Result<SaidImage, String> {
+fn lines(format: Format, file: &Path, text: &str) -> std::result::Result<ParsedImage, String> {
     let stem = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let image = stem.strip_prefix("gt_").unwrap_or(&stem).to_string();
     let mut regions = Vec::new();
@@ -274,9 +285,9 @@ fn lines(format: Format, file: &Path, text: &str) -> std::result::Result<SaidIma
         let at = format!("line {}", n + 1);
         let said = if format == Format::Icdar13 { icdar13(line) } else { corners(line, format == Format::Mlt17) };
         let (polygon, script, transcription) = said.map_err(|e| format!("{at}: {e}"))?;
-        regions.push(Said { id: None, polygon, transcription, script, is_difficult: false, at });
+        regions.push(ParsedRegion { id: None, polygon, transcription, script, is_difficult: false, at });
     }
-    Ok(SaidImage { file: file.into(), image, regions })
+    Ok(ParsedImage { file: file.into(), image, regions })
 }
 
 type Line = (Vec<[f64; 2]>, Option<String>, String);

@@ -75,6 +75,19 @@ fn regions_without_ids_are_told_apart_and_unreadable_ones_are_ignored() {
 }
 
 #[test]
+fn one_image_in_several_places_is_one_and_names_may_have_dots() {
+    let line =
+        |text: &str, x: u32| format!("001.png\t[{{\"transcription\":\"{text}\",\"points\":[[{x},1],[{},1],[{},9]]}}]\n", x + 5, x + 5);
+    let all = imported(Format::Ppocr, &[("Label.txt", &(line("A", 1) + &line("A", 20) + &line("B", 40)))]);
+    assert!(all.len() == 1 && all[0].regions.len() == 3);
+    let ids: Vec<u32> = all[0].regions.iter().map(|r| r.id).collect();
+    assert!(ids[0] != ids[1] && ids[1] != ids[2] && ids[0] != ids[2]);
+    let dotted = [Known { path: "images/a.b.jpg".into(), size: (100, 60) }];
+    let dir = folder(&[("gt_a.b.txt", "1,1,9,1,9,9,1,9,A\n")]);
+    assert_eq!(import(Format::Icdar15, dir.path(), &dotted).unwrap()[0].image, "images/a.b.jpg");
+}
+
+#[test]
 fn errors_name_file_line_and_what_is_expected() {
     refused(
         Format::Icdar15,
@@ -91,7 +104,7 @@ fn errors_name_file_line_and_what_is_expected() {
         &[("gt_003.txt", "1,1,9,1,9,9,1,9,A\n")],
         &["gt_003.txt", "labels \"003\", which is no photograph", "images/001.png"],
     );
-    refused(Format::Icdar15, &[("gt_001.txt", "1,1,9,9,9,1,1,9,A\n")], &["line 1: the side after vertex 0 crosses"]);
+    refused(Format::Icdar15, &[("gt_001.txt", "1,1,9,9,9,1,3,9,A\n")], &["line 1: the side after vertex 0 crosses"]);
     refused(
         Format::Icdar15,
         &[("gt_001.txt", "1,1,109,1,109,9,1,9,A\n")],
@@ -103,7 +116,19 @@ fn errors_name_file_line_and_what_is_expected() {
             ["A", "B"][id as usize - 1]
         )
     };
-    refused(Format::Labelme, &[("a.json", &two(1)), ("b.json", &two(2))], &["b.json", "region 7 is \"B\"", "it is \"A\""]);
+    refused(
+        Format::Labelme,
+        &[("a.json", &two(1)), ("b.json", &two(2))],
+        &["b.json, shape 0: region 7 is \"B\"", "at a.json, shape 0 it is \"A\""],
+    );
+    let twice = r#"{"imagePath":"001.png","shapes":[{"label":"A","points":[[1,1],[9,1],[9,9]],"group_id":7},{"label":"A","points":[[1,1],[9,1],[9,9]],"group_id":7}]}"#;
+    refused(Format::Labelme, &[("a.json", twice)], &["shape 1: region 7 is labelled twice in images/001.png"]);
+    let largest = r#"{"imagePath":"001.png","shapes":[{"label":"A","points":[[1,1],[9,1],[9,9]],"group_id":4294967295},{"label":"B","points":[[1,1],[9,1],[9,9]]}]}"#;
+    refused(Format::Labelme, &[("a.json", largest)], &["shape 1: an id is as large as ids can be"]);
+    let two = ["cam0/001.png", "cam1/001.png"].map(|p| Known { path: p.into(), size: (100, 60) });
+    let dir = folder(&[("gt_001.txt", "1,1,9,1,9,9,1,9,A\n")]);
+    let error = import(Format::Icdar15, dir.path(), &two).unwrap_err().to_string();
+    assert!(error.contains("may be \"cam0/001.png\" or \"cam1/001.png\""), "{error}");
     refused(Format::Icdar15, &[("readme.md", "")], &["holds no gt_NAME.txt, as icdar15 has"]);
     refused(Format::Icdar15, &[("gt_001.txt", "\n")], &["holds no label of the format icdar15"]);
     let missing = tempfile::tempdir().unwrap().path().join("none");

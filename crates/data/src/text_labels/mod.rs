@@ -17,6 +17,8 @@ pub use formats::{Format, Known, count, import};
 /// Transcription of what is not to be read.
 pub const UNREADABLE: &str = "###";
 const LIMIT: u64 = 1 << 30;
+/// Twice the area in square pixels below which a polygon has none.
+const LEAST_AREA: f64 = 1e-6;
 /// What a line looks like, for errors.
 const EXAMPLE: &str =
     r#"{"image": "images/001.png", "regions": [{"id": 0, "polygon": [[10,8],[90,10],[90,30],[10,28]], "transcription": "CAFE"}]}"#;
@@ -57,7 +59,7 @@ pub enum Kind {
     Custom,
 }
 
-/// Reads labels and checks each polygon: at least three corners, finite, and no two sides that cross.
+/// Reads labels and checks each polygon: at least three corners, finite, around an area, and no two sides that cross.
 ///
 /// # Errors
 /// With the line, and where it is a polygon the vertex, when the file cannot be read or holds something else; when one id has two
@@ -121,6 +123,10 @@ fn check(polygon: &[[f64; 2]]) -> std::result::Result<(), String> {
     }
     if let Some(k) = polygon.iter().position(|p| p.iter().any(|v| !v.is_finite())) {
         return Err(format!("vertex {k} is not a number"));
+    }
+    let area: f64 = (0..n).map(|k| polygon[k][0] * polygon[(k + 1) % n][1] - polygon[k][1] * polygon[(k + 1) % n][0]).sum();
+    if area.abs() < LEAST_AREA {
+        return Err("its corners enclose no area; draw around the writing".into());
     }
     let turn = |a: [f64; 2], b: [f64; 2], c: [f64; 2]| (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
     let side = |k: usize| (polygon[k], polygon[(k + 1) % n]);
@@ -186,7 +192,8 @@ mod tests {
         let good = line("[[0,0],[4,0],[4,2],[0,2]]", "A");
         for (text, expected) in [
             (format!("{good}\n{}", line("[[0,0],[4,0]]", "A")), "line 2: region 3: 2 corners; a polygon has at least 3"),
-            (line("[[0,0],[4,2],[4,0],[0,2]]", "A"), "line 1: region 3: the side after vertex 0 crosses the side after vertex 2"),
+            (line("[[0,0],[4,0],[9,0],[2,0]]", "A"), "line 1: region 3: its corners enclose no area"),
+            (line("[[0,0],[6,2],[4,0],[0,2]]", "A"), "line 1: region 3: the side after vertex 0 crosses the side after vertex 2"),
             (format!("{good}\n\n{}", line("[[0,0],[4,0],[4,2],[0,2]]", "B")), "line 3: region 3 is \"B\", at line 1 it is \"A\""),
             (line("[[0,0],[4,0],[4,2],[0,\"x\"]]", "A"), "expected a line such as {\"image\""),
             ("{\"image\":\"a.png\"}".into(), "missing field `regions`"),

@@ -29,7 +29,10 @@ pub struct Annotated {
 /// # Errors
 /// When the capture has labels that are not replaced by `force`, or the capture or the labels are wrong.
 pub fn annotate(capture: &Path, labels: &Path, format: Format, force: bool) -> Result<Annotated> {
-    let folder = if capture.is_file() { capture.parent().unwrap_or(Path::new(".")) } else { capture };
+    if capture.extension().is_some_and(|e| e.eq_ignore_ascii_case("zip")) {
+        return Err(PipelineError::Usage(format!("{}: unpack it first; labels are written beside the photographs", capture.display())));
+    }
+    let folder = if capture.is_file() { capture.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")) } else { capture };
     let file = folder.join(LABELS);
     if file.exists() && !force {
         return Err(PipelineError::Usage(format!("{}: is there already; give --force to replace it", file.display())));

@@ -5,12 +5,11 @@
 
 use diorama_geom::glam::DQuat;
 use diorama_geom::rng::Rng;
+use nalgebra::{Matrix4, SymmetricEigen, Vector4};
 
 /// Beginnings of which the best is kept.
 const RESTARTS: u64 = 20;
 const ITERATIONS: usize = 100;
-/// Multiplications by which an eigenvector is found.
-const POWERS: usize = 200;
 /// Random numbers that a beginning may draw.
 const DRAWS: u64 = 1 << 20;
 
@@ -29,34 +28,22 @@ pub fn distance(a: DQuat, b: DQuat) -> f64 {
     (1.0 - a.dot(b).powi(2)).max(0.0)
 }
 
-/// Mean rotation; the first where all cancel out.
+/// Mean rotation; the identity of none.
 pub fn mean(rotations: &[DQuat]) -> DQuat {
-    let mut sum = [[0.0; 4]; 4];
-    for q in rotations.iter().map(|q| q.to_array()) {
-        (0..4).for_each(|i| (0..4).for_each(|j| sum[i][j] += q[i] * q[j] / rotations.len() as f64));
+    if rotations.is_empty() {
+        return DQuat::IDENTITY;
     }
-    // By powers from the rotation that is nearest to all: never perpendicular to what is looked for.
-    let score = |q: &DQuat| {
-        let q = q.to_array();
-        (0..4).map(|i| (0..4).map(|j| q[i] * sum[i][j] * q[j]).sum::<f64>()).sum::<f64>()
-    };
-    let mut v = rotations.iter().copied().max_by(|a, b| score(a).total_cmp(&score(b))).unwrap_or(DQuat::IDENTITY).to_array();
-    for _ in 0..POWERS {
-        let next: [f64; 4] = std::array::from_fn(|i| (0..4).map(|j| sum[i][j] * v[j]).sum());
-        let length = next.iter().map(|x| x * x).sum::<f64>().sqrt();
-        if length < 1e-12 {
-            break;
-        }
-        v = next.map(|x| x / length);
-    }
-    DQuat::from_array(v)
+    let sum: Matrix4<f64> = rotations.iter().map(|q| Vector4::from(q.to_array())).map(|v| v * v.transpose()).sum();
+    let eigen = SymmetricEigen::new(sum);
+    let largest = eigen.eigenvalues.imax();
+    DQuat::from_array(std::array::from_fn(|k| eigen.eigenvectors[(k, largest)])).normalize()
 }
 
 /// At most `k` clusters of unit quaternions, fewer where there are not so many different ones; the same for the same seed.
 pub fn clusters(rotations: &[DQuat], k: usize, seed: u64) -> Clusters {
     let mut best: Option<Clusters> = None;
     for restart in 0..RESTARTS {
-        let found = settled(rotations, begun(rotations, k, &Rng::new(seed, restart)));
+        let found = lloyd(rotations, seed_centers(rotations, k, &Rng::new(seed, restart)));
         if best.as_ref().is_none_or(|b| found.spread < b.spread) {
             best = Some(found);
         }
@@ -65,7 +52,7 @@ pub fn clusters(rotations: &[DQuat], k: usize, seed: u64) -> Clusters {
 }
 
 /// Centers by k-means++: each next one is drawn with a probability in proportion to its distance from those before.
-fn begun(rotations: &[DQuat], k: usize, rng: &Rng) -> Vec<DQuat> {
+fn seed_centers(rotations: &[DQuat], k: usize, rng: &Rng) -> Vec<DQuat> {
     let mut centers: Vec<DQuat> = Vec::new();
     let mut off = vec![1.0; rotations.len()];
     let mut draw = 0;
@@ -88,7 +75,7 @@ fn begun(rotations: &[DQuat], k: usize, rng: &Rng) -> Vec<DQuat> {
 }
 
 /// Lloyd's iterations until nothing changes.
-fn settled(rotations: &[DQuat], mut centers: Vec<DQuat>) -> Clusters {
+fn lloyd(rotations: &[DQuat], mut centers: Vec<DQuat>) -> Clusters {
     let nearest = |centers: &[DQuat], q: &DQuat| {
         let by_distance = |a: &usize, b: &usize| distance(*q, centers[*a]).total_cmp(&distance(*q, centers[*b]));
         (0..centers.len()).min_by(by_distance).unwrap_or(0)
@@ -138,6 +125,13 @@ mod tests {
         for axis in [DVec3::X, DVec3::Y, DVec3::Z, -DVec3::X, -DVec3::Y, -DVec3::Z] {
             assert!(cost(DQuat::from_axis_angle(axis, 1e-3) * m) > cost(m));
         }
+        // Half turns about another axis, an eigenvector too, do not hold it.
+        let turned = |axis: DVec3, degrees: f64| DQuat::from_axis_angle(axis, degrees.to_radians());
+        let mut spread = vec![turned(DVec3::X, 180.0); 5];
+        for axis in [DVec3::Y, DVec3::Z] {
+            spread.extend([turned(axis, 90.0); 3].into_iter().chain([turned(axis, -90.0); 3]));
+        }
+        assert!(distance(mean(&spread), DQuat::IDENTITY) < 1e-12);
         // Half a turn apart about one axis: the distance is 1.
         assert!((distance(center, DQuat::from_axis_angle(DVec3::X, std::f64::consts::PI) * center) - 1.0).abs() < 1e-12);
     }

@@ -123,6 +123,29 @@ pub fn visibility(scene: &Scene, board: &Board, rect: &Rect, camera: &Camera, po
     (0..columns * rows).filter(|i| is_visible(at(*i))).count() as f64 / (columns * rows) as f64
 }
 
+/// What of a polygon is in a picture (Sutherland and Hodgman 1974), from the first corner that is, in the same order.
+pub fn clipped(polygon: &[[f64; 2]], size: [f64; 2]) -> Vec<[f64; 2]> {
+    let mut out = polygon.to_vec();
+    for (axis, at, sign) in [(0, 0.0, 1.0), (0, size[0], -1.0), (1, 0.0, 1.0), (1, size[1], -1.0)] {
+        let depth = |p: [f64; 2]| sign * (p[axis] - at);
+        let mut next = Vec::new();
+        for k in 0..out.len() {
+            let (a, b) = (out[k], out[(k + 1) % out.len()]);
+            if depth(a) >= 0.0 {
+                next.push(a);
+            }
+            if (depth(a) >= 0.0) != (depth(b) >= 0.0) {
+                let share = depth(a) / (depth(a) - depth(b));
+                let mut crossing = [0, 1].map(|k| a[k] + share * (b[k] - a[k]));
+                crossing[axis] = at;
+                next.push(crossing);
+            }
+        }
+        out = next;
+    }
+    out
+}
+
 /// Length of the shortest side of a quadrilateral.
 pub fn shortest_side(quad: &[[f64; 2]; 4]) -> f64 {
     let side = |k: usize| DVec2::from(quad[k]).distance(DVec2::from(quad[(k + 1) % 4]));

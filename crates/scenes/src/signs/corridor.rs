@@ -1,6 +1,6 @@
 //! A passage of 2.8 × 14 m along +y with doors, notices on both walls and signs across it, lit through three roof lights.
 
-use super::views::Walk;
+use super::views::CameraPath;
 use super::{Board, Draw, Finishes, slab};
 use crate::assembly::{Assembly, ModelBuilder};
 use diorama_geom::glam::{DAffine3, DVec2, DVec3, dvec3};
@@ -11,7 +11,7 @@ const HALF: f64 = 1.4;
 const ENDS: [f64; 2] = [-3.0, 11.0];
 const HEIGHT: f64 = 2.8;
 
-pub const WALK: Walk = Walk {
+pub const PATH: CameraPath = CameraPath {
     from: [-0.5, -1.6, 1.5],
     to: [0.5, 3.6, 1.65],
     bulge: [0.3, 0.0, 0.05],

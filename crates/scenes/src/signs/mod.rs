@@ -159,14 +159,14 @@ impl Stage {
 
     /// `n` cameras of a person who walks past and films, for images of any size.
     pub fn cameras(&self, n: usize, width: u32, height: u32) -> Vec<(Camera, Pose)> {
-        let walk: views::Walk = match self.family {
-            Family::Room => room::WALK,
-            Family::Corridor => corridor::WALK,
-            Family::Street => street::WALK,
-            Family::Shelf => shelf::WALK,
-            Family::Pillar => pillar::WALK,
+        let path: views::CameraPath = match self.family {
+            Family::Room => room::PATH,
+            Family::Corridor => corridor::PATH,
+            Family::Street => street::PATH,
+            Family::Shelf => shelf::PATH,
+            Family::Pillar => pillar::PATH,
         };
-        walk.cameras(n, width, height, &Rng::new(self.draw.seed, WALK))
+        path.cameras(n, width, height, &Rng::new(self.draw.seed, WALK))
     }
 }
 

@@ -1,6 +1,6 @@
 //! A square with three advertising pillars, whose posters bend around them, before a wall.
 
-use super::views::Walk;
+use super::views::CameraPath;
 use super::{Board, Draw, Finishes, slab};
 use crate::assembly::{Assembly, ModelBuilder};
 use diorama_geom::glam::{DAffine3, DVec2, DVec3, dvec2, dvec3};
@@ -10,7 +10,7 @@ const PILLARS: [([f64; 2], f64, f64); 3] = [([-2.1, 0.3], 0.6, 3.0), ([0.15, -0.
 /// How far posters stand out.
 const OUT: f64 = 0.012;
 
-pub const WALK: Walk = Walk {
+pub const PATH: CameraPath = CameraPath {
     from: [-3.4, -4.3, 1.55],
     to: [3.4, -4.3, 1.7],
     bulge: [0.0, -0.6, 0.0],
@@ -24,11 +24,11 @@ pub const WALK: Walk = Walk {
 pub fn boards(draw: &Draw) -> Vec<Board> {
     let mut out = Vec::new();
     for (k, ([x, y], radius, _)) in PILLARS.iter().enumerate() {
-        for row in 0..if k == 1 { 3 } else { 2 } {
+        for row in 0..if k < 2 { 3 } else { 2 } {
             let what = 10 * k as u64 + 3 * row;
             let turn = draw.between(what, -0.45, 0.45) - 0.12 * x;
             let r = radius + OUT;
-            let z = 1.0 + 0.75 * row as f64 + draw.between(what + 1, -0.06, 0.06) + if k == 1 { 0.0 } else { 0.3 };
+            let z = 1.0 + 0.75 * row as f64 + draw.between(what + 1, -0.06, 0.06) + if k < 2 { 0.0 } else { 0.3 };
             let at = [x + r * turn.sin(), y - r * turn.cos(), z];
             let wide = draw.between(what + 2, 1.25, 1.6) * radius;
             out.push(Board::flat(at, turn, [wide, 0.32 * wide + 0.1]).bent(r));
@@ -37,7 +37,7 @@ pub fn boards(draw: &Draw) -> Vec<Board> {
     out
 }
 
-/// Ground, wall and pillars; bollards, a bench and a tree in a tub before them.
+/// Ground, wall and pillars; bollards and a tree in a tub before them.
 pub fn stand(b: &mut ModelBuilder, m: &Finishes, draw: &Draw) {
     slab(b, "square.ground", m.slabs, [-9.0, -9.0, -0.2], [9.0, 3.2, 0.0]);
     slab(b, "square.wall", [m.brick, m.stone, m.plaster[2]][draw.below(40, 3)], [-9.0, 3.0, -0.2], [9.0, 3.4, 4.6]);

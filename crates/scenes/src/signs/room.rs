@@ -1,6 +1,6 @@
 //! A furnished room of 6 × 5.2 m with posters, lit through a roof light and a window behind the camera.
 
-use super::views::Walk;
+use super::views::CameraPath;
 use super::{Board, Draw, Finishes, slab};
 use crate::assembly::{Assembly, ModelBuilder, place};
 use diorama_geom::glam::{DAffine3, DVec2, DVec3, dvec3};
@@ -10,7 +10,7 @@ use std::f64::consts::FRAC_PI_2;
 const HALF: [f64; 2] = [3.0, 2.6];
 const HEIGHT: f64 = 2.9;
 
-pub const WALK: Walk = Walk {
+pub const PATH: CameraPath = CameraPath {
     from: [-1.9, -1.0, 1.3],
     to: [1.9, -1.2, 1.7],
     bulge: [0.0, -0.8, 0.1],
@@ -32,6 +32,7 @@ pub fn boards(draw: &Draw) -> Vec<Board> {
         poster([2.15 + shift(7), y, 2.0 + shift(8)], 0.0, [0.9, 0.4]),
         poster([-x, 1.3 + shift(9), 1.75 + shift(10)], FRAC_PI_2, [1.2, 0.5]),
         poster([x, 1.2 + shift(11), 1.7 + shift(12)], -FRAC_PI_2, [1.1, 0.6]),
+        poster([1.25 + shift(15), y, 2.5], 0.0, [1.0, 0.3]),
         Board::flat([0.15 + shift(13), 0.75, 0.955], draw.between(14, -0.5, 0.5), [0.6, 0.24]).leaning(0.25),
     ]
 }

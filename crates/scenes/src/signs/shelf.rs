@@ -1,6 +1,6 @@
 //! A shelf of 2.4 × 2 m with boxes and cans whose fronts carry writing, before a wall; lit from an open room.
 
-use super::views::Walk;
+use super::views::CameraPath;
 use super::{Board, Draw, Finishes, slab};
 use crate::assembly::{Assembly, ModelBuilder};
 use diorama_geom::glam::{DAffine3, DVec2, dvec2, dvec3};
@@ -11,7 +11,7 @@ const DEPTH: f64 = 0.45;
 /// Middle of the goods.
 const ROW: f64 = 0.2;
 
-pub const WALK: Walk = Walk {
+pub const PATH: CameraPath = CameraPath {
     from: [-0.95, -1.5, 1.05],
     to: [0.95, -1.45, 1.5],
     bulge: [0.0, -0.25, 0.0],

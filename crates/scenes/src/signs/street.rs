@@ -1,6 +1,6 @@
-//! Three shop fronts of 4.5 m along a pavement, with signs above their windows, across the pavement, behind glass and on the ground.
+//! Three shop fronts of 4.5 m along a pavement, with signs above and in their windows, across the pavement and on the ground.
 
-use super::views::Walk;
+use super::views::CameraPath;
 use super::{Board, Draw, Finishes, slab};
 use crate::assembly::{Assembly, ModelBuilder};
 use diorama_geom::glam::{DAffine3, DVec2, DVec3, dvec3};
@@ -11,7 +11,7 @@ const SHOP: f64 = 4.5;
 const HEIGHT: f64 = 6.4;
 const REVEAL: f64 = 0.16;
 
-pub const WALK: Walk = Walk {
+pub const PATH: CameraPath = CameraPath {
     from: [-3.8, -7.0, 1.6],
     to: [3.8, -6.4, 1.7],
     bulge: [0.0, -0.8, 0.0],
@@ -48,7 +48,7 @@ pub fn boards(draw: &Draw) -> Vec<Board> {
     ]
 }
 
-/// Walls with windows, doors and awnings; a lamp, trees, a bench and bollards before them.
+/// Walls with windows and doors; a lamp, trees and bollards before them.
 pub fn stand(b: &mut ModelBuilder, m: &Finishes, draw: &Draw) {
     slab(b, "street.pavement", m.slabs, [-14.0, -3.2, -0.2], [14.0, 0.2, 0.0]);
     slab(b, "street.road", m.asphalt, [-14.0, -14.0, -0.32], [14.0, -3.2, -0.12]);
@@ -73,7 +73,7 @@ pub fn stand(b: &mut ModelBuilder, m: &Finishes, draw: &Draw) {
     b.stand("bollard", &iron, &places);
 }
 
-/// A front with a shop window, a door, an awning's rod and two windows above.
+/// A front with a shop window, a door and two windows above.
 fn shop_front(m: &Finishes, front: crate::assembly::Finish, paint: crate::assembly::Finish) -> Assembly {
     let mut out = Assembly::default();
     let half = 0.5 * SHOP;

@@ -48,7 +48,7 @@ fn every_board_of_every_family_is_in_sight_of_many_cameras() {
     for family in Family::ALL {
         for seed in [0, 7] {
             let stage = Stage::of(family, seed, usize::MAX);
-            assert_eq!(stage.boards.len(), family.most_boards());
+            assert!(stage.boards.len() == 8 && family.most_boards() == 8);
             let cameras = stage.cameras(14, 96, 72);
             for (k, board) in stage.boards.iter().enumerate() {
                 let seen = cameras.iter().filter(|(camera, pose)| {

@@ -7,9 +7,9 @@ use diorama_geom::{Camera, Pose};
 /// Field of view over the longer side of the image in radians.
 const FOV: f64 = 1.1;
 
-/// Boxes in which the camera's path begins and ends, and from where to where it looks. Halfway, both are as far from the straight line as
+/// Points at which the camera's path begins and ends, and from where to where it looks. Halfway, the path is as far from the straight line as
 /// `bulge` says.
-pub struct Walk {
+pub struct CameraPath {
     pub from: [f64; 3],
     pub to: [f64; 3],
     pub bulge: [f64; 3],
@@ -20,7 +20,7 @@ pub struct Walk {
     pub glance: f64,
 }
 
-impl Walk {
+impl CameraPath {
     pub fn cameras(&self, n: usize, width: u32, height: u32, rng: &Rng) -> Vec<(Camera, Pose)> {
         let fov_x = if width >= height { FOV } else { 2.0 * ((0.5 * FOV).tan() * width as f64 / height as f64).atan() };
         let camera = Camera::pinhole(width, height, fov_x);

@@ -35,7 +35,7 @@ impl Verb for Annotate {
     fn run(&self) -> Result<Outcome> {
         let format = Format::named(&self.format).ok_or_else(|| {
             let names: Vec<&str> = Format::ALL.iter().map(|f| f.name()).collect();
-            usage(format!("--format {:?}: expected {}", self.format, names.join(", ")))
+            usage(format!("format {:?}: expected {}", self.format, names.join(", ")))
         })?;
         let made = annotate::annotate(&self.capture, &self.labels, format, self.force)?;
         made.notes.iter().for_each(|n| note(n));

@@ -16,10 +16,10 @@ use std::time::Instant;
     after_help = "Examples:\n  diorama text make-scenes --size ci -o data/signs\n  diorama text make-scenes --family street,pillar --scenes 4 --views 60 --pixels 320x240 --signs 3-6 -o data/signs"
 )]
 pub struct MakeScenes {
-    /// ci (a scene of 14 views of 96×72 with 2 signs) or gpu (60 scenes of 60 views of 960×540 with 3 to 8 signs)
+    /// ci (a shelf in 14 views of 96×72 with 2 signs) or gpu (60 scenes of 60 views of 960×540 with 3 to 8 signs)
     #[arg(long, default_value = "ci")]
     size: String,
-    /// Families, taken in turns: room, corridor, street, shelf, pillar [default: all]
+    /// Families, taken in turns: room, corridor, street, shelf, pillar [default: by size]
     #[arg(long, value_delimiter = ',')]
     family: Vec<String>,
     /// Scenes [default: by size]
@@ -75,11 +75,11 @@ impl MakeScenes {
                 Some((from, to)) => number(from).zip(number(to)),
                 None => number(signs).map(|n| (n, n)),
             };
-            let (from, to) = range.ok_or_else(|| usage(format!("--signs {signs:?}: expected a number or FROM-TO, such as 3-8")))?;
+            let (from, to) = range.ok_or_else(|| usage(format!("signs {signs:?}: expected a number or FROM-TO, such as 3-8")))?;
             o.boards = [from, to];
         }
         if let Some(pixels) = &self.pixels {
-            o.size = parse_size(pixels)?;
+            o.size = parse_size(pixels).map_err(|_| usage(format!("pixels {pixels:?}: expected WIDTHxHEIGHT, each 16 to 8192")))?;
         }
         o.fonts = match &self.fonts[..] {
             [one] if one == "shipped" => FontSource::Shipped,

@@ -1,6 +1,6 @@
 //! One task per arrangement, each with a gradient of its own; their sum does not depend on threads.
 
-use super::{C1, C2, Tile};
+use super::{C1, C2, Tile, WINDOW};
 use crate::tasks::{self, Parts};
 
 /// One minus the mean similarity; adds `weight` times its gradient to `d_colors`, `[R, 3]`. Sums of a window are in f64: variances are
@@ -13,6 +13,7 @@ pub fn loss(colors: &[f32], targets: &[f32], tile: Tile, arrangements: &[u32], w
     assert!(colors.len() == targets.len() && colors.len() == d_colors.len() && colors.len() == 3 * rays, "s3im: shapes");
     let m = arrangements.len() / rays.max(1);
     assert!(arrangements.len() == m * rays && rays.is_multiple_of(tile.pixels()), "s3im: {rays} rays, tiles of {} pixels", tile.pixels());
+    assert!(tile.height >= WINDOW && tile.width >= WINDOW, "s3im: tiles of {} × {} are smaller than a window", tile.height, tile.width);
     if rays == 0 || m == 0 {
         return 0.0;
     }

@@ -79,5 +79,6 @@ fn the_value_does_not_depend_on_threads_and_whole_tiles_are_needed() {
     };
     assert_eq!(run(1), run(4));
     let ragged = std::panic::catch_unwind(|| cpu::loss(&x[..60], &y[..60], tile(4, 4), &arranged[..20], 1.0, &mut vec![0.0; 60]));
-    assert!(ragged.is_err());
+    let narrow = std::panic::catch_unwind(|| cpu::loss(&x[..30], &y[..30], tile(2, 5), &arranged[..10], 1.0, &mut [0.0; 30]));
+    assert!(ragged.is_err() && narrow.is_err());
 }

@@ -74,6 +74,29 @@ impl Fonts {
         added.ok_or_else(|| DataError::input(file, "holds no font; give a .ttf, .otf or .ttc file").into())
     }
 
+    /// [`Fonts::add`] of a font for Latin words.
+    ///
+    /// # Errors
+    /// As [`Fonts::add`], and when it lacks Latin letters or digits.
+    pub fn add_latin(&mut self, file: &Path) -> Result<Face> {
+        let face = self.add(file)?;
+        if !self.latin().contains(&face) {
+            return Err(DataError::input(file, "lacks Latin letters or digits, in which words of signs are; give another font").into());
+        }
+        Ok(face)
+    }
+
+    /// A number that differs where faces or their fonts differ (FNV-1a).
+    pub fn fingerprint(&self, faces: &[Face]) -> u64 {
+        let db = self.system.db();
+        let mut hash = 0xcbf2_9ce4_8422_2325u64;
+        let mut add = |bytes: &[u8]| bytes.iter().for_each(|b| hash = (hash ^ *b as u64).wrapping_mul(0x0100_0000_01b3));
+        faces.iter().for_each(|f| add(f.name().as_bytes()));
+        let used = db.faces().filter(|info| faces.contains(&face_of(info))).map(|info| info.id);
+        used.for_each(|id| db.with_face_data(id, |data, _| add(data)).unwrap_or(()));
+        hash
+    }
+
     /// Faces that have all Latin letters and digits and are no pictures, shipped ones first, the others by name.
     pub fn latin(&self) -> Vec<Face> {
         let db = self.system.db();

@@ -29,6 +29,25 @@ fn bounds_hold_the_ink_of_each_character_and_word_and_nothing_else() {
         let (x, y) = (i % set.ink.width, i / set.ink.width);
         assert!(set.characters.iter().any(|c| inside(&c.bounds, x, y)), "({x}, {y})");
     }
+    // No bound is larger than its ink: at each of its sides there is some, and characters of a word do not share bounds.
+    for b in set.characters.iter().map(|c| &c.bounds) {
+        let inked = |x: std::ops::Range<f32>, y: std::ops::Range<f32>| {
+            let w = set.ink.width;
+            let pixels = set.ink.data.iter().enumerate().filter(|(_, v)| **v > 20);
+            pixels.into_iter().any(|(i, _)| x.contains(&((i % w) as f32 + 0.5)) && y.contains(&((i / w) as f32 + 0.5)))
+        };
+        let ([x0, y0], [x1, y1]) = (b.low, b.high);
+        let (x, y) = (x0 - 0.5..x1 + 0.5, y0 - 0.5..y1 + 0.5);
+        assert!(
+            inked(x0 - 0.5..x0 + 1.5, y.clone())
+                && inked(x1 - 1.5..x1 + 0.5, y)
+                && inked(x.clone(), y0 - 0.5..y0 + 1.5)
+                && inked(x, y1 - 1.5..y1 + 0.5),
+            "{b:?}"
+        );
+    }
+    let letters: Vec<&Piece> = set.characters.iter().filter(|c| "HEW".contains(&c.text)).collect();
+    assert!(letters.windows(2).all(|l| l[0].bounds.high[0] < l[1].bounds.low[0] + 2.0));
     for word in &set.words {
         let own = set.characters.iter().filter(|c| word.bytes.contains(&c.bytes.start));
         assert_eq!(own.fold(Bounds::NONE, |all, c| all.with(c.bounds)), word.bounds);

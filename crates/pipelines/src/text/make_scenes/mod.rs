@@ -7,6 +7,7 @@ mod pictures;
 mod staged;
 
 use super::lettering::Fonts;
+use super::truth::Truth;
 use crate::error::{PipelineError, Result};
 use diorama_data::{DataError, atomic, error};
 use diorama_geom::rng::Rng;
@@ -19,8 +20,12 @@ use std::sync::atomic::AtomicBool;
 /// File in which a folder says how its scenes were made.
 const MANIFEST: &str = "make-scenes.json";
 const MANIFEST_LIMIT: u64 = 1 << 20;
+/// File of a scene's capture, which is written last.
+const CAPTURE: &str = "transforms.json";
 /// Stream of random numbers of boards' pictures.
 const PAINT: u64 = 71;
+/// Boards that every family has room for.
+const MOST_BOARDS: usize = 8;
 /// Share of the views that is held out.
 const HELD_OUT: f64 = 0.15;
 
@@ -55,7 +60,7 @@ pub enum FontSource {
 }
 
 impl SceneOptions {
-    /// The options of a size: `ci` (14 views of 96×72) or `gpu` (60 of 960×540).
+    /// The options of a size: `ci` (a shelf in 14 views of 96×72, where words are largest) or `gpu` (60 of 960×540).
     ///
     /// # Errors
     /// When the name is not that of a size.
@@ -73,7 +78,7 @@ impl SceneOptions {
             fonts: FontSource::Shipped,
         };
         match name {
-            "ci" => Ok(of(1, 14, [2, 2], (96, 72), 64)),
+            "ci" => Ok(SceneOptions { families: vec![Family::Shelf.name().into()], ..of(1, 14, [2, 2], (96, 72), 64) }),
             "gpu" => Ok(of(60, 60, [3, 8], (960, 540), 128)),
             _ => Err(PipelineError::Usage(format!("size {name:?}: expected ci or gpu"))),
         }
@@ -83,15 +88,16 @@ impl SceneOptions {
     /// With what cannot be, and what can.
     fn check(&self) -> Result<Vec<Family>> {
         let usage = |m: String| Err(PipelineError::Usage(m));
-        let most = (self.views as f64 * (1.0 - HELD_OUT)) as usize;
+        let most = staged::held_out(self.views).iter().filter(|h| !**h).count();
         if self.scenes == 0 || self.views < 8 || self.samples == 0 {
             return usage("scenes need at least 8 views and one sample per pixel".into());
         }
         if !(1..=most).contains(&self.labelled) {
             return usage(format!("--labelled {}: expected 1 to {most}, the photographs that are not held out", self.labelled));
         }
-        if self.boards[0] == 0 || self.boards[0] > self.boards[1] {
-            return usage(format!("--signs {}-{}: expected a number or FROM-TO, at least 1", self.boards[0], self.boards[1]));
+        if self.boards[0] == 0 || self.boards[0] > self.boards[1] || self.boards[1] > MOST_BOARDS {
+            let [from, to] = self.boards;
+            return usage(format!("--signs {from}-{to}: expected a number or FROM-TO, from 1 to {MOST_BOARDS}"));
         }
         let family = |name: &String| {
             let names: Vec<&str> = Family::ALL.iter().map(|f| f.name()).collect();
@@ -118,7 +124,6 @@ pub struct MadeScenes {
 /// written.
 pub fn generate(out: &Path, options: &SceneOptions, force: bool, stop: &AtomicBool, progress: &mut dyn FnMut(f64)) -> Result<MadeScenes> {
     let families = options.check()?;
-    begin(out, options, force)?;
     let mut fonts = Fonts::shipped();
     let faces = match &options.fonts {
         FontSource::Shipped => fonts.latin(),
@@ -126,14 +131,23 @@ pub fn generate(out: &Path, options: &SceneOptions, force: bool, stop: &AtomicBo
             fonts = fonts.with_installed();
             fonts.latin()
         }
-        FontSource::Files(files) => files.iter().map(|f| fonts.add(f)).collect::<Result<_>>()?,
+        FontSource::Files(files) => files.iter().map(|f| fonts.add_latin(f)).collect::<Result<_>>()?,
     };
+    begin(out, options, fonts.fingerprint(&faces), force)?;
     let mut made = MadeScenes::default();
     for s in 0..options.scenes {
         let family = families[s % families.len()];
         let name = format!("{}-{s:03}", family.name());
         let folder = out.join(&name);
-        let seed = options.seed.wrapping_mul(1000) + s as u64;
+        if folder.join(CAPTURE).exists() {
+            let truth = Truth::read(&folder)?;
+            made.photographs += truth.views.len();
+            made.regions += truth.regions.len();
+            made.scenes.push(name);
+            progress((s + 1) as f64 / options.scenes as f64);
+            continue;
+        }
+        let seed = options.seed.wrapping_mul(1000).wrapping_add(s as u64);
         let boards = options.boards[0] + Rng::new(seed, PAINT).below(0, (options.boards[1] - options.boards[0] + 1) as u64) as usize;
         let staged = Staged::new(Stage::of(family, seed, boards), seed, &mut fonts, &faces)?;
         let done = staged.photograph(&folder, options, stop, &mut |share: f64| progress((s as f64 + share) / options.scenes as f64))?;
@@ -149,9 +163,10 @@ pub fn generate(out: &Path, options: &SceneOptions, force: bool, stop: &AtomicBo
 }
 
 /// Writes how the scenes are made, or checks that those of the folder are made so.
-fn begin(out: &Path, options: &SceneOptions, force: bool) -> Result<()> {
+fn begin(out: &Path, options: &SceneOptions, fonts: u64, force: bool) -> Result<()> {
     let path = out.join(MANIFEST);
-    let now = serde_json::to_value(options).expect("plain values");
+    let mut now = serde_json::to_value(options).expect("plain values");
+    now["fonts_found"] = format!("{fonts:016x}").into();
     if path.exists() {
         let bytes = error::read(&path, MANIFEST_LIMIT)?;
         let before: serde_json::Value =

@@ -21,7 +21,7 @@ const MEASURED: f32 = 96.0;
 const CONTRAST: f64 = 3.0;
 /// Bounds of linear colors: paint is neither darker nor brighter.
 const PAINT: [f64; 2] = [0.03, 0.8];
-/// Ways to lay words out before the one that fills most is taken.
+/// Texts that are tried; the one with the largest letters is taken.
 const TRIES: u64 = 3;
 
 /// A painted board.

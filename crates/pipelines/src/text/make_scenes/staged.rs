@@ -3,7 +3,7 @@
 use super::super::lettering::{Face, Fonts};
 use super::super::regions::{self, Region};
 use super::super::truth::{Shown, Truth, ViewTruth, file, rows};
-use super::{HELD_OUT, PAINT, SceneOptions, pictures};
+use super::{CAPTURE, HELD_OUT, PAINT, SceneOptions, pictures};
 use crate::error::Result;
 use diorama_data::text_labels::{self, Kind, LabelledImage, LabelledRegion, UNREADABLE};
 use diorama_data::{DataError, atomic, error, photo, transforms_json};
@@ -190,10 +190,10 @@ impl Staged {
 
     /// Labels of all views in the truth and of some beside the photographs, and the capture, which says that the scene is complete.
     fn finish(&self, folder: &Path, views: Vec<ViewTruth>, cameras: &[(Camera, Pose)], o: &SceneOptions) -> Result<()> {
-        let all: Vec<LabelledImage> = views.iter().map(|v| self.labels(v, READABLE_PX)).collect();
+        let all: Vec<LabelledImage> = views.iter().map(|v| self.labels(v, READABLE_PX, o)).collect();
         text_labels::save(&file(folder, "labels.jsonl"), &all)?;
         let chosen = labelled(&views, o.labelled);
-        let some: Vec<LabelledImage> = chosen.iter().map(|v| self.labels(&views[*v], 0.0)).collect();
+        let some: Vec<LabelledImage> = chosen.iter().map(|v| self.labels(&views[*v], 0.0, o)).collect();
         text_labels::save(&folder.join("labels.jsonl"), &some)?;
         let frame = |(view, (camera, pose)): (&ViewTruth, &(Camera, Pose))| {
             let mut frame = Frame::new(view.name.clone(), folder.join(format!("images/{}.png", view.name)), *camera, *pose);
@@ -210,24 +210,26 @@ impl Staged {
         }
         let eyes: Vec<DVec3> = cameras.iter().map(|(_, pose)| pose.translation).collect();
         let capture = Capture::new(frames, SceneBox::holding(&eyes, &seen));
-        Ok(transforms_json::write(&folder.join("transforms.json"), folder, &capture, None)?)
+        Ok(transforms_json::write(&folder.join(CAPTURE), folder, &capture, None)?)
     }
 
-    /// Labels of a view; shorter sides than `readable_px` are not to be read.
-    fn labels(&self, view: &ViewTruth, readable_px: f64) -> LabelledImage {
+    /// Labels of a view, with outlines that end with the photograph; shorter sides than `readable_px` are not to be read.
+    fn labels(&self, view: &ViewTruth, readable_px: f64, o: &SceneOptions) -> LabelledImage {
+        let size = [o.size.0, o.size.1].map(f64::from);
         let label = |shown: &Shown| {
             let region = &self.regions[shown.id];
+            let polygon = regions::clipped(&shown.polygon, size);
             let ignore = shown.visibility < READABLE || regions::shortest_side(&shown.quad) < readable_px;
-            LabelledRegion {
+            (polygon.len() > 2).then(|| LabelledRegion {
                 id: shown.id as u32,
-                polygon: shown.polygon.clone(),
+                polygon,
                 transcription: if ignore { UNREADABLE.into() } else { region.transcription.clone() },
                 script: Some(region.script.clone()),
                 kind: Kind::Text,
                 ignore,
-            }
+            })
         };
-        LabelledImage { image: format!("images/{}.png", view.name), regions: view.regions.iter().map(label).collect() }
+        LabelledImage { image: format!("images/{}.png", view.name), regions: view.regions.iter().filter_map(label).collect() }
     }
 }
 
@@ -264,7 +266,7 @@ fn drift(rng: &Rng, share: f64) -> f64 {
 }
 
 /// Which views are held out, evenly spaced.
-fn held_out(views: usize) -> Vec<bool> {
+pub fn held_out(views: usize) -> Vec<bool> {
     let n = ((HELD_OUT * views as f64).round() as usize).max(1);
     let mut out = vec![false; views];
     (0..n).for_each(|k| out[((k as f64 + 0.5) * views as f64 / n as f64) as usize] = true);

@@ -85,7 +85,9 @@ fn regions_classes_ink_and_poses_of_every_family_agree() {
         assert!(labels.len() == 2 && labels.iter().any(|l| l.regions.iter().any(|r| !r.ignore)), "{name}");
         let held_out: Vec<String> = truth.views.iter().filter(|v| v.held_out).map(|v| format!("images/{}.png", v.name)).collect();
         assert!(held_out.len() == 1 && labels.iter().all(|l| !held_out.contains(&l.image)));
-        assert_eq!(text_labels::load(&file(&scene, "labels.jsonl")).unwrap().len(), 8);
+        let all = text_labels::load(&file(&scene, "labels.jsonl")).unwrap();
+        let corners = all.iter().flat_map(|l| &l.regions).flat_map(|r| &r.polygon);
+        assert!(all.len() == 8 && corners.into_iter().all(|p| (0.0..=160.0).contains(&p[0]) && (0.0..=120.0).contains(&p[1])));
     }
 }
 
@@ -107,6 +109,11 @@ fn an_interrupted_call_goes_on_to_the_same_bits_and_other_options_are_refused() 
         // Paths are relative, so that both folders hold the same.
         assert!(a == b, "{name}");
     }
+    // What is complete stays as it is: labels that a user put there as well.
+    let labels = parts.path().join("shelf-000/labels.jsonl");
+    std::fs::write(&labels, "mine").unwrap();
+    let made = generate(parts.path(), &options, false, &ON, &mut |_| ()).unwrap();
+    assert!(made.photographs == 8 && made.regions > 0 && std::fs::read(&labels).unwrap() == b"mine");
     let other = SceneOptions { seed: 1, views: 9, ..options.clone() };
     let error = generate(parts.path(), &other, false, &ON, &mut |_| ()).unwrap_err().to_string();
     assert!(error.contains("made with other views, seed; give --force"), "{error}");
@@ -122,12 +129,13 @@ fn options_that_cannot_be_are_refused_before_anything_is_written() {
     for (options, expected) in [
         (SceneOptions { families: vec!["cave".into()], ..good.clone() }, "family \"cave\": expected room, corridor, street, shelf, pillar"),
         (SceneOptions { views: 3, ..good.clone() }, "at least 8 views"),
-        (SceneOptions { labelled: 8, ..good.clone() }, "--labelled 8: expected 1 to 6"),
+        (SceneOptions { labelled: 8, ..good.clone() }, "--labelled 8: expected 1 to 7"),
         (SceneOptions { boards: [3, 2], ..good.clone() }, "--signs 3-2"),
+        (SceneOptions { boards: [3, 20], ..good.clone() }, "from 1 to 8"),
     ] {
         let error = generate(&out, &options, false, &ON, &mut |_| ()).unwrap_err().to_string();
         assert!(error.contains(expected) && !out.exists(), "{error}");
     }
     let missing = SceneOptions { fonts: FontSource::Files(vec![folder.path().join("no.ttf")]), ..good };
-    assert!(generate(&out, &missing, false, &ON, &mut |_| ()).unwrap_err().to_string().contains("no.ttf"));
+    assert!(generate(&out, &missing, false, &ON, &mut |_| ()).unwrap_err().to_string().contains("no.ttf") && !out.exists());
 }

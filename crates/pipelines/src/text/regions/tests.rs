@@ -50,7 +50,33 @@ fn visibility_is_the_share_in_the_picture_and_not_hidden() {
     let wide = Rect { low: [-2.0 * half, -0.05], high: [2.0 * half, 0.05] };
     let share = visibility(&scene, board, &wide, &camera, &pose);
     assert!((share - 0.5).abs() <= 1.0 / 32.0, "{share}");
-    // From behind, through the wall, nothing.
+    // From behind it shows its back.
     let behind = Pose::look_at(board.point(DVec2::ZERO) - board.world_from_face(0.0).z_axis, board.point(DVec2::ZERO), DVec3::Z);
     assert_eq!(visibility(&scene, board, &small, &camera, &behind), 0.0);
+    // A screen that ends in the middle hides half.
+    let mut model = stage.model(&pictures);
+    let face = board.world_from_face(0.0);
+    let screen = board.point(DVec2::ZERO) + 0.3 * face.z_axis;
+    let corners =
+        [[0.0, -1.0], [1.0, -1.0], [1.0, 1.0], [0.0, 1.0]].map(|[x, y]| (screen + x * face.x_axis + y * face.y_axis).as_vec3().to_array());
+    let mesh = diorama_geom::Mesh { positions: corners.to_vec(), faces: vec![[0, 1, 2], [0, 2, 3]], ..Default::default() };
+    model.add(diorama_geom::Model::of("screen", mesh), diorama_geom::glam::DAffine3::IDENTITY);
+    let hidden = Scene::new(&model, &Daylight::of(Environment::uniform([1.0; 3], 8)));
+    assert!((visibility(&hidden, board, &small, &camera, &pose) - 0.5).abs() < 1e-12);
+}
+
+#[test]
+fn polygons_end_with_the_picture_and_keep_their_first_corner() {
+    let size = [100.0, 60.0];
+    let square = [[10.0, 10.0], [50.0, 10.0], [50.0, 40.0], [10.0, 40.0]];
+    assert_eq!(clipped(&square, size), square);
+    assert_eq!(
+        clipped(&[[80.0, 10.0], [120.0, 10.0], [120.0, 40.0], [80.0, 40.0]], size),
+        [[80.0, 10.0], [100.0, 10.0], [100.0, 40.0], [80.0, 40.0]]
+    );
+    assert_eq!(
+        clipped(&[[-20.0, 10.0], [20.0, 10.0], [20.0, 40.0], [-20.0, 40.0]], size),
+        [[0.0, 10.0], [20.0, 10.0], [20.0, 40.0], [0.0, 40.0]]
+    );
+    assert!(clipped(&[[-20.0, 10.0], [-1.0, 10.0], [-1.0, 40.0]], size).is_empty());
 }

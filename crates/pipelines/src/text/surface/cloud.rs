@@ -9,8 +9,10 @@ const MOST: usize = 20_000;
 /// Neighbors whose mean distance tells outliers, and standard deviations beyond the mean at which they begin.
 const NEIGHBORS: usize = 16;
 const OUTLYING: f64 = 2.0;
-/// How much finer each attempt to thin is.
-const FINER: f64 = 1.1;
+/// How much coarser each attempt to thin is.
+const COARSER: f64 = 1.1;
+/// Share of the points on either side of an axis that extents leave out.
+const OUTERMOST: f64 = 0.05;
 
 /// Points by the cells of a grid.
 pub(super) struct Cells<'a> {
@@ -30,15 +32,21 @@ impl<'a> Cells<'a> {
         Cells { points, edge, cells }
     }
 
-    /// Points within a distance, in the order of the cloud within each cell.
+    /// Points within a distance.
     pub fn within(&self, p: DVec3, radius: f64) -> Vec<DVec3> {
         let (low, high) = (cell(p - radius, self.edge), cell(p + radius, self.edge));
+        let is_near = |q: &DVec3| q.distance_squared(p) <= radius * radius;
+        let count = (0..3).map(|k| (high[k] - low[k] + 1) as f64).product::<f64>();
+        // Where there are fewer points than cells, as around a point far from all.
+        if count > self.points.len() as f64 {
+            return self.points.iter().copied().filter(is_near).collect();
+        }
         let mut out = Vec::new();
         for x in low[0]..=high[0] {
             for y in low[1]..=high[1] {
                 for z in low[2]..=high[2] {
                     let near = self.cells.get(&[x, y, z]).into_iter().flatten().map(|i| self.points[*i as usize]);
-                    out.extend(near.filter(|q| q.distance_squared(p) <= radius * radius));
+                    out.extend(near.filter(is_near));
                 }
             }
         }
@@ -60,10 +68,15 @@ impl<'a> Cells<'a> {
     }
 }
 
+/// Largest extent along an axis of all but the outermost twentieth on either side.
 fn extent(points: &[DVec3]) -> f64 {
-    let low = points.iter().fold(DVec3::INFINITY, |a, p| a.min(*p));
-    let high = points.iter().fold(DVec3::NEG_INFINITY, |a, p| a.max(*p));
-    (high - low).max_element().max(1e-12)
+    let along = |axis: usize| {
+        let mut values: Vec<f64> = points.iter().map(|p| p[axis]).collect();
+        values.sort_by(f64::total_cmp);
+        let at = |share: f64| values[((values.len() - 1) as f64 * share) as usize];
+        if values.is_empty() { 0.0 } else { at(1.0 - OUTERMOST) - at(OUTERMOST) }
+    };
+    (0..3).map(along).fold(1e-12, f64::max)
 }
 
 /// Edge of cells that hold about one point of a surface.
@@ -88,14 +101,15 @@ fn thinned(points: &[DVec3]) -> Vec<DVec3> {
             sorted.sort_by_key(|(at, _)| *at);
             return sorted.into_iter().map(|(_, (sum, n))| sum / n).collect();
         }
-        size *= FINER;
+        size *= COARSER;
     }
 }
 
-/// The points thinned to at most 20,000 and without those whose sixteen nearest neighbors are farther away than the mean by two standard
+/// The finite points, thinned to at most 20,000 and without those whose sixteen nearest neighbors are farther away than the mean by two standard
 /// deviations, and the median distance to the nearest neighbor.
 pub fn cleaned(points: &[DVec3]) -> (Vec<DVec3>, f64) {
-    let points = thinned(points);
+    let finite: Vec<DVec3> = points.iter().copied().filter(|p| p.is_finite()).collect();
+    let points = thinned(&finite);
     let cells = Cells::new(&points, edge(&points));
     let near: Vec<Vec<f64>> = points.par_iter().map(|p| cells.nearest(*p, NEIGHBORS)).collect();
     let means: Vec<f64> = near.iter().map(|d| d.iter().sum::<f64>() / d.len().max(1) as f64).collect();

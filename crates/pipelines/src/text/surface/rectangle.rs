@@ -107,7 +107,7 @@ pub fn rectangle(surface: &Surface, points: &[DVec3], reading: Option<DVec3>, up
         let right = up.cross(pose.z_axis);
         if right.length() > 1e-9 { right } else { pose.x_axis }
     });
-    // The longer side as it reads, else its upper end left of the reading direction's.
+    // Text along the longer side turns x; text along the shorter one counts quarter turns.
     let [along, above] = [pose.x_axis.dot(reading), pose.y_axis.dot(reading)];
     if along.abs() >= above.abs() {
         if along < 0.0 {

@@ -138,8 +138,10 @@ fn clouds_lose_outliers_and_what_is_too_many() {
     points.extend(&far);
     let (kept, spacing) = cleaned(&points);
     assert!(kept.len() > 2800 && far.iter().all(|p| !kept.contains(p)) && (0.001..0.02).contains(&spacing), "{} {spacing}", kept.len());
-    let (kept, _) = cleaned(&board.points(60_000, 0.0));
-    assert!((10_000..=20_000).contains(&kept.len()), "{}", kept.len());
+    let mut many = board.points(60_000, 0.0);
+    many.extend([DVec3::splat(100.0), DVec3::splat(f64::NAN), DVec3::new(f64::INFINITY, 0.0, 0.0)]);
+    let (kept, _) = cleaned(&many);
+    assert!((10_000..=20_000).contains(&kept.len()) && kept.iter().all(|p| (*p - board.center).length() < 1.0), "{}", kept.len());
 }
 
 #[test]
