@@ -124,10 +124,6 @@ fn check(polygon: &[[f64; 2]]) -> std::result::Result<(), String> {
     if let Some(k) = polygon.iter().position(|p| p.iter().any(|v| !v.is_finite())) {
         return Err(format!("vertex {k} is not a number"));
     }
-    let area: f64 = (0..n).map(|k| polygon[k][0] * polygon[(k + 1) % n][1] - polygon[k][1] * polygon[(k + 1) % n][0]).sum();
-    if area.abs() < LEAST_AREA {
-        return Err("its corners enclose no area; draw around the writing".into());
-    }
     let turn = |a: [f64; 2], b: [f64; 2], c: [f64; 2]| (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
     let side = |k: usize| (polygon[k], polygon[(k + 1) % n]);
     for i in 0..n {
@@ -140,6 +136,10 @@ fn check(polygon: &[[f64; 2]]) -> std::result::Result<(), String> {
                 return Err(format!("the side after vertex {i} crosses the side after vertex {j}; order the corners clockwise"));
             }
         }
+    }
+    let area: f64 = (0..n).map(|k| polygon[k][0] * polygon[(k + 1) % n][1] - polygon[k][1] * polygon[(k + 1) % n][0]).sum();
+    if area.abs() < LEAST_AREA {
+        return Err("its corners enclose no area; draw around the writing".into());
     }
     Ok(())
 }
