@@ -159,7 +159,8 @@ fn files(format: Format, path: &Path) -> Result<Vec<PathBuf>> {
             _ => name.ends_with(".txt"),
         }
     };
-    let mut out: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(is_of).collect();
+    let all = entries.map(|e| e.map(|e| e.path())).collect::<std::io::Result<Vec<PathBuf>>>().map_err(DataError::io(path, "read"))?;
+    let mut out: Vec<PathBuf> = all.into_iter().filter(is_of).collect();
     out.sort();
     if out.is_empty() {
         let wanted = match format {

@@ -82,11 +82,6 @@ impl Truth {
     pub fn save(&self, scene: &Path) -> Result<()> {
         Ok(atomic::write(&file(scene, NAME), &serde_json::to_vec_pretty(self).expect("plain values"))?)
     }
-
-    /// The region of an id.
-    pub fn region(&self, id: usize) -> &Region {
-        &self.regions[id]
-    }
 }
 
 /// A file of the truth.

@@ -24,8 +24,6 @@ const MANIFEST_LIMIT: u64 = 1 << 20;
 const CAPTURE: &str = "transforms.json";
 /// Stream of random numbers of boards' pictures.
 const PAINT: u64 = 71;
-/// Boards that every family has room for.
-const MOST_BOARDS: usize = 8;
 /// Share of the views that is held out.
 const HELD_OUT: f64 = 0.15;
 
@@ -95,15 +93,16 @@ impl SceneOptions {
         if !(1..=most).contains(&self.labelled) {
             return usage(format!("--labelled {}: expected 1 to {most}, the photographs that are not held out", self.labelled));
         }
-        if self.boards[0] == 0 || self.boards[0] > self.boards[1] || self.boards[1] > MOST_BOARDS {
-            let [from, to] = self.boards;
-            return usage(format!("--signs {from}-{to}: expected a number or FROM-TO, from 1 to {MOST_BOARDS}"));
-        }
         let family = |name: &String| {
             let names: Vec<&str> = Family::ALL.iter().map(|f| f.name()).collect();
             Family::named(name).ok_or_else(|| PipelineError::Usage(format!("family {name:?}: expected {}", names.join(", "))))
         };
-        self.families.iter().map(family).collect()
+        let families = self.families.iter().map(family).collect::<Result<Vec<Family>>>()?;
+        let ([from, to], room) = (self.boards, families.iter().map(|f| f.most_boards()).min().unwrap_or(0));
+        if from == 0 || from > to || to > room {
+            return usage(format!("--signs {from}-{to}: expected a number or FROM-TO, from 1 to {room}"));
+        }
+        Ok(families)
     }
 }
 
@@ -166,7 +165,7 @@ pub fn generate(out: &Path, options: &SceneOptions, force: bool, stop: &AtomicBo
 fn begin(out: &Path, options: &SceneOptions, fonts: u64, force: bool) -> Result<()> {
     let path = out.join(MANIFEST);
     let mut now = serde_json::to_value(options).expect("plain values");
-    now["fonts_found"] = format!("{fonts:016x}").into();
+    now["fonts on this machine"] = format!("{fonts:016x}").into();
     if path.exists() {
         let bytes = error::read(&path, MANIFEST_LIMIT)?;
         let before: serde_json::Value =
@@ -187,11 +186,17 @@ fn begin(out: &Path, options: &SceneOptions, fonts: u64, force: bool) -> Result<
     Ok(atomic::write(&path, &serde_json::to_vec_pretty(&now).expect("plain values"))?)
 }
 
-/// Removes the scenes of a folder: subfolders that hold a truth.
+/// Removes the scenes of a folder: subfolders named after a family and a number that hold a truth. Others are not ours.
 fn remove_scenes(out: &Path) -> Result<()> {
-    let entries = std::fs::read_dir(out).map_err(DataError::io(out, "read"))?;
-    for entry in entries.flatten().map(|e| e.path()).filter(|p| p.join("truth").is_dir()) {
-        std::fs::remove_dir_all(&entry).map_err(DataError::io(&entry, "remove"))?;
+    let is_scene = |p: &Path| {
+        let parts = p.file_name().and_then(|n| n.to_str()).and_then(|n| n.rsplit_once('-'));
+        parts.is_some_and(|(family, n)| Family::named(family).is_some() && n.parse::<usize>().is_ok()) && p.join("truth").is_dir()
+    };
+    for entry in std::fs::read_dir(out).map_err(DataError::io(out, "read"))? {
+        let path = entry.map_err(DataError::io(out, "read"))?.path();
+        if is_scene(&path) {
+            std::fs::remove_dir_all(&path).map_err(DataError::io(&path, "remove"))?;
+        }
     }
     Ok(())
 }

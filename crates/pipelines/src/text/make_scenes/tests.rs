@@ -114,11 +114,13 @@ fn an_interrupted_call_goes_on_to_the_same_bits_and_other_options_are_refused() 
     std::fs::write(&labels, "mine").unwrap();
     let made = generate(parts.path(), &options, false, &ON, &mut |_| ()).unwrap();
     assert!(made.photographs == 8 && made.regions > 0 && std::fs::read(&labels).unwrap() == b"mine");
+    let not_ours = parts.path().join("street-mine/truth");
+    std::fs::create_dir_all(&not_ours).unwrap();
     let other = SceneOptions { seed: 1, views: 9, ..options.clone() };
     let error = generate(parts.path(), &other, false, &ON, &mut |_| ()).unwrap_err().to_string();
     assert!(error.contains("made with other views, seed; give --force"), "{error}");
     assert!(generate(parts.path(), &other, true, &ON, &mut |_| ()).unwrap().photographs == 9);
-    assert!(parts.path().join("shelf-000/images/008.png").exists());
+    assert!(parts.path().join("shelf-000/images/008.png").exists() && not_ours.is_dir());
 }
 
 #[test]
