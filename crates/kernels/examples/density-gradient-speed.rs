@@ -101,7 +101,7 @@ fn main() {
             let d = d_rays(3 + width);
             let extras = Extras { values: &extras[..SAMPLES * width], width };
             let background = &background[..RAYS * (3 + width)];
-            let input = StepInput { net: &net, params: &params, samples, extras, background, near_scaling: 0.0 };
+            let input = StepInput { net: &net, params: &params, samples, extras, background, beside: None, near_scaling: 0.0 };
             let [mut alone, mut trained] = [false, true].map(|is_trained| {
                 time(|| {
                     work.copy_from_slice(&features);

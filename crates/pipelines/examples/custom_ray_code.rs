@@ -67,7 +67,7 @@ fn field() -> Field {
     let table = (0..grid.params_len() as u64).map(|i| 1e-4 * (2.0 * rng.uniform(i) - 1.0)).collect();
     let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(1, 1)), adam);
     let encoder = Encoder::Hash { grid, table: ParamGroup::sparse("table", table, adam) };
-    Field { encoder, codes, net, space: Space::Cube(1.0), weights, normals: None }
+    Field { encoder, codes, net, space: Space::Cube(1.0), weights, normals: None, waves: None }
 }
 
 /// Squared difference to colors.

@@ -161,7 +161,7 @@ fn styled_field() -> Field {
     let net = FieldNet::of_color(mlp, head(3, kernels::Activation::Softplus, 2.0), head(0, kernels::Activation::Sigmoid, 0.0));
     let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(3, 3)), Adam { rate: 5e-3, ..Adam::default() });
     let codes = RayCodes { given: vec![STYLE], ..RayCodes::new(DirectionCode::None, None) };
-    Field { encoder: Encoder::Frequency(encoding), codes, net, space: Space::Cube(1.0), weights, normals: None }
+    Field { encoder: Encoder::Frequency(encoding), codes, net, space: Space::Cube(1.0), weights, normals: None, waves: None }
 }
 
 /// Rays of even number are red, the others blue.

@@ -59,15 +59,15 @@ fn field() -> Field {
     let net = FieldNet {
         density: Head { shift: 3.0, ..head(1, Activation::Softplus) },
         outputs: vec![
-            Output { head: head(3, Activation::Sigmoid), channels: 3 },
-            Output { head: head(4, Activation::Sigmoid), channels: MATERIALS },
+            Output { head: head(3, Activation::Sigmoid), channels: 3, are_shares: false },
+            Output { head: head(4, Activation::Sigmoid), channels: MATERIALS, are_shares: false },
         ],
         mlp: Mlp::new(vec![FEATURES, 4], layers),
     };
     let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(7, 2)), Adam { rate: 1e-2, ..Adam::default() });
     let codes = RayCodes::new(DirectionCode::SphericalHarmonics(2), None);
     let encoder = Encoder::VoxelCorners { grid, table: ParamGroup::sparse("table", table, adam) };
-    let mut field = Field { encoder, codes, net, space: Space::Cube(1.0), weights, normals: None };
+    let mut field = Field { encoder, codes, net, space: Space::Cube(1.0), weights, normals: None, waves: None };
     // The color network stays as it is: colors are learned as features alone.
     field.freeze_layers(|l| l == 2 || l == 3);
     field

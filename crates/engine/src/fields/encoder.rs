@@ -176,20 +176,20 @@ impl Encoder {
         }
     }
 
-    /// Encoded samples as the fused step takes them; `d_points` receives gradients of positions that are encoded there, and features of a
+    /// Samples at `unit` with the table's `features` as the fused step takes them; `d_points` receives gradients of positions that are encoded there, and features of a
     /// table are replaced by their gradients if those are `wanted`.
-    pub fn positions<'a>(&self, encoded: &'a mut Encoded, d_points: Option<&'a mut [f32]>, wanted: bool) -> Positions<'a> {
+    pub fn positions<'a>(&self, unit: &'a [f32], features: &'a mut [f32], d_points: Option<&'a mut [f32]>, wanted: bool) -> Positions<'a> {
         let in_block = match self {
             Encoder::Frequency(f) => BlockEncoding::Frequency(*f),
             Encoder::TriangleWave { bands } => BlockEncoding::TriangleWave { bands: *bands },
             Encoder::Hash { grid, .. } => {
-                return Positions::Features { data: &mut encoded.features, levels: grid.levels.len(), width: grid.config.features, wanted };
+                return Positions::Features { data: features, levels: grid.levels.len(), width: grid.config.features, wanted };
             }
             Encoder::VoxelCorners { grid, .. } => {
-                return Positions::Features { data: &mut encoded.features, levels: 1, width: grid.features, wanted };
+                return Positions::Features { data: features, levels: 1, width: grid.features, wanted };
             }
         };
-        Positions::Encoded { encoding: in_block, points: &encoded.unit, d_points }
+        Positions::Encoded { encoding: in_block, points: unit, d_points }
     }
 
     /// Adds to the table's gradient that of the features, unless it is frozen.

@@ -137,6 +137,7 @@ impl InvertedSphere {
             samples,
             extras: Extras::default(),
             background: &background,
+            beside: None,
             near_scaling: 0.0,
         };
         let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(self.encoding), points: &on.points, d_points: None };

@@ -24,7 +24,8 @@ use diorama_geom::contraction::Space;
 use diorama_kernels::gemm::Precision;
 use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::field_step::{
-    self, BatchLoss, Extras, FieldNet, RayCode, RayGradients, RayLoss, RayOutputs, StepBuffers, StepInput, StepOutput,
+    self, BatchLoss, Beside, BlockEncoding, Extras, FieldNet, RayCode, RayGradients, RayLoss, RayOutputs, StepBuffers, StepInput,
+    StepOutput,
 };
 use diorama_kernels::ops::fused_mlp::cpu::Activations;
 use rayon::prelude::*;
@@ -39,6 +40,8 @@ pub struct Field {
     pub weights: ParamGroup,
     /// Normals that are composited behind the network's outputs; see [`Field::set_normals`].
     pub normals: Option<Normals>,
+    /// Bands of triangle waves of the encoder's coordinates, which the network reads last.
+    pub waves: Option<usize>,
 }
 
 /// Anything with a density at every point, for occupancy grids and meshing.
@@ -162,8 +165,9 @@ impl Field {
         let (mut direction, mut appearance) = (std::mem::take(&mut buf.direction), std::mem::take(&mut buf.appearance));
         self.codes.encode(batch.dirs, batch.images, &mut direction, &mut appearance);
         let mut codes = self.ray_codes(batch, &direction, &appearance);
-        let positions = self.encoder.positions(encoded, None, false);
-        let input = self.step_input(batch, Extras::default(), batch.background);
+        let Encoded { unit, features } = encoded;
+        let positions = self.encoder.positions(unit, features, None, false);
+        let input = self.step_input(batch, Extras::default(), batch.background, self.beside(unit, false));
         field_step::run(&input, positions, &mut codes, None, &mut buf.step, &mut buf.out, &mut []);
         drop(codes);
         (buf.direction, buf.appearance) = (direction, appearance);
@@ -184,13 +188,19 @@ impl Field {
         &buf.out.values
     }
 
-    fn step_input<'a>(&'a self, batch: &Batch<'a>, extras: Extras<'a>, background: &'a [f32]) -> StepInput<'a> {
+    /// The second encoding of samples at `unit`, where the field has one.
+    fn beside<'a>(&self, unit: &'a [f32], wanted: bool) -> Option<Beside<'a>> {
+        self.waves.map(|bands| Beside { encoding: BlockEncoding::TriangleWave { bands }, points: unit, wanted })
+    }
+
+    fn step_input<'a>(&'a self, batch: &Batch<'a>, extras: Extras<'a>, background: &'a [f32], beside: Option<Beside<'a>>) -> StepInput<'a> {
         StepInput {
             net: &self.net,
             params: &self.weights.values,
             samples: batch.samples,
             extras,
             background,
+            beside,
             near_scaling: batch.near_scaling,
         }
     }
@@ -251,12 +261,14 @@ impl Field {
         // Gradients of positions that are encoded in the step; features have theirs in place.
         let in_step = d_positions.is_some() && self.encoder.levels().is_none();
         buf.d_points.resize(if in_step { batch.positions.len() } else { 0 }, 0.0);
-        let positions = self.encoder.positions(encoded, in_step.then_some(&mut buf.d_points[..]), wants_features);
+        let Encoded { unit, features } = &mut *encoded;
+        let beside = self.beside(unit, d_positions.is_some());
+        let positions = self.encoder.positions(unit, features, in_step.then_some(&mut buf.d_points[..]), wants_features);
         let (extras, background) = match self.normals {
             None => (Extras::default(), batch.background),
             Some(_) => (buf.normals.extras(), buf.normals.background()),
         };
-        let input = self.step_input(batch, extras, background);
+        let input = self.step_input(batch, extras, background, beside);
         field_step::run(&input, positions, &mut codes, Some(loss), &mut buf.step, &mut buf.out, &mut grads);
         drop(codes);
         self.weights.grads = grads;
@@ -271,6 +283,9 @@ impl Field {
             match in_step {
                 true => d.copy_from_slice(&buf.d_points),
                 false => self.encoder.positions_backward(encoded, d),
+            }
+            if self.waves.is_some() {
+                d.iter_mut().zip(&buf.out.d_beside).for_each(|(d, w)| *d += w);
             }
             self.unit_backward(batch.positions, d);
         }
@@ -292,6 +307,7 @@ impl Field {
             space: self.space,
             weights: self.weights.values_only(),
             normals: self.normals,
+            waves: self.waves,
         }
     }
 

@@ -66,6 +66,7 @@ pub fn ngp(grid: HashGridConfig, space: Space, rate: f32, images: usize, dims: u
         net,
         space,
         normals: None,
+        waves: None,
     }
 }
 
@@ -136,5 +137,6 @@ fn frequency_field(net: FieldNet, encoding: Frequency, codes: RayCodes, space: S
         net,
         space,
         normals: None,
+        waves: None,
     }
 }

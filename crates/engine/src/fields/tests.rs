@@ -24,13 +24,13 @@ fn field(encoder: Encoder, codes: RayCodes) -> Field {
     let net = FieldNet {
         density: head(1, 0, Activation::Softplus),
         outputs: vec![
-            Output { head: head(2, 0, Activation::Sigmoid), channels: 3 },
-            Output { head: head(1, 4, Activation::None), channels: 4 },
+            Output { head: head(2, 0, Activation::Sigmoid), channels: 3, are_shares: false },
+            Output { head: head(1, 4, Activation::None), channels: 4, are_shares: false },
         ],
         mlp,
     };
     let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(1, 1)), Adam::default());
-    Field { encoder, codes, net, space: Space::Cube(1.0), weights, normals: None }
+    Field { encoder, codes, net, space: Space::Cube(1.0), weights, normals: None, waves: None }
 }
 
 fn voxels() -> Encoder {
@@ -220,4 +220,27 @@ fn frozen_layers_stay_where_they_are() {
     let frozen = f.net.mlp.offsets[2];
     assert_eq!(f.weights.values[frozen..], before[frozen..]);
     assert!(f.weights.values[..frozen].iter().zip(&before).filter(|(a, b)| a != b).count() > frozen / 2);
+}
+
+#[test]
+fn waves_that_are_read_last_are_the_encoding_of_the_same_positions() {
+    let encoder = Encoder::TriangleWave { bands: 3 };
+    let codes = || RayCodes::new(DirectionCode::SphericalHarmonics(2), None);
+    let mut plain = field(encoder.clone(), codes());
+    let mut beside = field(encoder, codes());
+    let mut layers = beside.net.mlp.layers.clone();
+    let last = beside.net.mlp.input_widths.len();
+    layers.iter_mut().flat_map(|l| &mut l.inputs).filter(|i| **i == Source::Input(0)).for_each(|i| *i = Source::Input(last));
+    beside.net.mlp = Mlp::new([&beside.net.mlp.input_widths[..], &[9]].concat(), layers);
+    beside.waves = Some(3);
+    let rays = Rays::new(8);
+    let of = |f: &mut Field| {
+        let (mut buf, mut encoded, mut d) = (FieldBuffers::default(), Encoded::default(), Vec::new());
+        f.encode(&rays.positions, &mut encoded);
+        f.train(&rays.batch(&rays.positions, &[]), &mut encoded, Loss::Rays(&Sum), &mut buf, Some(&mut d));
+        (buf.out.values, f.weights.grads.clone(), d)
+    };
+    let want = of(&mut plain);
+    assert!(want.2.iter().any(|d| *d != 0.0));
+    assert_eq!(of(&mut beside), want);
 }

@@ -7,6 +7,7 @@ use diorama_kernels::gemm::Precision;
 use diorama_kernels::gpu::{Buffer, Gpu, Rows};
 use diorama_kernels::ops::field_step::gpu::{Arithmetic, GpuNet};
 use diorama_kernels::ops::frequency::Frequency;
+use diorama_kernels::ops::fused_mlp::gpu::columns;
 use diorama_kernels::ops::hash_grid::gpu::GpuHashGrid;
 use diorama_kernels::ops::march::Space;
 use diorama_kernels::ops::photometric_loss::Measure;
@@ -24,6 +25,8 @@ enum Encoder {
 pub struct Shape {
     encoder: Encoder,
     directions: DirectionCode,
+    /// Bands of the second encoding, which the network reads last.
+    waves: Option<usize>,
     pub net: GpuNet,
     /// Space in which positions are encoded.
     pub space: Space,
@@ -48,6 +51,7 @@ impl Shape {
         let mut wanted = vec![field.encoder.table().is_some_and(|t| !t.frozen) || moves];
         wanted.extend((field.codes.direction.dims() > 0).then_some(false));
         wanted.extend(field.codes.appearance.as_ref().map(|a| !a.group.frozen).into_iter().chain(field.codes.given.iter().map(|_| true)));
+        wanted.extend(field.waves.map(|_| moves));
         let space = match (field.encoder.is_centered(), field.space) {
             (false, geom::Space::Contracted(edge)) => Space::Contracted(edge),
             (false, geom::Space::Cube(edge)) => Space::Cube(edge),
@@ -55,7 +59,7 @@ impl Shape {
             (true, geom::Space::Cube(edge)) => Space::Centered(edge),
         };
         let net = GpuNet::new(gpu, &field.net, &field.density_net(Precision::F32), per_level, &wanted, arithmetic);
-        Shape { encoder, directions: field.codes.direction, net, space, measure: measure(field) }
+        Shape { encoder, directions: field.codes.direction, waves: field.waves, net, space, measure: measure(field) }
     }
 
     /// Encoded points `[S, 3]` of the field's space.
@@ -72,6 +76,19 @@ impl Shape {
                 let (corners, local) = voxels.locate(gpu, rows, points);
                 corners.forward(gpu, &local, table(), *features)
             }
+        }
+    }
+
+    /// Triangle waves of points `[S, 3]`, where the network reads them.
+    pub fn waves(&self, gpu: &Gpu, points: &Buffer) -> Option<Buffer> {
+        self.waves.map(|bands| triangle_wave::gpu::forward(gpu, bands, points))
+    }
+
+    /// Adds the gradient of the points through the waves.
+    pub fn waves_backward(&self, gpu: &Gpu, rows: &Rows, points: &Buffer, d_waves: &Buffer, d_points: &Buffer) {
+        if let Some(bands) = self.waves {
+            let own = triangle_wave::gpu::backward(gpu, bands, points, d_waves);
+            columns(gpu, rows, 3, (&own, 3, 0), (d_points, 3, 0), true);
         }
     }
 

@@ -55,7 +55,14 @@ impl ViewField {
     }
 
     /// Evaluates and composites encoded samples before black.
-    fn shade(&self, gpu: &Gpu, rays: &GpuRays, packed: &GpuPacked, features: &Buffer, appearance: Option<u32>) -> GpuComposited {
+    fn shade(
+        &self,
+        gpu: &Gpu,
+        rays: &GpuRays,
+        packed: &GpuPacked,
+        (points, features): (&Buffer, &Buffer),
+        appearance: Option<u32>,
+    ) -> GpuComposited {
         let n = packed.rays();
         let direction = self.shape.direction(gpu, &rays.dirs);
         let code = self.appearance.as_ref().map(|(codes, dims)| {
@@ -63,8 +70,10 @@ impl ViewField {
             field::look_up(gpu, codes, &gpu.upload(&vec![appearance.unwrap_or(mean); n]), *dims)
         });
         let codes: Vec<&Buffer> = direction.iter().chain(&code).collect();
-        let black = gpu.zeros(n * 3);
-        self.shape.net.forward(gpu, &self.weights, &FieldInput { packed, features, codes: &codes }, &black, false).out
+        let black = gpu.zeros(n * self.shape.net.net.channels());
+        let waves = self.shape.waves(gpu, points);
+        let input = FieldInput { packed, features, codes: &codes, beside: waves.as_ref() };
+        self.shape.net.forward(gpu, &self.weights, &input, &black, false).out
     }
 }
 
@@ -135,7 +144,7 @@ impl GpuTracer {
             let rays = GpuRays { origins: points.clone(), dirs: gpu.upload(dirs), near_far, jitter, resumed: false };
             let points = march::to_space(gpu, &points, f.shape.space);
             let features = f.shape.features(gpu, &packed.rows(), &points, f.table.as_ref());
-            out.extend(gpu.read(&f.shade(gpu, &rays, &packed, &features, None).color)?);
+            out.extend(gpu.read(&f.shade(gpu, &rays, &packed, (&points, &features), None).color)?);
         }
         Ok(out)
     }
@@ -163,11 +172,11 @@ impl GpuTracer {
         let on = PlaceOn { field: self.field.read(), grid: self.occupancy.as_ref(), rays: &rays, first: 0, room: (room, room) };
         let mut weights = |packed: &GpuPacked| {
             let coarse = self.coarse.as_ref().expect("a coarse field");
-            let (_, features) = coarse.read().encode(gpu, &rays, packed);
-            Ok(coarse.shade(gpu, &rays, packed, &features, appearance).weights)
+            let (points, features) = coarse.read().encode(gpu, &rays, packed);
+            Ok(coarse.shade(gpu, &rays, packed, (&points, &features), appearance).weights)
         };
         let samples = place::place(gpu, placement, &on, &mut weights)?;
-        let view = self.field.shade(gpu, &rays, &samples.packed, &samples.features, appearance);
+        let view = self.field.shade(gpu, &rays, &samples.packed, (&samples.points, &samples.features), appearance);
         let light = samples.march.map_or_else(|| gpu.empty(0), |m| m.light);
         let [needed, light, rgb, opacity, depth] =
             gpu.read_together([&samples.marched.last().cast(), &light, &view.color, &view.opacity, &view.depth])?;

@@ -164,7 +164,8 @@ impl GpuField {
         let appearance = self.appearance.as_ref().map(|(g, dims)| field::look_up(gpu, &g.values, &r.drawn.images, *dims));
         let codes: Vec<&Buffer> = direction.iter().chain(&appearance).chain(&r.codes).collect();
         let background = &r.background;
-        let input = FieldInput { packed, features: &on.features, codes: &codes };
+        let waves = self.shape.waves(gpu, &on.points);
+        let input = FieldInput { packed, features: &on.features, codes: &codes, beside: waves.as_ref() };
         let (g, errors, composited, loss) = match s.loss {
             Loss::Batch(loss) => {
                 let step = net.forward(gpu, weights, &input, background, true);
@@ -196,6 +197,9 @@ impl GpuField {
             (Some(d), true) => Some(self.shape.points_backward(gpu, &packed.rows(), &on.points, self.table(), d)),
             _ => None,
         };
+        if let (Some(points), Some(d)) = (&points, &g.beside) {
+            self.shape.waves_backward(gpu, &packed.rows(), &on.points, d, points);
+        }
         self.weights.step(gpu, s, &g.params);
         if let (Some((table, d_table)), Some(d)) = (&self.table, &g.features)
             && !table.frozen

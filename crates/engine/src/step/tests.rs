@@ -121,14 +121,14 @@ fn voxel_field(features: usize) -> Field {
     let net = FieldNet {
         density: head(1, 3, Activation::Softplus),
         outputs: vec![
-            Output { head: head(1, 0, Activation::Sigmoid), channels: 3 },
-            Output { head: head(2, 0, Activation::None), channels: features },
+            Output { head: head(1, 0, Activation::Sigmoid), channels: 3, are_shares: false },
+            Output { head: head(2, 0, Activation::None), channels: features, are_shares: false },
         ],
         mlp: Mlp::new(vec![8, 5], layers),
     };
     let weights = ParamGroup::dense("weights", net.mlp.init(&Rng::new(1, 1)), Adam { rate: 1e-2, ..Adam::default() });
     let codes = RayCodes { given: vec![5], ..RayCodes::new(DirectionCode::None, None) };
-    Field { encoder: Encoder::VoxelCorners { grid, table }, codes, net, space: Space::Cube(1.0), weights, normals: None }
+    Field { encoder: Encoder::VoxelCorners { grid, table }, codes, net, space: Space::Cube(1.0), weights, normals: None, waves: None }
 }
 
 /// Mean squared distance of every channel from one value, which is known only of all rays together: their mean is subtracted.

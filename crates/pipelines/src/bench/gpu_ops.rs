@@ -141,7 +141,7 @@ fn networks(gpu: &Gpu, s: usize, t: &mut Table) -> Result<()> {
     let p = evenly(gpu, s);
     let direction = random(gpu, p.rays() * 16, 5);
     let g = GpuGradients { sigma: random(gpu, s, 6), features: random(gpu, s * 3, 7), background: gpu.zeros(p.rays() * 3) };
-    let input = FieldInput { packed: &p, features: &features, codes: &[&direction] };
+    let input = FieldInput { packed: &p, features: &features, codes: &[&direction], beside: None };
     for (arithmetic, name) in [(Arithmetic::Layers, "layers"), (Arithmetic::Exact, "one launch"), (Arithmetic::Best, "tensor cores")] {
         let net = GpuNet::new(gpu, net, &density, 2, &[true, false], arithmetic);
         let element = net.element();

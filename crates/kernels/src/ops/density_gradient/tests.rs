@@ -21,7 +21,7 @@ fn small(features: usize, activation: Activation) -> FieldNet {
     FieldNet {
         mlp: Mlp::new(vec![features, 5], layers),
         density: head(2, 3, activation),
-        outputs: vec![Output { head: head(3, 0, Activation::None), channels: 3 }],
+        outputs: vec![Output { head: head(3, 0, Activation::None), channels: 3, are_shares: false }],
     }
 }
 

@@ -10,6 +10,7 @@ use crate::ops::fused_mlp::{Head, Layer, Mlp, Source};
 #[cfg(feature = "gpu")]
 use crate::ops::fused_mlp::{cases::compare_as, gpu::fused::Element};
 use crate::ops::linear::Activation;
+use crate::ops::triangle_wave;
 #[cfg(feature = "gpu")]
 use crate::{
     gpu::{Buffer, Gpu, GpuError, table::Table},
@@ -50,8 +51,23 @@ fn with_labels(features: usize) -> FieldNet {
     net.mlp = Mlp::new(net.mlp.input_widths.clone(), layers);
     net.density.channel = 2;
     let head = |layer, channel, activation| Head { layer, channel, activation, shift: 0.1 };
-    net.outputs.push(Output { head: head(4, 0, Activation::None), channels: 10 });
-    net.outputs.push(Output { head: head(3, 2, Activation::Tanh), channels: 1 });
+    net.outputs.push(Output { head: head(4, 0, Activation::None), channels: 10, are_shares: false });
+    net.outputs.push(Output { head: head(3, 2, Activation::Tanh), channels: 1, are_shares: false });
+    net
+}
+
+/// Bands of the second encoding, where the network reads one.
+pub const BANDS: usize = 3;
+
+/// The network with six shares more, of a layer that reads triangle waves of the positions besides.
+fn with_shares(features: usize) -> FieldNet {
+    let mut net = ngp_net(features);
+    let mut layers = net.mlp.layers.clone();
+    layers.push(Layer::new(vec![Source::Input(3), Source::Layer(1)], 16, Activation::Relu, true));
+    layers.push(Layer::new(vec![Source::Layer(4)], 8, Activation::None, true));
+    net.mlp = Mlp::new([&net.mlp.input_widths[..], &[3 * BANDS]].concat(), layers);
+    let head = Head { layer: 5, channel: 1, activation: Activation::None, shift: 0.1 };
+    net.outputs.push(Output { head, channels: 6, are_shares: true });
     net
 }
 
@@ -65,6 +81,8 @@ pub struct Case {
     pub features: Vec<f32>,
     /// `[R, K]` of each code.
     pub codes: [Vec<f32>; 2],
+    /// Positions of the second encoding `[S, 3]`, where the network reads one.
+    pub points: Option<Vec<f32>>,
     pub background: Vec<f32>,
     /// Of color, depth, opacity and weights.
     pub d: [Vec<f32>; 4],
@@ -79,6 +97,7 @@ pub fn cases() -> Vec<Case> {
             params: net.mlp.init(&Rng::new(1, 1)),
             features: random(s * LEVELS.0 * LEVELS.1, 6),
             codes: [random(rays * CODES[0], 7), random(rays * CODES[1], 8)],
+            points: (net.mlp.input_widths.len() == 4).then(|| random(s * 3, 10)),
             background: random(rays * c, 9),
             d: [random(rays * c, 1), random(rays, 2), random(rays, 3), random(s, 4)],
             scene,
@@ -86,7 +105,8 @@ pub fn cases() -> Vec<Case> {
         }
     };
     let width = LEVELS.0 * LEVELS.1;
-    [ngp_net(width), with_labels(width)].into_iter().flat_map(|net| [0, 1, 90].map(|rays| (net.clone(), rays))).map(of).collect()
+    let nets = [ngp_net(width), with_labels(width), with_shares(width)];
+    nets.into_iter().flat_map(|net| [0, 1, 90].map(|rays| (net.clone(), rays))).map(of).collect()
 }
 
 impl Case {
@@ -102,7 +122,14 @@ impl Case {
         });
         let [color, depth, opacity, weights] = self.d.each_ref().map(|v| wide(v));
         let d = Composited { color, depth, opacity, weights };
-        reference::step(&self.net, &wide(&self.params), &p, &[&rows, &codes[0], &codes[1]], &wide(&self.background), &d)
+        let waves = self.points.as_ref().map(|points| triangle_wave::reference::forward(BANDS, &wide(points)));
+        let inputs: Vec<&[f64]> = [&rows, &codes[0], &codes[1]].into_iter().chain(&waves).map(|v| &v[..]).collect();
+        reference::step(&self.net, &wide(&self.params), &p, &inputs, &wide(&self.background), &d)
+    }
+
+    /// Gradients of [`Case::points`].
+    pub fn want_points(&self, want: &Step) -> Option<Vec<f64>> {
+        self.points.as_ref().map(|points| triangle_wave::reference::backward(BANDS, &wide(points), &want.d_inputs[3]))
     }
 
     /// Gradients of the features, level by level.
@@ -166,7 +193,7 @@ fn check_near_scaling(gpu: &Gpu, table: &mut Table, case: &Case) -> Result<(), G
 fn check_case(gpu: &Gpu, table: &mut Table, case: &Case, (arithmetic, name): (Arithmetic, &str)) -> Result<(), GpuError> {
     let (net, p) = (&case.net, case.scene.packed());
     let density = Mlp::new(net.mlp.input_widths[..1].to_vec(), net.mlp.layers[..=net.density.layer].to_vec());
-    let on_gpu = GpuNet::new(gpu, net, &density, LEVELS.1, &[true; 3], arithmetic);
+    let on_gpu = GpuNet::new(gpu, net, &density, LEVELS.1, &[true; 4][..net.mlp.input_widths.len()], arithmetic);
     let element = on_gpu.element();
     if matches!((arithmetic, element), (Arithmetic::Exact, None) | (Arithmetic::Best, None | Some(Element::F32))) {
         // The device has no arithmetic besides those checked before.
@@ -184,7 +211,8 @@ fn check_case(gpu: &Gpu, table: &mut Table, case: &Case, (arithmetic, name): (Ar
         Ok::<_, GpuError>(())
     };
     close("density", &on_gpu.density(gpu, &params, &features, &packed.rows()), &want.sigma)?;
-    let input = FieldInput { packed: &packed, features: &features, codes: &codes.each_ref() };
+    let waves = case.points.as_ref().map(|points| triangle_wave::gpu::forward(gpu, BANDS, &up(points)));
+    let input = FieldInput { packed: &packed, features: &features, codes: &codes.each_ref(), beside: waves.as_ref() };
     let step = on_gpu.forward(gpu, &params, &input, &background, true);
     close("color", &step.out.color, &want.out.color)?;
     close("weights", &step.out.weights, &want.out.weights)?;
@@ -193,6 +221,10 @@ fn check_case(gpu: &Gpu, table: &mut Table, case: &Case, (arithmetic, name): (Ar
     close("d parameters", &g.params, &want.d_params)?;
     close("d background", &g.background, &want.d_background)?;
     close("d features", g.features.as_ref().expect("wanted"), &case.want_features(&want))?;
+    if let (Some(points), Some(want)) = (&case.points, case.want_points(&want)) {
+        let d = triangle_wave::gpu::backward(gpu, BANDS, &up(points), g.beside.as_ref().expect("wanted"));
+        close("d points", &d, &want)?;
+    }
     for i in 0..CODES.len() {
         close("d code", g.codes[i].as_ref().expect("wanted"), &case.want_code(&want, i))?;
     }

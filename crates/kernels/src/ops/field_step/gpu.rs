@@ -1,6 +1,6 @@
 //! The standard field on a device: encoded positions, network, compositing, and their gradients.
 
-use super::FieldNet;
+use super::{FieldNet, Output, shares};
 use crate::gpu::{Accumulate, Buffer, Gpu, Rows, launch};
 use crate::ops::composite::gpu::{self as composite, GpuComposited, GpuGradients, GpuPacked};
 use crate::ops::fused_mlp::gpu::fused::{Element, Fused, Kept, tensor_element};
@@ -37,12 +37,13 @@ pub struct GpuNet {
 /// Samples as a network reads them.
 ///
 /// # Shapes
-/// features: as [`GpuNet::features`] gives them; codes: `[R, K_i]`.
+/// features: as [`GpuNet::features`] gives them; codes: `[R, K_i]`; beside, a second encoding of the positions: `[S, K]`.
 #[derive(Clone, Copy)]
 pub struct FieldInput<'a> {
     pub packed: &'a GpuPacked,
     pub features: &'a Buffer,
     pub codes: &'a [&'a Buffer],
+    pub beside: Option<&'a Buffer>,
 }
 
 impl GpuNet {
@@ -54,6 +55,9 @@ impl GpuNet {
             _ => Element::F32,
         };
         let both = |element| {
+            if net.outputs.iter().any(|o| o.are_shares) {
+                return None;
+            }
             let whole = Fused::new(gpu, &net.mlp, &net.heads().collect::<Vec<_>>(), per_level, wanted, element)?;
             let part = Fused::new(gpu, density, &[(net.density, 1)], per_level, &wanted[..1], element)?;
             Some([whole, part])
@@ -115,6 +119,7 @@ impl GpuNet {
             expand_ray_code(gpu, p, code, &per_sample, *width, true);
             inputs.push(per_sample);
         }
+        inputs.extend(input.beside.cloned());
         let refs: Vec<&Buffer> = inputs.iter().collect();
         let (values, sigma, outputs) = match &self.fused {
             Some([whole, _]) => {
@@ -129,18 +134,18 @@ impl GpuNet {
                 (Values::Layers(values), sigma, outputs)
             }
         };
-        Evaluated { packed: p.clone(), inputs, values, sigma, outputs }
+        Evaluated { packed: p.clone(), codes: input.codes.len(), inputs, values, sigma, outputs }
     }
 
     /// Activated channels of all outputs, `[S, C]`.
     fn side_by_side(&self, gpu: &Gpu, values: &mlp::Values, rows: &Rows) -> Buffer {
         if let [only] = &self.net.outputs[..] {
-            return head(gpu, &self.net, only.head, values, rows, only.channels);
+            return output(gpu, &self.net, only, values, rows);
         }
         let c = self.net.channels();
         let (out, mut first) = (gpu.empty(rows.most * c), 0);
         for o in &self.net.outputs {
-            let own = head(gpu, &self.net, o.head, values, rows, o.channels);
+            let own = output(gpu, &self.net, o, values, rows);
             columns(gpu, rows, o.channels, (&own, o.channels, 0), (&out, c, first), false);
             first += o.channels;
         }
@@ -179,7 +184,10 @@ impl GpuNet {
                         _ => (own(&at.outputs), own(&g.features)),
                     };
                     first += if i == 0 { 0 } else { channels };
-                    let slope = linear::before_activation(gpu, &rows, channels, h.activation, &out, &d);
+                    let slope = match i {
+                        1.. if net.outputs[i - 1].are_shares => shares::gpu::backward(gpu, &rows, channels, &out, &d),
+                        _ => linear::before_activation(gpu, &rows, channels, h.activation, &out, &d),
+                    };
                     let width = net.mlp.layers[h.layer].width;
                     let seed = seeds[h.layer].get_or_insert_with(|| gpu.zeros(rows.most * width));
                     columns(gpu, &rows, channels, (&slope, channels, 0), (seed, width, h.channel), true);
@@ -194,14 +202,16 @@ impl GpuNet {
             let turned = self.per_level > 0 && !self.in_levels();
             if turned { transpose_levels(gpu, &rows, &d, self.per_level, net.mlp.input_widths[0], false) } else { d }
         });
-        let codes = d_inputs.zip(&net.mlp.input_widths[1..]).map(|(d, width)| {
+        let mut others: Vec<Option<Buffer>> = d_inputs.collect();
+        let beside = others.split_off(at.codes.min(others.len())).pop().flatten();
+        let codes = others.into_iter().zip(&net.mlp.input_widths[1..]).map(|(d, width)| {
             d.map(|d| {
                 let sum = gpu.empty(p.rays() * width);
                 expand_ray_code(gpu, p, &sum, &d, *width, false);
                 sum
             })
         });
-        GpuStepGradients { codes: codes.collect(), params: d_params, features, background: g.background.clone() }
+        GpuStepGradients { codes: codes.collect(), beside, params: d_params, features, background: g.background.clone() }
     }
 
     /// [`GpuNet::gradients`], given those of what compositing gave; see [`super::StepInput::near_scaling`].
@@ -280,6 +290,7 @@ enum Values {
 /// Densities `[S]` and outputs `[S, C]`, with the values that a backward pass needs.
 pub struct Evaluated {
     packed: GpuPacked,
+    codes: usize,
     inputs: Vec<Buffer>,
     values: Values,
     pub sigma: Buffer,
@@ -300,12 +311,23 @@ pub struct GpuStepGradients {
     pub features: Option<Buffer>,
     /// Per code, `[R, K]`, where wanted.
     pub codes: Vec<Option<Buffer>>,
+    /// Of the second encoding, `[S, K]`, where wanted.
+    pub beside: Option<Buffer>,
     pub background: Buffer,
 }
 
 /// Activated channels of a layer, `[S, channels]`.
 fn head(gpu: &Gpu, net: &FieldNet, h: Head, values: &mlp::Values, rows: &Rows, channels: usize) -> Buffer {
     linear::head(gpu, rows, (&values.layers[h.layer], net.mlp.layers[h.layer].width, h.channel), channels, h.shift, h.activation)
+}
+
+/// Values of an output, `[S, channels]`.
+fn output(gpu: &Gpu, net: &FieldNet, o: &Output, values: &mlp::Values, rows: &Rows) -> Buffer {
+    let own = head(gpu, net, o.head, values, rows, o.channels);
+    if o.are_shares {
+        shares::gpu::forward(gpu, rows, o.channels, &own);
+    }
+    own
 }
 
 /// Rows `[R, width]` of `table` `[N, width]` named by `index` `[R]`.

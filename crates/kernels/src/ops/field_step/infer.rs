@@ -54,7 +54,7 @@ impl<'a> Inference<'a> {
     pub fn new(grid: &'a HashGrid, table: &'a [f32], net: &'a FieldNet, params: &'a [f32]) -> Option<Self> {
         let all = &net.mlp;
         let cut = net.density.layer + 1;
-        let &[Output { head: rgb, channels: 3 }] = &net.outputs[..] else { return None };
+        let &[Output { head: rgb, channels: 3, are_shares: false }] = &net.outputs[..] else { return None };
         if rgb.layer < cut || rgb.layer + 1 != all.layers.len() || all.layers.iter().any(|l| l.modulation.is_some()) {
             return None;
         }

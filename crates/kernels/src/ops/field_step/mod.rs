@@ -16,6 +16,7 @@ mod disjoint;
 pub mod gpu;
 pub mod infer;
 pub mod reference;
+mod shares;
 pub mod step;
 #[cfg(test)]
 mod tests;
@@ -24,11 +25,11 @@ use super::frequency::{self, Frequency};
 use super::fused_mlp::{Head, Mlp};
 use super::triangle_wave;
 
-pub use step::{Extras, StepBuffers, StepInput, StepOutput, run};
+pub use step::{Beside, Extras, StepBuffers, StepInput, StepOutput, run};
 
 /// A network that maps an encoded position and per-ray codes to a density and to what is composited with it.
 ///
-/// The network's input 0 is the encoded position; input `1 + i` is per-ray code `i`.
+/// The network's input 0 is the encoded position; input `1 + i` is per-ray code `i`; a second encoding of the position ([`Beside`]) comes last.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FieldNet {
     pub mlp: Mlp,
@@ -42,12 +43,14 @@ pub struct FieldNet {
 pub struct Output {
     pub head: Head,
     pub channels: usize,
+    /// Whether a softmax over the channels makes them shares; the head then has no activation.
+    pub are_shares: bool,
 }
 
 impl FieldNet {
     /// A network with a density and a color of three channels.
     pub fn of_color(mlp: Mlp, density: Head, color: Head) -> FieldNet {
-        FieldNet { mlp, density, outputs: vec![Output { head: color, channels: 3 }] }
+        FieldNet { mlp, density, outputs: vec![Output { head: color, channels: 3, are_shares: false }] }
     }
 
     /// Head of the color.

@@ -30,6 +30,16 @@ fn head(net: &FieldNet, h: Head, channels: usize, values: &[Vec<f64>], s: usize,
     (0..s * channels).map(|e| f(values[h.layer][e / channels * width + h.channel + e % channels] + h.shift as f64)).collect()
 }
 
+/// Softmax of rows.
+fn shares(mut logits: Vec<f64>, channels: usize) -> Vec<f64> {
+    for row in logits.chunks_exact_mut(channels) {
+        let most = row.iter().copied().fold(f64::MIN, f64::max);
+        let sum: f64 = row.iter().map(|v| (v - most).exp()).sum();
+        row.iter_mut().for_each(|v| *v = (*v - most).exp() / sum);
+    }
+    logits
+}
+
 /// [`step_with_extras`] without any.
 pub fn step(net: &FieldNet, params: &[f64], p: &Packed, inputs: &[&[f64]], background: &[f64], d: &Composited<f64>) -> Step {
     step_with_extras(net, params, p, inputs, &[], background, d)
@@ -53,6 +63,7 @@ pub fn step_with_extras(
     let (mut outputs, mut first) = (vec![0.0; s * c], 0);
     for o in &net.outputs {
         let own = head(net, o.head, o.channels, &values, s, |x| activate(o.head.activation, x));
+        let own = if o.are_shares { shares(own, o.channels) } else { own };
         for (e, v) in own.into_iter().enumerate() {
             outputs[e / o.channels * c + first + e % o.channels] = v;
         }
@@ -69,7 +80,12 @@ pub fn step_with_extras(
         let slopes = head(net, h, channels, &values, s, |x| slope(h.activation, x));
         let width = net.mlp.layers[h.layer].width;
         for e in 0..s * channels {
-            let g = if i == 0 { ds[e] } else { dc[e / channels * c + first + e % channels] };
+            let d = |k: usize| if i == 0 { ds[e] } else { dc[e / channels * c + first + k] };
+            let mut g = d(e % channels);
+            if i > 0 && net.outputs[i - 1].are_shares {
+                let y = |k: usize| outputs[e / channels * c + first + k];
+                g = y(e % channels) * (g - (0..channels).map(|k| y(k) * d(k)).sum::<f64>());
+            }
             seeds[h.layer][e / channels * width + h.channel + e % channels] += g * slopes[e];
         }
         first += if i == 0 { 0 } else { channels };

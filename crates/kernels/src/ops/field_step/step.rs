@@ -2,10 +2,12 @@
 //! gradients, and groups are added in order, so that results do not depend on the number of threads.
 
 use super::disjoint::Disjoint;
-use super::{BlockEncoding, FieldNet, Positions, RayCode, RayGradient, RayLoss, RayOutput};
+use super::shares::{self, Columns};
+use super::{BlockEncoding, FieldNet, Output, Positions, RayCode, RayGradient, RayLoss, RayOutput};
 use crate::ops::composite::{Packed, cpu as composite};
 use crate::ops::fused_mlp::Head;
 use crate::ops::fused_mlp::cpu::{Activations, Prepared, backward_block, forward_block};
+use crate::ops::linear::Activation;
 use crate::ops::linear::cpu::slope_from_output;
 use rayon::prelude::*;
 
@@ -24,11 +26,22 @@ pub struct StepInput<'a> {
     pub samples: Packed<'a>,
     /// Composited behind the network's outputs.
     pub extras: Extras<'a>,
+    pub beside: Option<Beside<'a>>,
     /// Background of every output and extra, `[R, C + K]`.
     pub background: &'a [f32],
     /// Distance `D` within which gradients of samples are scaled by `(t / D)²`, so that space close to a
     /// camera, which few rays share, learns no faster than the rest (Philip and Deschaintre 2023); 0: none.
     pub near_scaling: f32,
+}
+
+/// A second encoding of positions, which the network reads last.
+#[derive(Clone, Copy, Debug)]
+pub struct Beside<'a> {
+    pub encoding: BlockEncoding,
+    /// `[S, D]`
+    pub points: &'a [f32],
+    /// Whether a backward pass gives [`StepOutput::d_beside`].
+    pub wanted: bool,
 }
 
 /// Values of samples that the caller gives.
@@ -55,6 +68,8 @@ pub struct StepOutput {
     pub d_background: Vec<f32>,
     /// Gradients of the extras, `[S, K]`; without a loss they are not written.
     pub d_extras: Vec<f32>,
+    /// Gradients of [`Beside::points`] where they are wanted, `[S, D]`; without a loss they are not written.
+    pub d_beside: Vec<f32>,
     pub loss: f64,
 }
 
@@ -104,12 +119,26 @@ struct Shared<'a> {
     weights: Disjoint<'a>,
     d_background: Disjoint<'a>,
     d_extras: Disjoint<'a>,
+    d_beside: Disjoint<'a>,
 }
 
 impl StepInput<'_> {
     /// Channels that are composited.
     fn channels(&self) -> usize {
         self.net.channels() + self.extras.width
+    }
+
+    /// # Panics
+    /// When shapes do not fit, or a head is none that can be trained.
+    fn check(&self, codes: usize) {
+        let (r, s, mlp) = (self.samples.rays(), self.samples.samples(), &self.net.mlp);
+        assert!(self.background.len() == r * self.channels() && self.params.len() == mlp.params_len(), "field: shapes");
+        assert!(self.beside.is_none_or(|b| b.points.len() == s * b.encoding.dims()), "field: points of the second encoding");
+        let inputs = codes + 1 + self.beside.iter().len();
+        assert!(inputs == mlp.input_widths.len() && self.extras.values.len() == s * self.extras.width, "field: codes and extras");
+        assert!(self.channels() > 0 && self.net.heads().all(|(h, _)| h.activation.is_monotonic()), "field: heads");
+        let is_plain = |o: &Output| !o.are_shares || o.head.activation == Activation::None;
+        assert!(self.net.outputs.iter().all(is_plain), "field: shares have no other activation");
     }
 }
 
@@ -128,10 +157,9 @@ pub fn run(
 ) {
     let (r, s, c, k) = (input.samples.rays(), input.samples.samples(), input.channels(), input.extras.width);
     let mlp = &input.net.mlp;
-    assert!(input.background.len() == r * c && input.params.len() == mlp.params_len(), "field: shapes");
-    assert!(codes.len() + 1 == mlp.input_widths.len() && input.extras.values.len() == s * k, "field: codes and extras");
-    assert!(c > 0 && input.net.heads().all(|(h, _)| h.activation.is_monotonic()), "field: heads");
+    input.check(codes.len());
     out.resize(r, s, c, k);
+    out.d_beside.resize(input.beside.filter(|b| b.wanted).map_or(0, |b| b.points.len()), 0.0);
     let shared = Shared {
         features: None,
         encoded: None,
@@ -148,6 +176,7 @@ pub fn run(
         weights: Disjoint::new(&mut out.weights),
         d_background: Disjoint::new(&mut out.d_background),
         d_extras: Disjoint::new(&mut out.d_extras),
+        d_beside: Disjoint::new(&mut out.d_beside),
     };
     let shared = match positions {
         Positions::Features { data, levels, width, wanted } => {
@@ -231,6 +260,9 @@ fn run_block(
     let mut first = 0;
     for o in &net.outputs {
         read_head(net, o.head, n, &group.acts, (&mut group.values, c, first, o.channels));
+        if o.are_shares {
+            group.values.chunks_exact_mut(c).take(n).for_each(|row| shares::softmax(&mut row[first..first + o.channels]));
+        }
         first += o.channels;
     }
     input.extras.copy(s0, c, &mut group.values);
@@ -356,6 +388,10 @@ fn gather_inputs(input: &StepInput, shared: &Shared, rays: std::ops::Range<usize
         let d = encoding.dims();
         encoding.forward(&points[s0 * d..(s0 + n) * d], &mut group.inputs[0]);
     }
+    if let Some(b) = input.beside {
+        let d = b.encoding.dims();
+        b.encoding.forward(&b.points[s0 * d..(s0 + n) * d], &mut group.inputs[widths.len() - 1]);
+    }
     for (c, (values, width, _)) in shared.codes.iter().enumerate() {
         let mut rows = group.inputs[1 + c].chunks_exact_mut(*width);
         for r in rays.clone() {
@@ -365,9 +401,6 @@ fn gather_inputs(input: &StepInput, shared: &Shared, rays: std::ops::Range<usize
         }
     }
 }
-
-/// Some columns of a matrix: values, row length, first column, columns.
-type Columns<T> = (T, usize, usize, usize);
 
 /// Activated channels of a head.
 fn read_head(net: &FieldNet, head: Head, n: usize, acts: &Activations, (out, stride, first, channels): Columns<&mut [f32]>) {
@@ -407,7 +440,8 @@ fn backward(input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::
     write_head(net, net.density, &mut group.acts, &group.sigma, (&group.d_sigma, 1, 0, 1));
     let mut first = 0;
     for o in &net.outputs {
-        write_head(net, o.head, &mut group.acts, &group.values, (&group.d_values, c, first, o.channels));
+        let write = if o.are_shares { shares::write } else { write_head };
+        write(net, o.head, &mut group.acts, &group.values, (&group.d_values, c, first, o.channels));
         first += o.channels;
     }
     group.d_inputs.resize_with(widths.len(), Vec::new);
@@ -416,6 +450,7 @@ fn backward(input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::
     }
     let wanted = |i: usize| match i {
         0 => shared.features.as_ref().is_some_and(|f| f.3) || shared.encoded.as_ref().is_some_and(|e| e.2.is_some()),
+        i if i > shared.codes.len() => input.beside.is_some_and(|b| b.wanted),
         i => shared.codes[i - 1].2.is_some(),
     };
     let inputs: Vec<&[f32]> = group.inputs.iter().map(|v| &v[..]).collect();
@@ -438,6 +473,12 @@ fn backward(input: &StepInput, shared: &Shared, prepared: &Prepared, rays: std::
         let dims = encoding.dims();
         let d = unsafe { d_points.part(s0 * dims..(s0 + n) * dims) };
         encoding.backward(&points[s0 * dims..(s0 + n) * dims], &group.d_inputs[0], d);
+    }
+    if let Some(b) = input.beside.filter(|b| b.wanted) {
+        let own = s0 * b.encoding.dims()..(s0 + n) * b.encoding.dims();
+        // SAFETY: this block's samples.
+        let d = unsafe { shared.d_beside.part(own.clone()) };
+        b.encoding.backward(&b.points[own], &group.d_inputs[widths.len() - 1], d);
     }
     for (c, (_, width, gradient)) in shared.codes.iter().enumerate() {
         let Some(gradient) = gradient else { continue };

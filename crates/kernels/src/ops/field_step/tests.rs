@@ -54,10 +54,19 @@ fn fused_equals_composed_with_features_codes_and_all_gradients() {
         let mut features = c.features.clone();
         let [color, depth, opacity, weights] = c.d.clone();
         let loss = Linear { color, depth, opacity, weights };
+        let encoding = BlockEncoding::TriangleWave { bands: cases::BANDS };
+        let beside = c.points.as_ref().map(|points| Beside { encoding, points, wanted: true });
         let (mut d_first, mut d_second) = (vec![9.0; c.codes[0].len()], vec![9.0; c.codes[1].len()]);
         let (mut out, mut d_params) = (StepOutput::default(), vec![0.0; c.params.len()]);
-        let input =
-            StepInput { net, params: &c.params, samples: p, extras: Extras::default(), background: &c.background, near_scaling: 0.0 };
+        let input = StepInput {
+            net,
+            params: &c.params,
+            samples: p,
+            extras: Extras::default(),
+            background: &c.background,
+            beside,
+            near_scaling: 0.0,
+        };
         let [first, second] = cases::CODES;
         let mut codes = [
             RayCode { values: &c.codes[0], width: first, gradient: Some(&mut d_first) },
@@ -77,6 +86,8 @@ fn fused_equals_composed_with_features_codes_and_all_gradients() {
         assert_close("d first code", &d_first, &c.want_code(&want, 0), 1e-4);
         assert_close("d second code", &d_second, &c.want_code(&want, 1), 1e-4);
         assert_close("d features", &features, &c.want_features(&want), 1e-4);
+        assert_eq!(out.d_beside.is_empty(), c.points.as_ref().is_none_or(Vec::is_empty));
+        c.want_points(&want).into_iter().for_each(|want| assert_close("d points", &out.d_beside, &want, 1e-4));
     }
 }
 
@@ -95,7 +106,8 @@ fn fused_equals_composed_with_encoded_positions() {
     let bg = random(210, 9);
     let loss = Linear::new(70, 3, n);
     let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
-    let input = StepInput { net: &net, params: &params, samples: p, extras: Extras::default(), background: &bg, near_scaling: 0.0 };
+    let input =
+        StepInput { net: &net, params: &params, samples: p, extras: Extras::default(), background: &bg, beside: None, near_scaling: 0.0 };
     let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: Some(&mut d_points) };
     run(&input, positions, &mut [], Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
     let rows = frequency::reference::forward(&encoding, &wide(&points));
@@ -125,6 +137,7 @@ fn the_result_does_not_depend_on_the_thread_count() {
                 samples: s.packed(),
                 extras: Extras::default(),
                 background: &bg,
+                beside: None,
                 near_scaling: 0.0,
             };
             let mut codes = [RayCode { values: &sh, width: 16, gradient: None }, RayCode { values: &emb, width: 5, gradient: None }];
@@ -149,7 +162,15 @@ fn near_samples_learn_with_the_square_of_their_distance() {
     let (points, bg, params) = (random(n * 3, 5), random(60, 9), net.mlp.init(&Rng::new(1, 1)));
     let gradient = |near_scaling: f32| {
         let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
-        let input = StepInput { net: &net, params: &params, samples: s.packed(), extras: Extras::default(), background: &bg, near_scaling };
+        let input = StepInput {
+            net: &net,
+            params: &params,
+            samples: s.packed(),
+            extras: Extras::default(),
+            background: &bg,
+            beside: None,
+            near_scaling,
+        };
         let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: Some(&mut d_points) };
         run(&input, positions, &mut [], Some(&Linear::new(20, 3, n)), &mut StepBuffers::default(), &mut out, &mut d_params);
         d_points
@@ -238,8 +259,8 @@ fn many_outputs(features: usize) -> FieldNet {
         mlp,
         density: head(0, 3, Activation::Softplus),
         outputs: vec![
-            Output { head: head(2, 1, Activation::Sigmoid), channels: 3 },
-            Output { head: head(3, 0, Activation::None), channels: 40 },
+            Output { head: head(2, 1, Activation::Sigmoid), channels: 3, are_shares: false },
+            Output { head: head(3, 0, Activation::None), channels: 40, are_shares: false },
         ],
     }
 }
@@ -251,7 +272,15 @@ fn run_many(loss: &dyn RayLoss, net: &FieldNet, rays: usize) -> (StepOutput, Vec
     let points = random(s.t.len() * 3, 5);
     let (params, code, bg) = (net.mlp.init(&Rng::new(1, 1)), random(rays * 36, 7), random(rays * 43, 9));
     let (mut out, mut d_params, mut d_code) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; code.len()]);
-    let input = StepInput { net, params: &params, samples: s.packed(), extras: Extras::default(), background: &bg, near_scaling: 0.0 };
+    let input = StepInput {
+        net,
+        params: &params,
+        samples: s.packed(),
+        extras: Extras::default(),
+        background: &bg,
+        beside: None,
+        near_scaling: 0.0,
+    };
     let mut codes = [RayCode { values: &code, width: 36, gradient: Some(&mut d_code) }];
     let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: None };
     run(&input, positions, &mut codes, Some(loss), &mut StepBuffers::default(), &mut out, &mut d_params);
@@ -290,7 +319,7 @@ fn extras_are_composited_behind_the_outputs_and_differentiated() {
         let (loss, params) = (Linear::new(rays, c, n), net.mlp.init(&Rng::new(1, 1)));
         let (mut out, mut d_params, mut d_code) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; code.len()]);
         let extra = Extras { values: &extras, width: k };
-        let input = StepInput { net: &net, params: &params, samples: p, extras: extra, background: &bg, near_scaling: 0.0 };
+        let input = StepInput { net: &net, params: &params, samples: p, extras: extra, background: &bg, beside: None, near_scaling: 0.0 };
         let mut codes = [RayCode { values: &code, width: 36, gradient: Some(&mut d_code) }];
         let positions = Positions::Encoded { encoding: BlockEncoding::Frequency(encoding), points: &points, d_points: None };
         run(&input, positions, &mut codes, Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
@@ -343,7 +372,8 @@ fn triangle_waves_are_encoded_in_the_step() {
     let (points, params, bg) = (random(n * 3, 5), net.mlp.init(&Rng::new(1, 1)), random(150, 9));
     let loss = Linear::new(50, 3, n);
     let (mut out, mut d_params, mut d_points) = (StepOutput::default(), vec![0.0; params.len()], vec![9.0; n * 3]);
-    let input = StepInput { net: &net, params: &params, samples: p, extras: Extras::default(), background: &bg, near_scaling: 0.0 };
+    let input =
+        StepInput { net: &net, params: &params, samples: p, extras: Extras::default(), background: &bg, beside: None, near_scaling: 0.0 };
     let positions = Positions::Encoded { encoding: BlockEncoding::TriangleWave { bands }, points: &points, d_points: Some(&mut d_points) };
     run(&input, positions, &mut [], Some(&loss), &mut StepBuffers::default(), &mut out, &mut d_params);
     let rows = wave::forward(bands, &wide(&points));

@@ -134,10 +134,10 @@ fn joined(gpu: &Gpu, mlp: &Mlp, j: usize, inputs: &[&Buffer], values: &[Buffer],
 }
 
 /// Columns of a matrix: its buffer, its width, and the first of them.
-pub(crate) type Columns<'a> = (&'a Buffer, usize, usize);
+pub type Columns<'a> = (&'a Buffer, usize, usize);
 
 /// Copies or adds `width` columns.
-pub(crate) fn columns(gpu: &Gpu, rows: &Rows, width: usize, from: Columns, to: Columns, add: bool) {
+pub fn columns(gpu: &Gpu, rows: &Rows, width: usize, from: Columns, to: Columns, add: bool) {
     assert!(from.2 + width <= from.1 && to.2 + width <= to.1, "columns beyond a matrix");
     let m = rows.most;
     launch!(

@@ -4,7 +4,7 @@
 #[inline(always)]
 fn phase(v: f32, k: usize) -> (f64, f64) {
     let scale = (1u64 << k) as f64;
-    let p = v as f64 * scale + 0.5;
+    let p = v as f64 * scale + 0.5 * k as f64;
     (p - 2.0 * (p * 0.5).floor(), scale)
 }
 

@@ -19,10 +19,10 @@ pub fn backward(gpu: &Gpu, bands: usize, x: &Buffer, d_out: &Buffer) -> Buffer {
     out
 }
 
-/// `(v + ½) mod 2` in [0, 2).
+/// `(v + k/2) mod 2` in [0, 2).
 #[cube]
-fn phase(v: f32) -> f32 {
-    let p = (v + 0.5) * 0.5;
+fn phase(v: f32, k: u32) -> f32 {
+    let p = v * 0.5 + f32::cast_from(k) * 0.25;
     (p - p.floor()) * 2.0
 }
 
@@ -34,7 +34,7 @@ fn wave(x: &[f32], out: &mut [f32], len: u32, bands: u32) {
     }
     let mut v = x[i];
     for k in 0..bands as usize {
-        out[i * bands as usize + k] = 2.0 * (phase(v) - 1.0).abs() - 1.0;
+        out[i * bands as usize + k] = 2.0 * (phase(v, k as u32) - 1.0).abs() - 1.0;
         v *= 2.0;
     }
 }
@@ -49,7 +49,7 @@ fn slope(x: &[f32], d_out: &[f32], out: &mut [f32], len: u32, bands: u32) {
     let mut g = 0.0f32;
     for k in 0..bands as usize {
         let mut d = 2.0 * s * d_out[i * bands as usize + k];
-        if phase(s * x[i]) < 1.0 {
+        if phase(s * x[i], k as u32) < 1.0 {
             d = -d;
         }
         g += d;

@@ -102,13 +102,13 @@ pub fn of_materials(config: &Config, surfaces: Field) -> Result<Field> {
         ]);
     }
     let mut outputs = vec![
-        Output { head: head(4, Activation::Sigmoid, 0.0), channels: 3 },
-        Output { head: head(7, Activation::Sigmoid, LIT), channels: 1 },
-        Output { head: head(10, Activation::Tanh, 0.0), channels: 3 },
+        Output { head: head(4, Activation::Sigmoid, 0.0), channels: 3, are_shares: false },
+        Output { head: head(7, Activation::Sigmoid, LIT), channels: 1, are_shares: false },
+        Output { head: head(10, Activation::Tanh, 0.0), channels: 3, are_shares: false },
     ];
     let mut given = vec![9];
     if is_apart {
-        outputs.push(Output { head: head(13, Activation::Sigmoid, LIT), channels: 1 });
+        outputs.push(Output { head: head(13, Activation::Sigmoid, LIT), channels: 1, are_shares: false });
         given.push(9);
     }
     let inputs = std::iter::once(surfaces.encoder.dims()).chain(given.iter().copied()).collect();
@@ -147,8 +147,8 @@ pub fn of_all(config: &Config, edge: f32, stream: u64) -> Field {
     let net = FieldNet {
         density: head(trunk, Activation::Relu, 0.0),
         outputs: vec![
-            Output { head: head(trunk + 3, Activation::Sigmoid, 0.0), channels: 3 },
-            Output { head: head(trunk + 5, Activation::Sigmoid, 0.0), channels: 1 },
+            Output { head: head(trunk + 3, Activation::Sigmoid, 0.0), channels: 3, are_shares: false },
+            Output { head: head(trunk + 5, Activation::Sigmoid, 0.0), channels: 1, are_shares: false },
         ],
         mlp: Mlp::new(vec![encoding.output_dims(), 9], layers),
     };
@@ -160,6 +160,7 @@ pub fn of_all(config: &Config, edge: f32, stream: u64) -> Field {
         space: Space::Cube(edge),
         net,
         normals: None,
+        waves: None,
     };
     // All samples, however thin: normals are those of the whole ray.
     let all = Normals { min_weight: 0.0, ..Normals::default() };
