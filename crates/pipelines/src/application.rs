@@ -6,6 +6,7 @@ use crate::object::{config::Config, run_folder};
 use crate::relight::{object as relit, outdoor};
 use crate::run::RunDescription;
 use crate::run::config::Configuration;
+use crate::text::field as writing;
 use diorama_data::DataError;
 use serde_json::Value;
 use std::path::Path;
@@ -19,11 +20,13 @@ pub enum Application {
     Relight,
     /// Photographs of an object to a mesh with materials, and its light.
     RelightObject,
+    /// Photographs of writing to a field with classes.
+    Text,
 }
 
 impl Application {
     /// All of them, in the order in which they are listed to users.
-    pub const ALL: [Application; 3] = [Application::Object, Application::Relight, Application::RelightObject];
+    pub const ALL: [Application; 4] = [Application::Object, Application::Relight, Application::RelightObject, Application::Text];
 
     /// The name that `config.toml` gives.
     pub fn name(self) -> &'static str {
@@ -31,6 +34,7 @@ impl Application {
             Application::Object => Config::APPLICATION,
             Application::Relight => outdoor::config::Config::APPLICATION,
             Application::RelightObject => relit::config::Config::APPLICATION,
+            Application::Text => writing::config::Config::APPLICATION,
         }
     }
 
@@ -63,6 +67,7 @@ impl Application {
             Application::Object => run_folder::describe(run),
             Application::Relight => outdoor::recipe::describe(run),
             Application::RelightObject => relit::recipe::describe(run),
+            Application::Text => writing::recipe::describe(run),
         }
     }
 }

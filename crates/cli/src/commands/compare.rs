@@ -36,6 +36,7 @@ impl Verb for Compare {
                 Application::Object => {}
                 of @ Application::Relight => return Err(of.refuse(run, "diorama relight eval")),
                 of @ Application::RelightObject => return Err(of.refuse(run, "diorama relight eval")),
+                of @ Application::Text => return Err(of.refuse(run, "diorama text eval")),
             }
         }
         self.objects()

@@ -66,6 +66,7 @@ impl Verb for Eval {
             Application::Object => self.object(),
             of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight eval")),
             of @ Application::RelightObject => Err(of.refuse(&self.run, "diorama relight eval")),
+            of @ Application::Text => Err(of.refuse(&self.run, "diorama text eval")),
         }
     }
 }

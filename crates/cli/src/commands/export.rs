@@ -110,6 +110,7 @@ impl Verb for Export {
             Application::Object => self.object(),
             of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight render")),
             of @ Application::RelightObject => Err(of.refuse(&self.run, "diorama relight object --resume, which writes the GLB again")),
+            of @ Application::Text => Err(of.refuse(&self.run, "a run of object: a text run exports no mesh")),
         }
     }
 }

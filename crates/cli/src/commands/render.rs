@@ -79,6 +79,7 @@ impl Verb for Render {
             Application::Object => self.object(),
             of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight render")),
             of @ Application::RelightObject => Err(of.refuse(&self.run, "diorama relight turntable with its GLB")),
+            of @ Application::Text => Err(of.refuse(&self.run, "diorama text eval, which draws its held-out views")),
         }
     }
 }

@@ -107,6 +107,7 @@ impl Verb for Train {
             Application::Object => self.object(),
             of @ Application::Relight => Err(of.refuse(&self.out, "diorama relight train --resume")),
             of @ Application::RelightObject => Err(of.refuse(&self.out, "diorama relight object --resume")),
+            of @ Application::Text => Err(of.refuse(&self.out, "diorama text train --resume")),
         }
     }
 }

@@ -142,6 +142,7 @@ fn source(a: &View) -> Result<Source> {
             Application::Object => object(a),
             Application::Relight => scene(a),
             of @ Application::RelightObject => Err(of.refuse(&a.path, "the GLB file that diorama relight object wrote")),
+            of @ Application::Text => Err(of.refuse(&a.path, "diorama text eval, which draws its held-out views")),
         };
     }
     let capture = import::import(&a.path, &ImportOptions { min_views: 1, allow_broken: true, ..ImportOptions::default() })?;

@@ -20,7 +20,7 @@ const LIMIT: u64 = 1 << 30;
 /// Twice the area in square pixels below which a polygon has none.
 const LEAST_AREA: f64 = 1e-6;
 /// What a line looks like, for errors.
-const EXAMPLE: &str =
+pub const EXAMPLE: &str =
     r#"{"image": "images/001.png", "regions": [{"id": 0, "polygon": [[10,8],[90,10],[90,30],[10,28]], "transcription": "CAFE"}]}"#;
 
 /// An image and its regions.

@@ -1,7 +1,9 @@
 //! `diorama text`: a group of commands.
 
 mod annotate;
+mod eval;
 mod make_scenes;
+mod train;
 
 use super::Verb;
 use clap::Subcommand;
@@ -10,7 +12,9 @@ use clap::Subcommand;
 #[derive(Subcommand)]
 pub enum Text {
     Annotate(annotate::Annotate),
+    Eval(eval::Eval),
     MakeScenes(make_scenes::MakeScenes),
+    Train(train::Train),
 }
 
 impl Text {
@@ -18,7 +22,9 @@ impl Text {
     pub fn verb(&self) -> &dyn Verb {
         match self {
             Text::Annotate(v) => v,
+            Text::Eval(v) => v,
             Text::MakeScenes(v) => v,
+            Text::Train(v) => v,
         }
     }
 }
