@@ -54,3 +54,30 @@ fn generated_scenes_are_captures_whose_labels_other_formats_can_replace() {
         "expected labelme, ppocr, icdar13, icdar15, mlt17",
     );
 }
+
+#[test]
+fn a_run_is_trained_scored_and_refuses_what_it_cannot_learn_from() {
+    let dir = tempfile::tempdir().unwrap();
+    let make = ["make-scenes", "--family", "shelf", "--views", "8", "--pixels", "64x48", "--spp", "2", "--fonts", "shipped", "-o", "signs"];
+    assert!(run(dir.path(), &make).status.success());
+    let labels = dir.path().join("signs/shelf-000/labels.jsonl");
+    let kept = std::fs::read_to_string(&labels).unwrap();
+    let train = ["train", "signs/shelf-000", "--preset", "ci", "--device", "cpu", "--steps", "4", "-o", "run"];
+    std::fs::write(&labels, kept.replace("images/", "other/")).unwrap();
+    refused(dir.path(), &train, "the capture has no such photograph; its first is images/000.png");
+    std::fs::remove_file(&labels).unwrap();
+    refused(dir.path(), &train, "labels.jsonl: is missing; import labels with");
+    assert!(!dir.path().join("run").exists(), "a refused run leaves nothing");
+    std::fs::write(&labels, kept).unwrap();
+    let o = run(dir.path(), &[&train[..], &["--no-s3im", "--no-dist", "--no-pe", "--json"]].concat());
+    assert!(o.status.success(), "{}", String::from_utf8_lossy(&o.stderr));
+    let config = std::fs::read_to_string(dir.path().join("run/config.toml")).unwrap();
+    for line in ["application = \"text\"", "s3im = 0.0", "distortion = 0.0", "waves = 0"] {
+        assert!(config.lines().any(|l| l == line), "{line} is not in {config}");
+    }
+    refused(dir.path(), &["train", "--resume", "--no-pe", "-o", "run"], "leave out --no-s3im, --no-dist and --no-pe");
+    let o = run(dir.path(), &["eval", "run", "--json"]);
+    let json: serde_json::Value = serde_json::from_slice(&o.stdout).unwrap();
+    assert!(json["views"] == 1 && json["psnr"].as_f64().is_some_and(f64::is_finite) && json["miou"].is_number(), "{json}");
+    assert!(dir.path().join("run/eval").read_dir().unwrap().count() == 1);
+}
