@@ -178,17 +178,9 @@ impl TextModel {
         self.stage = Stage::Labels;
     }
 
-    /// The parameters that a checkpoint holds: grid and density stand once.
-    fn params(&mut self) -> ParamSet<'_> {
-        let mut params = ParamSet::default();
-        params.add("field", self.field.groups_mut());
-        params.add("labels", self.classes.iter_mut().map(|c| &mut c.weights));
-        params
-    }
-
     /// Whether any parameter is not finite.
     pub fn is_broken(&mut self) -> bool {
-        self.params().is_broken()
+        params(&mut self.field, &mut self.classes).is_broken()
     }
 
     /// Everything that a checkpoint holds.
@@ -201,10 +193,7 @@ impl TextModel {
             ("seconds_bits".into(), self.origin.seconds.to_bits().to_string()),
             ("rate_scale_bits".into(), self.rate_scale.to_bits().to_string()),
         ]);
-        let mut params = ParamSet::default();
-        params.add("field", self.field.groups_mut());
-        params.add("labels", self.classes.iter_mut().map(|c| &mut c.weights));
-        let mut entries = param_state::entries(params);
+        let mut entries = param_state::entries(params(&mut self.field, &mut self.classes));
         entries.extend([entry("occupancy", &self.occupancy.grid.density), entry("occupancy.fresh", &self.occupancy.grid.fresh)]);
         (entries, metadata)
     }
@@ -225,21 +214,24 @@ impl TextModel {
         self.origin = Origin { step: number(&c, "step", file)?, seconds: f64::from_bits(number(&c, "seconds_bits", file)?) };
         self.rays = number(&c, "rays", file)?;
         self.rate_scale = f32::from_bits(number(&c, "rate_scale_bits", file)?);
-        param_state::restore(&mut self.params(), &mut c, file)?;
+        param_state::restore(&mut params(&mut self.field, &mut self.classes), &mut c, file)?;
         param_state::take(&mut self.occupancy.grid.density, "occupancy", &mut c, file)?;
         param_state::take(&mut self.occupancy.grid.fresh, "occupancy.fresh", &mut c, file)?;
         self.occupancy.grid.refresh();
-        if let Some(classes) = &mut self.classes {
-            // The grid and the density are the field's.
-            let own = classes.weights.values.clone();
-            let mut fresh = of_labels(&self.config, &self.field, self.labels.count());
-            fresh.weights.values = own;
-            (fresh.weights.moment1, fresh.weights.moment2) =
-                (std::mem::take(&mut classes.weights.moment1), std::mem::take(&mut classes.weights.moment2));
-            *classes = fresh;
+        // The grid of both fields is one.
+        if let (Some(classes), Some(table)) = (&mut self.classes, self.field.encoder.table()) {
+            classes.encoder.table_mut().into_iter().for_each(|t| t.values.clone_from(&table.values));
         }
         Ok(())
     }
+}
+
+/// The parameters that a checkpoint holds: the grid stands once.
+fn params<'a>(field: &'a mut Field, classes: &'a mut Option<Field>) -> ParamSet<'a> {
+    let mut params = ParamSet::default();
+    params.add("field", field.groups_mut());
+    params.add("labels", classes.iter_mut().map(|c| &mut c.weights));
+    params
 }
 
 /// Course of the rates over each stage.

@@ -130,13 +130,14 @@ pub(super) fn load_pixels(config: &Config, capture: &Capture, of: Split) -> Resu
 /// # Errors
 /// When the folder holds no run of this application, or its checkpoint is damaged.
 pub fn load(run: &Path, data: Option<&Path>) -> Result<(TextModel, Vec<String>)> {
-    let config: Config = RunDescription::read(run)?.config()?;
+    let mut config: Config = RunDescription::read(run)?.config()?;
     let capture = kept_capture::read(run, data, &config.data.path)?;
     let root = match data {
         Some(data) => data.to_path_buf(),
         None => kept_capture::data_set(run, &config.data.path)?,
     };
     let labels = Labels::read(run, &capture, &import::root(&root)?)?;
+    config.data.path = root;
     let (checkpoint, file, note) = folder::last_checkpoint(run)?;
     let mut model = TextModel::new(config, capture, labels)?;
     model.restore(checkpoint, &file)?;

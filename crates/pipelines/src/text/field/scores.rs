@@ -3,7 +3,7 @@
 use super::label_maps::{self, UNKNOWN};
 use super::model::TextModel;
 use super::recipe;
-use crate::error::Result;
+use crate::error::{PipelineError, Result};
 use crate::run::photographs::StoredPhotographs;
 use diorama_data::import;
 use diorama_engine::metrics;
@@ -93,9 +93,13 @@ fn sheet(photo: &Image, view: &Image, classes: [Option<&[u8]>; 2]) -> ImageU8 {
 /// Renders and compares the held-out views; `look` receives the name and a picture of each: photograph, view, classes, known classes.
 ///
 /// # Errors
-/// When a photograph cannot be read, or `look` fails.
+/// When none is held out, a photograph cannot be read, or `look` fails.
 pub fn evaluate(model: &TextModel, look: &mut dyn FnMut(&str, &ImageU8) -> Result<()>) -> Result<Scores> {
     let held_out = model.capture.indices(Split::Test);
+    if held_out.is_empty() {
+        let path = model.config.data.path.display();
+        return Err(PipelineError::Usage(format!("{path}: no photograph is held out: train with --set data.split=every:8")));
+    }
     let photographs = StoredPhotographs::new(recipe::load_pixels(&model.config, &model.capture, Split::Test)?);
     let (mut scores, mut overlap) = (Scores { views: held_out.len(), ..Scores::default() }, Overlap::new(model.labels.count()));
     for (k, frame) in held_out.iter().enumerate() {
