@@ -90,6 +90,7 @@ pub mod splat_ply;
 pub mod split;
 pub mod tetrahedra_npz;
 pub mod text_labels;
+pub mod text_set;
 pub mod tfevents;
 pub mod transforms_json;
 pub mod usdz;

@@ -10,7 +10,7 @@
 //!
 //! Formats without ids: the k-th region with a text in one image is the k-th with that text in the others.
 
-use super::{Kind, LIMIT, LabelledImage, LabelledRegion, UNREADABLE, check, known_texts};
+use super::{Kind, LIMIT, LabelledImage, LabelledRegion, UNREADABLE, check_polygon, known_texts};
 use crate::error::{DataError, Result, read};
 use serde::Deserialize;
 use std::collections::{BTreeMap, HashMap};
@@ -94,7 +94,7 @@ pub fn import(format: Format, path: &Path, known: &[Known]) -> Result<Vec<Labell
         let (regions, counts) = out.entry(at.path.clone()).or_default();
         for region in image.regions {
             let wrong = |e: String| DataError::input(&image.file, format!("{}: {e}", region.at));
-            check(&region.polygon).map_err(wrong)?;
+            check_polygon(&region.polygon).map_err(wrong)?;
             inside(&region.polygon, at.size).map_err(wrong)?;
             let is_read = region.transcription != UNREADABLE && !region.transcription.is_empty();
             let count = counts.entry(region.transcription.clone()).or_default();

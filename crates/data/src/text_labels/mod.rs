@@ -104,7 +104,7 @@ pub fn parse(text: &str) -> std::result::Result<Vec<LabelledImage>, String> {
         let at = format!("line {}", n + 1);
         let image: LabelledImage = serde_json::from_str(line).map_err(|e| format!("{at}: {e}; expected a line such as {EXAMPLE}"))?;
         for region in &image.regions {
-            check(&region.polygon).map_err(|e| format!("{at}: region {}: {e}", region.id))?;
+            check_polygon(&region.polygon).map_err(|e| format!("{at}: region {}: {e}", region.id))?;
             known_texts(&mut known, region.id, &region.transcription, &at)?;
         }
         out.push(image);
@@ -116,7 +116,10 @@ pub fn parse(text: &str) -> std::result::Result<Vec<LabelledImage>, String> {
 }
 
 /// Whether a polygon is a simple one.
-fn check(polygon: &[[f64; 2]]) -> std::result::Result<(), String> {
+///
+/// # Errors
+/// With the vertex or the sides at fault.
+pub fn check_polygon(polygon: &[[f64; 2]]) -> std::result::Result<(), String> {
     let n = polygon.len();
     if n < 3 {
         return Err(format!("{n} corners; a polygon has at least 3"));

@@ -48,6 +48,8 @@ pub struct Tracer<'a> {
     pub within: Option<Sphere>,
     /// Training image whose appearance code is used; none: the mean code.
     pub appearance: Option<u32>,
+    /// Unit direction in which colors are seen; none: each ray's own. Then the CPU traces, whatever the accelerator.
+    pub seen_along: Option<[f32; 3]>,
     /// Whether colors are linear light, which [`Tracer::view`] encodes to sRGB; values above 1 go on along the curve.
     pub is_linear: bool,
     /// Weight up to which neighbouring samples of a ray share one color on the CPU; 0: each has its own.
@@ -90,6 +92,7 @@ impl<'a> Tracer<'a> {
             crop: None,
             within: None,
             appearance: None,
+            seen_along: None,
             is_linear: false,
             shared_weight: Quality::Full.shared_weight(),
             tolerance: Quality::Full.tolerance(),
@@ -171,7 +174,7 @@ impl Tracer<'_> {
     pub fn trace(&self, batch: &mut RayBatch, buf: &mut FieldBuffers) -> Traced {
         assert_eq!(self.field.net.channels(), 3, "a tracer draws three channels; Tracer::layers renders any");
         self.cut(batch);
-        match self.accelerator.map(|a| a.trace(batch, &self.placement, self.appearance)) {
+        match self.accelerator.filter(|_| self.seen_along.is_none()).map(|a| a.trace(batch, &self.placement, self.appearance)) {
             Some(Ok((out, light))) => {
                 let out = match (self.placement, light) {
                     (Placement::Occupancy { pruning, .. }, Some(light)) => restored(out, &light, pruning),
@@ -227,7 +230,7 @@ impl Tracer<'_> {
     /// Traces block by block; none where samples are not placed by a grid, or the field cannot be evaluated this way.
     fn trace_blocks(&self, batch: &RayBatch) -> Option<Traced> {
         let Placement::Occupancy { march, pruning } = self.placement else { return None };
-        if self.shared_weight == 0.0 {
+        if self.shared_weight == 0.0 || self.seen_along.is_some() {
             return None;
         }
         let RayBatch { origins, dirs, near_far, jitter, .. } = batch;
@@ -257,7 +260,9 @@ impl Tracer<'_> {
         let background = vec![0.0; batch.len() * field.net.channels()];
         let images = self.appearance.map(|i| vec![i; batch.len()]);
         let samples = Packed { offsets: &on.samples.offsets, t: &on.samples.t, dt: &on.samples.dt };
-        let (dirs, images, background) = (&batch.dirs[..], images.as_deref(), &background[..]);
+        let given_dirs = self.seen_along.map(|d| d.repeat(batch.len()));
+        let dirs = given_dirs.as_deref().unwrap_or(&batch.dirs);
+        let (images, background) = (images.as_deref(), &background[..]);
         let b = Batch { samples, positions: &on.positions, dirs, images, given, background, near_scaling: 0.0 };
         field.render_outputs(&b, &mut on.encoded, buf);
     }
@@ -351,6 +356,30 @@ mod tests {
         let at = |x: usize, y: usize| v.opacity.data[y * 9 + x];
         assert!(at(4, 4) > 0.9 && at(3, 4) > 0.5 && at(4, 3) > 0.5, "within");
         assert!([(0, 0), (8, 8), (0, 4), (2, 2)].iter().all(|(x, y)| at(*x, *y) == 0.0), "beside");
+    }
+
+    #[test]
+    fn colors_are_seen_along_a_given_direction_and_opacities_are_not() {
+        let grid = HashGridConfig { levels: 2, features: 2, log2_size: 8, base: 4, finest: 8 };
+        let mut field = fields::ngp(grid, Space::Cube(1.0), 1e-2, 0, 0, 1);
+        field.net.density.shift = 3.0;
+        let occupancy = Occupancy::new(16, 1, false);
+        let pose = Pose::look_at(DVec3::new(1.9, 1.2, 1.0), DVec3::splat(0.5), DVec3::Z);
+        let camera = PosedCamera { camera: Camera::pinhole(3, 3, 0.1), pose };
+        let pruning = Pruning { stop: 1e-4, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 };
+        let placement = Placement::occupied(&occupancy, 1024, pruning);
+        let mut tracer =
+            Tracer { occupancy: Some(&occupancy), near: 0.1, shared_weight: 0.0, ..Tracer::new(&field, placement, (0.0, 1.0)) };
+        let own = tracer.view(&camera, &mut |_| {});
+        // The middle pixel's own direction changes nothing there; another one changes its color.
+        let along = (pose.rotation * DVec3::Z).to_array().map(|v| v as f32);
+        tracer.seen_along = Some(along);
+        let same = tracer.view(&camera, &mut |_| {});
+        tracer.seen_along = Some(along.map(|v| -v));
+        let other = tracer.view(&camera, &mut |_| {});
+        let off = |v: &View| (12..15).map(|k| (v.rgb.data[k] - own.rgb.data[k]).abs()).fold(0.0, f32::max);
+        assert!(off(&same) < 1e-5 && off(&other) > 1e-4, "{} {}", off(&same), off(&other));
+        assert!(own.opacity.data.iter().zip(&other.opacity.data).all(|(a, b)| (a - b).abs() < 1e-6));
     }
 
     #[test]

@@ -272,6 +272,7 @@ impl ObjectModel {
             appearance: None,
             tolerance: quality.tolerance(),
             accelerator: self.accelerator.as_ref().map(|a| a as &dyn Accelerator),
+            seen_along: None,
         }
     }
 

@@ -4,11 +4,17 @@
 
 pub mod annotate;
 pub mod camera;
+pub mod edit;
 pub mod field;
+pub mod label;
 pub mod lettering;
 pub mod make_scenes;
+pub mod placed;
 pub mod pose_clusters;
 pub mod regions;
+pub mod retouch;
+pub mod styling;
 pub mod surface;
+pub mod synth;
 pub mod truth;
 mod words;

@@ -16,7 +16,7 @@ use crate::assembly::{Finish, ModelBuilder};
 use crate::textures as tx;
 use diorama_geom::daylight::Daylight;
 use diorama_geom::environment::Environment;
-use diorama_geom::glam::DVec3;
+use diorama_geom::glam::{DVec2, DVec3};
 use diorama_geom::rng::Rng;
 use diorama_geom::sky::Sky;
 use diorama_geom::{Camera, ImageU8, Model, Pose};
@@ -109,6 +109,8 @@ pub struct Stage {
     pub family: Family,
     pub boards: Vec<Board>,
     draw: Draw,
+    /// Share of the distance to the boards by which the walk is nearer.
+    closer: f64,
 }
 
 impl Stage {
@@ -120,7 +122,21 @@ impl Stage {
         while all.len() > boards {
             all.remove(draw.below(1000 + all.len() as u64, all.len()));
         }
-        Stage { family, boards: all, draw }
+        Stage { family, boards: all, draw, closer: 0.0 }
+    }
+
+    /// The same with the boards that are next to one of them, filmed from nearer: the walk is moved toward their middle by a share of its
+    /// distance.
+    pub fn closer(family: Family, seed: u64, boards: usize, share: f64) -> Stage {
+        let draw = Draw::new(seed);
+        let all = family.boards(&draw);
+        let middle = |b: &Board| b.point(DVec2::ZERO);
+        let first = middle(&all[draw.below(1000, all.len())]);
+        let mut order: Vec<usize> = (0..all.len()).collect();
+        order.sort_by(|a, b| middle(&all[*a]).distance(first).total_cmp(&middle(&all[*b]).distance(first)));
+        order.truncate(boards);
+        order.sort_unstable();
+        Stage { family, boards: order.into_iter().map(|k| all[k]).collect(), draw, closer: share }
     }
 
     /// The place with its boards' pictures, RGB in sRGB and of the boards' proportions, z up, in meters.
@@ -166,7 +182,8 @@ impl Stage {
             Family::Shelf => shelf::PATH,
             Family::Pillar => pillar::PATH,
         };
-        path.cameras(n, width, height, &Rng::new(self.draw.seed, WALK))
+        let middle = self.boards.iter().map(|b| b.point(DVec2::ZERO)).sum::<DVec3>() / self.boards.len().max(1) as f64;
+        path.cameras(n, (width, height), (middle, self.closer), &Rng::new(self.draw.seed, WALK))
     }
 }
 

@@ -21,7 +21,9 @@ pub struct CameraPath {
 }
 
 impl CameraPath {
-    pub fn cameras(&self, n: usize, width: u32, height: u32, rng: &Rng) -> Vec<(Camera, Pose)> {
+    /// Cameras along the path; eyes are moved toward a point by a share of the distance, and what they look at by more, so that the point
+    /// stays in sight.
+    pub fn cameras(&self, n: usize, (width, height): (u32, u32), toward: (DVec3, f64), rng: &Rng) -> Vec<(Camera, Pose)> {
         let fov_x = if width >= height { FOV } else { 2.0 * ((0.5 * FOV).tan() * width as f64 / height as f64).atan() };
         let camera = Camera::pinhole(width, height, fov_x);
         let random = |i: usize, k: u64| {
@@ -34,6 +36,8 @@ impl CameraPath {
             let line = |a: [f64; 3], b: [f64; 3]| DVec3::from(a).lerp(DVec3::from(b), t);
             let eye = line(self.from, self.to) + swing * DVec3::from(self.bulge) + self.sway * random(i, 0);
             let target = line(self.looks_from, self.looks_to) + self.glance * random(i, 1);
+            let (toward, share) = toward;
+            let (eye, target) = (eye.lerp(toward, share), target.lerp(toward, 1.0 - (1.0 - share).powi(2)));
             (camera, Pose::look_at(eye, target, DVec3::Z))
         };
         (0..n).map(pose).collect()

@@ -52,6 +52,9 @@ impl Verb for Eval {
                 Some(miou) => println!("classes         mIoU {miou:.3}"),
                 None => println!("classes         none are known of the held-out views"),
             }
+            if let Some(error) = s.depth_error {
+                println!("depth           median error {:.1} %", 100.0 * error);
+            }
             println!("{}", out.display());
         }
         Ok(Outcome::Done)

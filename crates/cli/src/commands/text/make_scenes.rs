@@ -16,7 +16,7 @@ use std::time::Instant;
     after_help = "Examples:\n  diorama text make-scenes --size ci -o data/signs\n  diorama text make-scenes --family street,pillar --scenes 4 --views 60 --pixels 320x240 --signs 3-6 -o data/signs"
 )]
 pub struct MakeScenes {
-    /// ci (a shelf in 14 views of 96×72 with 2 signs) or gpu (60 scenes of 60 views of 960×540 with 3 to 8 signs)
+    /// ci (a room in 14 views of 96×72 with 2 signs of a word each, filmed close by) or gpu (60 scenes of 60 views of 960×540 with 3 to 8 signs)
     #[arg(long, default_value = "ci")]
     size: String,
     /// Families, taken in turns: room, corridor, street, shelf, pillar [default: by size]
@@ -34,6 +34,12 @@ pub struct MakeScenes {
     /// Signs of each scene: a number, or FROM-TO [default: by size]
     #[arg(long)]
     signs: Option<String>,
+    /// Most words on a sign: 1 or 2 [default: by size]
+    #[arg(long)]
+    words: Option<usize>,
+    /// Film from nearer by this share of the distance, with signs next to each other: 0 to 0.8 [default: by size]
+    #[arg(long)]
+    closer: Option<f64>,
     /// Width and height of the photographs, for example 320x240 [default: by size]
     #[arg(long)]
     pixels: Option<String>,
@@ -68,6 +74,8 @@ impl MakeScenes {
         self.scenes.iter().for_each(|v| o.scenes = *v);
         self.views.iter().for_each(|v| o.views = *v);
         self.labelled.iter().for_each(|v| o.labelled = *v);
+        self.words.iter().for_each(|v| o.words = *v);
+        self.closer.iter().for_each(|v| o.closer = *v);
         self.spp.iter().for_each(|v| o.samples = *v);
         if let Some(signs) = &self.signs {
             let number = |s: &str| s.parse::<usize>().ok();

@@ -1,8 +1,12 @@
 //! `diorama text`: a group of commands.
 
 mod annotate;
+mod edit;
 mod eval;
+mod label;
 mod make_scenes;
+mod prior;
+mod synth;
 mod train;
 
 use super::Verb;
@@ -12,8 +16,13 @@ use clap::Subcommand;
 #[derive(Subcommand)]
 pub enum Text {
     Annotate(annotate::Annotate),
+    Edit(edit::Edit),
     Eval(eval::Eval),
+    Label(label::Label),
     MakeScenes(make_scenes::MakeScenes),
+    Merge(synth::Merge),
+    Prior(prior::PriorCommand),
+    Synth(synth::Synth),
     Train(train::Train),
 }
 
@@ -22,8 +31,13 @@ impl Text {
     pub fn verb(&self) -> &dyn Verb {
         match self {
             Text::Annotate(v) => v,
+            Text::Edit(v) => v,
             Text::Eval(v) => v,
+            Text::Label(v) => v,
             Text::MakeScenes(v) => v,
+            Text::Merge(v) => v,
+            Text::Prior(v) => v,
+            Text::Synth(v) => v,
             Text::Train(v) => v,
         }
     }

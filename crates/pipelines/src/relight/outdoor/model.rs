@@ -208,6 +208,7 @@ impl SceneModel {
             tolerance: 0.0,
             within: self.joint.as_ref().filter(|j| !j.backgrounds.is_empty()).map(|j| j.sphere),
             accelerator: None,
+            seen_along: None,
         }
     }
 

@@ -91,6 +91,11 @@ pub struct LossConfig {
     pub opacity: f32,
     /// Labels that depth carries to other photographs, over those that were given.
     pub proxy: f32,
+    /// Relative error of depth where the distance is known.
+    pub depth: f32,
+    /// Gradients of samples nearer than this many inner cubes are scaled by the squared share (Philip and Deschaintre 2023), against fog
+    /// before cameras.
+    pub near_scaling: f32,
 }
 
 /// Rates and their course.
@@ -111,7 +116,7 @@ pub struct SamplingConfig {
     /// Rays per step, a multiple of a tile's pixels.
     pub rays: usize,
     pub max_samples: usize,
-    /// Nearest distance at which matter may be, in inner cubes; 0: told by the sparse points, if there are any.
+    /// Nearest distance at which matter may be, in inner cubes; 0: told by pixels of known distance.
     pub near: f32,
     pub occupancy_resolution: usize,
     pub occupancy_points: usize,
@@ -171,7 +176,7 @@ impl Config {
                 space: "unbounded".into(),
             },
             labels: LabelConfig { share: labels[of] / (steps[of] + labels[of]), width: pick(32, 64, 64), waves: 12 },
-            loss: LossConfig { distortion: 1e-3, s3im: 1.0, tile: [tile; 2], opacity: 1e-3, proxy: 0.3 },
+            loss: LossConfig { distortion: 1e-3, s3im: 1.0, tile: [tile; 2], opacity: 1e-3, proxy: 0.3, depth: 0.1, near_scaling: 1.0 },
             optim: OptimConfig { rate: 1e-2, label_rate: 1e-2, final_scale: 1.0 / 30.0 },
             sampling: SamplingConfig {
                 rays: pick(1024, 2048, 8192),
@@ -222,7 +227,8 @@ impl Configuration for Config {
         if !(l.share > 0.0 && l.share < 1.0) || l.width == 0 || !l.width.is_multiple_of(16) || l.width > 512 || l.waves > 24 {
             return fault("labels: share must lie between 0 and 1, width be a multiple of 16 up to 512, waves at most 24".into());
         }
-        let weights = [self.loss.distortion, self.loss.s3im, self.loss.opacity, self.loss.proxy];
+        let l = &self.loss;
+        let weights = [l.distortion, l.s3im, l.opacity, l.proxy, l.depth, l.near_scaling];
         if weights.iter().any(|v| !(*v >= 0.0 && v.is_finite())) {
             return fault("loss: weights must be 0 or more".into());
         }

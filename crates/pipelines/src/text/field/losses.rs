@@ -6,6 +6,9 @@ use std::sync::Mutex;
 
 /// Least share and opacity whose logarithm is taken.
 const LEAST: f32 = 1e-6;
+/// Opacity from which a ray has a depth, and the relative error from which the loss is linear.
+const LEAST_OPACITY: f32 = 0.05;
+const ROBUST: f32 = 0.1;
 
 /// Colors against photographs: squared error, structure of random tiles, and entropy of opacities.
 pub struct SceneLoss<'a> {
@@ -18,6 +21,9 @@ pub struct SceneLoss<'a> {
     pub s3im: f32,
     pub distortion: f32,
     pub opacity: f32,
+    /// Distance of each ray's surface, 0 where it is not known, `[R]`, and the weight of its relative error.
+    pub distance: &'a [f32],
+    pub depth: f32,
     /// Squared error of the last batch.
     pub mse: Mutex<f64>,
 }
@@ -47,12 +53,33 @@ impl BatchLoss for SceneLoss<'_> {
             loss -= (self.opacity * o * o.ln()) as f64 / counted;
             gradients.opacity[r] -= self.opacity * (o.ln() + 1.0) / counted as f32;
         }
+        loss += self.depths(out, gradients);
         *self.mse.lock().expect("no other thread holds it") = mse;
         loss + mse
     }
 
     fn distortion(&self) -> f32 {
         self.distortion
+    }
+}
+
+impl SceneLoss<'_> {
+    /// Huber's loss of `D / d − 1` over rays of known distance `d`, where `D = Σ w t / Σ w`.
+    fn depths(&self, out: &RayOutputs, gradients: &mut RayGradients) -> f64 {
+        let known = self.distance.iter().filter(|d| **d > 0.0).count().max(1) as f32;
+        let mut loss = 0.0;
+        for (r, d) in self.distance.iter().enumerate().filter(|(_, d)| **d > 0.0) {
+            let opacity = out.opacity[r];
+            if opacity < LEAST_OPACITY {
+                continue;
+            }
+            let error = out.depth[r] / opacity / d - 1.0;
+            let slope = self.depth * error.clamp(-ROBUST, ROBUST) / known;
+            loss += (self.depth * error.abs().min(ROBUST) * (error.abs() - 0.5 * error.abs().min(ROBUST)) / known) as f64;
+            gradients.depth[r] += slope / (opacity * d);
+            gradients.opacity[r] -= slope * out.depth[r] / (opacity * opacity * d);
+        }
+        loss
     }
 }
 

@@ -6,6 +6,7 @@
 //! labels that depth carries to the others ([`label_maps`]).
 
 pub mod config;
+mod distances;
 pub mod label_maps;
 mod losses;
 pub mod model;

@@ -1,13 +1,14 @@
 //! Training recipe of the field, to be read from top to bottom.
 
 use super::config::Config;
+use super::distances;
 use super::label_maps::Labels;
 use super::model::TextModel;
 use super::trainer::Trainer;
 use crate::error::{PipelineError, Result};
 use crate::run::device::Device;
 use crate::run::photographs::StoredPhotographs;
-use crate::run::{RunDescription, RunFolder, folder, kept_capture, nearest};
+use crate::run::{RunDescription, RunFolder, folder, kept_capture};
 use diorama_data::checkpoint;
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
@@ -16,9 +17,6 @@ use diorama_geom::capture::Split;
 use diorama_geom::{Capture, Reduction};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
-
-/// Least distance of matter from a camera where nothing tells it, in inner cubes.
-const NEAR: f32 = 0.05;
 
 /// Result of training.
 pub struct Trained {
@@ -44,11 +42,9 @@ pub fn train(
     let root = import::root(&config.data.path)?;
     let labels = Labels::read(if resume { folder.path() } else { &root }, &capture, &root)?;
     let photographs = StoredPhotographs::new(load_pixels(config, &capture, Split::Train)?);
-    let mut config = config.clone();
-    if config.sampling.near == 0.0 {
-        config.sampling.near = nearest::of_points(&capture).unwrap_or(NEAR);
-    }
-    let mut model = TextModel::new(config, capture, labels)?;
+    let mut model = TextModel::new(config.clone(), capture, labels)?;
+    let note = &mut |n: String| events(&Event::Note(n));
+    let observations = distances::find(&mut model, &photographs, interrupt, note);
     if resume {
         if checkpoint::exists(&folder.checkpoints()) {
             let (c, note) = checkpoint::load(&folder.checkpoints())?;
@@ -61,7 +57,7 @@ pub fn train(
         model.labels.save(folder.path())?;
     }
     let (origin, checkpoints, options) = (model.origin, folder.checkpoints(), run_options(&model.config));
-    let mut trainer = Trainer::new(model, photographs, device, &checkpoints)?;
+    let mut trainer = Trainer::new(model, (photographs, observations), device, &checkpoints)?;
     let mut log_error = None;
     let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
         if let Err(e) = folder.log(e) {

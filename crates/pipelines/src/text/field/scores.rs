@@ -5,8 +5,10 @@ use super::model::TextModel;
 use super::recipe;
 use crate::error::{PipelineError, Result};
 use crate::run::photographs::StoredPhotographs;
-use diorama_data::import;
+use crate::text::truth;
+use diorama_data::{import, photo};
 use diorama_engine::metrics;
+use diorama_engine::renderers::view::View;
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::samplers::pixels::PixelSource;
 use diorama_geom::capture::Split;
@@ -23,6 +25,8 @@ pub struct Scores {
     /// Mean over the regions that any of the views shows of the intersection over the union, all views together; none where no classes are
     /// known or learned.
     pub miou: Option<f64>,
+    /// Median over the pixels of all views of the error of depth over depth; none where it is not known.
+    pub depth_error: Option<f64>,
 }
 
 /// Pixels of each class that are its own in both maps, and in either.
@@ -101,6 +105,7 @@ pub fn evaluate(model: &TextModel, look: &mut dyn FnMut(&str, &ImageU8) -> Resul
         return Err(PipelineError::Usage(format!("{path}: no photograph is held out: train with --set data.split=every:8")));
     }
     let photographs = StoredPhotographs::new(recipe::load_pixels(&model.config, &model.capture, Split::Test)?);
+    let mut off: Vec<f64> = Vec::new();
     let (mut scores, mut overlap) = (Scores { views: held_out.len(), ..Scores::default() }, Overlap::new(model.labels.count()));
     for (k, frame) in held_out.iter().enumerate() {
         let camera = model.posed(*frame);
@@ -118,8 +123,29 @@ pub fn evaluate(model: &TextModel, look: &mut dyn FnMut(&str, &ImageU8) -> Resul
         if let (Some(got), Some(wanted)) = (&got, &wanted) {
             overlap.add(got, wanted);
         }
+        depth_errors(model, *frame, &view, &mut off)?;
         look(&model.capture.frames[*frame].name, &sheet(&photo, &view.rgb, [got.as_deref(), wanted.as_deref()]))?;
     }
     scores.miou = overlap.mean();
+    off.sort_by(f64::total_cmp);
+    scores.depth_error = off.get(off.len() / 2).copied();
     Ok(scores)
+}
+
+/// Adds the errors of a view's depth over the exact depth of a generated scene, where it has surfaces.
+fn depth_errors(model: &TextModel, frame: usize, view: &View, out: &mut Vec<f64>) -> Result<()> {
+    let stem = model.capture.frames[frame].image.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let file = truth::file(&import::root(&model.config.data.path)?, &format!("{stem}_depth.exr"));
+    if !file.exists() {
+        return Ok(());
+    }
+    let photo::Photo::Linear(exact) = photo::load_full(&file)? else { return Ok(()) };
+    if (exact.width, exact.height) != (view.depth.width, view.depth.height) {
+        return Ok(());
+    }
+    let scale = model.model_from_world.scale;
+    for (i, pixel) in exact.data.chunks_exact(exact.channels).enumerate().filter(|(_, p)| p[1] > 0.5) {
+        out.push((view.depth.data[i] as f64 / (scale * pixel[0] as f64) - 1.0).abs());
+    }
+    Ok(())
 }

@@ -57,6 +57,8 @@ fn the_losses_have_the_gradients_of_their_values() {
         s3im: 1.0,
         distortion: 0.0,
         opacity: 0.1,
+        distance: &[],
+        depth: 0.0,
         mse: Mutex::default(),
     };
     check_gradients(&loss, 3, &values, &opacity, &[0, 14, 77, 191]);

@@ -11,7 +11,7 @@ use diorama_data::checkpoint;
 use diorama_engine::renderers::view::View;
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::samplers::RayBatch;
-use diorama_engine::samplers::pixels::{self, DrawOptions, PixelSource};
+use diorama_engine::samplers::pixels::{self, DrawOptions, Observation, PixelSource};
 use diorama_engine::samplers::placement::Placement;
 use diorama_engine::step::{Figures, GivenRays, Loss, Probes, RaySource, Step, Trainees};
 use diorama_engine::train::{Event, Scalar, Scalars, StepReport, Trainee};
@@ -71,6 +71,8 @@ impl Labelled {
 pub(super) struct Trainer<'a> {
     pub model: TextModel,
     photographs: StoredPhotographs,
+    /// Pixels of known distance.
+    observations: Vec<Observation>,
     cameras: Vec<PosedCamera>,
     device: Device,
     batch: RayBatch,
@@ -81,11 +83,17 @@ pub(super) struct Trainer<'a> {
 }
 
 impl<'a> Trainer<'a> {
-    pub fn new(model: TextModel, photographs: StoredPhotographs, device: Device, checkpoints: &'a Path) -> Result<Trainer<'a>> {
+    pub fn new(
+        model: TextModel,
+        (photographs, observations): (StoredPhotographs, Vec<Observation>),
+        device: Device,
+        checkpoints: &'a Path,
+    ) -> Result<Trainer<'a>> {
         let cameras = model.cameras();
         let mut trainer = Trainer {
             model,
             photographs,
+            observations,
             cameras,
             device,
             batch: RayBatch::default(),
@@ -128,8 +136,13 @@ impl<'a> Trainer<'a> {
         };
         let march = m.occupancy.march_config(m.config.sampling.max_samples).stretched(most.powf(1.0 - ended));
         let placement = Placement::Occupancy { march, pruning: m.pruning() };
-        let described =
-            Step { probes, progress: share, rate_scale: m.rate_scale, ..Step::new(step, m.rays, RaySource::Given(given), placement, loss) };
+        let described = Step {
+            probes,
+            progress: share,
+            rate_scale: m.rate_scale,
+            near_scaling: m.config.loss.near_scaling,
+            ..Step::new(step, m.rays, RaySource::Given(given), placement, loss)
+        };
         let done = self.device.step(&mut Trainer::trainees(&mut self.model), None, &described, 1)?;
         if done.shown.loss.is_finite() {
             self.model.rays += b.len() as u64;
@@ -143,7 +156,7 @@ impl<'a> Trainer<'a> {
         let (n, first) = (c.sampling.rays, self.model.rays);
         self.batch.resize(n);
         let (near, cube, rng) = (c.sampling.near, self.model.cube(), self.rng(PIXELS));
-        let o = DrawOptions { cameras: &self.cameras, first, rng, near, cube, error_map: None, observations: &[] };
+        let o = DrawOptions { cameras: &self.cameras, first, rng, near, cube, error_map: None, observations: &self.observations };
         pixels::draw(&self.photographs, &o, &mut self.batch);
         let rng = self.rng(BACKGROUND);
         let background: Vec<f32> = (0..3 * n).map(|i| rng.uniform(3 * first + i as u64)).collect();
@@ -154,7 +167,7 @@ impl<'a> Trainer<'a> {
             true => s3im::arrangements(n, m, &self.rng(TILES), step * s3im::draws(n, m)),
             false => Vec::new(),
         };
-        let counts = self.batch.counts.clone();
+        let (counts, distance) = (self.batch.counts.clone(), self.batch.distance.clone());
         let loss = SceneLoss {
             target: &target,
             counts: &counts,
@@ -163,6 +176,8 @@ impl<'a> Trainer<'a> {
             s3im: c.loss.s3im,
             distortion: c.loss.distortion * (share / DISTORTION_RAMP).min(1.0),
             opacity: c.loss.opacity,
+            distance: &distance,
+            depth: c.loss.depth,
             mse: Mutex::default(),
         };
         let is_probed = step > 0 && step.is_multiple_of(c.sampling.occupancy_every);

@@ -24,6 +24,9 @@ const MANIFEST_LIMIT: u64 = 1 << 20;
 const CAPTURE: &str = "transforms.json";
 /// Stream of random numbers of boards' pictures.
 const PAINT: u64 = 71;
+/// Share by which the walk of small scenes is nearer, so that words are a dozen pixels high.
+const CLOSE_BY: f64 = 0.5;
+const MOST_CLOSER: f64 = 0.8;
 /// Share of the views that is held out.
 const HELD_OUT: f64 = 0.15;
 
@@ -36,8 +39,11 @@ pub struct SceneOptions {
     /// Photographs of each scene, and how many of them are labelled.
     pub views: usize,
     pub labelled: usize,
-    /// Boards of each scene, from one number to another.
+    /// Boards of each scene, from one number to another, and the most words on one.
     pub boards: [usize; 2],
+    pub words: usize,
+    /// Share of the distance to the boards by which the walk is nearer; above 0, boards are next to each other.
+    pub closer: f64,
     pub size: (u32, u32),
     /// Samples per pixel.
     pub samples: u32,
@@ -58,7 +64,7 @@ pub enum FontSource {
 }
 
 impl SceneOptions {
-    /// The options of a size: `ci` (a shelf in 14 views of 96×72, where words are largest) or `gpu` (60 of 960×540).
+    /// The options of a size: `ci` (a room in 14 views of 96×72, filmed close by) or `gpu` (60 of 960×540).
     ///
     /// # Errors
     /// When the name is not that of a size.
@@ -70,13 +76,18 @@ impl SceneOptions {
             views,
             labelled: 2,
             boards,
+            words: 2,
+            closer: 0.0,
             size,
             samples,
             seed: 0,
             fonts: FontSource::Shipped,
         };
         match name {
-            "ci" => Ok(SceneOptions { families: vec![Family::Shelf.name().into()], ..of(1, 14, [2, 2], (96, 72), 64) }),
+            "ci" => {
+                let families = vec![Family::Room.name().into()];
+                Ok(SceneOptions { families, words: 1, closer: CLOSE_BY, ..of(1, 14, [2, 2], (96, 72), 64) })
+            }
             "gpu" => Ok(of(60, 60, [3, 8], (960, 540), 128)),
             _ => Err(PipelineError::Usage(format!("size {name:?}: expected ci or gpu"))),
         }
@@ -92,6 +103,9 @@ impl SceneOptions {
         }
         if !(1..=most).contains(&self.labelled) {
             return usage(format!("--labelled {}: expected 1 to {most}, the photographs that are not held out", self.labelled));
+        }
+        if !(1..=2).contains(&self.words) || !(0.0..=MOST_CLOSER).contains(&self.closer) {
+            return usage(format!("--words must be 1 or 2, and --closer from 0 to {MOST_CLOSER}"));
         }
         let family = |name: &String| {
             let names: Vec<&str> = Family::ALL.iter().map(|f| f.name()).collect();
@@ -148,7 +162,11 @@ pub fn generate(out: &Path, options: &SceneOptions, force: bool, stop: &AtomicBo
         }
         let seed = options.seed.wrapping_mul(1000).wrapping_add(s as u64);
         let boards = options.boards[0] + Rng::new(seed, PAINT).below(0, (options.boards[1] - options.boards[0] + 1) as u64) as usize;
-        let staged = Staged::new(Stage::of(family, seed, boards), seed, &mut fonts, &faces)?;
+        let stage = match options.closer > 0.0 {
+            true => Stage::closer(family, seed, boards, options.closer),
+            false => Stage::of(family, seed, boards),
+        };
+        let staged = Staged::new(stage, (seed, options.words), &mut fonts, &faces)?;
         let done = staged.photograph(&folder, options, stop, &mut |share: f64| progress((s as f64 + share) / options.scenes as f64))?;
         made.photographs += done;
         made.regions += staged.regions();

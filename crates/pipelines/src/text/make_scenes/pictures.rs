@@ -33,11 +33,11 @@ pub struct Painted {
     pub font: String,
 }
 
-/// Paints a board of a number; ids of its regions go on from another.
+/// Paints a board of a number with at most so many words; ids of its regions go on from another.
 ///
 /// # Errors
 /// When a font cannot draw a word.
-pub fn paint(board: &Board, (k, first_id): (usize, usize), fonts: &mut Fonts, faces: &[Face], rng: &Rng) -> Result<Painted> {
+pub fn paint(board: &Board, (k, first_id, words): (usize, usize, usize), fonts: &mut Fonts, faces: &[Face], rng: &Rng) -> Result<Painted> {
     let face = &faces[rng.below(0, faces.len() as u64) as usize];
     let scale = LONGER / board.size.max_element();
     let [w, h] = board.size.to_array().map(|v| (v * scale).round().max(1.0) as usize);
@@ -45,7 +45,7 @@ pub fn paint(board: &Board, (k, first_id): (usize, usize), fonts: &mut Fonts, fa
     let fitting = |set: &Lettering| (room[0] / set.ink.width as f64).min(room[1] / set.ink.height as f64);
     let mut best: Option<(f64, String)> = None;
     for attempt in 0..TRIES {
-        let text = text(rng, 16 * attempt, w as f64 / h as f64);
+        let text = text(rng, 16 * attempt, (w as f64 / h as f64, words));
         let fits = fitting(&fonts.set(&text, face, MEASURED)?);
         if best.as_ref().is_none_or(|b| fits > b.0) {
             best = Some((fits, text));
@@ -84,13 +84,13 @@ pub fn paint(board: &Board, (k, first_id): (usize, usize), fonts: &mut Fonts, fa
     Ok(Painted { picture: colored(&ink, rng), ink, regions, font: face.name() })
 }
 
-/// Words for a board of so many times its height; a line break where that is low.
-fn text(rng: &Rng, at: u64, ratio: f64) -> String {
+/// Words for a board of so many times its height, at most so many; a line break where that is low.
+fn text(rng: &Rng, at: u64, (ratio, words): (f64, usize)) -> String {
     let word = |k: u64| WORDS[rng.below(100 + at + k, WORDS.len() as u64) as usize].to_string();
-    let numbered = rng.uniform(101 + at) < 0.15;
+    let numbered = words > 1 && rng.uniform(101 + at) < 0.15;
     let first = if numbered { NUMBERED[rng.below(102 + at, NUMBERED.len() as u64) as usize].to_string() } else { word(3) };
     let second = if numbered { (1 + rng.below(104 + at, 98)).to_string() } else { word(5) };
-    let line = match (rng.uniform(106 + at) < 0.5, ratio > 2.6) {
+    let line = match (words == 1 || rng.uniform(106 + at) < 0.5, ratio > 2.6) {
         (true, _) if !numbered => first,
         (_, true) => format!("{first} {second}"),
         (_, false) => format!("{first}\n{second}"),

@@ -53,13 +53,15 @@ pub struct Staged {
 }
 
 impl Staged {
+    /// A place whose boards have at most so many words each.
+    ///
     /// # Errors
     /// When a font cannot draw a word.
-    pub fn new(stage: Stage, seed: u64, fonts: &mut Fonts, faces: &[Face]) -> Result<Staged> {
+    pub fn new(stage: Stage, (seed, words): (u64, usize), fonts: &mut Fonts, faces: &[Face]) -> Result<Staged> {
         let (mut painted_boards, mut inks, mut regions, mut used) = (Vec::new(), Vec::new(), Vec::<Region>::new(), Vec::new());
         for (k, board) in stage.boards.iter().enumerate() {
             let rng = Rng::new(seed, PAINT + 1 + k as u64);
-            let painted = pictures::paint(board, (k, regions.len()), fonts, faces, &rng)?;
+            let painted = pictures::paint(board, (k, regions.len(), words), fonts, faces, &rng)?;
             painted_boards.push(painted.picture);
             inks.push(painted.ink);
             regions.extend(painted.regions);

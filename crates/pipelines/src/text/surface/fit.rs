@@ -5,6 +5,7 @@ use super::smoothing::principal;
 use super::{LEAST_POINTS, NoSurface, Wanted};
 use diorama_geom::glam::{DMat3, DVec2, DVec3, dvec2};
 use nalgebra::{SMatrix, SVector};
+use serde::{Deserialize, Serialize};
 
 /// Tukey's constant over the median absolute deviation.
 const TUKEY: f64 = 4.685 * 1.4826;
@@ -12,6 +13,8 @@ const ITERATIONS: usize = 30;
 /// Share of the plane's error that a quadric may have, and points that it needs, to be chosen.
 const BETTER: f64 = 0.7;
 const QUADRIC_POINTS: usize = 200;
+/// Height of a quadric over its plane at the points' extent, over that extent, below which it is noise of a plane.
+const LEAST_BEND: f64 = 0.06;
 /// Newton's steps to a foot point.
 const FOOT_STEPS: usize = 8;
 /// Share of the extent below which an error is none.
@@ -21,14 +24,15 @@ const EXACT: f64 = 1e-12;
 const TERMS: usize = 6;
 
 /// Kind of a fitted surface.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Kind {
     Plane,
     Quadric,
 }
 
 /// A plane or quadric over a plane.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Surface {
     pub kind: Kind,
     /// u, v and the normal, toward the viewer.
@@ -85,6 +89,12 @@ impl Surface {
         (at, (x - foot).length() * (x.z - foot.z).signum())
     }
 
+    /// Half of the largest curvature at the origin: the height at a distance over its square.
+    fn bend(&self) -> f64 {
+        let [a, b, c, ..] = self.height;
+        0.5 * (a + c).abs() + 0.5 * ((a - c).powi(2) + b * b).sqrt()
+    }
+
     fn distances(&self, points: &[DVec3]) -> Vec<f64> {
         points.iter().map(|p| self.nearest(*p).1).collect()
     }
@@ -117,7 +127,7 @@ pub fn fit(points: &[DVec3], toward: DVec3, wanted: Wanted) -> Result<Surface, N
     }
     let quadric = quadric(points, plane, extent);
     // Both judged alike: by the distances that each holds for its own.
-    let is_better = quadric.rms <= BETTER * plane.rms && plane.rms > EXACT * extent;
+    let is_better = quadric.rms <= BETTER * plane.rms && plane.rms > EXACT * extent && quadric.bend() * extent > LEAST_BEND;
     Ok(if wanted == Wanted::Quadric || is_better { quadric } else { plane })
 }
 

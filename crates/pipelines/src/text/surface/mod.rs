@@ -3,12 +3,15 @@
 
 mod cloud;
 mod fit;
+mod reading;
 mod rectangle;
 mod smoothing;
 
 pub use cloud::cleaned;
 pub use fit::{Kind, Surface, fit};
-pub use rectangle::{Rectangle, rectangle};
+pub use reading::outlined;
+pub use rectangle::{Rectangle, plane_rectangle, rectangle};
+pub(in crate::text) use smoothing::principal;
 pub use smoothing::smoothed;
 
 /// Points below which nothing is fitted.

@@ -2,6 +2,7 @@
 
 use super::fit::Surface;
 use diorama_geom::glam::{DMat2, DMat3, DVec2, DVec3, dvec2};
+use serde::{Deserialize, Serialize};
 
 /// Share of the points, the most central ones, that the rectangle holds.
 const CENTRAL: f64 = 0.99;
@@ -11,7 +12,7 @@ const STEPS: usize = 64;
 const INVERSIONS: usize = 30;
 
 /// A rectangle on a surface. Its coordinates `(x, y)` are lengths along the surface from its middle: x along the longer side.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Rectangle {
     pub surface: Surface,
     /// Longer and shorter side.
@@ -32,10 +33,26 @@ impl Rectangle {
         self.surface.point(self.place(at))
     }
 
-    fn place(&self, at: DVec2) -> DVec2 {
+    pub(super) fn place(&self, at: DVec2) -> DVec2 {
         let lengths = self.middle + self.lengths_from_own * at;
         let along = |k: usize| inverse(&self.surface, self.from, self.bends.col(k), lengths[k]);
         self.from + self.bends * dvec2(along(0), along(1))
+    }
+
+    /// Coordinates of a point of the surface's plane.
+    pub(super) fn locate(&self, place: DVec2) -> DVec2 {
+        self.lengths_from_own.transpose() * (lengths(&self.surface, self.from, self.bends, place) - self.middle)
+    }
+
+    /// A rectangle whose reading direction is that of unit length `along`, from `low` to `high` along and across it, all in lengths along the
+    /// bends of a surface from `from`.
+    pub(super) fn reading_along(surface: &Surface, from: DVec2, along: DVec2, [low, high]: [DVec2; 2]) -> Rectangle {
+        let across = dvec2(-along.y, along.x);
+        let (size, middle) = (high - low, DMat2::from_cols(along, across) * (0.5 * (low + high)));
+        // Upright text: x points down, and a quarter turn leads to the reading direction.
+        let (x, size, quarter_turns) = if size.x >= size.y { (along, size, 0) } else { (-across, dvec2(size.y, size.x), 1) };
+        let own = DMat2::from_cols(x, dvec2(-x.y, x.x));
+        Rectangle { surface: *surface, size, bends: bends(surface), from, lengths_from_own: own, middle, quarter_turns }
     }
 
     /// Corners from the upper left, clockwise, as the rectangle's own axes say.
@@ -62,6 +79,12 @@ fn length(surface: &Surface, from: DVec2, direction: DVec2, to: f64) -> f64 {
     (0..=STEPS).map(|k| weight(k) * speed(k as f64 * step)).sum::<f64>() * step / 3.0
 }
 
+/// Lengths along both bends from `from` to a place.
+pub(super) fn lengths(surface: &Surface, from: DVec2, bends: DMat2, place: DVec2) -> DVec2 {
+    let at = bends.transpose() * (place - from);
+    dvec2(length(surface, from, bends.x_axis, at.x), length(surface, from, bends.y_axis, at.y))
+}
+
 /// Where so much length is reached.
 fn inverse(surface: &Surface, from: DVec2, direction: DVec2, wanted: f64) -> f64 {
     let mut t = wanted;
@@ -82,13 +105,7 @@ pub fn rectangle(surface: &Surface, points: &[DVec3], reading: Option<DVec3>, up
     let places: Vec<DVec2> = points.iter().map(|p| surface.nearest(*p).0).collect();
     let from = places.iter().sum::<DVec2>() / places.len().max(1) as f64;
     let bends = bends(surface);
-    let mut lengths: Vec<DVec2> = places
-        .iter()
-        .map(|p| {
-            let at = bends.transpose() * (*p - from);
-            dvec2(length(surface, from, bends.x_axis, at.x), length(surface, from, bends.y_axis, at.y))
-        })
-        .collect();
+    let mut lengths: Vec<DVec2> = places.iter().map(|p| lengths(surface, from, bends, *p)).collect();
     keep_central(&mut lengths);
     let (axis, low, high) = smallest(&hull(lengths));
     let across = dvec2(-axis.y, axis.x);
@@ -134,7 +151,7 @@ fn keep_central(points: &mut Vec<DVec2>) {
 }
 
 /// Directions of a quadric's strongest and weakest bend; of a plane its axes.
-fn bends(surface: &Surface) -> DMat2 {
+pub(super) fn bends(surface: &Surface) -> DMat2 {
     let [a, b, c, ..] = surface.height;
     let angle = 0.5 * b.atan2(a - c);
     let first = dvec2(angle.cos(), angle.sin());
@@ -176,4 +193,17 @@ fn smallest(hull: &[DVec2]) -> (DVec2, DVec2, DVec2) {
     let area = |b: &(DVec2, DVec2, DVec2)| (b.2 - b.1).x * (b.2 - b.1).y;
     let edges = (0..hull.len()).filter_map(|k| (hull[(k + 1) % hull.len()] - hull[k]).try_normalize());
     edges.map(bounds).min_by(|a, b| area(a).total_cmp(&area(b))).unwrap_or_else(|| bounds(DVec2::X))
+}
+
+/// Corners of the smallest rectangle around points of a plane, clockwise from the upper left of one who reads about along `reading`, y up.
+pub fn plane_rectangle(points: Vec<DVec2>, reading: DVec2) -> [DVec2; 4] {
+    let (mut x, low, high) = smallest(&hull(points));
+    let corner = |a: f64, b: f64, x: DVec2| x * a + dvec2(-x.y, x.x) * b;
+    let mut corners = [(low.x, high.y), (high.x, high.y), (high.x, low.y), (low.x, low.y)].map(|(a, b)| corner(a, b, x));
+    // Turned until its first side is the one most along the reading direction.
+    while x.dot(reading) < std::f64::consts::FRAC_1_SQRT_2 - 1e-9 {
+        x = dvec2(x.y, -x.x);
+        corners.rotate_left(1);
+    }
+    corners
 }

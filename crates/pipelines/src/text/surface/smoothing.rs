@@ -17,7 +17,7 @@ const REACH: f64 = 2.0;
 const TERMS: usize = 6;
 
 /// Eigenvectors of the points' covariance by ascending eigenvalue, with the mean: the first is the normal.
-pub(super) fn principal(points: &[DVec3], weights: impl Fn(usize) -> f64) -> (DVec3, DMat3, DVec3) {
+pub(in crate::text) fn principal(points: &[DVec3], weights: impl Fn(usize) -> f64) -> (DVec3, DMat3, DVec3) {
     let (mut sum, mut total) = (DVec3::ZERO, 0.0);
     points.iter().enumerate().for_each(|(i, p)| (sum, total) = (sum + weights(i) * *p, total + weights(i)));
     let mean = sum / total.max(1e-300);

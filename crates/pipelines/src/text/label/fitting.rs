@@ -1,0 +1,113 @@
+//! A region's rectangle in the world: from its points a surface, and on it the smallest rectangle, or the rectangle of its labels.
+
+use super::super::field::model::TextModel;
+use super::super::placed::PlacedRegion;
+use super::super::surface::{self, Rectangle, Surface, Wanted};
+use super::points::{Cloud, ViewCache};
+use diorama_data::text_labels::LabelledRegion;
+use diorama_geom::capture::Frame;
+use diorama_geom::glam::{DVec2, DVec3};
+
+/// Views that a region needs.
+const LEAST_VIEWS: usize = 2;
+/// Deviation of the points from the surface, over the rectangle's height, from which they are on none.
+const MOST_RESIDUAL: f64 = 0.05;
+/// Pixels from the photograph's border at which an outline may have been cut.
+const BORDER_PX: f64 = 0.75;
+
+/// What the rectangle's sides follow.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Extent {
+    /// The labels' outlines, carried to the surface; the points where these are cut by the border.
+    #[default]
+    Labels,
+    /// The smallest rectangle of the central 99 % of the points.
+    Points,
+}
+
+/// How regions are fitted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FitOptions {
+    pub surface: Wanted,
+    pub extent: Extent,
+}
+
+/// A labelled outline of a region and the frame that shows it.
+type Outline<'a> = (&'a Frame, &'a LabelledRegion);
+
+/// Fits a region of a class; the note says what went wrong.
+pub fn fit(model: &TextModel, class: u8, options: FitOptions, cache: &mut ViewCache) -> (PlacedRegion, Option<String>) {
+    let known = &model.labels.classes[class as usize - 1];
+    let outlines: Vec<Outline> = model
+        .train
+        .iter()
+        .filter_map(|i| Some((&model.capture.frames[*i], model.labels.of_frame[*i].as_ref()?)))
+        .flat_map(|(frame, image)| image.regions.iter().filter(|r| r.id == known.id).map(move |r| (frame, r)))
+        .collect();
+    let cloud = cache.cloud(class);
+    let first = outlines.iter().map(|o| o.1).find(|r| !r.ignore);
+    let mut out = PlacedRegion {
+        id: known.id,
+        transcription: known.transcription.clone(),
+        script: first.and_then(|r| r.script.clone()),
+        kind: first.map(|r| r.kind).unwrap_or_default(),
+        rectangle: None,
+        points: cloud.points.len(),
+    };
+    let note = match rectangle(&cloud, &outlines, options) {
+        Ok(r) => {
+            out.rectangle = Some(r);
+            None
+        }
+        Err(why) => Some(format!("region {} ({:?}): {why}", known.id, known.transcription)),
+    };
+    (out, note)
+}
+
+/// The rectangle of a cloud.
+fn rectangle(cloud: &Cloud, outlines: &[Outline], options: FitOptions) -> Result<Rectangle, String> {
+    let n = cloud.points.len();
+    if cloud.views < LEAST_VIEWS || n < surface::LEAST_POINTS {
+        let least = surface::LEAST_POINTS;
+        let have = format!("{n} points in {} views, of which {least} in {LEAST_VIEWS} are needed", cloud.views);
+        return Err(format!("{have}; label a photograph that shows it larger"));
+    }
+    let (points, spacing) = surface::cleaned(&cloud.points);
+    let points = surface::smoothed(&points, spacing);
+    let mean = points.iter().sum::<DVec3>() / points.len().max(1) as f64;
+    let fitted = surface::fit(&points, cloud.eye - mean, options.surface).map_err(|e| e.to_string())?;
+    let carried: Vec<(bool, Vec<DVec2>)> = outlines.iter().filter_map(|o| Some((is_whole(o), carried(&fitted, o)?))).collect();
+    let whole: Vec<Vec<DVec2>> = carried.iter().filter(|c| c.0).map(|c| c.1.clone()).collect();
+    let by_labels = surface::outlined(&fitted, &whole);
+    let reading = carried.first().map(|(_, outline)| {
+        let half = outline.len() / 2;
+        fitted.point(outline[half - 1]) - fitted.point(outline[0])
+    });
+    let by_points = || surface::rectangle(&fitted, &points, reading, DVec3::Z);
+    let out = match (options.extent, by_labels) {
+        (Extent::Labels, Some(r)) => r,
+        _ => by_points(),
+    };
+    let share = fitted.rms / out.reading_size().y;
+    if share > MOST_RESIDUAL {
+        let percent = 100.0 * share;
+        return Err(format!("not a surface: its points deviate by {percent:.0} % of its height; its polygons are kept view by view"));
+    }
+    Ok(out)
+}
+
+/// Whether an outline is not cut by the photograph's border.
+fn is_whole((frame, region): &Outline) -> bool {
+    let (w, h) = (frame.camera.width as f64, frame.camera.height as f64);
+    region.polygon.iter().all(|[x, y]| x.min(*y) > BORDER_PX && w - x > BORDER_PX && h - y > BORDER_PX)
+}
+
+/// An outline on a surface, as points of its plane; none where a ray passes it by.
+fn carried(surface: &Surface, (frame, region): &Outline) -> Option<Vec<DVec2>> {
+    let pose = &frame.world_from_camera;
+    let at = |p: &[f64; 2]| {
+        let direction = pose.rotation * frame.camera.direction(p[0], p[1]).normalize();
+        surface.hits(pose.translation, direction).into_iter().flatten().next().map(|(_, place)| place)
+    };
+    region.polygon.iter().map(at).collect()
+}

@@ -1,0 +1,107 @@
+//! A trained scene as data sets are drawn from it: its field, its text regions, and what its photographs show.
+
+use super::super::field::model::TextModel;
+use super::super::field::recipe;
+use super::super::label::in_view::{self, OnSurface, READABLE};
+use super::super::placed::{self, PlacedRegion};
+use crate::error::{PipelineError, Result};
+use diorama_engine::renderers::view::View;
+use diorama_engine::renderers::volume::Quality;
+use diorama_geom::glam::{DQuat, DVec3};
+use diorama_geom::{Camera, Lens, Pose};
+use diorama_kernels::ops::ray_generation::PosedCamera;
+use std::path::Path;
+
+/// Pixels along the longer side of the depth maps of the photographs.
+const COARSE: u32 = 64;
+
+/// A region as a photograph shows it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Member {
+    /// Index into the scene's regions.
+    pub region: usize,
+    /// Rotation from the region's frame to the camera's.
+    pub camera_from_region: DQuat,
+    /// Place of its middle in widths and heights of the picture, and its area over the picture's.
+    pub center: [f64; 2],
+    pub area_ratio: f64,
+}
+
+/// A scene.
+pub struct SynthScene {
+    pub name: String,
+    pub model: TextModel,
+    /// Those with a rectangle.
+    pub regions: Vec<PlacedRegion>,
+    /// Of all training photographs in which a region can be read.
+    pub members: Vec<Member>,
+    /// Poses of the training photographs in the world, and their coarse views.
+    pub photographs: Vec<(Pose, PosedCamera, View)>,
+}
+
+impl SynthScene {
+    /// Loads a run and its regions.
+    ///
+    /// # Errors
+    /// When the run or its regions cannot be read, or no region can be read in any photograph.
+    pub fn load(name: String, run: &Path, progress: &mut dyn FnMut(f64)) -> Result<SynthScene> {
+        let (model, _) = recipe::load(run, None)?;
+        let regions: Vec<PlacedRegion> = placed::read(run)?.into_iter().filter(|r| r.rectangle.is_some()).collect();
+        let (mut members, mut photographs) = (Vec::new(), Vec::new());
+        for (k, frame) in model.train.iter().enumerate() {
+            progress(k as f64 / model.train.len() as f64);
+            let f = &model.capture.frames[*frame];
+            for (i, region) in regions.iter().enumerate() {
+                let own = OnSurface::of(region).and_then(|w| in_view::labelled(&model, &w, &f.camera, &f.world_from_camera));
+                let Some(word) = own else { continue };
+                let Some(pose) = word.pose.filter(|_| word.visibility >= READABLE) else { continue };
+                let (rotation, center) = placed::from_rows(&pose.text_pose);
+                let size = [f.camera.width as f64, f.camera.height as f64];
+                let Some(at) = f.camera.project(center) else { continue };
+                members.push(Member {
+                    region: i,
+                    camera_from_region: DQuat::from_mat3(&rotation),
+                    center: [at.x / size[0], at.y / size[1]],
+                    area_ratio: in_view::area(&word.polygon) / (size[0] * size[1]),
+                });
+            }
+            let posed = model.posed(*frame);
+            let longer = posed.camera.width.max(posed.camera.height) as f64;
+            let size = [posed.camera.width, posed.camera.height].map(|v| ((v as f64 * COARSE as f64 / longer) as u32).max(1));
+            let coarse = PosedCamera { camera: posed.camera.resized(size[0], size[1]), ..posed };
+            let view = model.tracer(Quality::Full).view(&coarse, &mut |_| ());
+            photographs.push((f.world_from_camera, coarse, view));
+        }
+        if members.is_empty() {
+            let what = "no region can be read in any training photograph; label one that shows it larger";
+            return Err(PipelineError::Usage(format!("{}: {what}", run.display())));
+        }
+        Ok(SynthScene { name, model, regions, members, photographs })
+    }
+
+    /// A pinhole camera of a size with the photographs' field of view over the longer side.
+    pub fn camera(&self, (width, height): (u32, u32)) -> Camera {
+        let c = &self.model.capture.frames[self.model.train[0]].camera;
+        let (longer, focal) = if c.width >= c.height { (c.width as f64, c.fx) } else { (c.height as f64, c.fy) };
+        let f = focal * width.max(height) as f64 / longer;
+        Camera { width, height, fx: f, fy: f, cx: 0.5 * width as f64, cy: 0.5 * height as f64, lens: Lens::Pinhole }
+    }
+
+    /// A camera in model space.
+    pub fn posed(&self, camera: &Camera, pose: &Pose) -> PosedCamera {
+        PosedCamera { camera: *camera, pose: self.model.model_from_world.pose(pose) }
+    }
+
+    /// Whether a photograph shows a point in model space: in its picture and not behind what its depth says, up to a share of it.
+    pub fn shows(&self, photograph: usize, point: DVec3, tolerance: f64) -> bool {
+        let (_, posed, view) = &self.photographs[photograph];
+        let seen = posed.pose.inverse().point(point);
+        let Some(p) = (seen.z > 0.0).then(|| posed.camera.project(seen)).flatten() else { return false };
+        let (x, y) = (p.x.floor(), p.y.floor());
+        if x < 0.0 || y < 0.0 || x >= posed.camera.width as f64 || y >= posed.camera.height as f64 {
+            return false;
+        }
+        let i = y as usize * posed.camera.width as usize + x as usize;
+        view.opacity.data[i] > 0.5 && seen.length() < (1.0 + tolerance) * view.depth.data[i] as f64
+    }
+}
