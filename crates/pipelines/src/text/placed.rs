@@ -26,6 +26,9 @@ pub struct PlacedRegion {
     pub rectangle: Option<Rectangle>,
     /// Points that the surface was fitted to.
     pub points: usize,
+    /// Distance before the surface, in units of the capture, from which on matter is its own.
+    #[serde(default)]
+    pub front: f64,
 }
 
 impl PlacedRegion {

@@ -1,4 +1,4 @@
-//! A region as seen from its front, in a few directions: the geometry is that of rays along the normal, only the direction that colors are
+//! A region as seen from its front, in a few directions: the geometry is that of a camera on its normal, only the direction that colors are
 //! seen in changes.
 
 use super::super::field::model::TextModel;
@@ -14,8 +14,10 @@ use diorama_geom::glam::{DVec2, DVec3, dvec2};
 pub const MARGIN: f64 = 0.25;
 /// Most pixels along the width.
 const WIDEST: usize = 1024;
-/// Distance before and behind the surface in which colors are looked for: deviations of the fit, steps of a ray, and heights of the region.
-const BAND: [f64; 3] = [4.0, 3.0, 0.1];
+/// Where rays begin and end, over the distance of the surface: beyond what stands before it, and behind its matter.
+const BAND: [f64; 2] = [0.7, 1.15];
+/// Least pixels along the height, so that patches find room beside the writing.
+const LEAST_HEIGHT: f64 = 56.0;
 /// Opacity below which a pixel of the surface is unknown.
 const KNOWN: f32 = 0.3;
 
@@ -38,11 +40,18 @@ impl Frontal {
     }
 }
 
-/// Distance between points of the surface that neighboring pixels of the nearest photograph see, and all directions of photographs that face
-/// the region.
-fn photographs(model: &TextModel, rectangle: &Rectangle) -> (f64, Vec<DVec3>) {
+/// What photographs that face a region say of it.
+struct Facing {
+    /// Distance between points of the surface that neighboring pixels of the nearest one see.
+    pixel: f64,
+    /// Median distance.
+    distance: f64,
+    directions: Vec<DVec3>,
+}
+
+fn photographs(model: &TextModel, rectangle: &Rectangle) -> Facing {
     let middle = rectangle.reading_point(DVec2::ZERO);
-    let (mut finest, mut all) = (f64::INFINITY, Vec::new());
+    let (mut pixel, mut distances, mut directions) = (f64::INFINITY, Vec::new(), Vec::new());
     for frame in &model.train {
         let f = &model.capture.frames[*frame];
         let seen = f.world_from_camera.inverse().point(middle);
@@ -50,24 +59,27 @@ fn photographs(model: &TextModel, rectangle: &Rectangle) -> (f64, Vec<DVec3>) {
         if rectangle.reading_frame(DVec2::ZERO).z_axis.dot(way) >= 0.0 || !f.camera.shows(seen) {
             continue;
         }
-        finest = finest.min(seen.length() / model.posed(*frame).camera.fx);
-        all.push(way.normalize());
+        pixel = pixel.min(seen.length() / model.posed(*frame).camera.fx);
+        distances.push(way.length());
+        directions.push(way.normalize());
     }
-    (finest, all)
+    distances.sort_by(f64::total_cmp);
+    Facing { pixel, distance: distances.get(distances.len() / 2).copied().unwrap_or(0.0), directions }
 }
 
 /// Renders a region from its front; none where no photograph shows it.
 pub fn frontal(model: &TextModel, rectangle: &Rectangle) -> Option<Frontal> {
-    let (pixel, all) = photographs(model, rectangle);
-    let directions = directions::clustered(&all);
+    let facing = photographs(model, rectangle);
+    let directions = directions::clustered(&facing.directions);
     if directions.is_empty() {
         return None;
     }
     let half = 0.5 * rectangle.reading_size();
     let half = half + 2.0 * MARGIN * half.y;
+    let pixel = facing.pixel.min(2.0 * half.y / LEAST_HEIGHT);
     let width = ((2.0 * half.x / pixel).ceil() as usize).clamp(8, WIDEST);
     let height = ((width as f64 * half.y / half.x).round() as usize).max(8);
-    let (mut batch, mut buf) = (rays(model, rectangle, half, [width, height]), FieldBuffers::default());
+    let (mut batch, mut buf) = (rays(model, rectangle, (half, facing.distance), [width, height]), FieldBuffers::default());
     let mut known = Vec::new();
     let views = directions
         .iter()
@@ -87,23 +99,21 @@ fn along(model: &TextModel, direction: DVec3) -> [f32; 3] {
     (model.model_from_world.rotation * direction).to_array().map(|v| v as f32)
 }
 
-/// Rays against the normal through the pixels of a picture of the rectangle and its margin, as long as the band around the surface.
-fn rays(model: &TextModel, rectangle: &Rectangle, half: DVec2, [width, height]: [usize; 2]) -> RayBatch {
+/// Rays of a camera on the normal at a distance through the pixels of a picture of the rectangle and its margin.
+fn rays(model: &TextModel, rectangle: &Rectangle, (half, distance): (DVec2, f64), [width, height]: [usize; 2]) -> RayBatch {
     let to_model = &model.model_from_world;
-    let march = model.occupancy.march_config(model.config.sampling.max_samples);
+    let eye = rectangle.reading_point(DVec2::ZERO) + distance * rectangle.reading_frame(DVec2::ZERO).z_axis;
+    let eye = to_model.point(eye);
     let mut batch = RayBatch::default();
     batch.resize(width * height);
     for i in 0..width * height {
         let share = dvec2((i % width) as f64 + 0.5, (i / width) as f64 + 0.5) / dvec2(width as f64, height as f64);
         let at = dvec2(2.0 * share.x - 1.0, 1.0 - 2.0 * share.y) * half;
-        let normal = to_model.rotation * rectangle.reading_frame(at).z_axis;
-        let step = march.step(1.0) as f64;
-        let heights = BAND[2] * rectangle.reading_size().y * to_model.scale;
-        let band = (BAND[0] * rectangle.surface.rms * to_model.scale).max(BAND[1] * step).max(heights);
-        let origin = to_model.point(rectangle.reading_point(at)) + 2.0 * band * normal;
-        batch.origins[3 * i..3 * i + 3].copy_from_slice(&origin.to_array().map(|v| v as f32));
-        batch.dirs[3 * i..3 * i + 3].copy_from_slice(&(-normal).to_array().map(|v| v as f32));
-        batch.near_far[2 * i..2 * i + 2].copy_from_slice(&[band as f32, 3.0 * band as f32]);
+        let way = to_model.point(rectangle.reading_point(at)) - eye;
+        let length = way.length();
+        batch.origins[3 * i..3 * i + 3].copy_from_slice(&eye.to_array().map(|v| v as f32));
+        batch.dirs[3 * i..3 * i + 3].copy_from_slice(&(way / length).to_array().map(|v| v as f32));
+        batch.near_far[2 * i..2 * i + 2].copy_from_slice(&BAND.map(|b| (b * length) as f32));
         (batch.images[i], batch.jitter[i]) = (0, 0.5);
     }
     batch

@@ -15,7 +15,7 @@ const DEVIATIONS: f32 = 5.0;
 /// Shares of the region that ink may be; beyond them the whole region is erased.
 const INK: [f64; 2] = [0.02, 0.65];
 /// Pixels around ink that are erased with it, over the region's height.
-const AROUND: f64 = 0.06;
+const AROUND: f64 = 0.1;
 /// Share of the ink, the pixels that differ most from the ground, that tells its color.
 const PUREST: f64 = 0.25;
 /// Least albedo whose logarithm is taken.
@@ -81,8 +81,8 @@ pub fn erased(model: &TextModel, rectangle: &Rectangle, eraser: Eraser, seed: u6
     let shading = Shading::fit(&mean, &unknown);
     let unlit: Vec<Image> = frontal.views.iter().map(|v| shading.unlit(&linear(v))).collect();
     let filled = match eraser {
-        Eraser::PatchMatch => patch_match::fill(&unlit, &mask, seed),
-        Eraser::Telea => unlit.iter().map(|v| telea::fill(v, &mask, TELEA_PX)).collect(),
+        Eraser::PatchMatch => patch_match::fill(&unlit, &unknown, seed),
+        Eraser::Telea => unlit.iter().map(|v| telea::fill(v, &unknown, TELEA_PX)).collect(),
     };
     let filled = filled.map_err(|e| wrong(e.to_string()))?;
     let ink_linear = ink_color(&shading.unlit(&mean), &found, &mask);

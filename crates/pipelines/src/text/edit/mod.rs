@@ -280,7 +280,8 @@ fn preview(model: &TextModel, region: &PlacedRegion, edit: Edit) -> ImageU8 {
     let before = model.tracer(Quality::Full).view(&posed, &mut |_| ());
     let mut after = before.clone();
     let pose = model.capture.frames[frame].world_from_camera;
-    Overlay::new(edit, rectangle).put(model, &posed.camera, &pose, &mut after);
+    let overlay = Overlay::new(edit, region).expect("regions with a surface");
+    overlay.put(model, &posed.camera, &pose, &mut after);
     let (w, h) = (before.rgb.width, before.rgb.height);
     let [a, b] = [before.rgb.to_u8(), after.rgb.to_u8()];
     let rows = (0..h).flat_map(|y| [&a.data[3 * w * y..3 * w * (y + 1)], &b.data[3 * w * y..3 * w * (y + 1)]].concat()).collect();

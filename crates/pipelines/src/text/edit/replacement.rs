@@ -2,6 +2,8 @@
 //! `C = C_front + (1 − a) C_back + a T_front E(u, v, direction)`.
 
 use super::super::field::model::TextModel;
+use super::super::label::in_view;
+use super::super::placed::PlacedRegion;
 use super::super::surface::Rectangle;
 use super::Edit;
 use super::directions;
@@ -16,8 +18,6 @@ use diorama_kernels::ops::ray_generation::PosedCamera;
 
 /// Rays of a pixel along an axis.
 const FOOTPRINT: usize = 4;
-/// Distance before the surface at which the front ends: deviations of the fit, and steps of the ray.
-const BEFORE: [f64; 2] = [2.0, 1.5];
 /// Share of a pixel below which it is unchanged.
 const LEAST: f32 = 1e-4;
 
@@ -25,6 +25,8 @@ const LEAST: f32 = 1e-4;
 pub struct Overlay {
     pub edit: Edit,
     rectangle: Rectangle,
+    /// See [`PlacedRegion::front`].
+    front: f64,
     /// Of each direction, in the field's colors.
     colors: Vec<Texture>,
     /// Share that is replaced, and share that is a glyph.
@@ -43,10 +45,12 @@ struct Replaced {
 }
 
 impl Overlay {
-    pub fn new(edit: Edit, rectangle: Rectangle) -> Overlay {
+    /// None where the region is on no surface.
+    pub fn new(edit: Edit, region: &PlacedRegion) -> Option<Overlay> {
+        let rectangle = region.rectangle?;
         let colors = edit.colors.iter().cloned().map(Texture::new).collect();
         let shares = Texture::new(edit.shares.clone());
-        Overlay { edit, rectangle, colors, shares }
+        Some(Overlay { edit, rectangle, front: region.front, colors, shares })
     }
 
     /// Place in the textures of reading coordinates.
@@ -127,11 +131,8 @@ impl Overlay {
         }
         let posed = PosedCamera { camera: *camera, pose: model.model_from_world.pose(pose) };
         pixels::rays(&[posed], model.config.sampling.near, model.cube(), &mut batch);
-        let march = model.occupancy.march_config(model.config.sampling.max_samples);
-        let rms = self.rectangle.surface.rms * model.model_from_world.scale;
         for (r, near_far) in replaced.iter().zip(batch.near_far.chunks_exact_mut(2)) {
-            let before = (BEFORE[0] * rms).max(BEFORE[1] * march.step(r.distance as f32) as f64);
-            let far = (r.distance - before) as f32;
+            let far = in_view::end(model, r.distance, self.front);
             near_far.copy_from_slice(&if far > near_far[0] { [near_far[0], far] } else { [0.0; 2] });
         }
         let front = model.tracer(Quality::Full).trace(&mut batch, &mut buf);

@@ -176,7 +176,7 @@ impl Config {
                 space: "unbounded".into(),
             },
             labels: LabelConfig { share: labels[of] / (steps[of] + labels[of]), width: pick(32, 64, 64), waves: 12 },
-            loss: LossConfig { distortion: 1e-3, s3im: 1.0, tile: [tile; 2], opacity: 1e-3, proxy: 0.3, depth: 0.1, near_scaling: 1.0 },
+            loss: LossConfig { distortion: 1e-3, s3im: 1.0, tile: [tile; 2], opacity: 1e-3, proxy: 0.3, depth: 1.0, near_scaling: 1.0 },
             optim: OptimConfig { rate: 1e-2, label_rate: 1e-2, final_scale: 1.0 / 30.0 },
             sampling: SamplingConfig {
                 rays: pick(1024, 2048, 8192),

@@ -5,11 +5,13 @@ use super::label_maps::Labels;
 use crate::error::{PipelineError, Result};
 use crate::run::param_state::{self, entry};
 use diorama_data::checkpoint::{Checkpoint, Entry};
-use diorama_engine::fields::{self, DirectionCode, Encoder, Field, Pruning, RayCodes};
+use diorama_engine::fields::{self, DirectionCode, Encoder, Field, FieldBuffers, Pruning, RayCodes};
 use diorama_engine::params::{ParamGroup, ParamSet, Schedule};
+use diorama_engine::renderers::view::View;
 use diorama_engine::renderers::volume::{Backdrop, Quality, Tracer};
 use diorama_engine::samplers::occupancy::Occupancy;
 use diorama_engine::samplers::placement::Placement;
+use diorama_engine::samplers::{RayBatch, pixels};
 use diorama_engine::step::Scene;
 use diorama_engine::train::Origin;
 use diorama_geom::capture::Split;
@@ -34,6 +36,10 @@ const FIRST_DENSITY: f32 = 0.1;
 const TABLE_DECAY: f32 = 1e-5;
 /// Layers of the density, which come first.
 const DENSITY: usize = 2;
+/// Half widths of the windows in which surfaces are looked for, over the distance, and the opacity that one has.
+const WINDOWS: [f32; 3] = [0.3, 0.15, 0.08];
+const SURFACE: f32 = 0.5;
+const SURFACE_RAYS: usize = 1 << 12;
 /// Output layers are padded to whole vectors.
 const PADDED: usize = 16;
 /// Stream of the head's initial values.
@@ -170,6 +176,41 @@ impl TextModel {
             row[0] += 1.0 - opacity;
         }
         Some(shares)
+    }
+
+    /// Distances of surfaces along rays of a camera's pixels, from those that their light ends at on average: means in narrowing windows around
+    /// them, which leave out fog before a surface. 0 where less than half of the light ends there.
+    pub fn surfaces(&self, camera: &PosedCamera, pixels: &[usize], distances: &[f32]) -> Vec<f32> {
+        let (w, mut out, mut buf) = (camera.camera.width as usize, distances.to_vec(), FieldBuffers::default());
+        let tracer = self.tracer(Quality::Full);
+        for (pixels, out) in pixels.chunks(SURFACE_RAYS).zip(out.chunks_mut(SURFACE_RAYS)) {
+            let mut batch = RayBatch::default();
+            batch.resize(pixels.len());
+            for (i, p) in pixels.iter().enumerate() {
+                batch.pixels[2 * i..2 * i + 2].copy_from_slice(&[(p % w) as f32 + 0.5, (p / w) as f32 + 0.5]);
+                (batch.images[i], batch.jitter[i]) = (0, 0.5);
+            }
+            pixels::rays(std::slice::from_ref(camera), self.config.sampling.near, self.cube(), &mut batch);
+            for share in WINDOWS {
+                for (i, d) in out.iter().enumerate() {
+                    batch.near_far[2 * i..2 * i + 2].copy_from_slice(&[(1.0 - share) * d, (1.0 + share) * d]);
+                }
+                let traced = tracer.trace(&mut batch, &mut buf);
+                for (i, d) in out.iter_mut().enumerate() {
+                    *d = if traced.opacity[i] > SURFACE { traced.depth[i] / traced.opacity[i] } else { 0.0 };
+                }
+            }
+        }
+        out
+    }
+
+    /// A view whose depths are those of surfaces, and whose opacity is 0 where there is none.
+    pub fn surface_view(&self, camera: &PosedCamera) -> View {
+        let mut view = self.tracer(Quality::Full).view(camera, &mut |_| ());
+        let all: Vec<usize> = (0..view.depth.data.len()).collect();
+        view.depth.data = self.surfaces(camera, &all, &view.depth.data);
+        view.opacity.data.iter_mut().zip(&view.depth.data).filter(|(_, d)| **d == 0.0).for_each(|(o, _)| *o = 0.0);
+        view
     }
 
     /// Goes on to the stage of labels: density and color stay.

@@ -9,7 +9,6 @@ use crate::run::device::Device;
 use crate::run::photographs::StoredPhotographs;
 use diorama_data::checkpoint;
 use diorama_engine::renderers::view::View;
-use diorama_engine::renderers::volume::Quality;
 use diorama_engine::samplers::RayBatch;
 use diorama_engine::samplers::pixels::{self, DrawOptions, Observation, PixelSource};
 use diorama_engine::samplers::placement::Placement;
@@ -237,7 +236,7 @@ impl<'a> Trainer<'a> {
                 return Ok(false);
             }
             events(&Event::Preparing { what: "carrying labels to other photographs", share: i as f64 / n as f64 });
-            views.push(m.tracer(Quality::Full).view(camera, &mut |_| ()));
+            views.push(m.surface_view(camera));
         }
         let given: Vec<Option<Vec<u8>>> = m
             .train

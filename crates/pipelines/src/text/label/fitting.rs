@@ -2,7 +2,9 @@
 
 use super::super::field::model::TextModel;
 use super::super::placed::PlacedRegion;
+use super::super::regions::GRID;
 use super::super::surface::{self, Rectangle, Surface, Wanted};
+use super::in_view::{self, OnSurface};
 use super::points::{Cloud, ViewCache};
 use diorama_data::text_labels::LabelledRegion;
 use diorama_geom::capture::Frame;
@@ -14,6 +16,11 @@ const LEAST_VIEWS: usize = 2;
 const MOST_RESIDUAL: f64 = 0.05;
 /// Pixels from the photograph's border at which an outline may have been cut.
 const BORDER_PX: f64 = 0.75;
+/// Deviations of the fit before the surface that are its own at least, and shares of the distance that may be.
+const DEVIATIONS: f64 = 2.0;
+const FRONTS: [f64; 8] = [0.0, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.16];
+/// Share of the most points that are seen at any of them with which one is enough.
+const ENOUGH: f64 = 0.97;
 
 /// What the rectangle's sides follow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -53,10 +60,12 @@ pub fn fit(model: &TextModel, class: u8, options: FitOptions, cache: &mut ViewCa
         kind: first.map(|r| r.kind).unwrap_or_default(),
         rectangle: None,
         points: cloud.points.len(),
+        front: 0.0,
     };
     let note = match rectangle(&cloud, &outlines, options) {
         Ok(r) => {
             out.rectangle = Some(r);
+            out.front = front(model, &out, &outlines);
             None
         }
         Err(why) => Some(format!("region {} ({:?}): {why}", known.id, known.transcription)),
@@ -94,6 +103,31 @@ fn rectangle(cloud: &Cloud, outlines: &[Outline], options: FitOptions) -> Result
         return Err(format!("not a surface: its points deviate by {percent:.0} % of its height; its polygons are kept view by view"));
     }
     Ok(out)
+}
+
+/// Distance before a region's surface from which on matter is the surface's own: the least at which photographs whose labels say that it can
+/// be read see it.
+fn front(model: &TextModel, region: &PlacedRegion, outlines: &[Outline]) -> f64 {
+    let Some(word) = OnSurface::of(region) else { return 0.0 };
+    let least = DEVIATIONS * word.rectangle.surface.rms;
+    let frames: Vec<&Frame> = outlines.iter().filter(|(_, r)| !r.ignore).map(|(frame, _)| *frame).collect();
+    let seen = |share: f64| {
+        let (mut n, mut of) = (0, 0);
+        for frame in &frames {
+            let (eye, camera_from_world) = (frame.world_from_camera.translation, frame.world_from_camera.inverse());
+            let points = (0..GRID[0] * GRID[1]).map(|i| word.rectangle.reading_point(word.grid_point(i)));
+            let points: Vec<DVec3> = points.filter(|p| frame.camera.shows(camera_from_world.point(*p))).collect();
+            let front = (share * eye.distance(word.rectangle.reading_point(DVec2::ZERO))).max(least);
+            let light = in_view::transmittance(model, eye, &points, front);
+            (n, of) = (n + light.iter().filter(|l| **l > 0.5).count(), of + light.len());
+        }
+        n as f64 / of.max(1) as f64
+    };
+    let shares: Vec<f64> = FRONTS.iter().map(|f| seen(*f)).collect();
+    let most = shares.iter().copied().fold(0.0, f64::max);
+    let k = shares.iter().position(|s| *s >= ENOUGH * most).unwrap_or(0);
+    let mean = frames.iter().map(|f| f.world_from_camera.translation.distance(word.rectangle.reading_point(DVec2::ZERO))).sum::<f64>();
+    (FRONTS[k] * mean / frames.len().max(1) as f64).max(least)
 }
 
 /// Whether an outline is not cut by the photograph's border.

@@ -23,8 +23,8 @@ pub const READABLE_PX: f64 = 8.0;
 const BENT_POINTS: usize = 10;
 /// Transmittance from which a point is seen.
 const SEEN: f32 = 0.5;
-/// Distance before a surface at which light is measured: deviations of the fit, and steps along the ray.
-const BEFORE: [f64; 2] = [2.0, 1.5];
+/// Steps along the ray before a surface that are its own at least.
+const STEPS: f64 = 1.5;
 
 /// A word on a rectangle.
 #[derive(Clone, Copy)]
@@ -35,6 +35,8 @@ pub struct OnSurface<'a> {
     pub id: u32,
     pub transcription: &'a str,
     pub script: Option<&'a str>,
+    /// See [`PlacedRegion::front`].
+    pub front: f64,
     /// Its characters, as far as they are known, with their bounds.
     pub characters: &'a [Lettered],
 }
@@ -51,12 +53,12 @@ impl<'a> OnSurface<'a> {
     pub fn of(region: &'a PlacedRegion) -> Option<OnSurface<'a>> {
         let rectangle = region.rectangle.as_ref()?;
         let half = 0.5 * rectangle.reading_size();
-        let (id, transcription, script) = (region.id, &region.transcription[..], region.script.as_deref());
-        Some(OnSurface { rectangle, bounds: [-half, half], id, transcription, script, characters: &[] })
+        let (id, transcription, script, front) = (region.id, &region.transcription[..], region.script.as_deref(), region.front);
+        Some(OnSurface { rectangle, bounds: [-half, half], id, transcription, script, front, characters: &[] })
     }
 
     /// Reading coordinates of a point of the grid of [`GRID`] points.
-    fn grid_point(&self, i: usize) -> DVec2 {
+    pub fn grid_point(&self, i: usize) -> DVec2 {
         let [columns, rows] = GRID;
         let share = dvec2((i % columns) as f64 + 0.5, (i / columns) as f64 + 0.5) / dvec2(columns as f64, rows as f64);
         let [low, high] = self.bounds;
@@ -127,35 +129,40 @@ pub fn visible(model: &TextModel, word: &OnSurface, camera: &Camera, pose: &Pose
         .collect();
     let listed: Vec<usize> = (0..n).filter(|i| in_picture[*i]).collect();
     let points: Vec<DVec3> = listed.iter().map(|i| rectangle.reading_point(word.grid_point(*i))).collect();
-    let light = transmittance(model, pose.translation, &points, rectangle.surface.rms);
+    let light = transmittance(model, pose.translation, &points, word.front);
     let mut seen = vec![false; n];
     listed.iter().zip(light).for_each(|(i, light)| seen[*i] = light > SEEN);
     Visible { in_picture, seen }
 }
 
-/// Light that comes from just before points of the world to an eye, whose surface deviates by `rms`.
-pub fn transmittance(model: &TextModel, eye: DVec3, points: &[DVec3], rms: f64) -> Vec<f32> {
+/// Light that comes to an eye from `front` before points of the world, or from a few steps before them.
+pub fn transmittance(model: &TextModel, eye: DVec3, points: &[DVec3], front: f64) -> Vec<f32> {
+    if points.is_empty() {
+        return Vec::new();
+    }
     let to_model = &model.model_from_world;
-    let (origin, scale) = (to_model.point(eye), to_model.scale);
-    let march = model.occupancy.march_config(model.config.sampling.max_samples);
+    let origin = to_model.point(eye);
     let (mut batch, mut buf) = (RayBatch::default(), FieldBuffers::default());
     batch.resize(points.len());
     for (i, p) in points.iter().enumerate() {
         let way = to_model.point(*p) - origin;
         let (distance, direction) = (way.length(), way.normalize_or(DVec3::Z));
-        let before = (BEFORE[0] * rms * scale).max(BEFORE[1] * march.step(distance as f32) as f64);
-        let far = (distance - before) as f32;
+        let far = end(model, distance, front);
         let near = model.config.sampling.near;
         batch.origins[3 * i..3 * i + 3].copy_from_slice(&origin.to_array().map(|v| v as f32));
         batch.dirs[3 * i..3 * i + 3].copy_from_slice(&direction.to_array().map(|v| v as f32));
         batch.near_far[2 * i..2 * i + 2].copy_from_slice(&if far > near { [near, far] } else { [0.0; 2] });
         (batch.images[i], batch.jitter[i]) = (0, 0.5);
     }
-    if points.is_empty() {
-        return Vec::new();
-    }
     let traced = model.tracer(super::QUALITY).trace(&mut batch, &mut buf);
     traced.opacity.iter().map(|o| 1.0 - o).collect()
+}
+
+/// Where, in model space, what stands before a surface at a distance ends; `front` is in units of the capture.
+pub fn end(model: &TextModel, distance: f64, front: f64) -> f32 {
+    let march = model.occupancy.march_config(model.config.sampling.max_samples);
+    let own = (front * model.model_from_world.scale).max(STEPS * march.step(distance as f32) as f64);
+    (distance - own) as f32
 }
 
 /// A word as the label of a view of `camera`; none where less than [`LEAST_VISIBLE`] of it is visible.

@@ -45,8 +45,12 @@ impl<'a> ViewCache<'a> {
     fn points(&mut self, frame: usize, is_own: impl Fn(&Layers, usize) -> bool) -> Vec<DVec3> {
         let (camera, world_from_model) = (self.model.posed(frame), self.model.model_from_world.inverse());
         let layers = self.layers(frame);
-        let opaque = (0..layers.opacity.data.len()).filter(|i| layers.opacity.data[*i] > SURFACE && is_own(layers, *i));
-        opaque.map(|i| world_from_model.point(point(&camera, i, layers.depth.data[i]))).collect()
+        let is_chosen = |i: &usize| layers.opacity.data[*i] > SURFACE && is_own(layers, *i);
+        let opaque: Vec<usize> = (0..layers.opacity.data.len()).filter(is_chosen).collect();
+        let about: Vec<f32> = opaque.iter().map(|i| layers.depth.data[*i]).collect();
+        let found = self.model.surfaces(&camera, &opaque, &about);
+        let on_surfaces = opaque.iter().zip(found).filter(|(_, d)| *d > 0.0);
+        on_surfaces.map(|(i, d)| world_from_model.point(point(&camera, *i, d))).collect()
     }
 
     /// Points of a class.

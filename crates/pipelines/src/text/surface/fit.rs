@@ -15,6 +15,8 @@ const BETTER: f64 = 0.7;
 const QUADRIC_POINTS: usize = 200;
 /// Height of a quadric over its plane at the points' extent, over that extent, below which it is noise of a plane.
 const LEAST_BEND: f64 = 0.06;
+/// Cosine between the normals of least orthogonal and least viewed distances below which the latter holds.
+const DIFFERENT: f64 = 0.94;
 /// Newton's steps to a foot point.
 const FOOT_STEPS: usize = 8;
 /// Share of the extent below which an error is none.
@@ -131,9 +133,37 @@ pub fn fit(points: &[DVec3], toward: DVec3, wanted: Wanted) -> Result<Surface, N
     Ok(if wanted == Wanted::Quadric || is_better { quadric } else { plane })
 }
 
+/// Weights of points by their distances along the viewing direction from a plane, which is fitted to these, first by least absolute deviations;
+/// and the plane's normal. Depths err along the view: where they do by more than a region is high, the plane of least orthogonal distances
+/// is edge-on.
+fn as_viewed(points: &[DVec3], toward: DVec3) -> (Vec<f64>, DVec3) {
+    let along = toward.try_normalize().unwrap_or(DVec3::Z);
+    let (u, v) = along.any_orthonormal_pair();
+    let mean = points.iter().sum::<DVec3>() / points.len() as f64;
+    let local: Vec<DVec3> = points.iter().map(|p| DVec3::new((*p - mean).dot(u), (*p - mean).dot(v), (*p - mean).dot(along))).collect();
+    let size = local.iter().map(|p| p.truncate().length()).fold(0.0, f64::max).max(1e-300);
+    let (mut weights, mut slopes) = (vec![1.0; points.len()], SVector::<f64, 3>::zeros());
+    for round in 0..ITERATIONS {
+        let (mut a, mut b) = (SMatrix::<f64, 3, 3>::identity() * 1e-9, SVector::<f64, 3>::zeros());
+        for (p, w) in local.iter().zip(&weights) {
+            let row = SVector::<f64, 3>::new(p.x / size, p.y / size, 1.0);
+            a += *w * row * row.transpose();
+            b += *w * p.z * row;
+        }
+        let Some(found) = a.cholesky().map(|f| f.solve(&b)) else { break };
+        slopes = found;
+        let off: Vec<f64> = local.iter().map(|p| p.z - found[0] * p.x / size - found[1] * p.y / size - found[2]).collect();
+        weights = match round < ITERATIONS / 2 {
+            true => off.iter().map(|d| 1.0 / d.abs().max(1e-6 * size)).collect(),
+            false => tukey(&off, size),
+        };
+    }
+    (weights, (along - u * (slopes[0] / size) - v * (slopes[1] / size)).normalize())
+}
+
 /// The plane, and the points' extent along it.
 fn plane(points: &[DVec3], toward: DVec3) -> Result<(Surface, f64), NoSurface> {
-    let mut weights = vec![1.0; points.len()];
+    let (mut weights, viewed) = as_viewed(points, toward);
     let mut out = None;
     for _ in 0..ITERATIONS {
         let (origin, axes, values) = principal(points, |i| weights[i]);
@@ -141,8 +171,11 @@ fn plane(points: &[DVec3], toward: DVec3) -> Result<(Surface, f64), NoSurface> {
         if values.y.sqrt() <= 1e-6 * extent {
             return Err(NoSurface::Line);
         }
-        let normal = axes.x_axis * if axes.x_axis.dot(toward) < 0.0 { -1.0 } else { 1.0 };
-        let u = axes.z_axis;
+        let mut normal = axes.x_axis * if axes.x_axis.dot(toward) < 0.0 { -1.0 } else { 1.0 };
+        let mut u = axes.z_axis;
+        if normal.dot(viewed) < DIFFERENT {
+            (normal, u) = (viewed, (u - viewed * u.dot(viewed)).try_normalize().unwrap_or(viewed.any_orthonormal_vector()));
+        }
         let mut surface = Surface {
             kind: Kind::Plane,
             world_from_local: DMat3::from_cols(u, normal.cross(u), normal),

@@ -37,8 +37,7 @@ impl SceneEdits {
         let mut of_region: Vec<Vec<Overlay>> = scene.regions.iter().map(|_| Vec::new()).collect();
         for edit in edits {
             if let Some(k) = scene.regions.iter().position(|r| r.id == edit.region) {
-                let rectangle = scene.regions[k].rectangle.expect("regions of a data set have one");
-                of_region[k].push(Overlay::new(edit, rectangle));
+                of_region[k].extend(Overlay::new(edit, &scene.regions[k]));
             }
         }
         SceneEdits { of_region, original }

@@ -65,7 +65,7 @@ impl SynthScene {
         if self.is_in_matter(pose.translation, FREE * distance) {
             return Err(Fault::InMatter);
         }
-        let light = in_view::transmittance(&self.model, pose.translation, &[middle], rectangle.surface.rms);
+        let light = in_view::transmittance(&self.model, pose.translation, &[middle], region.front);
         if light[0] <= LIGHT {
             return Err(Fault::Hidden);
         }
