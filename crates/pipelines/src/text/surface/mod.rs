@@ -9,6 +9,7 @@ mod smoothing;
 pub use cloud::cleaned;
 pub use fit::{Kind, Surface, fit};
 pub use rectangle::{Rectangle, rectangle};
+pub(in crate::text) use rectangle::{hull, smallest};
 pub use smoothing::smoothed;
 
 /// Points below which nothing is fitted.
