@@ -10,6 +10,7 @@ mod renderer;
 mod resnet;
 #[cfg(test)]
 mod tests;
+mod to_onnx;
 mod unet;
 mod vgg;
 mod vit;
