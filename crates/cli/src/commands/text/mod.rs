@@ -2,8 +2,10 @@
 
 mod annotate;
 mod eval;
+mod eval_detector;
 mod make_scenes;
 mod train;
+mod train_detector;
 
 use super::Verb;
 use clap::Subcommand;
@@ -13,8 +15,10 @@ use clap::Subcommand;
 pub enum Text {
     Annotate(annotate::Annotate),
     Eval(eval::Eval),
+    EvalDetector(eval_detector::EvalDetector),
     MakeScenes(make_scenes::MakeScenes),
     Train(train::Train),
+    TrainDetector(train_detector::TrainDetector),
 }
 
 impl Text {
@@ -23,8 +27,10 @@ impl Text {
         match self {
             Text::Annotate(v) => v,
             Text::Eval(v) => v,
+            Text::EvalDetector(v) => v,
             Text::MakeScenes(v) => v,
             Text::Train(v) => v,
+            Text::TrainDetector(v) => v,
         }
     }
 }
