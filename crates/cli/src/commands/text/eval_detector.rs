@@ -60,7 +60,7 @@ impl EvalDetector {
         println!("{} images, {} words, {} detections, {:.2} images/s", e.images, e.labels, e.detections, judged.images_per_s);
         line("instances", &e.instance);
         line("scenes", &e.scene);
-        line("DetEval", &e.det_eval);
+        line("DetEval", &judged.det_eval);
         if self.by_scene {
             e.scenes.iter().for_each(|s| line(&s.scene, &s.score));
         }

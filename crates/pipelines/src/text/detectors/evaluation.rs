@@ -1,6 +1,5 @@
 //! Scores of detected writing against labels: precision, recall and F over all instances, over scenes, and per cluster of poses.
 
-use super::det_eval;
 use super::polygon::{self, iou, signed_area};
 use diorama_geom::glam::DVec2;
 use serde::Serialize;
@@ -149,8 +148,6 @@ pub struct Evaluation {
     pub instance: Score,
     /// Means over scenes of means over their images.
     pub scene: Score,
-    /// Over all instances, where labels may be split and joined.
-    pub det_eval: Score,
     pub scenes: Vec<SceneScore>,
     /// Of clusters that have labels; empty where no label's cluster is known.
     pub clusters: Vec<ClusterScore>,
@@ -188,7 +185,6 @@ pub fn evaluate(images: &[JudgedImage]) -> Evaluation {
         detections: total.detections,
         instance: total.score(),
         scene: Score::mean(&scenes.iter().map(|s| s.score).collect::<Vec<_>>()),
-        det_eval: det_eval::evaluate(images),
         scenes,
         clusters: clusters.into_iter().map(of_cluster).collect(),
     }

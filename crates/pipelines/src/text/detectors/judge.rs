@@ -1,7 +1,8 @@
 //! Scores of a detector on a data set.
 
 use super::config::Config;
-use super::evaluation::{self, Evaluation, JudgedImage};
+use super::det_eval;
+use super::evaluation::{self, Evaluation, JudgedImage, Score};
 use super::network::Detector;
 use super::samples;
 use crate::error::{PipelineError, Result};
@@ -22,6 +23,8 @@ const CLUSTERS: usize = 16;
 pub struct Judged {
     #[serde(flatten)]
     pub evaluation: Evaluation,
+    /// Over all instances, where labels may be split and joined.
+    pub det_eval: Score,
     /// Images per second of detection, decoding of files included.
     pub images_per_s: f64,
 }
@@ -52,7 +55,7 @@ pub fn judge(
         images.push(JudgedImage { scene: image.scene.clone(), labels: samples::labels(image, DVec2::ONE), detections });
     }
     let images_per_s = set.len() as f64 / begin.elapsed().as_secs_f64().max(1e-9);
-    Ok(Some(Judged { evaluation: evaluation::evaluate(&images), images_per_s }))
+    Ok(Some(Judged { evaluation: evaluation::evaluate(&images), det_eval: det_eval::evaluate(&images), images_per_s }))
 }
 
 /// Gives labels the clusters of their poses where the data set tells poses but no clusters.
