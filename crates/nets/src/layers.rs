@@ -77,6 +77,42 @@ impl Module for Conv2d {
     }
 }
 
+/// A transposed convolution.
+#[derive(Debug)]
+pub struct ConvTranspose2d {
+    /// `[in, out / groups, h, w]`.
+    pub weight: Param,
+    pub bias: Option<Param>,
+    pub settings: Conv,
+}
+
+impl ConvTranspose2d {
+    pub fn new(init: &mut Init, channels: [usize; 2], kernel: usize, settings: Conv) -> ConvTranspose2d {
+        let stride = settings.stride[0] * settings.stride[1];
+        // As many of the kernel's places as meet in one output.
+        let fan = (channels[0] / settings.groups * kernel * kernel / stride).max(1);
+        let weight = init.kaiming(&[channels[0], channels[1] / settings.groups, kernel, kernel], fan);
+        ConvTranspose2d { weight, bias: Some(init.constant(Kind::Weight, &[channels[1]], 0.0)), settings }
+    }
+
+    pub fn without_bias(self) -> ConvTranspose2d {
+        ConvTranspose2d { bias: None, ..self }
+    }
+
+    pub fn forward(&self, x: Tensor<4>, mode: Mode) -> Result<Tensor<4>, OpError> {
+        ops::conv_transpose2d(x, self.weight.tensor(mode), self.bias.as_ref().map(|b| b.tensor(mode)), self.settings)
+    }
+}
+
+impl Module for ConvTranspose2d {
+    fn visit(&self, v: &mut Visitor) {
+        v.param("weight", &self.weight);
+        if let Some(b) = &self.bias {
+            v.param("bias", b);
+        }
+    }
+}
+
 /// A fully connected layer on the last axis.
 #[derive(Debug)]
 pub struct Linear {

@@ -6,6 +6,7 @@
 pub mod bridge;
 pub mod layers;
 pub mod modules;
+pub mod onnx;
 pub mod ops;
 pub mod param;
 pub mod train;

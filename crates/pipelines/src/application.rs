@@ -6,7 +6,7 @@ use crate::object::{config::Config, run_folder};
 use crate::relight::{object as relit, outdoor};
 use crate::run::RunDescription;
 use crate::run::config::Configuration;
-use crate::text::field as writing;
+use crate::text::{detectors, field as writing};
 use diorama_data::DataError;
 use serde_json::Value;
 use std::path::Path;
@@ -22,11 +22,14 @@ pub enum Application {
     RelightObject,
     /// Photographs of writing to a field with classes.
     Text,
+    /// Labelled images to a detector of writing.
+    Detector,
 }
 
 impl Application {
     /// All of them, in the order in which they are listed to users.
-    pub const ALL: [Application; 4] = [Application::Object, Application::Relight, Application::RelightObject, Application::Text];
+    pub const ALL: [Application; 5] =
+        [Application::Object, Application::Relight, Application::RelightObject, Application::Text, Application::Detector];
 
     /// The name that `config.toml` gives.
     pub fn name(self) -> &'static str {
@@ -35,6 +38,7 @@ impl Application {
             Application::Relight => outdoor::config::Config::APPLICATION,
             Application::RelightObject => relit::config::Config::APPLICATION,
             Application::Text => writing::config::Config::APPLICATION,
+            Application::Detector => detectors::config::Config::APPLICATION,
         }
     }
 
@@ -68,6 +72,7 @@ impl Application {
             Application::Relight => outdoor::recipe::describe(run),
             Application::RelightObject => relit::recipe::describe(run),
             Application::Text => writing::recipe::describe(run),
+            Application::Detector => detectors::recipe::describe(run),
         }
     }
 }

@@ -37,6 +37,7 @@ impl Verb for Compare {
                 of @ Application::Relight => return Err(of.refuse(run, "diorama relight eval")),
                 of @ Application::RelightObject => return Err(of.refuse(run, "diorama relight eval")),
                 of @ Application::Text => return Err(of.refuse(run, "diorama text eval")),
+                of @ Application::Detector => return Err(of.refuse(run, "diorama text eval-detector --weights")),
             }
         }
         self.objects()

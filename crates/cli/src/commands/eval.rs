@@ -67,6 +67,7 @@ impl Verb for Eval {
             of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight eval")),
             of @ Application::RelightObject => Err(of.refuse(&self.run, "diorama relight eval")),
             of @ Application::Text => Err(of.refuse(&self.run, "diorama text eval")),
+            of @ Application::Detector => Err(of.refuse(&self.run, "diorama text eval-detector --weights")),
         }
     }
 }

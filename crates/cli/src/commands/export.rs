@@ -111,6 +111,7 @@ impl Verb for Export {
             of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight render")),
             of @ Application::RelightObject => Err(of.refuse(&self.run, "diorama relight object --resume, which writes the GLB again")),
             of @ Application::Text => Err(of.refuse(&self.run, "a run of object: a text run exports no mesh")),
+            of @ Application::Detector => Err(of.refuse(&self.run, "a run of object, or diorama text eval-detector --onnx")),
         }
     }
 }

@@ -80,6 +80,7 @@ impl Verb for Render {
             of @ Application::Relight => Err(of.refuse(&self.run, "diorama relight render")),
             of @ Application::RelightObject => Err(of.refuse(&self.run, "diorama relight turntable with its GLB")),
             of @ Application::Text => Err(of.refuse(&self.run, "diorama text eval, which draws its held-out views")),
+            of @ Application::Detector => Err(of.refuse(&self.run, "diorama text eval-detector --weights")),
         }
     }
 }

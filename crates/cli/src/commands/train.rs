@@ -108,6 +108,7 @@ impl Verb for Train {
             of @ Application::Relight => Err(of.refuse(&self.out, "diorama relight train --resume")),
             of @ Application::RelightObject => Err(of.refuse(&self.out, "diorama relight object --resume")),
             of @ Application::Text => Err(of.refuse(&self.out, "diorama text train --resume")),
+            of @ Application::Detector => Err(of.refuse(&self.out, "diorama text train-detector --resume")),
         }
     }
 }

@@ -143,6 +143,7 @@ fn source(a: &View) -> Result<Source> {
             Application::Relight => scene(a),
             of @ Application::RelightObject => Err(of.refuse(&a.path, "the GLB file that diorama relight object wrote")),
             of @ Application::Text => Err(of.refuse(&a.path, "diorama text eval, which draws its held-out views")),
+            of @ Application::Detector => Err(of.refuse(&a.path, "diorama text eval-detector --weights")),
         };
     }
     let capture = import::import(&a.path, &ImportOptions { min_views: 1, allow_broken: true, ..ImportOptions::default() })?;

@@ -136,6 +136,23 @@ pub fn count(format: Format, text: &str) -> std::result::Result<usize, String> {
     Ok(said_in(format, Path::new("gt_0.txt"), text)?.iter().map(|i| i.regions.len()).sum())
 }
 
+/// Regions of one file of a format that has a file per image, in their order; ids count them from 0.
+///
+/// # Errors
+/// With file and line, when something is not of the format or a polygon is not simple.
+pub fn read_image(format: Format, file: &Path) -> Result<Vec<LabelledRegion>> {
+    let bytes = read(file, LIMIT)?;
+    let wrong = |e: String| DataError::input(file, e);
+    let image = super::utf8(&bytes).and_then(|text| lines(format, file, text)).map_err(wrong)?;
+    let of = |(id, r): (usize, ParsedRegion)| {
+        check_polygon(&r.polygon).map_err(|e| wrong(format!("{}: {e}", r.at)))?;
+        let is_read = r.transcription != UNREADABLE && !r.transcription.is_empty();
+        let (polygon, transcription) = (clockwise(r.polygon), if is_read { r.transcription } else { UNREADABLE.into() });
+        Ok(LabelledRegion { id: id as u32, polygon, transcription, script: r.script, kind: Kind::Text, ignore: !is_read })
+    };
+    image.regions.into_iter().enumerate().map(of).collect()
+}
+
 /// What a file says.
 fn said_in(format: Format, file: &Path, text: &str) -> std::result::Result<Vec<ParsedImage>, String> {
     match format {

@@ -4,6 +4,7 @@
 //! Polygons are in pixels, clockwise from the upper left in reading order; one `id` is the same region in all images. The transcription
 //! `###` means that nobody can read it.
 
+pub mod detector_set;
 mod formats;
 
 use crate::atomic;
@@ -12,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::Path;
 
-pub use formats::{Format, Known, count, import};
+pub use formats::{Format, Known, count, import, read_image};
 
 /// Transcription of what is not to be read.
 pub const UNREADABLE: &str = "###";

@@ -18,6 +18,8 @@ use std::path::Path;
 
 /// Largest file that is read, in bytes.
 const LIMIT: u64 = 8 << 30;
+/// Largest header of a safetensors file, as the format has it.
+const HEADER_LIMIT: u64 = 100 << 20;
 
 /// Reads the floating-point tensors whose names `wanted` accepts, in the file's order, as f32.
 ///
@@ -61,6 +63,29 @@ fn from_safetensors(path: &Path, wanted: &dyn Fn(&str) -> bool) -> std::result::
         out.push(NamedArray { name: name.into(), shape: t.shape().to_vec(), values: kind.values(t.data()) });
     }
     Ok(out)
+}
+
+/// Texts that a safetensors file holds beside its tensors; none of a file of PyTorch's.
+///
+/// # Errors
+/// If the file cannot be read.
+pub fn metadata(path: &Path) -> Result<HashMap<String, String>> {
+    let mut file = File::open(path).map_err(DataError::io(path, "read"))?;
+    let size = file.metadata().map_err(DataError::io(path, "read"))?.len();
+    let mut length = [0; 8];
+    if size < 8 {
+        return Ok(HashMap::new());
+    }
+    file.read_exact(&mut length).map_err(DataError::io(path, "read"))?;
+    let length = u64::from_le_bytes(length);
+    if length > HEADER_LIMIT.min(size - 8) {
+        return Ok(HashMap::new());
+    }
+    let mut head = Vec::new();
+    file.take(length).read_to_end(&mut head).map_err(DataError::io(path, "read"))?;
+    let header: Option<serde_json::Value> = serde_json::from_slice(&head).ok();
+    let texts = header.and_then(|mut h| h.get_mut("__metadata__").map(serde_json::Value::take));
+    Ok(texts.and_then(|t| serde_json::from_value(t).ok()).unwrap_or_default())
 }
 
 /// Writes arrays as safetensors, with text in its metadata. The file appears complete or not at all.

@@ -163,3 +163,19 @@ fn hostile_files_get_one_line_and_no_memory() {
     std::fs::write(&path, claims).unwrap();
     assert!(read(&path, &|_| true).unwrap_err().to_string().contains("larger than the file"));
 }
+
+#[test]
+fn texts_beside_the_tensors_are_read_and_other_files_have_none() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.safetensors");
+    let texts = HashMap::from([("model".to_string(), "db".to_string())]);
+    save(&path, &[NamedArray::new("w", &[2], vec![1.0, 2.0])], texts.clone()).unwrap();
+    assert_eq!(metadata(&path).unwrap(), texts);
+    save(&path, &[NamedArray::new("w", &[1], vec![1.0])], HashMap::new()).unwrap();
+    assert!(metadata(&path).unwrap().is_empty() && metadata(&sample("small.pth")).unwrap().is_empty());
+    for bytes in [&b""[..], b"\xff\xff\xff\xff\xff\xff\xff\xff{}", b"\x02\0\0\0\0\0\0\0{]"] {
+        std::fs::write(&path, bytes).unwrap();
+        assert!(metadata(&path).unwrap().is_empty());
+    }
+    assert!(metadata(&dir.path().join("none")).is_err());
+}

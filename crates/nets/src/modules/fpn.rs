@@ -10,15 +10,20 @@ use burn::tensor::Tensor;
 /// A feature pyramid over four strides.
 #[derive(Debug)]
 pub struct Fpn {
-    inner: Vec<Conv2d>,
-    layer: Vec<Conv2d>,
+    pub(super) inner: Vec<Conv2d>,
+    pub(super) layer: Vec<Conv2d>,
 }
 
 impl Fpn {
     pub fn new(init: &mut Init, channels: [usize; 4], out: usize) -> Fpn {
-        let inner = channels.iter().map(|c| Conv2d::new(init, [*c, out], 1, Conv::default())).collect();
-        let layer = channels.iter().map(|_| Conv2d::new(init, [out, out], 3, Conv::same(3))).collect();
-        Fpn { inner, layer }
+        Fpn::narrowing(init, channels, out, out)
+    }
+
+    /// A pyramid whose levels are summed at `inner` channels and given at `out`.
+    pub fn narrowing(init: &mut Init, channels: [usize; 4], inner: usize, out: usize) -> Fpn {
+        let summed = channels.iter().map(|c| Conv2d::new(init, [*c, inner], 1, Conv::default())).collect();
+        let layer = channels.iter().map(|_| Conv2d::new(init, [inner, out], 3, Conv::same(3))).collect();
+        Fpn { inner: summed, layer }
     }
 
     /// The pyramid, finest first.

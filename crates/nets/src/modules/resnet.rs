@@ -4,7 +4,7 @@ use crate::bridge::OpError;
 use crate::layers::{BatchNorm, Conv2d, Init, Linear};
 use crate::ops::{self, Activation, Conv, Pool};
 use crate::param::{Mode, Module, Visitor};
-use burn::tensor::Tensor;
+use burn::tensor::{Tensor, TensorData};
 
 /// Size of a residual network.
 #[derive(Clone, Copy, Debug)]
@@ -20,6 +20,8 @@ pub struct ResNetSettings {
 
 impl ResNetSettings {
     pub const RESNET_18: ResNetSettings = ResNetSettings { blocks: [2; 4], bottleneck: false, width: 64, classes: None };
+    /// Backbone of small detectors: a block per stage, 16 to 128 channels, 0.31 M weights.
+    pub const TINY: ResNetSettings = ResNetSettings { blocks: [1; 4], bottleneck: false, width: 16, classes: None };
     pub const RESNET_50: ResNetSettings = ResNetSettings { blocks: [3, 4, 6, 3], bottleneck: true, width: 64, classes: None };
 
     /// Channels of the features at each stride.
@@ -28,29 +30,50 @@ impl ResNetSettings {
     }
 }
 
+/// Mean and standard deviation of the channels of ImageNet's photographs (sRGB from 0 to 1), on which backbones are trained elsewhere.
+pub(super) const IMAGENET: [[f32; 3]; 2] = [[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]];
+
+/// Images whose channels have mean 0 and variance 1 over many photographs.
+///
+/// # Shapes
+/// x `[N, 3, H, W]`.
+pub(super) fn normalized(x: Tensor<4>) -> Tensor<4> {
+    let device = x.device();
+    let [mean, deviation] = IMAGENET.map(|v| Tensor::<4>::from_data(TensorData::new(v.to_vec(), [1, 3, 1, 1]), &device));
+    (x - mean) / deviation
+}
+
 /// A convolution without bias and its normalization.
 #[derive(Debug)]
-struct Normed {
-    conv: Conv2d,
-    norm: BatchNorm,
+pub(super) struct Normed {
+    pub(super) conv: Conv2d,
+    pub(super) norm: BatchNorm,
 }
 
 impl Normed {
-    fn new(init: &mut Init, channels: [usize; 2], kernel: usize, stride: usize, activation: Activation) -> Normed {
+    pub(super) fn new(init: &mut Init, channels: [usize; 2], kernel: usize, stride: usize, activation: Activation) -> Normed {
         let conv = Conv2d::new(init, channels, kernel, Conv::same(kernel).stride(stride)).without_bias();
         Normed { conv, norm: BatchNorm::new(init, channels[1], activation) }
     }
 
-    fn forward(&self, x: Tensor<4>, mode: Mode) -> Result<Tensor<4>, OpError> {
+    pub(super) fn forward(&self, x: Tensor<4>, mode: Mode) -> Result<Tensor<4>, OpError> {
         self.norm.forward(self.conv.forward(x, mode)?, mode)
+    }
+}
+
+/// Named by their places, as in PyTorch's `Sequential`.
+impl Module for Normed {
+    fn visit(&self, v: &mut Visitor) {
+        v.part("0", &self.conv);
+        v.part("1", &self.norm);
     }
 }
 
 /// Two or three convolutions around which the input is added.
 #[derive(Debug)]
-struct Block {
-    parts: Vec<Normed>,
-    downsample: Option<Normed>,
+pub(super) struct Block {
+    pub(super) parts: Vec<Normed>,
+    pub(super) downsample: Option<Normed>,
 }
 
 impl Block {
@@ -99,8 +122,8 @@ pub type Features = [Tensor<4>; 4];
 /// A residual network.
 #[derive(Debug)]
 pub struct ResNet {
-    stem: Normed,
-    layers: [Vec<Block>; 4],
+    pub(super) stem: Normed,
+    pub(super) layers: [Vec<Block>; 4],
     head: Option<Linear>,
 }
 

@@ -13,10 +13,10 @@ use diorama_testkit::{compare_proven, wide};
 /// Of the root mean square, as everywhere.
 const TOLERANCE: f64 = 1e-4;
 
-struct Fixture(Vec<NamedArray>);
+pub(super) struct Fixture(Vec<NamedArray>);
 
 impl Fixture {
-    fn read(name: &str) -> Fixture {
+    pub(super) fn read(name: &str) -> Fixture {
         let path = format!("{}/tests/data/{name}.safetensors", env!("CARGO_MANIFEST_DIR"));
         let bytes = std::fs::read(path).unwrap();
         let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
@@ -28,25 +28,25 @@ impl Fixture {
         self.0.iter().find(|a| a.name == name).unwrap_or_else(|| panic!("{name} is missing"))
     }
 
-    fn tensor<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
+    pub(super) fn tensor<const D: usize>(&self, name: &str, device: &Device) -> Tensor<D> {
         let a = self.get(name);
         let shape: [usize; D] = a.shape[..].try_into().unwrap();
         Tensor::from_data(TensorData::new(a.values.clone(), shape), device)
     }
 
-    fn load(&self, net: &dyn Module, map: &KeyMap) {
+    pub(super) fn load(&self, net: &dyn Module, map: &KeyMap) {
         let of = |a: &NamedArray| Some(NamedArray { name: a.name.strip_prefix("net.")?.to_string(), ..a.clone() });
         let arrays: Vec<NamedArray> = self.0.iter().filter_map(of).collect();
         load(net, &arrays, map, Strictness::Exact).unwrap();
     }
 
-    fn check(&self, name: &str, got: Tensor<4>) {
+    pub(super) fn check(&self, name: &str, got: Tensor<4>) {
         let want = self.get(name);
         assert_eq!(got.dims()[..], want.shape[..], "{name}");
         self.check_values(name, &crate::read_values(got));
     }
 
-    fn check_values(&self, name: &str, got: &[f32]) {
+    pub(super) fn check_values(&self, name: &str, got: &[f32]) {
         if let Err(e) = compare_proven(got, &wide(&self.get(name).values), TOLERANCE) {
             panic!("{name}: {e}");
         }

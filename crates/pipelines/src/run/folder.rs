@@ -132,20 +132,38 @@ impl RunFolder {
     /// # Errors
     /// When a file cannot be written.
     pub fn write_description<C: Configuration>(&self, config: &C, capture: &Capture) -> Result<()> {
-        let results = [metrics::NAME, EVENTS, "curves.svg", "curves.png", summary::NAME];
-        for name in [description::NAME, kept_capture::NAME, "command.txt"].into_iter().chain(results) {
-            let _ = std::fs::remove_file(self.path.join(name));
-        }
-        let _ = std::fs::remove_dir_all(self.checkpoints());
+        self.clear();
         let mut config = config.clone();
         if let Some(data) = config.data_set() {
             kept_capture::write(&self.path, data, capture)?;
             // The run may be looked at from another folder.
             *data = absolute(data);
         }
+        self.write_configuration(&config)
+    }
+
+    /// As [`RunFolder::write_description`], for a run without a capture.
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub fn begin<C: Configuration>(&self, config: &C) -> Result<()> {
+        self.clear();
+        self.write_configuration(config)
+    }
+
+    /// Removes an earlier run.
+    fn clear(&self) {
+        let results = [metrics::NAME, EVENTS, "curves.svg", "curves.png", summary::NAME];
+        for name in [description::NAME, kept_capture::NAME, "command.txt"].into_iter().chain(results) {
+            let _ = std::fs::remove_file(self.path.join(name));
+        }
+        let _ = std::fs::remove_dir_all(self.checkpoints());
+    }
+
+    fn write_configuration<C: Configuration>(&self, config: &C) -> Result<()> {
         let command: Vec<String> = std::env::args().collect();
         atomic::write(&self.path.join("command.txt"), format!("{}\n", command.join(" ")).as_bytes())?;
-        atomic::write(&self.path.join(description::NAME), config::to_toml(&config).as_bytes())?;
+        atomic::write(&self.path.join(description::NAME), config::to_toml(config).as_bytes())?;
         Ok(())
     }
 

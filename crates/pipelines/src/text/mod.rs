@@ -4,6 +4,7 @@
 
 pub mod annotate;
 pub mod camera;
+pub mod detectors;
 pub mod edit;
 pub mod field;
 pub mod label;

@@ -36,7 +36,7 @@ impl Source<'_> {
             Application::Object => None,
             of @ Application::Relight => Some((of, "diorama relight mesh")),
             of @ Application::RelightObject => Some((of, "diorama relight object --resume, which writes the GLB again")),
-            of @ Application::Text => Some((of, "a run of object")),
+            of @ (Application::Text | Application::Detector) => Some((of, "a run of object")),
         };
         if let Some((of, instead)) = instead {
             return Err(of.refuse(self.run, instead));

@@ -3,11 +3,13 @@
 mod annotate;
 mod edit;
 mod eval;
+mod eval_detector;
 mod label;
 mod make_scenes;
 mod prior;
 mod synth;
 mod train;
+mod train_detector;
 
 use super::Verb;
 use clap::Subcommand;
@@ -19,11 +21,13 @@ pub enum Text {
     Edit(edit::Edit),
     Eval(eval::Eval),
     Label(label::Label),
+    EvalDetector(eval_detector::EvalDetector),
     MakeScenes(make_scenes::MakeScenes),
     Merge(synth::Merge),
     Prior(prior::PriorCommand),
     Synth(synth::Synth),
     Train(train::Train),
+    TrainDetector(train_detector::TrainDetector),
 }
 
 impl Text {
@@ -34,11 +38,13 @@ impl Text {
             Text::Edit(v) => v,
             Text::Eval(v) => v,
             Text::Label(v) => v,
+            Text::EvalDetector(v) => v,
             Text::MakeScenes(v) => v,
             Text::Merge(v) => v,
             Text::Prior(v) => v,
             Text::Synth(v) => v,
             Text::Train(v) => v,
+            Text::TrainDetector(v) => v,
         }
     }
 }

@@ -11,6 +11,7 @@ pub use cloud::cleaned;
 pub use fit::{Kind, Surface, fit};
 pub use reading::outlined;
 pub use rectangle::{Rectangle, plane_rectangle, rectangle};
+pub(in crate::text) use rectangle::{hull, smallest};
 pub(in crate::text) use smoothing::principal;
 pub use smoothing::smoothed;
 

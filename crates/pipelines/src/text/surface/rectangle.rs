@@ -161,7 +161,7 @@ pub(super) fn bends(surface: &Surface) -> DMat2 {
 }
 
 /// Convex hull, counterclockwise (Andrew's monotone chain).
-fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
+pub(in crate::text) fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
     points.sort_by(|a, b| a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y)));
     let half = |points: &mut dyn Iterator<Item = DVec2>| {
         let mut out: Vec<DVec2> = Vec::new();
@@ -184,7 +184,7 @@ fn hull(mut points: Vec<DVec2>) -> Vec<DVec2> {
 }
 
 /// The direction of a side of the smallest rectangle around a hull, which lies along one of its edges, with its bounds along and across.
-fn smallest(hull: &[DVec2]) -> (DVec2, DVec2, DVec2) {
+pub(in crate::text) fn smallest(hull: &[DVec2]) -> (DVec2, DVec2, DVec2) {
     let bounds = |axis: DVec2| {
         let own = |p: &DVec2| dvec2(p.dot(axis), p.dot(dvec2(-axis.y, axis.x)));
         let (low, high) = (hull.iter().map(own).reduce(DVec2::min), hull.iter().map(own).reduce(DVec2::max));
