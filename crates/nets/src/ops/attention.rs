@@ -56,7 +56,10 @@ impl SliceOp for AttentionOp {
         let a = self.attention(q.shape(), k.shape());
         let saved = cpu::Saved { q, k, v, out, log_sums: logs, d_out: d };
         let [mut dq, mut dk, mut dv] = [q, k, v].map(|t| ValuesMut::any(t.shape()));
-        SCRATCH.with_borrow_mut(|scratch| cpu::backward(&a, &saved, &mut dq, &mut dk, &mut dv, scratch));
+        // Taken, not borrowed: while this waits for the pool, its thread may run another backward pass.
+        let mut scratch = SCRATCH.take();
+        cpu::backward(&a, &saved, &mut dq, &mut dk, &mut dv, &mut scratch);
+        SCRATCH.set(scratch);
         vec![Some(dq.freeze()), Some(dk.freeze()), Some(dv.freeze())]
     }
 

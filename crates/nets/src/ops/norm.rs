@@ -113,7 +113,10 @@ impl SliceOp for NormOp {
         let mut dx = ValuesMut::any(x.shape());
         let (mut ds, mut dt) = (ValuesMut::any(scale.shape()), ValuesMut::any(shift.shape()));
         let gradients = cpu::Gradients { x: &mut dx, scale: &mut ds, shift: &mut dt };
-        SCRATCH.with_borrow_mut(|scratch| cpu::backward(&norm, x, mean, variance, d, gradients, scratch));
+        // Taken, not borrowed: while this waits for the pool, its thread may run another backward pass.
+        let mut scratch = SCRATCH.take();
+        cpu::backward(&norm, x, mean, variance, d, gradients, &mut scratch);
+        SCRATCH.set(scratch);
         let mut all = vec![Some(dx.freeze()), Some(ds.freeze()), Some(dt.freeze())];
         all.resize(wanted.len(), None);
         all
@@ -214,7 +217,10 @@ impl SliceOp for LayerNormOp {
         let mut dx = ValuesMut::any(x.shape());
         let (mut ds, mut dt) = (ValuesMut::any(scale.shape()), ValuesMut::any(shift.shape()));
         let gradients = cpu::Gradients { x: &mut dx, scale: &mut ds, shift: &mut dt };
-        SCRATCH.with_borrow_mut(|scratch| layer::backward(&norm, x, mean, variance, d, gradients, scratch));
+        // Taken, not borrowed: while this waits for the pool, its thread may run another backward pass.
+        let mut scratch = SCRATCH.take();
+        layer::backward(&norm, x, mean, variance, d, gradients, &mut scratch);
+        SCRATCH.set(scratch);
         vec![Some(dx.freeze()), Some(ds.freeze()), Some(dt.freeze())]
     }
 

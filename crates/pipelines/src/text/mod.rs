@@ -12,10 +12,13 @@ pub mod lettering;
 pub mod make_scenes;
 pub mod placed;
 pub mod pose_clusters;
+pub mod quickstart;
 pub mod regions;
 pub mod retouch;
 pub mod styling;
 pub mod surface;
 pub mod synth;
 pub mod truth;
+#[cfg(test)]
+mod whole_tests;
 mod words;

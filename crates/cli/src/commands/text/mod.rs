@@ -7,6 +7,7 @@ mod eval_detector;
 mod label;
 mod make_scenes;
 mod prior;
+mod quickstart;
 mod synth;
 mod train;
 mod train_detector;
@@ -25,6 +26,7 @@ pub enum Text {
     MakeScenes(make_scenes::MakeScenes),
     Merge(synth::Merge),
     Prior(prior::PriorCommand),
+    Quickstart(quickstart::Quickstart),
     Synth(synth::Synth),
     Train(train::Train),
     TrainDetector(train_detector::TrainDetector),
@@ -42,6 +44,7 @@ impl Text {
             Text::MakeScenes(v) => v,
             Text::Merge(v) => v,
             Text::Prior(v) => v,
+            Text::Quickstart(v) => v,
             Text::Synth(v) => v,
             Text::Train(v) => v,
             Text::TrainDetector(v) => v,

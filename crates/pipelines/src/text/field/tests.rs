@@ -2,10 +2,7 @@ use super::config::{Config, Preset, Stage};
 use super::label_maps::{self, UNKNOWN};
 use super::losses::{LabelLoss, SceneLoss};
 use super::scores::{self, Overlap};
-use super::{model::TextModel, recipe};
-use crate::run::RunFolder;
 use crate::run::config::{self, Configuration};
-use crate::text::make_scenes::{SceneOptions, generate};
 use diorama_engine::renderers::view::View;
 use diorama_geom::glam::{DMat3, DVec3};
 use diorama_geom::{Camera, Pose};
@@ -13,11 +10,7 @@ use diorama_kernels::ops::field_step::{BatchLoss, RayGradients, RayOutputs};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use diorama_kernels::ops::s3im::{self, Tile};
 use diorama_testkit::random;
-use std::path::Path;
 use std::sync::Mutex;
-use std::sync::atomic::AtomicBool;
-
-static ON: AtomicBool = AtomicBool::new(false);
 
 /// Compares a loss's gradients of colors and opacities with differences.
 fn check_gradients(loss: &dyn BatchLoss, channels: usize, values: &[f32], opacity: &[f32], at: &[usize]) {
@@ -95,49 +88,6 @@ fn the_overlap_is_the_mean_of_the_text_classes_that_occur() {
     assert_eq!(o.mean(), Some(0.5));
     assert_eq!(Overlap::new(3).mean(), None);
     assert_eq!(scores::classes(&[0.1, 0.7, 0.2, 0.5, 0.1, 0.4], 3), [1, 0]);
-}
-
-/// A generated scene and a configuration that trains on it.
-fn scene(folder: &Path) -> Config {
-    let options = SceneOptions {
-        families: vec!["shelf".into()],
-        scenes: 1,
-        views: 14,
-        boards: [2; 2],
-        size: (96, 72),
-        samples: 8,
-        ..SceneOptions::named("ci").unwrap()
-    };
-    let made = generate(folder, &options, false, &ON, &mut |_| ()).unwrap();
-    let data = folder.join(&made.scenes[0]);
-    let mut config = Config::new(Preset::Ci, data);
-    config.device = "cpu".into();
-    config.run.steps = 320;
-    config
-}
-
-fn judge(model: &TextModel) -> scores::Scores {
-    let mut seen = 0;
-    let s = scores::evaluate(model, &mut |_, sheet| {
-        assert_eq!((sheet.width, sheet.height), (4 * 96, 72));
-        seen += 1;
-        Ok(())
-    });
-    assert_eq!(seen, 2);
-    s.unwrap()
-}
-
-#[test]
-fn a_scene_and_its_classes_are_learned_from_two_labelled_photographs() {
-    let folder = tempfile::tempdir().unwrap();
-    let config = scene(folder.path());
-    let mut run = RunFolder::create(&folder.path().join("run"), false).unwrap();
-    let trained = recipe::train(&config, &mut run, false, &ON, &mut |_| ()).unwrap();
-    let s = judge(&trained.model);
-    // Words of three pixels after 80 steps; a head that has learned nothing has 0.
-    assert!(s.psnr > 20.0 && s.ssim > 0.6 && s.miou.is_some_and(|m| m > 0.1), "{s:?}");
-    let (again, _) = recipe::load(&folder.path().join("run"), None).unwrap();
-    assert_eq!(judge(&again), s, "what was saved is what was trained");
 }
 
 /// A camera at `x` that looks at the plane z = 2 along z, and its exact view.

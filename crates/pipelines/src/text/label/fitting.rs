@@ -98,11 +98,19 @@ fn rectangle(cloud: &Cloud, outlines: &[Outline], options: FitOptions) -> Result
         _ => by_points(),
     };
     let share = fitted.rms / out.reading_size().y;
-    if share > MOST_RESIDUAL {
+    // Photographs do not tell depth more finely than their pixels.
+    if share > MOST_RESIDUAL && fitted.rms > pixel(&out, outlines) {
         let percent = 100.0 * share;
         return Err(format!("not a surface: its points deviate by {percent:.0} % of its height; its polygons are kept view by view"));
     }
     Ok(out)
+}
+
+/// Length on a rectangle of a pixel of the nearest labelled photograph.
+fn pixel(rectangle: &Rectangle, outlines: &[Outline]) -> f64 {
+    let middle = rectangle.reading_point(DVec2::ZERO);
+    let of = |(frame, _): &Outline| frame.world_from_camera.translation.distance(middle) / frame.camera.fx;
+    outlines.iter().map(of).fold(f64::INFINITY, f64::min)
 }
 
 /// Distance before a region's surface from which on matter is the surface's own: the least at which photographs whose labels say that it can

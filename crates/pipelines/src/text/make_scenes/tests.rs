@@ -14,6 +14,8 @@ fn small(families: &[&str], boards: usize) -> SceneOptions {
         boards: [boards; 2],
         size: (160, 120),
         samples: 4,
+        words: 2,
+        closer: 0.0,
         ..SceneOptions::named("ci").unwrap()
     }
 }

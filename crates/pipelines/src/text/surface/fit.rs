@@ -13,10 +13,13 @@ const ITERATIONS: usize = 30;
 /// Share of the plane's error that a quadric may have, and points that it needs, to be chosen.
 const BETTER: f64 = 0.7;
 const QUADRIC_POINTS: usize = 200;
-/// Height of a quadric over its plane at the points' extent, over that extent, below which it is noise of a plane.
+/// Height of a quadric over its plane at the points' extent along an axis, over that extent and over its error, below which it is noise of a plane.
 const LEAST_BEND: f64 = 0.06;
+const LEAST_HEIGHT: f64 = 3.0;
 /// Cosine between the normals of least orthogonal and least viewed distances below which the latter holds.
 const DIFFERENT: f64 = 0.94;
+/// Variance of points across their plane over that along its shorter direction from which on depths' errors are not small.
+const THICK: f64 = 0.02;
 /// Newton's steps to a foot point.
 const FOOT_STEPS: usize = 8;
 /// Share of the extent below which an error is none.
@@ -91,10 +94,16 @@ impl Surface {
         (at, (x - foot).length() * (x.z - foot.z).signum())
     }
 
-    /// Half of the largest curvature at the origin: the height at a distance over its square.
-    fn bend(&self) -> f64 {
-        let [a, b, c, ..] = self.height;
-        0.5 * (a + c).abs() + 0.5 * ((a - c).powi(2) + b * b).sqrt()
+    /// Whether its bend along an axis is more than noise makes it over the points' extent.
+    fn is_bent(&self, points: &[DVec3]) -> bool {
+        let axes = [self.world_from_local.x_axis, self.world_from_local.y_axis];
+        let extents =
+            axes.map(|axis| (points.iter().map(|p| (*p - self.origin).dot(axis).powi(2)).sum::<f64>() / points.len() as f64).sqrt());
+        let is_bent = |k: usize| {
+            let height = self.height[2 * k].abs() * extents[k].powi(2);
+            height > LEAST_BEND * extents[k] && height > LEAST_HEIGHT * self.rms
+        };
+        is_bent(0) || is_bent(1)
     }
 
     fn distances(&self, points: &[DVec3]) -> Vec<f64> {
@@ -129,7 +138,7 @@ pub fn fit(points: &[DVec3], toward: DVec3, wanted: Wanted) -> Result<Surface, N
     }
     let quadric = quadric(points, plane, extent);
     // Both judged alike: by the distances that each holds for its own.
-    let is_better = quadric.rms <= BETTER * plane.rms && plane.rms > EXACT * extent && quadric.bend() * extent > LEAST_BEND;
+    let is_better = quadric.rms <= BETTER * plane.rms && plane.rms > EXACT * extent && quadric.is_bent(points);
     Ok(if wanted == Wanted::Quadric || is_better { quadric } else { plane })
 }
 
@@ -173,7 +182,7 @@ fn plane(points: &[DVec3], toward: DVec3) -> Result<(Surface, f64), NoSurface> {
         }
         let mut normal = axes.x_axis * if axes.x_axis.dot(toward) < 0.0 { -1.0 } else { 1.0 };
         let mut u = axes.z_axis;
-        if normal.dot(viewed) < DIFFERENT {
+        if normal.dot(viewed) < DIFFERENT || values.x > THICK * values.y {
             (normal, u) = (viewed, (u - viewed * u.dot(viewed)).try_normalize().unwrap_or(viewed.any_orthonormal_vector()));
         }
         let mut surface = Surface {

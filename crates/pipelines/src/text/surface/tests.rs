@@ -151,3 +151,66 @@ fn too_few_points_and_lines_have_no_surface() {
     let line: Vec<DVec3> = (0..100).map(|i| board.at(0.01 * i as f64, 0.0, 0.0)).collect();
     assert_eq!(fit(&line, board.toward(), Wanted::Auto), Err(NoSurface::Line));
 }
+
+#[test]
+fn reading_coordinates_invert_and_rays_meet_where_they_should() {
+    for radius in [None, Some(0.6)] {
+        for size in [[0.7, 0.3], [0.2, 0.6]] {
+            let board = Board::new(size, radius);
+            let points = board.points(6000, 0.0);
+            let surface = fit(&points, board.toward(), if radius.is_some() { Wanted::Quadric } else { Wanted::Plane }).unwrap();
+            let r = rectangle(&surface, &points, Some(board.world_from_board.x_axis), DVec3::Z);
+            assert!((r.reading_size().x / size[0] - 1.0).abs() < 0.02 && (r.reading_size().y / size[1] - 1.0).abs() < 0.02);
+            let frame = r.reading_frame(dvec2(0.0, 0.0));
+            assert!(degrees(frame.x_axis, board.world_from_board.x_axis) < 1.0 && degrees(frame.z_axis, board.toward()) < 1.0);
+            let eye = board.at(0.3, 0.2, 2.0);
+            for at in [dvec2(0.0, 0.0), dvec2(0.06, -0.1), dvec2(-0.09, 0.12)] {
+                let point = r.reading_point(at);
+                let (t, got) = r.hit(eye, (point - eye).normalize(), 0.0).unwrap();
+                assert!((got - at).length() < 1e-6 && (t - point.distance(eye)).abs() < 1e-6, "{got} {at}");
+            }
+            let beyond = r.reading_point(dvec2(0.7 * size[0], 0.0));
+            assert!(r.hit(eye, beyond - eye, 0.0).is_none() && r.hit(eye, beyond - eye, 0.3 * size[0]).is_some());
+            assert!(r.hit(eye, eye - beyond, 1.0).is_none(), "it is not behind the eye");
+            let [low, high] = r.facing(eye).unwrap();
+            assert!((high - low) / r.reading_size().x > 0.9 && r.facing(board.at(0.0, 0.0, -2.0)).is_none());
+        }
+    }
+}
+
+#[test]
+fn outlines_give_back_the_rectangle_that_they_were_drawn_around() {
+    for (size, radius) in [([0.8, 0.25], None), ([0.3, 0.5], None), ([0.6, 0.3], Some(0.6))] {
+        let board = Board::new(size, radius);
+        let points = board.points(6000, 0.0);
+        let surface = fit(&points, board.toward(), Wanted::Auto).unwrap();
+        let [x, y] = size.map(|v| 0.5 * v);
+        let along = |y: f64, from: f64| (0..5).map(move |k| (from * (1.0 - 0.5 * k as f64), y));
+        let outline: Vec<(f64, f64)> =
+            if radius.is_some() { along(y, -x).chain(along(-y, x)).collect() } else { vec![(-x, y), (x, y), (x, -y), (-x, -y)] };
+        let places = outline.iter().map(|(x, y)| surface.nearest(board.at(*x, *y, 0.0)).0).collect::<Vec<_>>();
+        let r = outlined(&surface, &[places.clone(), places]).unwrap();
+        assert!((r.reading_size().x - size[0]).abs() < 0.01 && (r.reading_size().y - size[1]).abs() < 0.01, "{:?}", r.reading_size());
+        let expected = [(-x, y), (x, y), (x, -y), (-x, -y)].map(|(x, y)| board.at(x, y, 0.0));
+        let got = r.reading_corners().map(|c| r.reading_point(c));
+        assert!(got.iter().zip(expected).all(|(a, b)| (*a - b).length() < 0.02), "{got:?} {expected:?}");
+    }
+    let flat = fit(&Board::new(FLAT, None).points(500, 0.0), DVec3::Z, Wanted::Plane).unwrap();
+    assert!(outlined(&flat, &[vec![dvec2(0.0, 0.0); 3]]).is_none() && outlined(&flat, &[]).is_none());
+}
+
+#[test]
+fn depths_that_err_by_more_than_a_region_is_high_do_not_turn_its_plane_edge_on() {
+    let board = Board::new([0.8, 0.06], None);
+    let rng = Rng::new(9, 9);
+    // Seen from the front, each point is off along the view; a fifth by much.
+    let points: Vec<DVec3> = board
+        .points(3000, 0.0)
+        .into_iter()
+        .enumerate()
+        .map(|(i, p)| p + board.toward() * rng.normal(i as u64) as f64 * if i % 5 == 0 { 0.4 } else { 0.04 })
+        .collect();
+    let surface = fit(&points, board.toward(), Wanted::Auto).unwrap();
+    assert_eq!(surface.kind, Kind::Plane);
+    assert!(degrees(surface.normal(dvec2(0.0, 0.0)), board.toward()) < 8.0, "{}", degrees(surface.normal(dvec2(0.0, 0.0)), board.toward()));
+}

@@ -52,3 +52,56 @@ pub fn misfit_px(word: &OnSurface, label: &SetWord, glyphs: &Image, (camera, pos
     };
     Some((0..4).map(|k| grown(k).distance(DVec2::from(label.quad[k]))).fold(0.0, f64::max))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::surface::{self, Rectangle, Wanted};
+    use super::*;
+    use diorama_geom::glam::{DMat3, DVec3};
+
+    /// A rectangle of 1 × 0.25 at z = 3 before a camera that looks along z, and glyphs that fill `bounds` of it.
+    fn case(bounds: [DVec2; 2]) -> (Rectangle, Image, Camera, Pose) {
+        let camera = Camera::pinhole(160, 120, 0.8);
+        let pose = Pose { rotation: DMat3::IDENTITY, translation: DVec3::ZERO };
+        let points: Vec<DVec3> =
+            (0..400).map(|i| DVec3::new(((i % 20) as f64 - 9.5) / 19.0, ((i / 20) as f64 - 9.5) / 76.0, 3.0)).collect();
+        let surface = surface::fit(&points, -DVec3::Z, Wanted::Plane).unwrap();
+        let rectangle = surface::rectangle(&surface, &points, Some(DVec3::X), -DVec3::Y);
+        let mut glyphs = Image::zeros(160, 120, 1);
+        for i in 0..160 * 120 {
+            let direction = camera.direction((i % 160) as f64 + 0.5, (i / 160) as f64 + 0.5);
+            let at = rectangle.hit(DVec3::ZERO, direction, 1.0).map(|h| h.1);
+            let inside = at.is_some_and(|p| p.cmpge(bounds[0]).all() && p.cmple(bounds[1]).all());
+            glyphs.data[i] = inside as u8 as f32;
+        }
+        (rectangle, glyphs, camera, pose)
+    }
+
+    #[test]
+    fn labels_are_as_far_from_the_glyphs_as_they_are_moved() {
+        let bounds = [dvec2(-0.4, -0.1), dvec2(0.4, 0.1)];
+        let (rectangle, glyphs, camera, pose) = case(bounds);
+        let word = OnSurface { rectangle: &rectangle, bounds, id: 0, transcription: "A", script: None, front: 0.0, characters: &[] };
+        let label = |by: f64| {
+            let seen = in_view::seen(&rectangle, bounds, &camera, &pose).unwrap();
+            SetWord {
+                id: 0,
+                quad: seen.quad.map(|p| [p[0] + by, p[1]]),
+                polygon: seen.quad.to_vec(),
+                transcription: "A".into(),
+                script: None,
+                ignore: false,
+                visibility: 1.0,
+                pose: None,
+                cluster: None,
+                characters: Vec::new(),
+            }
+        };
+        let off = |by: f64| misfit_px(&word, &label(by), &glyphs, (&camera, &pose)).unwrap();
+        assert!(off(0.0) < 0.8, "{}", off(0.0));
+        assert!((off(3.0) - 3.0).abs() < 0.9 && off(3.0) > 2.0, "{}", off(3.0));
+        let hidden = SetWord { visibility: 0.9, ..label(0.0) };
+        assert!(misfit_px(&word, &hidden, &glyphs, (&camera, &pose)).is_none());
+        assert!(misfit_px(&word, &label(0.0), &Image::zeros(160, 120, 1), (&camera, &pose)).is_none());
+    }
+}

@@ -1,0 +1,79 @@
+//! `diorama text quickstart`
+
+use crate::commands::process::{INTERRUPT, note, use_threads, watch_interrupts};
+use crate::commands::{Outcome, Verb};
+use crate::terminal::{Progress, ShareShown};
+use clap::Args;
+use diorama_data::DataError;
+use diorama_pipelines::Result;
+use diorama_pipelines::text::quickstart::{self, Listeners, QuickstartOptions};
+use std::cell::RefCell;
+use std::path::PathBuf;
+
+/// Run every step on a room with signs that the program generates itself
+#[derive(Args, Clone, Debug)]
+#[command(after_help = "Example:\n  diorama text quickstart -o runs/text-quickstart\n\nAfter an interruption, the same command goes on.")]
+pub struct Quickstart {
+    /// Folder for all results
+    #[arg(short, long, default_value = "runs/text-quickstart")]
+    out: PathBuf,
+    /// Begin again in place of an earlier quickstart
+    #[arg(long)]
+    force: bool,
+    /// Number of CPU threads [default: all]
+    #[arg(long)]
+    threads: Option<usize>,
+    /// Print one JSON object on stdout
+    #[arg(long)]
+    json: bool,
+}
+
+/// What marks a folder as one that a quickstart made.
+const MARK: &str = "scenes";
+
+impl Verb for Quickstart {
+    fn json(&self) -> bool {
+        self.json
+    }
+
+    fn run(&self) -> Result<Outcome> {
+        use_threads(self.threads)?;
+        let is_ours = self.out.join(MARK).is_dir();
+        if self.out.is_dir() && !is_ours && self.out.read_dir().map_err(DataError::io(&self.out, "list"))?.next().is_some() {
+            return Err(DataError::input(&self.out, "is not empty and holds no quickstart; give another --out").into());
+        }
+        if self.force && is_ours {
+            std::fs::remove_dir_all(&self.out).map_err(DataError::io(&self.out, "remove"))?;
+        }
+        watch_interrupts();
+        let (mut progress, shown) = (Progress::new(), RefCell::new(ShareShown::new()));
+        let stage = RefCell::new(String::new());
+        let listeners = Listeners {
+            stage: &mut |name| {
+                shown.replace(ShareShown::new()).finish();
+                stage.replace(name.to_string());
+                eprintln!("{name}");
+            },
+            share: &mut |share| shown.borrow_mut().show(share, &format!("{}: {:.0} %", stage.borrow(), 100.0 * share)),
+            events: &mut |e| progress.event(e),
+        };
+        let made = quickstart::quickstart(&self.out, &QuickstartOptions::default(), &INTERRUPT, listeners)?;
+        shown.into_inner().finish();
+        let Some(made) = made else {
+            eprintln!("interrupted: the same command goes on");
+            return Ok(Outcome::Interrupted);
+        };
+        made.notes.iter().for_each(|n| note(n));
+        if self.json {
+            println!("{}", serde_json::to_string(&made).expect("plain values"));
+            return Ok(Outcome::Done);
+        }
+        println!("field      {:.2} dB, SSIM {:.3}, mIoU {:.3}", made.psnr, made.ssim, made.miou.unwrap_or(f64::NAN));
+        println!("labels     corners {:.2} px, poses {:.1}° off", made.corner_error_px, made.pose_error_deg);
+        println!("images     {} at {:.1}/s, {} labels more than 2 px from their glyphs", made.images, made.images_per_s, made.misfits);
+        println!("detectors  F {:.1} (DB), {:.1} (EAST) on other images of the scene", 100.0 * made.f_db, 100.0 * made.f_east);
+        println!("data set   {}", made.dataset.display());
+        println!("report     {}", made.report.display());
+        Ok(Outcome::Done)
+    }
+}

@@ -1,0 +1,242 @@
+//! Everything at once on a scene that the project generates: photographs, field, regions, edits, a data set, and detectors that it trains.
+
+mod page;
+
+use super::detectors::config::{Backbone, Config as DetectorConfig, Kind};
+use super::detectors::{judge, recipe as detection};
+use super::edit::{self, Change, EditOptions, ground::Eraser};
+use super::field::config::{Config, Preset};
+use super::field::{recipe, scores};
+use super::label::accuracy::Accuracy;
+use super::label::fitting::FitOptions;
+use super::label::{self, Cameras, LabelOptions};
+use super::make_scenes::{self, FontSource, SceneOptions};
+use super::synth::dataset::{self, Synthesized};
+use super::synth::plan::{Scenes, Shard, SynthOptions};
+use super::synth::sampling::Sampling;
+use crate::error::Result;
+use crate::run::{RunFolder, folder};
+use diorama_data::text_set::SetFormat;
+use diorama_data::{DataError, atomic, photo};
+use diorama_engine::train::Event;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+/// Size of the images, and how many are kept for judging.
+const SIZE: (u32, u32) = (160, 120);
+const JUDGED: usize = 60;
+/// Side of the windows that detectors are trained on, and the rate of EAST in so few steps.
+const CROP: usize = 128;
+const EAST_RATE: f32 = 0.003;
+
+/// How much is generated and trained.
+#[derive(Clone, Debug)]
+pub struct QuickstartOptions {
+    pub steps: Option<u64>,
+    pub words: usize,
+    pub images: usize,
+    /// Seconds of training of each detector.
+    pub detector_seconds: f64,
+}
+
+impl Default for QuickstartOptions {
+    /// Less than a quarter of an hour on two cores.
+    fn default() -> Self {
+        QuickstartOptions { steps: None, words: 8, images: 500, detector_seconds: 100.0 }
+    }
+}
+
+/// Figures, and where everything is.
+#[derive(Clone, Debug, Serialize)]
+pub struct Made {
+    pub psnr: f64,
+    pub ssim: f64,
+    pub miou: Option<f64>,
+    pub corner_error_px: f64,
+    pub pose_error_deg: f64,
+    pub images: usize,
+    pub images_per_s: f64,
+    /// Labels more than 2 pixels from their glyphs.
+    pub misfits: usize,
+    /// F by instance on images of the same scene that no detector was trained on.
+    pub f_db: f64,
+    pub f_east: f64,
+    pub dataset: PathBuf,
+    pub report: PathBuf,
+    pub notes: Vec<String>,
+}
+
+/// Receivers of progress: the name of a stage that begins, the share of it that is done, events of training.
+pub struct Listeners<'a> {
+    pub stage: &'a mut dyn FnMut(&str),
+    pub share: &'a mut dyn FnMut(f64),
+    pub events: &'a mut dyn FnMut(&Event),
+}
+
+/// Generates, trains, labels, edits, draws, trains detectors and reports into `out`; none when stopped. What is done already is kept: the same
+/// command goes on after an interruption.
+///
+/// # Errors
+/// When a stage fails, or the folder cannot be written.
+pub fn quickstart(out: &Path, o: &QuickstartOptions, stop: &AtomicBool, listeners: Listeners) -> Result<Option<Made>> {
+    std::fs::create_dir_all(out).map_err(DataError::io(out, "create"))?;
+    let Listeners { stage, share, events } = listeners;
+    let mut q = Quickstart { out, o, stop, notes: Vec::new(), share, events };
+    stage("photographing a room with two signs");
+    let Some(scene) = q.scene()? else { return Ok(None) };
+    stage("training its field, and the classes of its signs");
+    if !q.field(&scene)? {
+        return Ok(None);
+    }
+    stage("finding the signs in space");
+    let Some((field, accuracy)) = q.label()? else { return Ok(None) };
+    stage("writing other words on them");
+    if !q.edit()? {
+        return Ok(None);
+    }
+    stage("drawing labelled images");
+    let Some(made) = q.synthesize()? else { return Ok(None) };
+    stage("training a DB detector");
+    let Some(f_db) = q.detector(Kind::Db)? else { return Ok(None) };
+    stage("training an EAST detector");
+    let Some(f_east) = q.detector(Kind::East)? else { return Ok(None) };
+    let made = Made {
+        psnr: field.psnr,
+        ssim: field.ssim,
+        miou: field.miou,
+        corner_error_px: accuracy.corner_error_px,
+        pose_error_deg: accuracy.pose_error_deg,
+        images: made.images,
+        images_per_s: made.images_per_s,
+        misfits: made.misfits,
+        f_db,
+        f_east,
+        dataset: out.join("dataset"),
+        report: out.join("report.html"),
+        notes: q.notes,
+    };
+    let pictures = page::pictures(&out.join("dataset"))?;
+    photo::save_png(&out.join("labels.png"), &pictures)?;
+    atomic::write(&made.report, page::html(&made).as_bytes())?;
+    Ok(Some(made))
+}
+
+struct Quickstart<'a> {
+    out: &'a Path,
+    o: &'a QuickstartOptions,
+    stop: &'a AtomicBool,
+    notes: Vec<String>,
+    share: &'a mut dyn FnMut(f64),
+    events: &'a mut dyn FnMut(&Event),
+}
+
+impl Quickstart<'_> {
+    fn run(&self) -> PathBuf {
+        self.out.join("field")
+    }
+
+    /// The scene's folder.
+    fn scene(&mut self) -> Result<Option<PathBuf>> {
+        let options = SceneOptions { fonts: FontSource::Shipped, ..SceneOptions::named("ci")? };
+        let folder = self.out.join("scenes");
+        let made = make_scenes::generate(&folder, &options, false, self.stop, self.share)?;
+        Ok((!made.interrupted).then(|| folder.join(&made.scenes[0])))
+    }
+
+    /// Trains the field, or goes on with it; false after an interrupt.
+    fn field(&mut self, scene: &Path) -> Result<bool> {
+        let (run, mut config) = (self.run(), Config::new(Preset::Ci, scene.to_path_buf()));
+        config.device = "cpu".into();
+        self.o.steps.iter().for_each(|s| config.run.steps = *s);
+        let resume = folder::checkpoints(&run).exists();
+        let mut run = if resume { RunFolder::open(&run)?.0 } else { RunFolder::create(&run, true)? };
+        let trained = recipe::train(&config, &mut run, resume, self.stop, self.events)?;
+        Ok(!trained.summary.interrupted)
+    }
+
+    /// Scores the field and labels all photographs.
+    fn label(&mut self) -> Result<Option<(scores::Scores, Accuracy)>> {
+        let (model, _) = recipe::load(&self.run(), None)?;
+        let views = self.out.join("views");
+        std::fs::create_dir_all(&views).map_err(DataError::io(&views, "create"))?;
+        let look = &mut |name: &str, sheet: &_| {
+            let stem = Path::new(name).file_stem().unwrap_or_default().to_string_lossy();
+            Ok(photo::save_png(&views.join(format!("{stem}.png")), sheet)?)
+        };
+        let field = scores::evaluate(&model, look)?;
+        let out = self.out.join("labels");
+        let options = LabelOptions { fit: FitOptions::default(), cameras: Cameras::All, formats: vec![SetFormat::Icdar15], out };
+        let (run, share) = (self.run(), &mut *self.share);
+        let done = label::label(&run, None, &options, self.stop, &mut |s, _| share(s))?;
+        self.notes.extend(done.notes);
+        Ok((!done.interrupted).then_some((field, done.accuracy.unwrap_or_default())))
+    }
+
+    fn edit(&mut self) -> Result<bool> {
+        let options = EditOptions {
+            regions: Vec::new(),
+            change: Change::Words(self.o.words),
+            font: None,
+            eraser: Eraser::PatchMatch,
+            blend: edit::drawing::Blend::Alpha,
+            color: None,
+            seed: 0,
+        };
+        if edit::Edit::names(&self.run())?.is_empty() {
+            let (run, share) = (self.run(), &mut *self.share);
+            let done = edit::edit(&run, None, &options, self.stop, &mut |s, _| share(s))?;
+            self.notes.extend(done.notes);
+            return Ok(!done.interrupted);
+        }
+        Ok(true)
+    }
+
+    /// The data set, and one to judge detectors on.
+    fn synthesize(&mut self) -> Result<Option<Synthesized>> {
+        let scenes = Scenes::read(&self.run())?;
+        let mut first = None;
+        for (name, count, seed) in [("dataset", self.o.images, 0), ("judged", JUDGED, 1)] {
+            let options = SynthOptions {
+                count,
+                size: SIZE,
+                sampling: Sampling::Balanced,
+                clusters: 16,
+                only: Vec::new(),
+                prior: None,
+                formats: vec![SetFormat::Icdar15, SetFormat::Ppocr, SetFormat::Mmocr, SetFormat::Coco],
+                seed,
+            };
+            let share = &mut *self.share;
+            let made =
+                dataset::synthesize(&self.out.join(name), (&scenes, &options, Shard::WHOLE), false, self.stop, &mut |s, _| share(s))?;
+            if made.interrupted {
+                return Ok(None);
+            }
+            self.notes.extend(made.notes.iter().filter(|_| first.is_none()).cloned());
+            first.get_or_insert(made);
+        }
+        Ok(first)
+    }
+
+    /// Trains a detector and judges it; F by instance.
+    fn detector(&mut self, kind: Kind) -> Result<Option<f64>> {
+        let run = self.out.join(kind.name());
+        let mut config = DetectorConfig::new(kind, Backbone::Tiny, self.out.join("dataset"));
+        config.batch.crop = CROP;
+        (config.run.steps, config.run.seconds) = (0, self.o.detector_seconds);
+        if kind == Kind::East {
+            config.optim.rate = EAST_RATE;
+        }
+        let resume = folder::checkpoints(&run).exists();
+        let mut run = if resume { RunFolder::open(&run)?.0 } else { RunFolder::create(&run, true)? };
+        let trained = detection::train(&config, &mut run, (resume, None), self.stop, self.events)?;
+        if trained.summary.interrupted {
+            return Ok(None);
+        }
+        let set = detection::labelled(&self.out.join("judged"))?;
+        let (share, n) = (&mut *self.share, set.len() as f64);
+        let judged = judge::judge(&trained.detector, &config, &set, self.stop, &mut |i| share(i as f64 / n))?;
+        Ok(judged.map(|j| j.evaluation.instance.f))
+    }
+}
