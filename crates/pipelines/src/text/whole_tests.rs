@@ -50,7 +50,7 @@ fn trained(folder: &Path) -> std::path::PathBuf {
 fn options(sampling: Sampling) -> SynthOptions {
     SynthOptions {
         count: 6,
-        size: (96, 72),
+        size: (160, 120),
         sampling,
         clusters: 3,
         only: Vec::new(),
