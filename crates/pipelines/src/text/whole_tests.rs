@@ -111,6 +111,8 @@ fn data_sets(dir: &Path, run: &Path) {
     let o = options(Sampling::Balanced);
     let whole = set(&dir.join("whole"), run, &o, Shard::WHOLE);
     assert!(whole.images == 6 && whole.misfits == 0 && whole.words >= 6, "{whole:?}");
+    let counts = whole.clusters.iter().filter(|n| **n > 0);
+    assert!(counts.clone().max().unwrap() - counts.min().unwrap() <= 1, "{whole:?}");
     let shards: Vec<_> = (1..=3).map(|part| (dir.join(format!("shard-{part}")), Shard { part, of: 3 })).collect();
     shards.iter().for_each(|(out, shard)| assert_eq!(set(out, run, &o, *shard).images, 2));
     let folders: Vec<_> = shards.iter().map(|(out, _)| out.clone()).collect();

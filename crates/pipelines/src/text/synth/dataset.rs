@@ -25,8 +25,9 @@ pub const JOURNAL: &str = "journal.jsonl";
 const LIMIT: u64 = 1 << 34;
 /// Distance in pixels from which a label does not fit its glyphs.
 const MISFIT_PX: f64 = 2.0;
-/// Clusters that are tried for a sample before it is given up.
-const CLUSTERS_TRIED: u64 = 8;
+/// Rounds of attempts in a sample's cluster, and all rounds, those in the next clusters, before it is given up.
+const OWN_ROUNDS: u64 = 8;
+const ROUNDS: u64 = 16;
 
 /// What a data set, or a shard of one, was made of.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -320,10 +321,13 @@ impl<'a> Maker<'a> {
         let draws = self.draws(&p.scene, number);
         let seed = sample_seed(self.options.seed, &p.scene.name, index);
         let mut drawn = None;
-        for again in 0..CLUSTERS_TRIED {
+        for again in 0..ROUNDS {
             let own = seed.wrapping_add(again);
             let found = match self.options.sampling {
-                Sampling::Balanced => draws.balanced(p.feasible[(index + again as usize) % p.feasible.len()], own),
+                Sampling::Balanced => {
+                    let other = (again + 1).saturating_sub(OWN_ROUNDS) as usize;
+                    draws.balanced(p.feasible[(index + other) % p.feasible.len()], own)
+                }
                 Sampling::Random => draws.random(own),
             };
             if let Ok(found) = found {
@@ -332,7 +336,7 @@ impl<'a> Maker<'a> {
             }
         }
         let Some(drawn) = drawn else {
-            return Err(PipelineError::Usage(format!("{}: sample {index} has no valid camera in {CLUSTERS_TRIED} clusters", p.scene.name)));
+            return Err(PipelineError::Usage(format!("{}: sample {index} has no valid camera in {ROUNDS} rounds", p.scene.name)));
         };
         let name = format!("{sample:08}");
         let made = image::draw(&p.scene, &p.edits, &self.clustering, (&draws.camera, &drawn), (&name, seed));

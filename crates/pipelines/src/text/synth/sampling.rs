@@ -15,6 +15,8 @@ use std::collections::BTreeMap;
 const ATTEMPTS: u64 = 32;
 /// Largest angle by which a rotation differs from its member's, in degrees.
 const PERTURBED: f64 = 5.0;
+/// Shares of it that are tried.
+const SHARES: [f64; 4] = [1.0, 0.5, 0.25, 0.125];
 /// Deviation of the place, over the picture, and of the logarithm of the area, of a camera like a photograph.
 const JITTER: [f64; 2] = [0.05, 0.2];
 /// Stream of random numbers of a sample, and those of the probes of a scene.
@@ -96,11 +98,11 @@ pub fn sample_seed(seed: u64, scene: &str, index: usize) -> u64 {
     bytes.fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ b as u64).wrapping_mul(0x0100_0000_01b3))
 }
 
-/// A rotation turned by at most [`PERTURBED`] about any axis.
-fn perturbed(q: DQuat, rng: &Rng, counter: u64) -> DMat3 {
+/// A rotation turned by at most a share of [`PERTURBED`] about any axis.
+fn perturbed(q: DQuat, share: f64, rng: &Rng, counter: u64) -> DMat3 {
     let v = |k: u64| rng.normal(counter + k) as f64;
     let axis = DVec3::new(v(0), v(1), v(2)).normalize_or(DVec3::X);
-    let angle = PERTURBED.to_radians() * rng.uniform(counter + 3) as f64;
+    let angle = share * PERTURBED.to_radians() * rng.uniform(counter + 3) as f64;
     DMat3::from_quat(DQuat::from_axis_angle(axis, angle) * q)
 }
 
@@ -118,8 +120,11 @@ impl Draws<'_> {
                 false => member.region,
             };
             let [x, y] = self.prior.center(rng, place);
-            let wanted = self.wanted(perturbed(member.camera_from_region, rng, turn + 2), [x, y], self.prior.area(rng, area));
-            (region, wanted)
+            // Turned less where it would leave its cluster.
+            let turned = |share: f64| perturbed(member.camera_from_region, share, rng, turn + 2);
+            let is_own = |r: &DMat3| self.clustering.nearest(r) == cluster;
+            let rotation = SHARES.into_iter().map(turned).find(is_own).unwrap_or_else(|| turned(0.0));
+            (region, self.wanted(rotation, [x, y], self.prior.area(rng, area)))
         })
     }
 
@@ -134,7 +139,7 @@ impl Draws<'_> {
             let [x, y] = member.center;
             let center = [x + JITTER[0] * rng.normal(place) as f64, y + JITTER[0] * rng.normal(place + 1) as f64];
             let ratio = member.area_ratio * (JITTER[1] * rng.normal(area) as f64).exp();
-            (member.region, self.wanted(perturbed(member.camera_from_region, rng, turn + 2), center, ratio))
+            (member.region, self.wanted(perturbed(member.camera_from_region, 1.0, rng, turn + 2), center, ratio))
         })
     }
 
@@ -194,7 +199,7 @@ mod tests {
         let rng = Rng::new(1, 1);
         let q = DQuat::from_rotation_y(0.4);
         for k in 0..200 {
-            let angle = super::super::super::placed::angle_between(&DMat3::from_quat(q), &perturbed(q, &rng, 8 * k)).to_degrees();
+            let angle = super::super::super::placed::angle_between(&DMat3::from_quat(q), &perturbed(q, 1.0, &rng, 8 * k)).to_degrees();
             assert!(angle <= PERTURBED + 1e-9);
         }
     }

@@ -7,7 +7,7 @@ use super::super::placed::{self, PlacedRegion};
 use crate::error::{PipelineError, Result};
 use diorama_engine::renderers::view::View;
 use diorama_engine::renderers::volume::Quality;
-use diorama_geom::glam::{DQuat, DVec3};
+use diorama_geom::glam::{DQuat, DVec2, DVec3};
 use diorama_geom::{Camera, Lens, Pose};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use std::path::Path;
@@ -35,6 +35,8 @@ pub struct SynthScene {
     pub regions: Vec<PlacedRegion>,
     /// Of all training photographs in which a region can be read.
     pub members: Vec<Member>,
+    /// Median light that these photographs receive from the middle of each region: 1 but for fog.
+    pub lights: Vec<f32>,
     /// Poses of the training photographs in the world, and their coarse views.
     pub photographs: Vec<(Pose, PosedCamera, View)>,
 }
@@ -48,6 +50,7 @@ impl SynthScene {
         let (model, _) = recipe::load(run, None)?;
         let regions: Vec<PlacedRegion> = placed::read(run)?.into_iter().filter(|r| r.rectangle.is_some()).collect();
         let (mut members, mut photographs) = (Vec::new(), Vec::new());
+        let mut lights: Vec<Vec<f32>> = regions.iter().map(|_| Vec::new()).collect();
         for (k, frame) in model.train.iter().enumerate() {
             progress(k as f64 / model.train.len() as f64);
             let f = &model.capture.frames[*frame];
@@ -58,6 +61,8 @@ impl SynthScene {
                 let (rotation, center) = placed::from_rows(&pose.text_pose);
                 let size = [f.camera.width as f64, f.camera.height as f64];
                 let Some(at) = f.camera.project(center) else { continue };
+                let middle = region.rectangle.map(|r| r.reading_point(DVec2::ZERO)).into_iter().collect::<Vec<_>>();
+                lights[i].extend(in_view::transmittance(&model, f.world_from_camera.translation, &middle, region.front));
                 members.push(Member {
                     region: i,
                     camera_from_region: DQuat::from_mat3(&rotation),
@@ -76,7 +81,12 @@ impl SynthScene {
             let what = "no region can be read in any training photograph; label one that shows it larger";
             return Err(PipelineError::Usage(format!("{}: {what}", run.display())));
         }
-        Ok(SynthScene { name, model, regions, members, photographs })
+        let median = |mut v: Vec<f32>| {
+            v.sort_by(f32::total_cmp);
+            v.get(v.len() / 2).copied().unwrap_or(1.0)
+        };
+        let lights = lights.into_iter().map(median).collect();
+        Ok(SynthScene { name, model, regions, members, lights, photographs })
     }
 
     /// A pinhole camera of a size with the photographs' field of view over the longer side.

@@ -13,7 +13,7 @@ use serde::Serialize;
 /// Radius of free space around a camera over the region's distance, and opacity from which it is not free.
 const FREE: f64 = 0.05;
 const OPAQUE: f32 = 0.5;
-/// Transmittance to the region's middle.
+/// Transmittance to the region's middle, over that of the photographs.
 const LIGHT: f32 = 0.9;
 /// Share of the region that is in the picture.
 const INSIDE: f64 = 0.9;
@@ -66,7 +66,8 @@ impl SynthScene {
             return Err(Fault::InMatter);
         }
         let light = in_view::transmittance(&self.model, pose.translation, &[middle], region.front);
-        if light[0] <= LIGHT {
+        let usual = self.regions.iter().position(|r| r.id == region.id).map_or(1.0, |k| self.lights[k]);
+        if light[0] <= LIGHT * usual {
             return Err(Fault::Hidden);
         }
         self.check_view(camera, pose)

@@ -7,15 +7,25 @@ use diorama_geom::{Camera, Image, Pose};
 
 /// Visibility from which a word's glyphs are wholly seen.
 const WHOLE: f64 = 0.999;
+/// Pixels by which a corner of a label differs from that of the whole word where the border cuts it.
+const CUT_PX: f64 = 1e-6;
 /// Share of the strongest pixel from which a pixel is a glyph.
 const GLYPH: f32 = 0.35;
 /// Pixels around a word in which glyphs are its own.
 const AROUND_PX: f64 = 3.0;
 
+/// Whether a label ends at the border of the picture.
+fn touches_border(label: &SetWord, camera: &Camera) -> bool {
+    let size = [camera.width as f64, camera.height as f64];
+    label.quad.iter().any(|p| (0..2).any(|k| p[k] <= 0.0 || p[k] >= size[k]))
+}
+
 /// Largest distance between the corners of a word's label and of the bounding quadrilateral, in the word's frame, of the glyphs that a view
 /// shows; none where the word is partly hidden or cut, or no glyph of it is seen.
 pub fn misfit_px(word: &OnSurface, label: &SetWord, glyphs: &Image, (camera, pose): (&Camera, &Pose)) -> Option<f64> {
-    if label.visibility < WHOLE {
+    let whole = in_view::seen(word.rectangle, word.bounds, camera, pose)?;
+    let is_cut = (0..4).any(|k| DVec2::from(whole.quad[k]).distance(DVec2::from(label.quad[k])) > CUT_PX);
+    if label.visibility < WHOLE || (is_cut && touches_border(label, camera)) {
         return None;
     }
     let [from, to] = [f64::min, f64::max].map(|f| [0, 1].map(|k| label.quad.iter().map(|p| p[k]).reduce(f).expect("four corners")));
