@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
     after_help = "Examples:\n  diorama text synth runs/room --count 500 --size 160x120 -o data/set\n  diorama text synth scenes.toml --count 12520 --size 640x360 --shard 3/8 --formats icdar15,mmocr,ppocr -o data/set-3"
 )]
 pub struct Synth {
-    /// A run, or scenes.toml, which lists runs as [[scene]] with run = "FOLDER"
+    /// A run, or a scenes.toml with a table named scene for each run, whose key run is its folder
     scenes: PathBuf,
     /// Images of the whole data set
     #[arg(long, default_value_t = 1000)]
