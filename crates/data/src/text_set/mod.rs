@@ -37,6 +37,16 @@ pub use set_check::check;
 /// File of the annotations in the data set's folder.
 pub const ANNOTATIONS: &str = "annotations.jsonl";
 const LIMIT: u64 = 4 << 30;
+/// Files of the formats that have one for all images.
+const PLACES: [&str; 7] = [
+    "Label.txt",
+    "meta.json",
+    "mmocr/textdet.json",
+    "doctr/labels.json",
+    "coco/instances.json",
+    "coco_text/cocotext.json",
+    "textocr/textocr.json",
+];
 /// What a line looks like, for errors.
 const EXAMPLE: &str = r#"{"image": "images/000000.png", "width": 640, "height": 480, "intrinsic": [500, 500, 320, 240], "world_from_camera": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scene": "s01", "words": []}"#;
 
@@ -277,6 +287,23 @@ pub fn write(folder: &Path, images: &[SetImage], formats: &[SetFormat]) -> Resul
         }
     }
     Ok(())
+}
+
+/// Removes images, their labels in all formats, and the annotations first: what else is in the folder stays.
+///
+/// # Errors
+/// When a file cannot be removed.
+pub fn remove(folder: &Path, images: &[SetImage]) -> Result<()> {
+    let gone = |place: &str| match std::fs::remove_file(folder.join(place)) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(DataError::io(&folder.join(place), "remove")(e)),
+        _ => Ok(()),
+    };
+    [ANNOTATIONS].into_iter().chain(PLACES).try_for_each(gone)?;
+    let lines = [SetFormat::Icdar13, SetFormat::Icdar15, SetFormat::Mlt17];
+    images.iter().try_for_each(|image| {
+        gone(&image.image)?;
+        lines.iter().try_for_each(|f| gone(&format!("{}/gt_{}.txt", f.name(), image.stem())))
+    })
 }
 
 /// Writes a file into its place in the data set's folder.

@@ -27,7 +27,6 @@ pub struct PlacedRegion {
     /// Points that the surface was fitted to.
     pub points: usize,
     /// Distance before the surface, in units of the capture, from which on matter is its own.
-    #[serde(default)]
     pub front: f64,
 }
 

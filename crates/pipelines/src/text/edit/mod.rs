@@ -27,6 +27,7 @@ use replacement::Overlay;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
+use unicode_script::{Script, UnicodeScript};
 
 /// Folder of a run's edits, and the file of one, which is written last.
 const EDITS: &str = "edits";
@@ -72,7 +73,10 @@ impl EditedWord {
     /// The word on the rectangle of its region.
     pub fn on<'a>(&'a self, region: &'a PlacedRegion) -> Option<OnSurface<'a>> {
         let all = OnSurface::of(region)?;
-        Some(OnSurface { bounds: self.whole.bounds, transcription: &self.whole.text, script: None, characters: &self.characters, ..all })
+        // Signs and digits are of no script of their own.
+        let scripts = self.whole.text.chars().map(|c| c.script());
+        let script = scripts.into_iter().find(|s| !matches!(s, Script::Common | Script::Inherited)).map(|s| s.full_name());
+        Some(OnSurface { bounds: self.whole.bounds, transcription: &self.whole.text, script, characters: &self.characters, ..all })
     }
 }
 

@@ -6,7 +6,7 @@ use super::recipe;
 use crate::error::{PipelineError, Result};
 use crate::run::photographs::StoredPhotographs;
 use crate::text::truth;
-use diorama_data::{import, photo};
+use diorama_data::{DataError, import, photo};
 use diorama_engine::metrics;
 use diorama_engine::renderers::view::View;
 use diorama_engine::renderers::volume::Quality;
@@ -139,7 +139,9 @@ fn depth_errors(model: &TextModel, frame: usize, view: &View, out: &mut Vec<f64>
     if !file.exists() {
         return Ok(());
     }
-    let photo::Photo::Linear(exact) = photo::load_full(&file)? else { return Ok(()) };
+    let photo::Photo::Linear(exact) = photo::load_full(&file)? else {
+        return Err(DataError::input(&file, "is no EXR of distances; generate the scene again").into());
+    };
     if (exact.width, exact.height) != (view.depth.width, view.depth.height) {
         return Ok(());
     }

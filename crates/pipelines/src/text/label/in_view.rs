@@ -4,7 +4,7 @@ use super::super::field::model::TextModel;
 use super::super::placed::PlacedRegion;
 use super::super::regions::TextPose;
 use super::super::regions::{GRID, clipped, shortest_side};
-use super::super::surface::Rectangle;
+use super::super::surface::{Kind, Rectangle};
 use super::super::truth::rows;
 use diorama_data::text_labels::{self, UNREADABLE};
 use diorama_data::text_set::{SetCharacter, SetWord, WordPose};
@@ -92,8 +92,11 @@ fn part(rectangle: &Rectangle, [low, high]: [DVec2; 2], camera: &Camera, pose: &
     let along = |y: f64, from: f64, to: f64| {
         (0..BENT_POINTS).map(move |k| at(from + (to - from) * k as f64 / (BENT_POINTS - 1) as f64, y)).collect::<Option<Vec<_>>>()
     };
-    let is_flat = rectangle.surface.height[..3].iter().all(|c| *c == 0.0);
-    let polygon = if is_flat { quad.to_vec() } else { [along(high.y, low.x, high.x)?, along(low.y, high.x, low.x)?].concat() };
+    let polygon = if rectangle.surface.kind == Kind::Plane {
+        quad.to_vec()
+    } else {
+        [along(high.y, low.x, high.x)?, along(low.y, high.x, low.x)?].concat()
+    };
     let middle = 0.5 * (low + high);
     let pose = TextPose {
         rotation: camera_from_world.rotation * rectangle.reading_frame(middle),

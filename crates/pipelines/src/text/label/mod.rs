@@ -107,6 +107,9 @@ pub fn label(
     let truth = truth(&model)?;
     let mut collected = Collected::default();
     let mut images = Vec::new();
+    if options.out.join(text_set::ANNOTATIONS).exists() {
+        text_set::remove(&options.out, &text_set::read(&options.out)?)?;
+    }
     std::fs::create_dir_all(options.out.join("images")).map_err(DataError::io(&options.out, "create"))?;
     for (k, view) in views.iter().enumerate() {
         if stop.load(Ordering::Relaxed) {

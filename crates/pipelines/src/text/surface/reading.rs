@@ -1,7 +1,7 @@
 //! Rectangles in reading coordinates, which are lengths from the middle, x along the reading direction and y up; rays that meet them; and
 //! rectangles from outlines.
 
-use super::fit::Surface;
+use super::fit::{Kind, Surface};
 use super::rectangle::{Rectangle, bends, lengths};
 use diorama_geom::glam::{DMat3, DVec2, DVec3, dvec2};
 
@@ -71,7 +71,7 @@ impl Rectangle {
             let at = dvec2(x, 0.0);
             self.surface.normal(self.place(self.own(at))).dot(eye - self.reading_point(at)) > 0.0
         };
-        if self.surface.height[..3].iter().all(|c| *c == 0.0) {
+        if self.surface.kind == Kind::Plane {
             return faces(0.0).then_some([-half, half]);
         }
         let edge = |k: usize| half * (2.0 * k as f64 / COLUMNS as f64 - 1.0);

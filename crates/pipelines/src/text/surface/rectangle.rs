@@ -1,6 +1,6 @@
 //! The smallest rectangle that holds the points of a surface, in coordinates of length along it, and its pose.
 
-use super::fit::Surface;
+use super::fit::{Kind, Surface};
 use diorama_geom::glam::{DMat2, DMat3, DVec2, DVec3, dvec2};
 use serde::{Deserialize, Serialize};
 
@@ -73,6 +73,9 @@ impl Rectangle {
 
 /// Length along the surface from `from` in a direction of its plane, signed.
 fn length(surface: &Surface, from: DVec2, direction: DVec2, to: f64) -> f64 {
+    if surface.kind == Kind::Plane {
+        return to;
+    }
     let speed = |t: f64| (1.0 + surface.height_at(from + t * direction).1.dot(direction).powi(2)).sqrt();
     let step = to / STEPS as f64;
     let weight = |k: usize| if k == 0 || k == STEPS { 1.0 } else { 2.0 + 2.0 * (k % 2) as f64 };

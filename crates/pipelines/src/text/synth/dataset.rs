@@ -151,10 +151,9 @@ fn begin(out: &Path, manifest: &Manifest, force: bool) -> Result<BTreeMap<usize,
     let path = out.join(MANIFEST);
     let now = serde_json::to_value(manifest).expect("plain values");
     if path.exists() && force {
-        for folder in ["images", "glyphs"].map(|f| out.join(f)).into_iter().filter(|f| f.exists()) {
-            std::fs::remove_dir_all(&folder).map_err(DataError::io(&folder, "remove"))?;
-        }
-        for file in [JOURNAL, text_set::ANNOTATIONS].map(|f| out.join(f)).into_iter().filter(|f| f.exists()) {
+        let earlier: Vec<SetImage> = journal(out)?.into_iter().map(|d| d.record).collect();
+        text_set::remove(out, &earlier)?;
+        for file in earlier.iter().map(|i| out.join(glyphs(&i.image))).chain([out.join(JOURNAL)]).filter(|f| f.exists()) {
             std::fs::remove_file(&file).map_err(DataError::io(&file, "remove"))?;
         }
     } else if path.exists() {
@@ -196,26 +195,34 @@ pub fn read_manifest(folder: &Path) -> Result<Manifest> {
     Ok(serde_json::from_slice(&bytes).map_err(|e| DataError::input(&path, format!("{e}; make the data set anew with --force")))?)
 }
 
-/// Samples of a folder's journal whose images are as they were written.
+/// Lines of a folder's journal; the last may have been cut, and is then left out.
+fn journal(folder: &Path) -> Result<Vec<Done>> {
+    let path = folder.join(JOURNAL);
+    if !path.exists() {
+        return Ok(Vec::new());
+    }
+    let bytes = error::read(&path, LIMIT)?;
+    Ok(bytes.split(|b| *b == b'\n').filter_map(|line| serde_json::from_slice(line).ok()).collect())
+}
+
+/// Samples of a folder's journal whose images are as they were written; others are to be drawn anew.
 ///
 /// # Errors
 /// When the journal or an image cannot be read.
 pub fn read_journal(folder: &Path) -> Result<BTreeMap<usize, Done>> {
-    let path = folder.join(JOURNAL);
-    if !path.exists() {
-        return Ok(BTreeMap::new());
-    }
-    let bytes = error::read(&path, LIMIT)?;
-    // The last line may have been cut.
-    let lines = bytes.split(|b| *b == b'\n').filter_map(|line| serde_json::from_slice::<Done>(line).ok());
     let mut out = BTreeMap::new();
-    for done in lines {
+    for done in journal(folder)? {
         let image = folder.join(&done.record.image);
         if image.exists() && hash(&error::read(&image, LIMIT)?) == done.hash {
             out.insert(done.sample, done);
         }
     }
     Ok(out)
+}
+
+/// Place of the glyphs of an image.
+pub fn glyphs(image: &str) -> String {
+    image.replacen("images/", "glyphs/", 1)
 }
 
 /// Samples that are done, one per line.
@@ -249,6 +256,8 @@ struct Maker<'a> {
     options: &'a SynthOptions,
     prior: Prior,
     clustering: Clustering,
+    /// The scene whose text poses were read last, with its number: it need not be loaded again where it comes first.
+    loaded: Option<(usize, SynthScene)>,
     present: Option<Present>,
 }
 
@@ -262,25 +271,25 @@ struct Present {
 
 impl<'a> Maker<'a> {
     fn new(scenes: &'a Scenes, options: &'a SynthOptions, prior: Prior, progress: &mut dyn FnMut(f64, &str)) -> Result<Maker<'a>> {
-        let (mut members, mut present, n) = (Vec::new(), None, scenes.scenes.len());
+        let (mut members, mut loaded, n) = (Vec::new(), None, scenes.scenes.len());
         for (k, entry) in scenes.scenes.iter().enumerate() {
-            let scene =
-                SynthScene::load(entry.name(), &entry.run, &mut |s| progress((k as f64 + s) / n as f64, "text poses of the photographs"))?;
+            let look = &mut |s| progress((k as f64 + s) / n as f64, "text poses of the photographs");
+            let scene = SynthScene::load(entry.name(), &entry.run, look)?;
             members.push(scene.members.clone());
-            present = Some((k, scene));
+            loaded = Some((k, scene));
         }
         let clustering = Clustering::new(&members, options.clusters, options.seed);
-        let mut maker = Maker { scenes, options, prior, clustering, present: None };
-        // A single scene need not be loaded twice.
-        if let Some((0, scene)) = present {
-            maker.enter(0, scene, &mut Vec::new())?;
-        }
-        Ok(maker)
+        Ok(Maker { scenes, options, prior, clustering, loaded, present: None })
     }
 
     /// Makes a scene the present one.
-    fn enter(&mut self, number: usize, scene: SynthScene, notes: &mut Vec<String>) -> Result<()> {
+    fn enter(&mut self, number: usize, notes: &mut Vec<String>) -> Result<()> {
         let entry = &self.scenes.scenes[number];
+        let mut scene = match self.loaded.take() {
+            Some((k, scene)) if k == number => scene,
+            _ => SynthScene::load(entry.name(), &entry.run, &mut |_| ())?,
+        };
+        scene.look();
         let edits = Edit::names(&entry.run)?.iter().map(|n| Edit::read(&entry.run, n)).collect::<Result<Vec<_>>>()?;
         let edits = SceneEdits::new(&scene, edits, entry.original);
         let mut feasible = Vec::new();
@@ -313,9 +322,7 @@ impl<'a> Maker<'a> {
     fn sample(&mut self, sample: usize, out: &Path, notes: &mut Vec<String>) -> Result<Done> {
         let (number, index) = plan::place(sample, self.options.count, self.scenes.scenes.len());
         if self.present.as_ref().is_none_or(|p| p.number != number) {
-            let entry = &self.scenes.scenes[number];
-            let scene = SynthScene::load(entry.name(), &entry.run, &mut |_| ())?;
-            self.enter(number, scene, notes)?;
+            self.enter(number, notes)?;
         }
         let p = self.present.as_ref().expect("a scene");
         let draws = self.draws(&p.scene, number);
@@ -343,7 +350,7 @@ impl<'a> Maker<'a> {
         text_set::check(&made.record).map_err(|e| PipelineError::Usage(format!("image {name}: {e}")))?;
         let bytes = photo::encode_png(&made.picture);
         atomic::write(&out.join(&made.record.image), &bytes)?;
-        photo::save_png(&out.join(format!("glyphs/{name}.png")), &made.glyphs)?;
+        photo::save_png(&out.join(glyphs(&made.record.image)), &made.glyphs)?;
         Ok(Done { sample, cluster: drawn.cluster, hash: hash(&bytes), misfit_px: made.misfit_px, record: made.record })
     }
 }

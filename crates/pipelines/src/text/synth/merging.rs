@@ -43,7 +43,7 @@ pub fn merge(out: &Path, shards: &[PathBuf]) -> Result<Synthesized> {
         std::fs::create_dir_all(&sub).map_err(DataError::io(&sub, "create"))?;
     }
     for (done, folder) in all.values() {
-        for file in [done.record.image.clone(), done.record.image.replace("images/", "glyphs/")] {
+        for file in [done.record.image.clone(), dataset::glyphs(&done.record.image)] {
             let (from, to) = (folder.join(&file), out.join(&file));
             std::fs::copy(&from, &to).map_err(DataError::io(&from, "copy"))?;
         }

@@ -37,7 +37,7 @@ pub struct SynthScene {
     pub members: Vec<Member>,
     /// Median light that these photographs receive from the middle of each region: 1 but for fog.
     pub lights: Vec<f32>,
-    /// Poses of the training photographs in the world, and their coarse views.
+    /// Poses of the training photographs in the world, and their coarse views; empty before [`SynthScene::look`].
     pub photographs: Vec<(Pose, PosedCamera, View)>,
 }
 
@@ -49,7 +49,7 @@ impl SynthScene {
     pub fn load(name: String, run: &Path, progress: &mut dyn FnMut(f64)) -> Result<SynthScene> {
         let (model, _) = recipe::load(run, None)?;
         let regions: Vec<PlacedRegion> = placed::read(run)?.into_iter().filter(|r| r.rectangle.is_some()).collect();
-        let (mut members, mut photographs) = (Vec::new(), Vec::new());
+        let mut members = Vec::new();
         let mut lights: Vec<Vec<f32>> = regions.iter().map(|_| Vec::new()).collect();
         for (k, frame) in model.train.iter().enumerate() {
             progress(k as f64 / model.train.len() as f64);
@@ -70,12 +70,6 @@ impl SynthScene {
                     area_ratio: in_view::area(&word.polygon) / (size[0] * size[1]),
                 });
             }
-            let posed = model.posed(*frame);
-            let longer = posed.camera.width.max(posed.camera.height) as f64;
-            let size = [posed.camera.width, posed.camera.height].map(|v| ((v as f64 * COARSE as f64 / longer) as u32).max(1));
-            let coarse = PosedCamera { camera: posed.camera.resized(size[0], size[1]), ..posed };
-            let view = model.tracer(Quality::Full).view(&coarse, &mut |_| ());
-            photographs.push((f.world_from_camera, coarse, view));
         }
         if members.is_empty() {
             let what = "no region can be read in any training photograph; label one that shows it larger";
@@ -86,7 +80,20 @@ impl SynthScene {
             v.get(v.len() / 2).copied().unwrap_or(1.0)
         };
         let lights = lights.into_iter().map(median).collect();
-        Ok(SynthScene { name, model, regions, members, lights, photographs })
+        Ok(SynthScene { name, model, regions, members, lights, photographs: Vec::new() })
+    }
+
+    /// Renders coarse views of the training photographs, which checks of cameras compare with.
+    pub fn look(&mut self) {
+        let coarse = |frame: &usize| {
+            let posed = self.model.posed(*frame);
+            let longer = posed.camera.width.max(posed.camera.height) as f64;
+            let size = [posed.camera.width, posed.camera.height].map(|v| ((v as f64 * COARSE as f64 / longer) as u32).max(1));
+            let coarse = PosedCamera { camera: posed.camera.resized(size[0], size[1]), ..posed };
+            let view = self.model.tracer(Quality::Full).view(&coarse, &mut |_| ());
+            (self.model.capture.frames[*frame].world_from_camera, coarse, view)
+        };
+        self.photographs = self.model.train.iter().map(coarse).collect();
     }
 
     /// A pinhole camera of a size with the photographs' field of view over the longer side.
