@@ -18,6 +18,7 @@ mod process;
 mod quickstart;
 mod relight;
 mod render;
+mod stages;
 mod text;
 mod train;
 mod view;

@@ -4,7 +4,6 @@
 //! Polygons are in pixels, clockwise from the upper left in reading order; one `id` is the same region in all images. The transcription
 //! `###` means that nobody can read it.
 
-pub mod detector_set;
 mod formats;
 
 use crate::atomic;

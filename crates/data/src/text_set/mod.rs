@@ -18,11 +18,11 @@
 //! | `textocr` | `textocr/textocr.json` | the text `.` |
 
 mod coco;
+pub mod detector_set;
 mod geometry;
 mod icdar;
 mod label_txt;
 mod set_check;
-mod sha256;
 mod toolboxes;
 
 use crate::atomic;

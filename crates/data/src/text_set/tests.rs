@@ -306,3 +306,28 @@ fn poses_say_their_rotation_in_three_ways() {
     let still = WordPose::new([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], [1.0, 1.0]);
     assert!(still.quaternion == [1.0, 0.0, 0.0, 0.0] && still.axis_angle == [0.0; 3]);
 }
+
+#[test]
+fn what_is_removed_is_what_was_written_and_nothing_else() {
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path();
+    let set = set();
+    for image in &set {
+        put(folder, &image.image, b"abc").unwrap();
+    }
+    put(folder, "images/mine.txt", b"mine").unwrap();
+    put(folder, "icdar15/gt_mine.txt", b"mine").unwrap();
+    save(folder, &set).unwrap();
+    write(folder, &set, &SetFormat::ALL).unwrap();
+    remove(folder, &set).unwrap();
+    let mut left = Vec::new();
+    let mut folders = vec![folder.to_path_buf()];
+    while let Some(at) = folders.pop() {
+        for entry in std::fs::read_dir(at).unwrap().map(|e| e.unwrap().path()) {
+            if entry.is_dir() { folders.push(entry) } else { left.push(entry.strip_prefix(folder).unwrap().to_path_buf()) }
+        }
+    }
+    left.sort();
+    assert_eq!(left, [PathBuf::from("icdar15/gt_mine.txt"), PathBuf::from("images/mine.txt")]);
+    remove(folder, &set).unwrap();
+}

@@ -1,10 +1,11 @@
 //! Annotations for detection toolboxes: MMOCR 1.x (`TextDetDataset`) and docTR (`DetectionDataset`).
 
 use super::geometry::{bounds, flat};
-use super::{SetImage, SetWord, put_json, sha256};
+use super::{SetImage, SetWord, put_json};
 use crate::error::{DataError, Result};
 use rayon::prelude::*;
 use serde_json::{Map, Value, json};
+use sha2::{Digest, Sha256};
 use std::path::Path;
 
 /// Writes `mmocr/textdet.json`; paths of images are relative to the data set's folder (`data_root`).
@@ -40,7 +41,7 @@ pub fn write_doctr(folder: &Path, images: &[SetImage]) -> Result<()> {
         }
         let path = folder.join(&image.image);
         let cure = |e: std::io::Error| DataError::input(&path, format!("{e}; doctr holds hashes of images: write them first"));
-        let hash = sha256::hex(&std::fs::read(&path).map_err(cure)?);
+        let hash = format!("{:x}", Sha256::digest(std::fs::read(&path).map_err(cure)?));
         let key = image.image.strip_prefix("images/").unwrap_or(&image.image);
         let labels = json!({"img_dimensions": [image.width, image.height], "img_hash": hash, "polygons": polygons});
         Ok(Some((key.into(), labels)))

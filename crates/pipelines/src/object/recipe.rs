@@ -10,18 +10,19 @@ use super::observations;
 use super::run_folder::{RunSummary, SparsePoints as _};
 use super::trainer::Trainer;
 use super::viewing::RunView;
-use crate::error::{PipelineError, Result};
+use crate::error::Result;
 use crate::run::RunFolder;
 use crate::run::device::{Device, cpu_name};
 use crate::run::nearest;
 use crate::run::photographs::StoredPhotographs;
 use crate::run::profile::{StageFigure, TrainReport};
+use crate::run::training;
 use diorama_data::checkpoint;
 use diorama_data::photo_check;
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_engine::samplers::pixels::Observation;
 use diorama_engine::stages::Stages;
-use diorama_engine::train::{self, Event, RunError, RunOptions, Summary, Trainee};
+use diorama_engine::train::{Event, RunOptions, Summary, Trainee};
 use diorama_geom::Capture;
 use diorama_geom::capture::Split;
 use diorama_geom::rng::Rng;
@@ -89,23 +90,11 @@ pub fn train(
     let checkpoints = folder.checkpoints();
     let mut trainer = Trainer::new(model, photographs, observations, &checkpoints, opened)?;
     (trainer.view, trainer.held_out) = (view, held_out);
-    let mut log_error = None;
-    let result = train::run(&run_options(config), origin, &mut trainer, interrupt, &mut |e| {
-        if let Err(e) = folder.log(e) {
-            log_error.get_or_insert(e);
-        }
+    let summary = training::train((&run_options(config), origin), &mut trainer, folder, interrupt, &mut |e| {
         view.into_iter().for_each(|v| v.update(e));
         events(e);
-    });
-    if let Some(e) = log_error {
-        return Err(e);
-    }
-    let summary = result.map_err(|e| match e {
-        RunError::Failed(e) => e,
-        RunError::Diverged { first, again } => PipelineError::Diverged { first, again, kept: kept(&checkpoints) },
     })?;
     trainer.show()?;
-    folder.draw_curves()?;
     let name = |i: usize| trainer.model.capture.frames[i].name.clone();
     if resume && summary.step == origin.step {
         // What the run came to stays in its summary.
@@ -143,15 +132,6 @@ fn go_on(model: &mut ObjectModel, folder: &mut RunFolder) -> Result<Option<Strin
     }
     folder.cut_metrics(model.origin.step)?;
     Ok(note)
-}
-
-/// Description of what a run that failed leaves.
-fn kept(checkpoints: &Path) -> String {
-    if checkpoint::exists(checkpoints) {
-        format!("{} is the last good checkpoint", checkpoint::latest(checkpoints).display())
-    } else {
-        "there was no checkpoint yet".into()
-    }
 }
 
 /// Results of the first steps.

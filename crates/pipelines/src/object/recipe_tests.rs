@@ -1,9 +1,11 @@
 //! Runs that go wrong.
 
 use super::*;
+use crate::error::PipelineError;
 use crate::object::config::Method;
+use crate::run::training::kept;
 use diorama_engine::renderers::volume::Quality;
-use diorama_engine::train::{Scores, StepReport};
+use diorama_engine::train::{self, RunError, Scores, StepReport};
 use diorama_geom::Reduction;
 use diorama_geom::capture::SparsePoint;
 

@@ -16,6 +16,7 @@ use super::{picture, scene_file, truth};
 use crate::error::{PipelineError, Result};
 use crate::run::RunFolder;
 use crate::run::config::Configuration;
+use crate::run::stages::Listeners;
 use diorama_data::{DataError, atomic, environment, photo};
 use diorama_engine::train::Event;
 use diorama_geom::ImageU8;
@@ -131,13 +132,6 @@ pub fn quickstart(folder: &Path, o: &QuickstartOptions, stop: &AtomicBool, liste
     };
     atomic::write(&made.report, page::html(&made).as_bytes())?;
     Ok(Some(made))
-}
-
-/// Receivers of progress: the name of a stage that begins, the share of it that is done, events of training.
-pub struct Listeners<'a> {
-    pub stage: &'a mut dyn FnMut(&str),
-    pub share: &'a mut dyn FnMut(f64),
-    pub events: &'a mut dyn FnMut(&Event),
 }
 
 struct Quickstart<'a> {

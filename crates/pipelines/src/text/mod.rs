@@ -7,6 +7,7 @@ pub mod camera;
 pub mod detectors;
 pub mod edit;
 pub mod field;
+mod fnv;
 pub mod label;
 pub mod lettering;
 pub mod make_scenes;

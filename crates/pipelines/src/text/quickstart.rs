@@ -15,6 +15,7 @@ use super::synth::dataset::{self, Synthesized};
 use super::synth::plan::{Scenes, Shard, SynthOptions};
 use super::synth::sampling::Sampling;
 use crate::error::Result;
+use crate::run::stages::Listeners;
 use crate::run::{RunFolder, folder};
 use diorama_data::text_set::SetFormat;
 use diorama_data::{DataError, atomic, photo};
@@ -65,13 +66,6 @@ pub struct Made {
     pub dataset: PathBuf,
     pub report: PathBuf,
     pub notes: Vec<String>,
-}
-
-/// Receivers of progress: the name of a stage that begins, the share of it that is done, events of training.
-pub struct Listeners<'a> {
-    pub stage: &'a mut dyn FnMut(&str),
-    pub share: &'a mut dyn FnMut(f64),
-    pub events: &'a mut dyn FnMut(&Event),
 }
 
 /// Generates, trains, labels, edits, draws, trains detectors and reports into `out`; none when stopped. What is done already is kept: the same

@@ -1,13 +1,10 @@
 //! `diorama text quickstart`
 
 use crate::commands::process::{INTERRUPT, note, use_threads, watch_interrupts};
-use crate::commands::{Outcome, Verb};
-use crate::terminal::{Progress, ShareShown};
+use crate::commands::{Outcome, Verb, stages};
 use clap::Args;
-use diorama_data::DataError;
 use diorama_pipelines::Result;
-use diorama_pipelines::text::quickstart::{self, Listeners, QuickstartOptions};
-use std::cell::RefCell;
+use diorama_pipelines::text::quickstart::{self, QuickstartOptions};
 use std::path::PathBuf;
 
 /// Run every step on a room with signs that the program generates itself
@@ -38,27 +35,9 @@ impl Verb for Quickstart {
 
     fn run(&self) -> Result<Outcome> {
         use_threads(self.threads)?;
-        let is_ours = self.out.join(MARK).is_dir();
-        if self.out.is_dir() && !is_ours && self.out.read_dir().map_err(DataError::io(&self.out, "list"))?.next().is_some() {
-            return Err(DataError::input(&self.out, "is not empty and holds no quickstart; give another --out").into());
-        }
-        if self.force && is_ours {
-            std::fs::remove_dir_all(&self.out).map_err(DataError::io(&self.out, "remove"))?;
-        }
+        stages::begin(&self.out, MARK, self.force)?;
         watch_interrupts();
-        let (mut progress, shown) = (Progress::new(), RefCell::new(ShareShown::new()));
-        let stage = RefCell::new(String::new());
-        let listeners = Listeners {
-            stage: &mut |name| {
-                shown.replace(ShareShown::new()).finish();
-                stage.replace(name.to_string());
-                eprintln!("{name}");
-            },
-            share: &mut |share| shown.borrow_mut().show(share, &format!("{}: {:.0} %", stage.borrow(), 100.0 * share)),
-            events: &mut |e| progress.event(e),
-        };
-        let made = quickstart::quickstart(&self.out, &QuickstartOptions::default(), &INTERRUPT, listeners)?;
-        shown.into_inner().finish();
+        let made = stages::shown(|l| quickstart::quickstart(&self.out, &QuickstartOptions::default(), &INTERRUPT, l))?;
         let Some(made) = made else {
             eprintln!("interrupted: the same command goes on");
             return Ok(Outcome::Interrupted);

@@ -6,10 +6,10 @@ use super::export;
 use super::model::{ObjectModel, Stage};
 use super::trainer::Trainer;
 use crate::error::{PipelineError, Result};
-use crate::run::{RunDescription, RunFolder, folder, kept_capture};
+use crate::run::{RunDescription, RunFolder, folder, kept_capture, training};
 use diorama_data::gltf::{self, WriteOptions};
 use diorama_data::{checkpoint, environment};
-use diorama_engine::train::{self, Event, RunError, RunOptions, Summary};
+use diorama_engine::train::{Event, RunOptions, Summary};
 use diorama_geom::Capture;
 use diorama_geom::capture::Split;
 use std::path::{Path, PathBuf};
@@ -61,23 +61,7 @@ pub fn train(
         save_every_steps: None,
         evaluate_every: None,
     };
-    let mut log_error = None;
-    let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
-        if let Err(e) = folder.log(e) {
-            log_error.get_or_insert(e);
-        }
-        events(e);
-    });
-    if let Some(e) = log_error {
-        return Err(e);
-    }
-    let summary = result.map_err(|e| match e {
-        RunError::Failed(e) => e,
-        RunError::Diverged { first, again } => {
-            PipelineError::Diverged { first, again, kept: format!("{} may hold a checkpoint", checkpoints.display()) }
-        }
-    })?;
-    folder.draw_curves()?;
+    let summary = training::train((&options, origin), &mut trainer, folder, interrupt, events)?;
     let Trainer { mut model, capture, .. } = trainer;
     model.probe.update();
     Ok(Trained { model, capture, summary })

@@ -6,14 +6,14 @@ use super::trainer::{Given, Trainer};
 use super::viewing::RunView;
 use crate::error::{PipelineError, Result};
 use crate::run::photographs::StoredPhotographs;
-use crate::run::{RunDescription, RunFolder, folder, kept_capture};
+use crate::run::{RunDescription, RunFolder, folder, kept_capture, training};
 use crate::run::{memory, nearest, sparse_points};
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
 use diorama_data::{DataError, checkpoint};
 use diorama_engine::samplers::pixels::{Observation, PixelSource};
 use diorama_engine::samplers::stereo;
-use diorama_engine::train::{self, Event, RunError, RunOptions, Summary};
+use diorama_engine::train::{Event, RunOptions, Summary};
 use diorama_geom::capture::{Frame, Split};
 use diorama_geom::{Capture, Reduction};
 use std::path::Path;
@@ -69,25 +69,11 @@ pub fn train(
         save_every_steps: None,
         evaluate_every: None,
     };
-    let mut log_error = None;
-    let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
-        if let Err(e) = folder.log(e) {
-            log_error.get_or_insert(e);
-        }
+    let summary = training::train((&options, origin), &mut trainer, folder, interrupt, &mut |e| {
         view.into_iter().for_each(|v| v.update(e));
         events(e);
-    });
-    if let Some(e) = log_error {
-        return Err(e);
-    }
-    let summary = result.map_err(|e| match e {
-        RunError::Failed(e) => e,
-        RunError::Diverged { first, again } => {
-            PipelineError::Diverged { first, again, kept: format!("{} may hold a checkpoint", checkpoints.display()) }
-        }
     })?;
     trainer.show();
-    folder.draw_curves()?;
     Ok(Trained { model: trainer.model, summary })
 }
 

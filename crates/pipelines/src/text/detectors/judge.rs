@@ -8,7 +8,7 @@ use super::samples;
 use crate::error::{PipelineError, Result};
 use crate::text::pose_clusters;
 use diorama_data::photo;
-use diorama_data::text_labels::detector_set::{ANNOTATIONS, DetectorImage};
+use diorama_data::text_set::{ANNOTATIONS, detector_set::DetectorImage};
 use diorama_geom::glam::{DQuat, DVec2, dvec2};
 use serde::Serialize;
 use std::path::Path;

@@ -6,10 +6,10 @@ use super::samples::Pictures;
 use super::trainer::{Trainer, metadata};
 use crate::error::{PipelineError, Result};
 use crate::run::config::Configuration;
-use crate::run::{RunDescription, RunFolder};
-use diorama_data::text_labels::detector_set::{self, DetectorImage};
+use crate::run::{RunDescription, RunFolder, training};
+use diorama_data::text_set::detector_set::{self, DetectorImage};
 use diorama_data::{DataError, atomic, checkpoint, weights};
-use diorama_engine::train::{self, Event, RunError, RunOptions, Summary};
+use diorama_engine::train::{Event, RunOptions, Summary};
 use diorama_geom::NamedArray;
 use diorama_nets::param;
 use diorama_nets::weights::{KeyMap, Rule, Strictness, load};
@@ -57,23 +57,7 @@ pub fn train(
         folder.begin(config)?;
     }
     let (origin, options) = (trainer.origin, run_options(config));
-    let mut log_error = None;
-    let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
-        if let Err(e) = folder.log(e) {
-            log_error.get_or_insert(e);
-        }
-        events(e);
-    });
-    if let Some(e) = log_error {
-        return Err(e);
-    }
-    let summary = result.map_err(|e| match e {
-        RunError::Failed(e) => e,
-        RunError::Diverged { first, again } => {
-            PipelineError::Diverged { first, again, kept: format!("{} may hold a checkpoint", checkpoints.display()) }
-        }
-    })?;
-    folder.draw_curves()?;
+    let summary = training::train((&options, origin), &mut trainer, folder, interrupt, events)?;
     let file = folder.path().join(WEIGHTS);
     weights::save(&file, &param::arrays(&trainer.detector), metadata(config))?;
     Ok(Trained { detector: trainer.detector, summary, weights: file })

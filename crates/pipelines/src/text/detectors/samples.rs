@@ -4,7 +4,7 @@ use super::evaluation::Label;
 use super::polygon::{intersection_area, signed_area};
 use crate::error::Result;
 use diorama_data::photo;
-use diorama_data::text_labels::detector_set::DetectorImage;
+use diorama_data::text_set::detector_set::DetectorImage;
 use diorama_geom::glam::{DMat2, DVec2, dvec2};
 use diorama_geom::rng::Rng;
 use diorama_geom::{Image, ImageU8};
@@ -91,7 +91,7 @@ impl Pictures {
 
 /// Labels of an image, scaled.
 pub fn labels(image: &DetectorImage, scale: DVec2) -> Vec<Label> {
-    let of = |l: &diorama_data::text_labels::detector_set::DetectorLabel| Label {
+    let of = |l: &diorama_data::text_set::detector_set::DetectorLabel| Label {
         polygon: l.region.polygon.iter().map(|p| DVec2::from(*p) * scale).collect(),
         ignore: l.region.ignore,
         cluster: l.cluster,

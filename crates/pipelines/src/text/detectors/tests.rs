@@ -206,7 +206,7 @@ fn wrong_files_are_named_with_a_cure() {
     std::fs::write(data.join("icdar15/gt_shop_000.txt"), "1,1,9,1,9,5,1,5,###").unwrap();
     let error = recipe::labelled(&data).unwrap_err().to_string();
     assert!(error.contains("icdar15: labels no word that counts; write lines such as"), "{error}");
-    let mut set = diorama_data::text_labels::detector_set::read_set(&data).unwrap();
+    let mut set = diorama_data::text_set::detector_set::read_set(&data).unwrap();
     let error = judge::find_clusters(&mut set, &data, 0).unwrap_err().to_string();
     assert!(error.contains("--by-pose: ") && error.contains("annotations.jsonl tells no poses"), "{error}");
     set[0].labels[0].region.ignore = false;

@@ -8,11 +8,11 @@ use super::trainer::Trainer;
 use crate::error::{PipelineError, Result};
 use crate::run::device::Device;
 use crate::run::photographs::StoredPhotographs;
-use crate::run::{RunDescription, RunFolder, folder, kept_capture};
+use crate::run::{RunDescription, RunFolder, folder, kept_capture, training};
 use diorama_data::checkpoint;
 use diorama_data::import::{self, ImportOptions};
 use diorama_data::pixel_store::{PixelStore, StoreOptions};
-use diorama_engine::train::{self, Event, RunError, RunOptions, Summary};
+use diorama_engine::train::{Event, RunOptions, Summary};
 use diorama_geom::capture::Split;
 use diorama_geom::{Capture, Reduction};
 use std::path::Path;
@@ -58,23 +58,7 @@ pub fn train(
     }
     let (origin, checkpoints, options) = (model.origin, folder.checkpoints(), run_options(&model.config));
     let mut trainer = Trainer::new(model, (photographs, observations), device, &checkpoints)?;
-    let mut log_error = None;
-    let result = train::run(&options, origin, &mut trainer, interrupt, &mut |e| {
-        if let Err(e) = folder.log(e) {
-            log_error.get_or_insert(e);
-        }
-        events(e);
-    });
-    if let Some(e) = log_error {
-        return Err(e);
-    }
-    let summary = result.map_err(|e| match e {
-        RunError::Failed(e) => e,
-        RunError::Diverged { first, again } => {
-            PipelineError::Diverged { first, again, kept: format!("{} may hold a checkpoint", checkpoints.display()) }
-        }
-    })?;
-    folder.draw_curves()?;
+    let summary = training::train((&options, origin), &mut trainer, folder, interrupt, events)?;
     Ok(Trained { model: trainer.model, summary })
 }
 

@@ -1,6 +1,7 @@
 //! Fonts that writing is set in: those that the program brings along, installed ones, and files of the user's.
 
 use crate::error::{PipelineError, Result};
+use crate::text::fnv;
 use cosmic_text::FontSystem;
 use cosmic_text::fontdb::{Database, Stretch, Style, Weight};
 use diorama_data::DataError;
@@ -86,11 +87,11 @@ impl Fonts {
         Ok(face)
     }
 
-    /// A number that differs where faces or their fonts differ (FNV-1a).
+    /// A number that differs where faces or their fonts differ.
     pub fn fingerprint(&self, faces: &[Face]) -> u64 {
         let db = self.system.db();
-        let mut hash = 0xcbf2_9ce4_8422_2325u64;
-        let mut add = |bytes: &[u8]| bytes.iter().for_each(|b| hash = (hash ^ *b as u64).wrapping_mul(0x0100_0000_01b3));
+        let mut hash = fnv::hash([]);
+        let mut add = |bytes: &[u8]| hash = fnv::with(hash, bytes.iter().copied());
         faces.iter().for_each(|f| add(f.name().as_bytes()));
         let used = db.faces().filter(|info| faces.contains(&face_of(info))).map(|info| info.id);
         used.for_each(|id| db.with_face_data(id, |data, _| add(data)).unwrap_or(()));

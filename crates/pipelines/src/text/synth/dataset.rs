@@ -4,6 +4,7 @@
 //! interrupted call goes on; images are verified by their hashes.
 
 use super::super::edit::Edit;
+use super::super::fnv;
 use super::image::{self, SceneEdits};
 use super::plan::{self, Scenes, Shard, SynthOptions};
 use super::prior::Prior;
@@ -67,9 +68,9 @@ pub struct Synthesized {
     pub interrupted: bool,
 }
 
-/// Hash of bytes (FNV-1a).
-pub fn hash(bytes: &[u8]) -> String {
-    format!("{:016x}", bytes.iter().fold(0xcbf2_9ce4_8422_2325u64, |h, b| (h ^ *b as u64).wrapping_mul(0x0100_0000_01b3)))
+/// Hash of a file's bytes.
+fn hash(bytes: &[u8]) -> String {
+    format!("{:016x}", fnv::hash(bytes.iter().copied()))
 }
 
 /// Makes a shard of a data set in a folder, or goes on with it.

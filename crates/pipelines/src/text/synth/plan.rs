@@ -1,5 +1,6 @@
 //! What a data set is to hold: `scenes.toml`, options, and the samples of a shard.
 
+use super::super::fnv;
 use super::sampling::Sampling;
 use crate::error::{PipelineError, Result};
 use crate::run::folder;
@@ -135,7 +136,7 @@ pub fn place(sample: usize, count: usize, scenes: usize) -> (usize, usize) {
     (scene, sample - first(scene))
 }
 
-/// What identifies the state of a run that images depend on: a hash of its checkpoint's, regions' and edits' bytes (FNV-1a).
+/// What identifies the state of a run that images depend on: a hash of its checkpoint's, regions' and edits' bytes.
 ///
 /// # Errors
 /// When a file cannot be read.
@@ -143,10 +144,9 @@ pub fn fingerprint(run: &Path) -> Result<String> {
     let (_, checkpoint, _) = folder::last_checkpoint(run)?;
     let mut files = vec![checkpoint, run.join(super::super::placed::REGIONS)];
     files.extend(super::super::edit::Edit::files(run)?);
-    let mut hash = 0xcbf2_9ce4_8422_2325u64;
+    let mut hash = fnv::hash([]);
     for file in files {
-        let bytes = error::read(&file, u64::MAX)?;
-        bytes.iter().for_each(|b| hash = (hash ^ *b as u64).wrapping_mul(0x0100_0000_01b3));
+        hash = fnv::with(hash, error::read(&file, u64::MAX)?);
     }
     Ok(format!("{hash:016x}"))
 }

@@ -1,6 +1,7 @@
 //! Cameras of samples: by clusters of text poses in equal numbers, or like the photographs.
 
 use super::super::camera::{self, Placed, Wanted};
+use super::super::fnv;
 use super::super::pose_clusters::{clusters, distance};
 use super::prior::Prior;
 use super::scene::{Member, SynthScene};
@@ -92,10 +93,9 @@ pub struct Draws<'a> {
     pub seed: u64,
 }
 
-/// Seed of a sample, by the data set's seed, the scene's name and the sample's number in the scene (FNV-1a).
+/// Seed of a sample, by the data set's seed, the scene's name and the sample's number in the scene.
 pub fn sample_seed(seed: u64, scene: &str, index: usize) -> u64 {
-    let bytes = seed.to_le_bytes().into_iter().chain(scene.bytes()).chain((index as u64).to_le_bytes());
-    bytes.fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ b as u64).wrapping_mul(0x0100_0000_01b3))
+    fnv::hash(seed.to_le_bytes().into_iter().chain(scene.bytes()).chain((index as u64).to_le_bytes()))
 }
 
 /// A rotation turned by at most a share of [`PERTURBED`] about any axis.

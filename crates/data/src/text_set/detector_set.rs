@@ -1,10 +1,9 @@
 //! A folder of images with outlines of their writing, as detectors are trained and judged on: `images/` and `icdar15/gt_NAME.txt` for each
 //! image, a line `x1,y1,…,x4,y4,text` per word. Where there is an `annotations.jsonl`, it tells the images' scenes and the words' poses.
 
-use super::formats::{self, Format};
-use super::{LIMIT, LabelledRegion, utf8};
-use crate::error::{DataError, Result, read};
-use serde::Deserialize;
+use super::{ANNOTATIONS, SetImage, SetWord};
+use crate::error::{DataError, Result};
+use crate::text_labels::{self, Format, LabelledRegion};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -12,8 +11,6 @@ use std::path::{Path, PathBuf};
 pub const IMAGES: &str = "images";
 /// Folder of the labels.
 pub const LABELS: &str = "icdar15";
-/// File of scenes and poses.
-pub const ANNOTATIONS: &str = "annotations.jsonl";
 /// Endings of images that are read.
 const ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
 /// Largest distance of a label's corner from the annotation's, in pixels: labels are rounded.
@@ -38,34 +35,13 @@ pub struct DetectorLabel {
     pub quaternion: Option<[f64; 4]>,
 }
 
-#[derive(Deserialize)]
-struct Annotated {
-    image: String,
-    scene: String,
-    words: Vec<AnnotatedWord>,
-}
-
-#[derive(Deserialize)]
-struct AnnotatedWord {
-    quad: [[f64; 2]; 4],
-    #[serde(default)]
-    cluster: Option<usize>,
-    #[serde(default)]
-    pose: Option<AnnotatedPose>,
-}
-
-#[derive(Deserialize)]
-struct AnnotatedPose {
-    quaternion: [f64; 4],
-}
-
 /// Reads the labels of a data set; images are not opened. Sorted by name.
 ///
 /// # Errors
 /// When a folder is missing or empty, an image has no file of labels, or a line is wrong; the error names the file and the line.
 pub fn read_set(folder: &Path) -> Result<Vec<DetectorImage>> {
     let images = images(&folder.join(IMAGES))?;
-    let annotated = annotations(&folder.join(ANNOTATIONS))?;
+    let annotated = annotations(folder)?;
     images.into_iter().map(|path| image(folder, path, &annotated)).collect()
 }
 
@@ -86,16 +62,16 @@ fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-fn image(folder: &Path, path: PathBuf, annotated: &HashMap<String, Annotated>) -> Result<DetectorImage> {
+fn image(folder: &Path, path: PathBuf, annotated: &HashMap<String, SetImage>) -> Result<DetectorImage> {
     let stem = stem(&path);
     let file = folder.join(LABELS).join(format!("gt_{stem}.txt"));
     if !file.is_file() {
         return Err(DataError::input(file, format!("is missing; {} without writing has an empty file", path.display())));
     }
-    let regions = formats::read_image(Format::Icdar15, &file)?;
+    let regions = text_labels::read_image(Format::Icdar15, &file)?;
     let known = annotated.get(&stem);
     let of = |region: LabelledRegion| {
-        let far = |w: &AnnotatedWord| {
+        let far = |w: &SetWord| {
             let off = |(a, b): (&[f64; 2], &[f64; 2])| (a[0] - b[0]).abs().max((a[1] - b[1]).abs());
             region.polygon.iter().zip(&w.quad).map(off).fold(0.0, f64::max)
         };
@@ -115,19 +91,11 @@ fn scene_of(stem: &str) -> String {
 }
 
 /// Annotations by the names of images; none where there is no file.
-fn annotations(file: &Path) -> Result<HashMap<String, Annotated>> {
-    if !file.is_file() {
+fn annotations(folder: &Path) -> Result<HashMap<String, SetImage>> {
+    if !folder.join(ANNOTATIONS).is_file() {
         return Ok(HashMap::new());
     }
-    let bytes = read(file, LIMIT)?;
-    let text = utf8(&bytes).map_err(|e| DataError::input(file, e))?;
-    let mut out = HashMap::new();
-    for (n, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty()) {
-        let a: Annotated = serde_json::from_str(line)
-            .map_err(|e| DataError::input(file, format!("line {}: {e}; write the data set again, or remove the file", n + 1)))?;
-        out.insert(stem(Path::new(&a.image)), a);
-    }
-    Ok(out)
+    Ok(super::read(folder)?.into_iter().map(|a| (a.stem().to_string(), a)).collect())
 }
 
 #[cfg(test)]
@@ -154,12 +122,18 @@ mod tests {
         let [first, second] = &set[0].labels[..] else { panic!() };
         assert_eq!((&first.region.transcription[..], first.region.ignore, second.region.ignore), ("A, B", false, true));
         assert_eq!(second.region.polygon[1], [30.0, 1.0], "clockwise");
-        let line = r#"{"image":"images/a-1.JPG","scene":"shop","words":[{"quad":[[1.2,2.4],[11,2],[11,6],[1,6]],"cluster":5,"pose":{"quaternion":[1,0,0,0],"size":[1,1]}}],"width":3}"#;
+        let pose =
+            r#"{"text_pose":[[1,0,0,0],[0,-1,0,0],[0,0,-1,3]],"quaternion":[0,1,0,0],"axis_angle":[3.141592653589793,0,0],"size":[1,1]}"#;
+        let quad = "[[1.2,2.4],[11,2],[11,6],[1,6]]";
+        let word = format!(r#"{{"id":0,"quad":{quad},"polygon":{quad},"transcription":"A","visibility":1,"cluster":5,"pose":{pose}}}"#);
+        let line = format!(
+            r#"{{"image":"images/a-1.JPG","width":40,"height":30,"intrinsic":[9,9,20,15],"world_from_camera":[[1,0,0,0],[0,1,0,0],[0,0,1,0]],"scene":"shop","words":[{word}]}}"#
+        );
         put(d, ANNOTATIONS, line.as_bytes());
         let set = read_set(d).unwrap();
         assert_eq!((&set[0].scene[..], &set[1].scene[..]), ("shop", "b"));
         assert_eq!((set[0].labels[0].cluster, set[0].labels[1].cluster), (Some(5), None));
-        assert_eq!(set[0].labels[0].quaternion, Some([1.0, 0.0, 0.0, 0.0]));
+        assert_eq!(set[0].labels[0].quaternion, Some([0.0, 1.0, 0.0, 0.0]));
     }
 
     #[test]
