@@ -1,6 +1,6 @@
 //! `diorama bench render`
 
-use super::median_seconds;
+use super::alternating_seconds;
 use crate::error::{PipelineError, Result};
 use crate::object::held_out;
 use crate::object::model::ObjectModel;
@@ -41,7 +41,7 @@ pub struct RenderReport {
     pub fast: QualityFigure,
 }
 
-/// Draws every held-out view `repeats` times at each quality, one quality after the other view by view, on what
+/// Draws every held-out view `repeats` times at each quality, the qualities in turns view by view, on what
 /// [`super::super::object::device::accelerate`] named.
 pub fn run(model: &ObjectModel, repeats: usize, device: String) -> Result<RenderReport> {
     let frames = held_out::frames(&model.capture, Split::Test);
@@ -57,14 +57,13 @@ pub fn run(model: &ObjectModel, repeats: usize, device: String) -> Result<Render
     for &i in &frames {
         let (photo, counts) = reference(model, i, photo::load_full(&model.capture.frames[i].image)?)?;
         let posed = model.posed(i);
-        let mut exhaustive: Option<View> = None;
-        for ((tracer, sum), seconds) in tracers.iter().zip(&mut sums).zip(&mut seconds) {
-            let mut view = None;
-            *seconds += median_seconds(repeats, || view = Some(tracer.view(&posed, &mut |_| {})));
-            let view = view.expect("a view was drawn");
-            sum.psnr += scores(&view, &photo, &counts).psnr;
-            let to = exhaustive.get_or_insert_with(|| view.clone());
-            let squares: f64 = view.rgb.data.iter().zip(&to.rgb.data).map(|(a, b)| ((a - b) as f64).powi(2)).sum();
+        let mut views = tracers.each_ref().map(|_| None);
+        let took: [f64; 3] = alternating_seconds(repeats, |k| views[k] = Some(tracers[k].view(&posed, &mut |_| {})));
+        let views = views.map(|v: Option<View>| v.expect("a view was drawn"));
+        for (k, (view, sum)) in views.iter().zip(&mut sums).enumerate() {
+            seconds[k] += took[k];
+            sum.psnr += scores(view, &photo, &counts).psnr;
+            let squares: f64 = view.rgb.data.iter().zip(&views[0].rgb.data).map(|(a, b)| ((a - b) as f64).powi(2)).sum();
             sum.psnr_against_exhaustive += metrics::psnr(squares / view.rgb.data.len() as f64);
         }
     }
