@@ -198,6 +198,7 @@ fn train_with_styles(is_frozen: bool) -> (Vec<f64>, bool, bool) {
             images: &images,
             origins: &origins,
             dirs: &dirs,
+            far: &[],
             jitter: &jitter,
             target: &[],
             background: &background,

@@ -167,6 +167,7 @@ fn train(device: &mut Device, steps: u64) -> (Vec<f64>, Field) {
             images: &images,
             origins: &patch.origins,
             dirs: &patch.dirs,
+            far: &[],
             jitter: &jitter,
             target: &[],
             background: &background,

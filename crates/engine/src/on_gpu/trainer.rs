@@ -373,7 +373,14 @@ impl GpuTrainer {
             }
         };
         let (low, size) = self.scene.cube;
-        let near_far = ray_aabb::gpu::intersect(gpu, &origins, &dirs, [low; 3], [low + size; 3], self.scene.near);
+        let near_far = match &s.rays {
+            RaySource::Given(g) if !g.far.is_empty() => {
+                let mut near_far = vec![0.0; 2 * g.images.len()];
+                g.extents(self.scene.cube, self.scene.near, &mut near_far);
+                gpu.upload(&near_far)
+            }
+            _ => ray_aabb::gpu::intersect(gpu, &origins, &dirs, [low; 3], [low + size; 3], self.scene.near),
+        };
         let rays = GpuRays { origins, dirs, near_far, jitter: drawn.jitter.clone(), resumed: false };
         Rays { rays, drawn, background, codes }
     }

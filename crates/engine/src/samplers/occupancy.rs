@@ -10,6 +10,9 @@ use diorama_kernels::ops::occupancy_update::{OccupancyGrid, UNSEEN};
 use diorama_kernels::ops::ray_generation::PosedCamera;
 use std::f64::consts::PI;
 
+/// Length of a step over the distance from the camera (instant-ngp).
+pub const CONE: f32 = 1.0 / 256.0;
+
 /// Smallest step of marching: the diagonal of the model cube in 1024 steps.
 pub const MIN_STEP: f32 = 1.732_050_8 / 1024.0;
 
@@ -38,13 +41,15 @@ pub struct Occupancy {
     pub grid: OccupancyGrid,
     /// Whether there is space beyond the outermost cascade.
     pub unbounded: bool,
+    /// Length of a step over the distance from the camera, where there is more than one cascade.
+    pub cone: f32,
 }
 
 impl Occupancy {
     pub fn new(resolution: usize, cascades: usize, unbounded: bool) -> Self {
         // Steps of a march grow with the cascades, so that thinner matter counts in the outer ones.
         let threshold = |cascade: usize| OCCUPIED / if unbounded { (1u32 << cascade) as f32 } else { 1.0 };
-        Occupancy { grid: OccupancyGrid::new(resolution, (0..cascades).map(threshold).collect()), unbounded }
+        Occupancy { grid: OccupancyGrid::new(resolution, (0..cascades).map(threshold).collect()), unbounded, cone: CONE }
     }
 
     /// What marching reads.
@@ -55,7 +60,7 @@ impl Occupancy {
     /// Step lengths of marching through this grid; `max_samples` bounds the samples of a ray.
     pub fn march_config(&self, max_samples: usize) -> MarchConfig {
         let (cascades, resolution) = (self.grid.bits.cascades, self.grid.bits.resolution);
-        let cone = if cascades > 1 { 1.0 / 256.0 } else { 0.0 };
+        let cone = if cascades > 1 { self.cone } else { 0.0 };
         let dt_max = MIN_STEP * 1024.0 / resolution as f32 * (1u32 << (cascades - 1)) as f32;
         if self.unbounded {
             let (disparity_from, dt_max) = (DISPARITY_FROM, LONGEST_STEP);

@@ -12,7 +12,6 @@ use diorama_kernels::ops::composite::Packed;
 use diorama_kernels::ops::linear::Activation;
 use diorama_kernels::ops::march;
 use diorama_kernels::ops::photometric_loss::{Measure, Photometric, RELATIVE, squared_error};
-use diorama_kernels::ops::ray_aabb;
 use diorama_kernels::ops::ray_generation::{self, CORRECTION, PosedCamera};
 
 /// Carries out [`Step`]s on the CPU; keeps its buffers.
@@ -168,8 +167,7 @@ impl CpuTrainer {
         } else {
             b.target.copy_from_slice(g.target)
         }
-        let (low, size) = self.scene.cube;
-        ray_aabb::cpu::intersect(&b.origins, &b.dirs, [low; 3], [low + size; 3], self.scene.near, &mut b.near_far);
+        g.extents(self.scene.cube, self.scene.near, &mut b.near_far);
     }
 
     /// Places samples and computes gradients for them: loss, samples trained, samples marched.

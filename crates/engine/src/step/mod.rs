@@ -17,6 +17,7 @@ use crate::samplers::placement::Placement;
 use diorama_geom::rng::Rng;
 use diorama_kernels::ops::field_step::BatchLoss;
 use diorama_kernels::ops::photometric_loss::Terms;
+use diorama_kernels::ops::ray_aabb;
 use diorama_kernels::ops::ray_generation::{CORRECTION, PosedCamera};
 
 /// Description of a training step.
@@ -101,6 +102,8 @@ pub struct GivenRays<'a> {
     pub origins: &'a [f32],
     /// Unit length, `[R, 3]`.
     pub dirs: &'a [f32],
+    /// Distance at which each ends, `[R]`; may be empty where all end with the scene.
+    pub far: &'a [f32],
     /// Offset of the first sample within a marching step, in `[0, 1)`, `[R]`.
     pub jitter: &'a [f32],
     /// Straight RGBA `[R, 4]`; may be empty where a [`BatchLoss`] knows what to compare with.
@@ -109,6 +112,19 @@ pub struct GivenRays<'a> {
     pub background: &'a [f32],
     /// Vectors of [`crate::fields::RayCodes::given`], `[R, width]` each.
     pub codes: &'a [&'a [f32]],
+}
+
+impl GivenRays<'_> {
+    /// Distances at which rays enter and leave the scene's outer `cube` (lowest corner and edge), or end, `[R, 2]`.
+    pub(crate) fn extents(&self, (low, size): (f32, f32), near: f32, near_far: &mut [f32]) {
+        ray_aabb::cpu::intersect(self.origins, self.dirs, [low; 3], [low + size; 3], near, near_far);
+        for (extent, far) in near_far.chunks_exact_mut(2).zip(self.far) {
+            extent[1] = extent[1].min(*far);
+            if extent[1] <= extent[0] {
+                extent.fill(0.0);
+            }
+        }
+    }
 }
 
 /// Random points at which the occupancy grid is sampled.

@@ -113,6 +113,7 @@ fn train(field: &mut Field, steps: u64, (rate, weight): (f32, f32), slope: impl 
             images: &b.images,
             origins: &b.origins,
             dirs: &b.dirs,
+            far: &[],
             jitter: &b.jitter,
             target: &[],
             background: &[0.0; RAYS * 3],

@@ -93,6 +93,9 @@ pub struct LossConfig {
     pub proxy: f32,
     /// Relative error of depth where the distance is known.
     pub depth: f32,
+    /// Mean optical depth of the space before known distances; runs that do not say have none.
+    #[serde(default)]
+    pub empty: f32,
     /// Gradients of samples nearer than this many inner cubes are scaled by the squared share (Philip and Deschaintre 2023), against fog
     /// before cameras.
     pub near_scaling: f32,
@@ -176,7 +179,16 @@ impl Config {
                 space: "unbounded".into(),
             },
             labels: LabelConfig { share: labels[of] / (steps[of] + labels[of]), width: pick(32, 64, 64), waves: 12 },
-            loss: LossConfig { distortion: 1e-3, s3im: 1.0, tile: [tile; 2], opacity: 1e-3, proxy: 0.3, depth: 1.0, near_scaling: 1.0 },
+            loss: LossConfig {
+                distortion: 1e-3,
+                s3im: 1.0,
+                tile: [tile; 2],
+                opacity: 1e-3,
+                proxy: 0.3,
+                depth: 1.0,
+                empty: 0.1,
+                near_scaling: 1.0,
+            },
             optim: OptimConfig { rate: 1e-2, label_rate: 1e-2, final_scale: 1.0 / 30.0 },
             sampling: SamplingConfig {
                 rays: pick(1024, 2048, 8192),
@@ -228,7 +240,7 @@ impl Configuration for Config {
             return fault("labels: share must lie between 0 and 1, width be a multiple of 16 up to 512, waves at most 24".into());
         }
         let l = &self.loss;
-        let weights = [l.distortion, l.s3im, l.opacity, l.proxy, l.depth, l.near_scaling];
+        let weights = [l.distortion, l.s3im, l.opacity, l.proxy, l.depth, l.empty, l.near_scaling];
         if weights.iter().any(|v| !(*v >= 0.0 && v.is_finite())) {
             return fault("loss: weights must be 0 or more".into());
         }

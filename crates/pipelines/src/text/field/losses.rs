@@ -9,6 +9,8 @@ const LEAST: f32 = 1e-6;
 /// Opacity from which a ray has a depth, and the relative error from which the loss is linear.
 const LEAST_OPACITY: f32 = 0.05;
 const ROBUST: f32 = 0.1;
+/// Least light behind matter where nothing should be.
+const LEAST_LIGHT: f32 = 0.01;
 
 /// Colors against photographs: squared error, structure of random tiles, and entropy of opacities.
 pub struct SceneLoss<'a> {
@@ -24,6 +26,8 @@ pub struct SceneLoss<'a> {
     /// Distance of each ray's surface, 0 where it is not known, `[R]`, and the weight of its relative error.
     pub distance: &'a [f32],
     pub depth: f32,
+    /// Weight of the mean optical depth of the rays from the `R`-th on, on which nothing is.
+    pub empty: f32,
     /// Squared error of the last batch.
     pub mse: Mutex<f64>,
 }
@@ -36,7 +40,7 @@ impl BatchLoss for SceneLoss<'_> {
         let color = |r: usize, k: usize| if self.counts[r] { out.values[3 * r + k] } else { self.target[3 * r + k] };
         let colors: Vec<f32> = (0..rays).flat_map(|r| (0..3).map(move |k| (r, k))).map(|(r, k)| color(r, k)).collect();
         let mut loss = match self.s3im > 0.0 {
-            true => s3im::cpu::loss(&colors, self.target, self.tile, self.arrangements, self.s3im, &mut gradients.values),
+            true => s3im::cpu::loss(&colors, self.target, self.tile, self.arrangements, self.s3im, &mut gradients.values[..3 * rays]),
             false => 0.0,
         };
         let mut mse = 0.0;
@@ -53,7 +57,7 @@ impl BatchLoss for SceneLoss<'_> {
             loss -= (self.opacity * o * o.ln()) as f64 / counted;
             gradients.opacity[r] -= self.opacity * (o.ln() + 1.0) / counted as f32;
         }
-        loss += self.depths(out, gradients);
+        loss += self.depths(out, gradients) + self.matter(out, gradients);
         *self.mse.lock().expect("no other thread holds it") = mse;
         loss + mse
     }
@@ -64,6 +68,19 @@ impl BatchLoss for SceneLoss<'_> {
 }
 
 impl SceneLoss<'_> {
+    /// Mean optical depth `−ln(1 − opacity)` of rays on which nothing is.
+    fn matter(&self, out: &RayOutputs, gradients: &mut RayGradients) -> f64 {
+        let (first, all) = (self.counts.len(), out.opacity.len());
+        let weight = self.empty / (all - first).max(1) as f32;
+        let mut loss = 0.0;
+        for r in first..all {
+            let light = (1.0 - out.opacity[r]).max(LEAST_LIGHT);
+            loss -= (weight * light.ln()) as f64;
+            gradients.opacity[r] += weight / light;
+        }
+        loss
+    }
+
     /// Huber's loss of `D / d − 1` over rays of known distance `d`, where `D = Σ w t / Σ w`.
     fn depths(&self, out: &RayOutputs, gradients: &mut RayGradients) -> f64 {
         let known = self.distance.iter().filter(|d| **d > 0.0).count().max(1) as f32;

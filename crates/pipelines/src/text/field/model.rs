@@ -9,7 +9,7 @@ use diorama_engine::fields::{self, DirectionCode, Encoder, Field, FieldBuffers, 
 use diorama_engine::params::{ParamGroup, ParamSet, Schedule};
 use diorama_engine::renderers::view::View;
 use diorama_engine::renderers::volume::{Backdrop, Quality, Tracer};
-use diorama_engine::samplers::occupancy::Occupancy;
+use diorama_engine::samplers::occupancy::{self, Occupancy};
 use diorama_engine::samplers::placement::Placement;
 use diorama_engine::samplers::{RayBatch, pixels};
 use diorama_engine::step::Scene;
@@ -113,6 +113,9 @@ impl TextModel {
             labels,
         };
         let cameras = model.cameras();
+        // Steps no finer than what a pixel sees: coarse photographs hold no more.
+        let focal = cameras.iter().map(|c| c.camera.fx).fold(0.0, f64::max);
+        model.occupancy.cone = occupancy::CONE.max(1.0 / focal as f32);
         model.occupancy.keep_visible(&cameras, 2);
         Ok(model)
     }

@@ -52,9 +52,14 @@ fn the_losses_have_the_gradients_of_their_values() {
         opacity: 0.1,
         distance: &[],
         depth: 0.0,
+        empty: 0.0,
         mse: Mutex::default(),
     };
     check_gradients(&loss, 3, &values, &opacity, &[0, 14, 77, 191]);
+    // Rays after them lead through what is empty.
+    let (more, light) = (unit(3 * rays + 12, 1), unit(rays + 4, 3));
+    let empty = SceneLoss { empty: 0.3, mse: Mutex::default(), ..loss };
+    check_gradients(&empty, 3, &more, &light, &[14, 3 * rays, 3 * rays + 9]);
     // A pixel that does not count has no say.
     let mut g = RayGradients::default();
     g.clear(rays, 3);

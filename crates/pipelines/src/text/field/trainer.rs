@@ -34,6 +34,8 @@ const MARCH_RAMP: (f32, f32) = (16.0, 0.3);
 /// Steps in which the distortion's weight grows from nothing.
 const DISTORTION_RAMP: f32 = 0.1;
 
+/// Share of a known distance before which nothing is.
+const EMPTY: f32 = 0.9;
 /// Every so many rays of labels, one is of text, which few pixels are: else the background alone is learned for long.
 const TEXT_EVERY: usize = 4;
 /// Share of the stage from which on rays weigh as if all pixels were drawn alike, so that outlines find their place.
@@ -64,6 +66,12 @@ impl Labelled {
         let among = if self.text > 0 && r.is_multiple_of(TEXT_EVERY) { self.text } else { self.pixels.len() };
         self.pixels[rng.below(counter, among as u64) as usize]
     }
+}
+
+/// What a step minimizes and measures.
+struct Described<'a> {
+    loss: Loss<'a>,
+    probes: Option<Probes>,
 }
 
 /// A model in training.
@@ -122,12 +130,21 @@ impl<'a> Trainer<'a> {
         Rng::new(self.model.config.seed, stream)
     }
 
-    /// Carries out a step of the batch's rays over `background` `[R, C]`.
-    fn carry_out(&mut self, (step, share): (u64, f32), background: &[f32], loss: Loss, probes: Option<Probes>) -> Result<Figures> {
+    /// Carries out a step of the batch's rays over `background` `[R, C]`; they end at distances `far`, where these are given.
+    fn carry_out(&mut self, (step, share): (u64, f32), (far, background): (&[f32], &[f32]), described: Described) -> Result<Figures> {
+        let Described { loss, probes } = described;
         let m = &self.model;
         let b = &self.batch;
-        let given =
-            GivenRays { images: &b.images, origins: &b.origins, dirs: &b.dirs, jitter: &b.jitter, target: &[], background, codes: &[] };
+        let given = GivenRays {
+            images: &b.images,
+            origins: &b.origins,
+            dirs: &b.dirs,
+            far,
+            jitter: &b.jitter,
+            target: &[],
+            background,
+            codes: &[],
+        };
         let (most, until) = MARCH_RAMP;
         let ended = match m.stage {
             Stage::Scene => (share / until).min(1.0),
@@ -149,6 +166,23 @@ impl<'a> Trainer<'a> {
         Ok(done.shown)
     }
 
+    /// Adds the batch's rays of known distance once more, up to what is empty before it; returns where all rays end.
+    fn add_empty(&mut self) -> Vec<f32> {
+        let b = &mut self.batch;
+        let known: Vec<usize> = (0..b.len()).filter(|r| b.distance[*r] > 0.0).collect();
+        let mut far = vec![f32::MAX; b.len()];
+        let first = b.len();
+        b.resize(first + known.len());
+        for (i, r) in known.into_iter().enumerate() {
+            let to = first + i;
+            (b.images[to], b.jitter[to], b.distance[to]) = (b.images[r], b.jitter[r], 0.0);
+            b.origins.copy_within(3 * r..3 * r + 3, 3 * to);
+            b.dirs.copy_within(3 * r..3 * r + 3, 3 * to);
+            far.push(EMPTY * b.distance[r]);
+        }
+        far
+    }
+
     /// One step of the scene's stage.
     fn look(&mut self, step: u64, share: f32) -> Result<StepReport> {
         let c = self.model.config.clone();
@@ -157,16 +191,17 @@ impl<'a> Trainer<'a> {
         let (near, cube, rng) = (c.sampling.near, self.model.cube(), self.rng(PIXELS));
         let o = DrawOptions { cameras: &self.cameras, first, rng, near, cube, error_map: None, observations: &self.observations };
         pixels::draw(&self.photographs, &o, &mut self.batch);
+        let far = if c.loss.empty > 0.0 { self.add_empty() } else { Vec::new() };
         let rng = self.rng(BACKGROUND);
-        let background: Vec<f32> = (0..3 * n).map(|i| rng.uniform(3 * first + i as u64)).collect();
-        let targets = self.batch.target.chunks_exact(4).zip(background.chunks_exact(3));
+        let background: Vec<f32> = (0..3 * self.batch.len()).map(|i| rng.uniform(3 * first + i as u64)).collect();
+        let targets = self.batch.target.chunks_exact(4).zip(background.chunks_exact(3)).take(n);
         let target: Vec<f32> = targets.flat_map(|(t, b)| [0, 1, 2].map(|k| t[k] * t[3] + b[k] * (1.0 - t[3]))).collect();
         let (m, [height, width]) = (s3im::ARRANGEMENTS, c.loss.tile);
         let arrangements = match c.loss.s3im > 0.0 {
             true => s3im::arrangements(n, m, &self.rng(TILES), step * s3im::draws(n, m)),
             false => Vec::new(),
         };
-        let (counts, distance) = (self.batch.counts.clone(), self.batch.distance.clone());
+        let (counts, distance) = (self.batch.counts[..n].to_vec(), self.batch.distance[..n].to_vec());
         let loss = SceneLoss {
             target: &target,
             counts: &counts,
@@ -177,13 +212,14 @@ impl<'a> Trainer<'a> {
             opacity: c.loss.opacity,
             distance: &distance,
             depth: c.loss.depth,
+            empty: c.loss.empty,
             mse: Mutex::default(),
         };
         let is_probed = step > 0 && step.is_multiple_of(c.sampling.occupancy_every);
         let (until, block) = OCCUPANCY_WARMUP;
         let block = if step <= until { block } else { 1 };
         let probes = is_probed.then(|| Probes { rng: self.rng(OCCUPANCY), points: c.sampling.occupancy_points, block });
-        let f = self.carry_out((step, share), &background, Loss::Batch(&loss), probes)?;
+        let f = self.carry_out((step, share), (&far, &background), Described { loss: Loss::Batch(&loss), probes })?;
         let mse = loss.mse.into_inner().expect("no other thread holds it");
         Ok(StepReport { loss: f.loss, scalars: self.scalars([Scalar::psnr("psnr", mse)], n, f.trained) })
     }
@@ -212,7 +248,7 @@ impl<'a> Trainer<'a> {
         // What nothing hides is background.
         let background: Vec<f32> = (0..n * classes).map(|i| if i % classes == 0 { 1.0 } else { 0.0 }).collect();
         let loss = LabelLoss { classes, labels: &labels };
-        let f = self.carry_out((step, share), &background, Loss::Batch(&loss), None)?;
+        let f = self.carry_out((step, share), (&[], &background), Described { loss: Loss::Batch(&loss), probes: None })?;
         Ok(StepReport { loss: f.loss, scalars: self.scalars([Scalar::new("cross_entropy", f.loss)], n, f.trained) })
     }
 

@@ -289,5 +289,5 @@ fn point(batch: &RayBatch, traced: &Traced, r: usize) -> Vec3 {
 
 /// The rays of a batch with their codes, before a background `[R, C]`.
 fn given<'b>(batch: &'b RayBatch, light: &'b [u32], background: &'b [f32], codes: &'b [&'b [f32]]) -> GivenRays<'b> {
-    GivenRays { images: light, origins: &batch.origins, dirs: &batch.dirs, jitter: &batch.jitter, target: &[], background, codes }
+    GivenRays { images: light, origins: &batch.origins, dirs: &batch.dirs, far: &[], jitter: &batch.jitter, target: &[], background, codes }
 }
