@@ -1,6 +1,7 @@
 //! `diorama text train-detector` and `eval-detector`: runs go on after an interruption, scores and ONNX files are written, and what is wrong
 //! is refused in one line.
 
+use diorama_data::weights;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -86,6 +87,29 @@ fn a_detector_is_trained_in_parts_scored_and_exported() {
     std::fs::write(d.join("ds/icdar15/gt_shop_1.txt"), "20,20,80\n").unwrap();
     refused(d, &text(&["train-detector", "--data", "ds", "-o", "new"]), "gt_shop_1.txt: line 1: 3 fields; expected x1,y1");
     assert!(!d.join("new").exists(), "nothing is left of what never began");
+}
+
+#[test]
+fn weights_of_another_shape_are_named_with_both_shapes() {
+    let dir = tempfile::tempdir().unwrap();
+    let d = dir.path();
+    write_set(&d.join("ds"));
+    let train = ["text", "train-detector", "--batch", "2", "--crop", "64", "--data", "ds", "--steps", "1", "-o"];
+    assert!(run(d, &[&train[..], &["db"]].concat()).status.success());
+    let file = d.join("db/detector.safetensors");
+    let metadata = weights::metadata(&file).unwrap();
+    let mut arrays = weights::read(&file, &|_| true).unwrap();
+    let wrong = arrays.iter_mut().find(|a| a.shape.len() == 4).unwrap();
+    let (name, shape) = (wrong.name.clone(), wrong.shape.clone());
+    wrong.shape = vec![shape.iter().product(), 1, 1, 1];
+    let other = format!("{:?}", wrong.shape);
+    weights::save(&d.join("other.safetensors"), &arrays, metadata).unwrap();
+    let begun = [&train[..], &["fine", "--weights", "other.safetensors"]].concat();
+    for part in ["other.safetensors: ", &name, &other, &format!("{shape:?}")] {
+        refused(d, &begun, part);
+        refused(d, &["text", "eval-detector", "--weights", "other.safetensors", "--data", "ds"], part);
+    }
+    assert!(!d.join("fine").exists());
 }
 
 #[cfg(unix)]

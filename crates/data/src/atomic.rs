@@ -2,6 +2,7 @@
 
 use crate::error::{DataError, Result};
 use std::fs::File;
+use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
@@ -24,9 +25,20 @@ pub fn write_with(path: &Path, fill: impl FnOnce(&mut BufWriter<File>) -> std::i
     })
 }
 
-/// [`write_with`] for bytes that are already in memory.
+/// [`write_with`] for bytes that are already in memory; where the system has no room for them, the error says how many they are.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    write_with(path, |w| w.write_all(bytes))
+    write_with(path, |w| w.write_all(bytes)).map_err(|e| with_size(e, bytes.len()))
+}
+
+/// An error of too little room with the bytes that were to be written.
+fn with_size(e: DataError, bytes: usize) -> DataError {
+    match e {
+        DataError::Io { path, doing, source } if matches!(source.kind(), StorageFull | QuotaExceeded | FileTooLarge) => {
+            let source = std::io::Error::new(source.kind(), format!("{source}; {bytes} bytes were to be written"));
+            DataError::Io { path, doing, source }
+        }
+        other => other,
+    }
 }
 
 /// Removes temporary files that interrupted writes left in a folder.
@@ -70,6 +82,20 @@ mod tests {
             Err(std::io::Error::other("disk full"))
         });
         assert!(failed.unwrap_err().to_string().contains("disk full"));
+        assert_eq!(std::fs::read(&path).unwrap(), b"old");
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn a_full_disk_is_told_with_the_bytes_that_have_no_room() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a");
+        write(&path, b"old").unwrap();
+        // Each write to this device finds no space.
+        std::os::unix::fs::symlink("/dev/full", temporary_name(&path)).unwrap();
+        let e = write(&path, &[7; 5000]).unwrap_err().to_string();
+        assert!(e.contains("cannot write: No space left") && e.contains("5000 bytes were to be written"), "{e}");
         assert_eq!(std::fs::read(&path).unwrap(), b"old");
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
     }

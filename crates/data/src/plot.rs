@@ -42,13 +42,14 @@ enum Mark {
 }
 
 /// "Nice" step so that about `n` of them span `range`.
-fn nice_step(range: f64, n: f64) -> f64 {
+pub fn nice_step(range: f64, n: f64) -> f64 {
     let raw = (range / n).max(1e-12);
     let power = 10f64.powf(raw.log10().floor());
     [1.0, 2.0, 5.0, 10.0].iter().map(|m| m * power).find(|s| *s >= raw).unwrap_or(10.0 * power)
 }
 
-fn label(v: f64, step: f64) -> String {
+/// A value as text, with the decimals that ticks of a `step` need.
+pub fn label(v: f64, step: f64) -> String {
     if v.abs() >= 10_000.0 && step >= 1000.0 {
         return format!("{}k", (v / 1000.0).round());
     }
@@ -157,8 +158,8 @@ pub fn raster(charts: &[Chart]) -> ImageU8 {
     im
 }
 
-/// An antialiased line: coverage falls off over one pixel at distance `width / 2`.
-fn line(im: &mut ImageU8, a: (f64, f64), b: (f64, f64), width: f64, color: [u8; 3]) {
+/// Draws an antialiased line on `[H, W, 3]`: coverage falls off over one pixel at distance `width / 2`.
+pub fn line(im: &mut ImageU8, a: (f64, f64), b: (f64, f64), width: f64, color: [u8; 3]) {
     let r = width / 2.0 + 1.0;
     let clamp = |v: f64, n: usize| v.clamp(0.0, n as f64) as usize;
     let (x0, x1) = (clamp(a.0.min(b.0) - r, im.width), clamp(a.0.max(b.0) + r + 1.0, im.width));

@@ -2,6 +2,8 @@
 
 use crate::error::{DataError, Result};
 use crate::process::{self, Ended};
+use crate::sharpness::{self, SHORT_SIDE};
+use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
@@ -19,6 +21,8 @@ pub enum Choice {
     Count(usize),
     /// This many per second.
     PerSecond(f64),
+    /// The sharpest of each of this many equal parts, without blurred ones, see [`sharpness::sharp`].
+    Sharp(usize),
 }
 
 /// Path of ffmpeg.
@@ -53,12 +57,15 @@ pub fn extract(
     interrupt: &AtomicBool,
 ) -> Result<Option<Extracted>> {
     let passthrough = passthrough(ffmpeg)?;
-    let (sharpness, fault) = measure(ffmpeg, passthrough, video)?;
-    let count = match choice {
-        Choice::Count(n) => n,
-        Choice::PerSecond(fps) => ((sharpness.len() as f64 / frames_per_second(ffmpeg, video)? * fps).round() as usize).max(1),
+    let (sharpness, fault) = measure(ffmpeg, passthrough, video, matches!(choice, Choice::Sharp(_)))?;
+    let chosen = match choice {
+        Choice::Count(n) => sharpness::sharpest(&sharpness, n),
+        Choice::PerSecond(fps) => {
+            let count = (sharpness.len() as f64 / frames_per_second(ffmpeg, video)? * fps).round() as usize;
+            sharpness::sharpest(&sharpness, count.max(1))
+        }
+        Choice::Sharp(windows) => sharpness::sharp(&sharpness, windows),
     };
-    let chosen = sharpest(&sharpness, count);
     for (i, part) in chosen.chunks(PER_CALL).enumerate() {
         // Runs of consecutive frames keep the expression short.
         let terms: Vec<String> =
@@ -102,18 +109,28 @@ fn version(text: &str) -> Option<(u32, u32)> {
     (major < 1000).then(|| (major, parts.next().and_then(|m| m.parse().ok()).unwrap_or(0)))
 }
 
-/// Variance of the Laplacian of each frame, small and gray; and ffmpeg's messages if it could not decode all frames.
-fn measure(ffmpeg: &Path, passthrough: [&str; 2], video: &Path) -> Result<(Vec<f32>, Option<String>)> {
+/// Variance of the Laplacian of each frame, gray: at [`SHORT_SIDE`] if it `keeps_shape`, else as a small square; and ffmpeg's messages if it
+/// could not decode all frames.
+fn measure(ffmpeg: &Path, passthrough: [&str; 2], video: &Path, keeps_shape: bool) -> Result<(Vec<f32>, Option<String>)> {
     let mut c = Command::new(ffmpeg);
     c.args(["-hide_banner", "-nostdin", "-loglevel", "error", "-i"]).arg(video).args(passthrough);
-    // Square frames: the shape does not matter for sharpness, and the size must be known.
-    c.args(["-vf", &format!("scale={WIDTH}:{WIDTH}:flags=area,format=gray"), "-f", "rawvideo", "-"]);
+    if keeps_shape {
+        let side = |own: &str, other: &str| format!("'if(lte({own},{other}),min({SHORT_SIDE},{own}),-1)'");
+        let size = format!("w={}:h={}", side("iw", "ih"), side("ih", "iw-1"));
+        c.args(["-vf", &format!("scale={size}:flags=area,format=gray"), "-f", "image2pipe", "-c:v", "pgm", "-"]);
+    } else {
+        // Square frames: the shape does not matter for sharpness, and the size must be known.
+        c.args(["-vf", &format!("scale={WIDTH}:{WIDTH}:flags=area,format=gray"), "-f", "rawvideo", "-"]);
+    }
     let mut out = Vec::new();
-    let mut frame = vec![0u8; WIDTH * WIDTH];
     let read = process::read_output(&mut c, &mut |pipe| {
+        let mut pipe = BufReader::new(pipe);
         loop {
+            let size = if keeps_shape { pgm_header(&mut pipe)? } else { Some((WIDTH, WIDTH)) };
+            let Some((width, height)) = size else { return Ok(()) };
+            let mut frame = vec![0u8; width * height];
             match pipe.read_exact(&mut frame) {
-                Ok(()) => out.push(laplacian_variance(&frame, WIDTH)),
+                Ok(()) => out.push(sharpness::laplacian_variance(&frame, width)),
                 Err(e) if e.kind() == std::io::ErrorKind::UnexpectedEof => return Ok(()),
                 Err(e) => return Err(e),
             }
@@ -124,10 +141,27 @@ fn measure(ffmpeg: &Path, passthrough: [&str; 2], video: &Path) -> Result<(Vec<f
         Err(e) if !out.is_empty() => Ok((out, Some(e.to_string()))),
         // If ffmpeg does not know an option, it has not read the video.
         Err(e) if ["Unrecognized option", "Option not found", "No such filter"].iter().any(|w| e.to_string().contains(w)) => Err(e),
-        Err(e) => Err(DataError::input(video, format!("holds no frames that can be decoded: {e}; convert it to MP4"))),
+        Err(e) => Err(DataError::input(video, format!("its first frame cannot be decoded: {e}; convert it to MP4"))),
         Ok(()) if out.is_empty() => Err(DataError::input(video, "holds no frames; give a video, or a folder of photographs")),
         Ok(()) => Ok((out, None)),
     }
+}
+
+/// Width and height of the PGM picture that begins, as ffmpeg writes it: three lines, with 8 bits per pixel; none at the end of the pipe.
+fn pgm_header(pipe: &mut dyn BufRead) -> std::io::Result<Option<(usize, usize)>> {
+    let mut header = String::new();
+    for _ in 0..3 {
+        pipe.read_line(&mut header)?;
+    }
+    if header.is_empty() {
+        return Ok(None);
+    }
+    let fields: Vec<&str> = header.split_ascii_whitespace().collect();
+    let size = match fields[..] {
+        ["P5", width, height, "255"] => width.parse().ok().zip(height.parse().ok()),
+        _ => None,
+    };
+    size.map(Some).ok_or_else(|| std::io::Error::other(format!("{header:?} is no header of a PGM picture")))
 }
 
 fn frames_per_second(ffmpeg: &Path, video: &Path) -> Result<f64> {
@@ -137,29 +171,6 @@ fn frames_per_second(ffmpeg: &Path, video: &Path) -> Result<f64> {
     let fps =
         text.lines().filter(|l| l.contains("Video:")).find_map(|l| l.split(" fps").next()?.rsplit([' ', ',']).next()?.parse::<f64>().ok());
     fps.filter(|f| *f > 0.0).ok_or_else(|| DataError::input(video, "does not state its frame rate; give --frames instead of --fps"))
-}
-
-/// Variance of the 4-neighbor Laplacian of a gray image that is `width` pixels wide.
-pub fn laplacian_variance(gray: &[u8], width: usize) -> f32 {
-    let height = gray.len() / width;
-    let (mut sum, mut squares, mut n) = (0.0f64, 0.0f64, 0.0f64);
-    for y in 1..height.saturating_sub(1) {
-        for x in 1..width - 1 {
-            let i = y * width + x;
-            let v = |i: usize| gray[i] as f64;
-            let l = v(i - 1) + v(i + 1) + v(i - width) + v(i + width) - 4.0 * v(i);
-            (sum, squares, n) = (sum + l, squares + l * l, n + 1.0);
-        }
-    }
-    if n > 0.0 { (squares / n - (sum / n).powi(2)) as f32 } else { 0.0 }
-}
-
-/// The sharpest frame of each of `count` equal intervals.
-fn sharpest(sharpness: &[f32], count: usize) -> Vec<usize> {
-    let (n, count) = (sharpness.len(), count.clamp(1, sharpness.len().max(1)));
-    (0..count)
-        .filter_map(|i| (i * n / count..(i + 1) * n / count).max_by(|a, b| sharpness[*a].total_cmp(&sharpness[*b]).then(b.cmp(a))))
-        .collect()
 }
 
 /// First and last number of each run of consecutive numbers.
@@ -179,20 +190,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_sharpest_of_each_stretch_is_taken() {
-        assert_eq!(sharpest(&[1.0, 5.0, 2.0, 9.0, 9.0, 1.0], 2), [1, 3]);
-        assert_eq!(sharpest(&[1.0; 3], 9), [0, 1, 2]);
+    fn consecutive_numbers_are_runs() {
         assert_eq!(runs(&[0, 1, 2, 5, 7, 8]), [(0, 2), (5, 5), (7, 8)]);
-    }
-
-    #[test]
-    fn blur_lowers_the_variance() {
-        let sharp: Vec<u8> = (0..64 * 64).map(|i| if (i / 64 / 4 + i % 64 / 4) % 2 == 0 { 255 } else { 0 }).collect();
-        let at = |x: i32, y: i32| sharp[(y.clamp(0, 63) * 64 + x.clamp(0, 63)) as usize] as u32;
-        let blurred: Vec<u8> =
-            (0..64 * 64i32).map(|i| ((0..25).map(|k| at(i % 64 + k % 5 - 2, i / 64 + k / 5 - 2)).sum::<u32>() / 25) as u8).collect();
-        assert!(laplacian_variance(&sharp, 64) > 10.0 * laplacian_variance(&blurred, 64));
-        assert_eq!(laplacian_variance(&[7; 64], 8), 0.0);
     }
 
     #[test]

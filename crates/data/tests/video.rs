@@ -85,6 +85,11 @@ fn sharp_frames_are_written(ffmpeg: &Path) {
     let made = extract(ffmpeg, &file, &out, Choice::Count(6)).unwrap().unwrap();
     assert_eq!(made, Extracted { frames: FRAMES, taken: 6, fault: None });
     assert_eq!(frames(&out).iter().map(|f| number(f)).collect::<Vec<_>>(), [2, 6, 10, 14, 18, 22]);
+    // Two of eight parts have no sharp frame.
+    let sharp = dir.path().join("sharp");
+    let made = extract(ffmpeg, &file, &sharp, Choice::Sharp(8)).unwrap().unwrap();
+    assert_eq!(made, Extracted { frames: FRAMES, taken: 6, fault: None });
+    assert_eq!(frames(&sharp).iter().map(|f| number(f)).collect::<Vec<_>>(), [2, 6, 10, 14, 18, 22]);
     // All of them are consecutive.
     let all = dir.path().join("all");
     assert_eq!(extract(ffmpeg, &file, &all, Choice::Count(99)).unwrap().unwrap().taken, FRAMES);

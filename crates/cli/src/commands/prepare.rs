@@ -7,7 +7,7 @@ use clap::Args;
 use diorama_data::split::SplitRule;
 use diorama_data::video::Choice;
 use diorama_pipelines::Result;
-use diorama_pipelines::run::prepare::{self, Finish, PrepareOptions, Prepared, Sfm};
+use diorama_pipelines::run::prepare::{self, Finish, PrepareOptions, Prepared, Sfm, Wanted};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -100,29 +100,36 @@ impl Verb for Prepare {
     fn run(&self) -> Result<Outcome> {
         use_threads(self.threads)?;
         self.check_numbers()?;
-        let options = self.options()?;
-        watch_interrupts();
-        let (mut last, mut stage) = (Instant::now(), String::new());
-        let mut note = |text: &str| {
-            // New stages are printed at once, counts within a stage every two seconds.
-            let begins = text.split(':').next().unwrap_or(text);
-            if begins != stage || last.elapsed() > Duration::from_secs(2) {
-                (last, stage) = (Instant::now(), begins.to_string());
-                eprintln!("{text}");
-            }
-        };
-        let Some(made) = prepare::prepare(&options, &INTERRUPT, &mut note)? else {
-            let sfm = if options.sfm == Sfm::None { " --sfm none" } else { "" };
-            eprintln!("interrupted; continue with: diorama prepare {} -o {}{sfm} --resume", self.input.display(), self.out.display());
-            return Ok(Outcome::Interrupted);
-        };
-        if self.json {
-            println!("{}", serde_json::to_string(&made).expect("plain values"));
-            return Ok(Outcome::Done);
-        }
-        print(&made);
-        Ok(Outcome::Done)
+        let name = self.out.file_name().unwrap_or_default().to_string_lossy();
+        let next = format!("diorama train {} -o runs/{name}", self.out.display());
+        carry_out(&self.options()?, "prepare", &next, self.json)
     }
+}
+
+/// Prepares a data set, prints progress and what was made; `command` is the one that goes on after an interrupt, `next` what to do then.
+pub fn carry_out(options: &PrepareOptions, command: &str, next: &str, json: bool) -> Result<Outcome> {
+    watch_interrupts();
+    let (mut last, mut stage) = (Instant::now(), String::new());
+    let mut note = |text: &str| {
+        // New stages are printed at once, counts within a stage every two seconds.
+        let begins = text.split(':').next().unwrap_or(text);
+        if begins != stage || last.elapsed() > Duration::from_secs(2) {
+            (last, stage) = (Instant::now(), begins.to_string());
+            eprintln!("{text}");
+        }
+    };
+    let Some(made) = prepare::prepare(options, &INTERRUPT, &mut note)? else {
+        let sfm = if options.sfm == Sfm::None { " --sfm none" } else { "" };
+        let (input, out) = (options.input.display(), options.out.display());
+        eprintln!("interrupted; continue with: diorama {command} {input} -o {out}{sfm} --resume");
+        return Ok(Outcome::Interrupted);
+    };
+    if json {
+        println!("{}", serde_json::to_string(&made).expect("plain values"));
+        return Ok(Outcome::Done);
+    }
+    print(&made, next);
+    Ok(Outcome::Done)
 }
 
 impl Prepare {
@@ -168,6 +175,7 @@ impl Prepare {
             format: self.format.as_deref().map(str::parse).transpose().map_err(usage)?,
             masks: self.masks.options()?,
             choice: self.fps.map_or(Choice::Count(self.frames), Choice::PerSecond),
+            wanted: Wanted::ANY,
             every: self.every,
             max_side: self.max_side.unwrap_or(u32::MAX),
             matcher: self.matcher.parse().map_err(usage)?,
@@ -184,7 +192,7 @@ impl Prepare {
     }
 }
 
-fn print(made: &Prepared) {
+fn print(made: &Prepared, next: &str) {
     println!(
         "{}: {} of {} photographs have poses, {} points, {} held out, scene {} times the inner cube{}",
         made.folder.display(),
@@ -215,5 +223,5 @@ fn print(made: &Prepared) {
         println!("background removed: {:.0} % of the pixels are left", 100.0 * share);
     }
     println!("look at: {}", made.sheet.display());
-    println!("next: diorama train {} -o runs/{}", made.folder.display(), made.folder.file_name().unwrap_or_default().to_string_lossy());
+    println!("next: {next}");
 }

@@ -40,6 +40,19 @@ impl Format {
         }
     }
 
+    /// What a label looks like, for errors.
+    fn example(self) -> &'static str {
+        match self {
+            Format::Labelme => {
+                r#"{"imagePath": "001.png", "shapes": [{"label": "CAFE", "points": [[10,8],[90,10],[90,30],[10,28]], "group_id": 0}]}"#
+            }
+            Format::Ppocr => r#"001.png, a tab, [{"transcription": "CAFE", "points": [[10,8],[90,10],[90,30],[10,28]]}]"#,
+            Format::Icdar13 => r#"10 8 90 30 "CAFE""#,
+            Format::Icdar15 => "10,8,90,10,90,30,10,28,CAFE",
+            Format::Mlt17 => "10,8,90,10,90,30,10,28,Latin,CAFE",
+        }
+    }
+
     /// The format of a name.
     pub fn named(name: &str) -> Option<Format> {
         Format::ALL.into_iter().find(|f| f.name() == name)
@@ -123,7 +136,8 @@ pub fn import(format: Format, path: &Path, known: &[Known]) -> Result<Vec<Labell
         }
     }
     if out.is_empty() {
-        return Err(DataError::input(path, format!("holds no label of the format {}", format.name())));
+        let (name, example) = (format.name(), format.example());
+        return Err(DataError::input(path, format!("holds no label of the format {name}; label at least one region, as in {example}")));
     }
     Ok(out.into_iter().map(|(image, (regions, _))| LabelledImage { image, regions }).collect())
 }

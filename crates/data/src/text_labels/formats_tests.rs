@@ -130,7 +130,11 @@ fn errors_name_file_line_and_what_is_expected() {
     let error = import(Format::Icdar15, dir.path(), &two).unwrap_err().to_string();
     assert!(error.contains("may be \"cam0/001.png\" or \"cam1/001.png\""), "{error}");
     refused(Format::Icdar15, &[("readme.md", "")], &["holds no gt_NAME.txt, as icdar15 has"]);
-    refused(Format::Icdar15, &[("gt_001.txt", "\n")], &["holds no label of the format icdar15"]);
+    refused(
+        Format::Icdar15,
+        &[("gt_001.txt", "\n")],
+        &["holds no label of the format icdar15; label at least one region, as in 10,8,90,10,90,30,10,28,CAFE"],
+    );
     let missing = tempfile::tempdir().unwrap().path().join("none");
     assert!(import(Format::Ppocr, &missing, &known()).unwrap_err().to_string().contains("give a file or folder of labels"));
     assert!(Format::ALL.iter().all(|f| Format::named(f.name()) == Some(*f)) && Format::named("voc").is_none());

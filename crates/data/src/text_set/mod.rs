@@ -23,6 +23,7 @@ mod geometry;
 mod icdar;
 mod label_txt;
 mod set_check;
+pub mod tar_shards;
 mod toolboxes;
 
 use crate::atomic;
@@ -289,7 +290,7 @@ pub fn write(folder: &Path, images: &[SetImage], formats: &[SetFormat]) -> Resul
     Ok(())
 }
 
-/// Removes images, their labels in all formats, and the annotations first: what else is in the folder stays.
+/// Removes images, their labels in all formats, shards, and the annotations first: what else is in the folder stays.
 ///
 /// # Errors
 /// When a file cannot be removed.
@@ -299,6 +300,7 @@ pub fn remove(folder: &Path, images: &[SetImage]) -> Result<()> {
         _ => Ok(()),
     };
     [ANNOTATIONS].into_iter().chain(PLACES).try_for_each(gone)?;
+    tar_shards::remove(folder)?;
     let lines = [SetFormat::Icdar13, SetFormat::Icdar15, SetFormat::Mlt17];
     images.iter().try_for_each(|image| {
         gone(&image.image)?;

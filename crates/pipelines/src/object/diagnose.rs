@@ -1,7 +1,7 @@
 //! `diorama doctor DATA`: what a capture holds, and what will likely go wrong with it in training.
 
 use crate::error::Result;
-use diorama_data::{masks, photo, pixel_store, sparse, video};
+use diorama_data::{masks, photo, pixel_store, sharpness, sparse};
 use diorama_geom::capture::{Agreement, ColorSpace, Frame, MaskRule, Split, focus_point};
 use diorama_geom::color::linear_from_srgb;
 use diorama_geom::glam::DVec3;
@@ -296,7 +296,7 @@ fn look(f: &Frame, rule: &MaskRule) -> Result<Look> {
     let variance = seen.iter().map(|i| (gray[*i] as f32 - middle).powi(2)).sum::<f32>() / n;
     Ok(Look {
         stops: mean.max(1e-6).log2(),
-        sharpness: video::laplacian_variance(&gray, small.width) / variance.max(1.0),
+        sharpness: sharpness::laplacian_variance(&gray, small.width) / variance.max(1.0),
         // What is brighter than white is not lost in linear light.
         clipped: if f.color_space == ColorSpace::Linear { 0.0 } else { seen.iter().filter(|i| gray[**i] >= 250).count() as f32 / n },
         clear,

@@ -224,6 +224,7 @@ fn posed(p: Photographs, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut 
             format: None,
             masks: MaskOptions::default(),
             choice: Choice::Count(1),
+            wanted: poses::Wanted::ANY,
             every: 1,
             max_side: o.max_side,
             matcher: o.matcher,

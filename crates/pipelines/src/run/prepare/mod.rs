@@ -2,6 +2,7 @@
 //! world, post-processes photographs, splits them into training and held-out views, and draws a contact sheet.
 
 pub mod finish;
+mod frames;
 mod posed;
 mod sfm;
 mod sheet;
@@ -20,6 +21,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 pub use finish::Finish;
+pub use frames::Wanted;
 pub use sfm::Matcher;
 pub(crate) use world::cameras_up;
 
@@ -54,8 +56,10 @@ pub struct PrepareOptions {
     pub format: Option<import::Format>,
     /// How the masks of a posed capture are read.
     pub masks: MaskOptions,
-    /// Which frames of a video are extracted.
+    /// Which frames of a video are extracted, and with [`Choice::Sharp`] which photographs of a folder are taken.
     pub choice: Choice,
+    /// How many photographs [`Sfm::Colmap`] is given.
+    pub wanted: Wanted,
     /// Take every n-th photograph.
     pub every: usize,
     /// Longest side in pixels; larger photographs are downsampled.
@@ -163,13 +167,7 @@ fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut d
     }
     let broken = left_out(&work.join(BROKEN))?;
     let images = photo_import::list(&o.out.join(IMAGES))?;
-    if images.len() < 3 {
-        return Err(DataError::input(
-            &o.input,
-            format!("{} photographs are not enough; at least 3 are needed, 30 to 150 are usual", images.len()),
-        )
-        .into());
-    }
+    o.wanted.check(&o.input, images.len(), note)?;
     let names: Vec<String> = images.iter().map(|p| p.file_name().unwrap_or_default().to_string_lossy().into_owned()).collect();
     let is_video = !o.input.is_dir();
     let one_size = one_size(&images)?;
@@ -354,6 +352,7 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
             Err(_) => e,
         })?;
         let all: Vec<PathBuf> = all.into_iter().step_by(o.every).collect();
+        let Some(all) = frames::of_folder(all, o, interrupt, note)? else { return Ok(false) };
         focal_ratio = common_focal_ratio(&all);
         let stems = stems(&all);
         for (i, (source, stem)) in all.iter().zip(&stems).enumerate() {
@@ -377,7 +376,7 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
         };
         note(&format!("frames: {} of {} taken", made.taken, made.frames));
         if let Some(fault) = made.fault {
-            note(&format!("the video can be decoded in part only, the rest is missing: {fault}"));
+            note(&format!("the video can be decoded up to frame {} only, the rest is missing: {fault}", made.frames));
         }
         if o.max_side < u32::MAX {
             for file in photo_import::list(&folder)? {

@@ -43,12 +43,19 @@ fn seen_images(o: &PrepareOptions) -> std::path::PathBuf {
 /// Supported COLMAP camera models.
 pub const LENSES: [&str; 6] = ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"];
 
+/// What to do without COLMAP.
+const WITHOUT: &str = "captures that have poses need no COLMAP: --sfm none";
+
 /// Path of COLMAP.
 ///
 /// # Errors
 /// If it is not installed.
 pub fn program() -> Result<PathBuf> {
-    Ok(process::find("colmap", "DIORAMA_COLMAP", "Debian: apt install colmap; others: colmap.github.io/install.html")?)
+    let found = process::find("colmap", "DIORAMA_COLMAP", "Debian: apt install colmap; others: colmap.github.io/install.html");
+    Ok(found.map_err(|e| match e {
+        DataError::Input { path, message } => DataError::input(path, format!("{message}; {WITHOUT}")),
+        other => other,
+    })?)
 }
 
 /// Photographs that need poses.
@@ -130,7 +137,11 @@ impl Sfm<'_> {
         for (name, value) in arguments {
             c.arg(format!("--{name}")).arg(value);
         }
-        Ok(process::run(&mut c, &self.work.join("colmap.log"), self.interrupt, on_line)? == Ended::Done)
+        let ended = process::run(&mut c, &self.work.join("colmap.log"), self.interrupt, on_line).map_err(|e| match e {
+            DataError::Failed { program, message } => DataError::failed(program, format!("{command} {message}; {WITHOUT}")),
+            other => other,
+        })?;
+        Ok(ended == Ended::Done)
     }
 
     /// The name of an option in the installed version of COLMAP: `names` is (new, old).
