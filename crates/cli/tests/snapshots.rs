@@ -31,7 +31,7 @@ fn help_of_every_verb() {
     for group in ["relight", "text", "bench"] {
         calls.extend(verbs(&[group]).into_iter().map(|v| vec![group.to_string(), v]));
     }
-    assert_eq!(calls.len(), 51, "the program, its verbs and those of groups");
+    assert_eq!(calls.len(), 54, "the program, its verbs and those of groups");
     for call in calls {
         let mut arguments: Vec<&str> = call.iter().map(String::as_str).collect();
         arguments.push("--help");

@@ -15,6 +15,7 @@ use diorama_pipelines::object::scored_view::ScoredView;
 use diorama_pipelines::object::seen_by::{SeenBy, Sights};
 use diorama_pipelines::object::{device, run_folder};
 use diorama_pipelines::run::kept_capture;
+use diorama_pipelines::run::perceptual;
 use diorama_pipelines::{Application, Result};
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
@@ -95,7 +96,7 @@ impl Eval {
             other => return Err(usage(format!("on {other}: expected train, val or test"))),
         };
         let quality = self.quality.parse().map_err(usage)?;
-        let lpips = if self.lpips.is_empty() { None } else { Some(evaluate::load_lpips(&self.lpips)?) };
+        let lpips = if self.lpips.is_empty() { None } else { Some(perceptual::load_lpips(&self.lpips)?) };
         let model = self.open()?;
         let folder = self.run.join("eval");
         if self.save_images || self.explain {

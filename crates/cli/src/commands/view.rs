@@ -10,6 +10,7 @@ use diorama_pipelines::object::{device, run_folder};
 use diorama_pipelines::relight::outdoor;
 use diorama_pipelines::run::viewing_points::PointsView;
 use diorama_pipelines::run::{description, folder, kept_capture};
+use diorama_pipelines::text;
 use diorama_pipelines::{Application, PipelineError, Result};
 use diorama_viewer::{Server, ViewerOptions};
 use std::net::IpAddr;
@@ -101,6 +102,7 @@ impl Verb for View {
 enum Source {
     Run(Arc<RunView>),
     Scene(Arc<outdoor::viewing::RunView>),
+    Text(Arc<text::viewing::RunView>),
     Points(Arc<PointsView>),
 }
 
@@ -109,6 +111,7 @@ impl Source {
         match self {
             Source::Run(r) => r.clone(),
             Source::Scene(r) => r.clone(),
+            Source::Text(r) => r.clone(),
             Source::Points(p) => p.clone(),
         }
     }
@@ -117,7 +120,7 @@ impl Source {
     fn check_device(&self) -> Result<()> {
         match self {
             Source::Run(r) => r.check_device(),
-            Source::Scene(_) | Source::Points(_) => Ok(()),
+            Source::Scene(_) | Source::Text(_) | Source::Points(_) => Ok(()),
         }
     }
 }
@@ -142,7 +145,7 @@ fn source(a: &View) -> Result<Source> {
             Application::Object => object(a),
             Application::Relight => scene(a),
             of @ Application::RelightObject => Err(of.refuse(&a.path, "the GLB file that diorama relight object wrote")),
-            of @ Application::Text => Err(of.refuse(&a.path, "diorama text eval, which draws its held-out views")),
+            Application::Text => written(a),
             of @ Application::Detector => Err(of.refuse(&a.path, "diorama text eval-detector --weights")),
         };
     }
@@ -162,6 +165,16 @@ fn object(a: &View) -> Result<Source> {
     }
     device::accelerate(&mut model, &a.device, Box::new(note))?;
     Ok(Source::Run(viewing::open(&a.path, model, false)?))
+}
+
+/// The view source of a run of the text application.
+fn written(a: &View) -> Result<Source> {
+    let (model, notes) = text::field::recipe::load(&a.path, a.data.as_deref())?;
+    notes.iter().for_each(|n| note(n));
+    if let Err(e) = kept_capture::require_photographs(&model.capture) {
+        note(&format!("photographs cannot be shown: {e}"));
+    }
+    Ok(Source::Text(text::viewing::open(&a.path, model)?))
 }
 
 /// The view source of a run of the scene model.

@@ -6,14 +6,13 @@ use super::held_out::{self, GAP_DB, GAP_MEANS};
 use super::model::ObjectModel;
 use super::scored_view::{Doing, ScoredView, admits, reference, score_view, where_it_counts};
 use crate::error::{PipelineError, Result};
-use diorama_data::{photo, weights};
-use diorama_engine::metrics::lpips::{self, Lpips};
+use diorama_data::photo;
+use diorama_engine::metrics::lpips::Lpips;
 use diorama_engine::metrics::{self, ImageScores};
 use diorama_engine::renderers::volume::Quality;
 use diorama_geom::Image;
 use diorama_geom::capture::Split;
 use serde::Serialize;
-use std::path::PathBuf;
 
 /// Scores of one view.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -172,19 +171,6 @@ pub fn evaluate(
 ) -> Result<Report> {
     let all = held_out::frames(&model.capture, split).len();
     evaluate_counted(model, split, quality, None, each, &mut Count { done: 0, all, report: &mut |_| {} })
-}
-
-/// Reads the network and the heads of LPIPS, which may be one file or several.
-///
-/// # Errors
-/// When a file is malformed, or the network or the heads are missing.
-pub fn load_lpips(files: &[PathBuf]) -> Result<Lpips> {
-    let mut tensors = Vec::new();
-    for file in files {
-        tensors.extend(weights::read(file, &lpips::is_wanted)?.into_iter().map(|t| (t.name, t.shape, t.values)));
-    }
-    let names: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
-    Lpips::new(tensors).map_err(|e| PipelineError::Usage(format!("{}: {e}", names.join(","))))
 }
 
 /// Frames of a split.

@@ -15,11 +15,15 @@ pub mod placed;
 pub mod pose_clusters;
 pub mod quickstart;
 pub mod regions;
+pub mod report;
 pub mod retouch;
+pub mod stages;
+pub mod study;
 pub mod styling;
 pub mod surface;
 pub mod synth;
 pub mod truth;
+pub mod viewing;
 #[cfg(test)]
 mod whole_tests;
 mod words;

@@ -2,21 +2,20 @@
 
 mod page;
 
-use super::detectors::config::{Backbone, Config as DetectorConfig, Kind};
-use super::detectors::{judge, recipe as detection};
-use super::edit::{self, Change, EditOptions, ground::Eraser};
+use super::detectors::config::Kind;
+use super::edit;
 use super::field::config::{Config, Preset};
 use super::field::{recipe, scores};
 use super::label::accuracy::Accuracy;
-use super::label::fitting::FitOptions;
-use super::label::{self, Cameras, LabelOptions};
 use super::make_scenes::{self, FontSource, SceneOptions};
+use super::report::{self, Contents, Failures, FieldQuality, Judging, LabelledSet};
+use super::stages;
+use super::styling::MaskMode;
 use super::synth::dataset::{self, Synthesized};
 use super::synth::plan::{Scenes, Shard, SynthOptions};
 use super::synth::sampling::Sampling;
 use crate::error::Result;
 use crate::run::stages::Listeners;
-use crate::run::{RunFolder, folder};
 use diorama_data::text_set::SetFormat;
 use diorama_data::{DataError, atomic, photo};
 use diorama_engine::train::Event;
@@ -27,9 +26,8 @@ use std::sync::atomic::AtomicBool;
 /// Size of the images, and how many are kept for judging.
 const SIZE: (u32, u32) = (160, 120);
 const JUDGED: usize = 60;
-/// Side of the windows that detectors are trained on, and their rate.
+/// Side of the windows that detectors are trained on.
 const CROP: usize = 128;
-const RATE: f32 = 0.003;
 
 /// How much is generated and trained.
 #[derive(Clone, Debug)]
@@ -92,9 +90,10 @@ pub fn quickstart(out: &Path, o: &QuickstartOptions, stop: &AtomicBool, listener
     stage("drawing labelled images");
     let Some(made) = q.synthesize()? else { return Ok(None) };
     stage("training a DB detector");
-    let Some(f_db) = q.detector(Kind::Db)? else { return Ok(None) };
+    let Some(db) = q.detector(Kind::Db)? else { return Ok(None) };
     stage("training an EAST detector");
-    let Some(f_east) = q.detector(Kind::East)? else { return Ok(None) };
+    let Some(east) = q.detector(Kind::East)? else { return Ok(None) };
+    let f = |d: &Failures| d.judged.evaluation.instance.f;
     let made = Made {
         psnr: field.psnr,
         ssim: field.ssim,
@@ -104,15 +103,20 @@ pub fn quickstart(out: &Path, o: &QuickstartOptions, stop: &AtomicBool, listener
         images: made.images,
         images_per_s: made.images_per_s,
         misfits: made.misfits,
-        f_db,
-        f_east,
+        f_db: f(&db),
+        f_east: f(&east),
         dataset: out.join("dataset"),
         report: out.join("report.html"),
         notes: q.notes,
     };
-    let pictures = page::pictures(&out.join("dataset"))?;
-    photo::save_png(&out.join("labels.png"), &pictures)?;
-    atomic::write(&made.report, page::html(&made).as_bytes())?;
+    let contents = Contents {
+        sets: vec![LabelledSet::read(&made.dataset)?],
+        real: None,
+        detectors: vec![db, east],
+        fields: vec![FieldQuality { run: out.join("field").display().to_string(), scores: field }],
+    };
+    let page = report::page::html("diorama text quickstart", &page::head(&made), &contents, page::FOOT)?;
+    atomic::write(&made.report, page.as_bytes())?;
     Ok(Some(made))
 }
 
@@ -143,10 +147,7 @@ impl Quickstart<'_> {
         let (run, mut config) = (self.run(), Config::new(Preset::Ci, scene.to_path_buf()));
         config.device = "cpu".into();
         self.o.steps.iter().for_each(|s| config.run.steps = *s);
-        let resume = folder::checkpoints(&run).exists();
-        let mut run = if resume { RunFolder::open(&run)?.0 } else { RunFolder::create(&run, true)? };
-        let trained = recipe::train(&config, &mut run, resume, self.stop, self.events)?;
-        Ok(!trained.summary.interrupted)
+        stages::field(&run, &config, self.stop, self.events)
     }
 
     /// Scores the field and labels all photographs.
@@ -159,27 +160,14 @@ impl Quickstart<'_> {
             Ok(photo::save_png(&views.join(format!("{stem}.png")), sheet)?)
         };
         let field = scores::evaluate(&model, look)?;
-        let out = self.out.join("labels");
-        let options = LabelOptions { fit: FitOptions::default(), cameras: Cameras::All, formats: vec![SetFormat::Icdar15], out };
-        let (run, share) = (self.run(), &mut *self.share);
-        let done = label::label(&run, None, &options, self.stop, &mut |s, _| share(s))?;
+        let done = stages::labels(&self.run(), self.out.join("labels"), self.stop, self.share)?;
         self.notes.extend(done.notes);
         Ok((!done.interrupted).then_some((field, done.accuracy.unwrap_or_default())))
     }
 
     fn edit(&mut self) -> Result<bool> {
-        let options = EditOptions {
-            regions: Vec::new(),
-            change: Change::Words(self.o.words),
-            font: None,
-            eraser: Eraser::PatchMatch,
-            blend: edit::drawing::Blend::Alpha,
-            color: None,
-            seed: 0,
-        };
         if edit::Edit::names(&self.run())?.is_empty() {
-            let (run, share) = (self.run(), &mut *self.share);
-            let done = edit::edit(&run, None, &options, self.stop, &mut |s, _| share(s))?;
+            let done = stages::words(&self.run(), (self.o.words, 0), self.stop, self.share)?;
             self.notes.extend(done.notes);
             return Ok(!done.interrupted);
         }
@@ -200,6 +188,8 @@ impl Quickstart<'_> {
                 prior: None,
                 formats: vec![SetFormat::Icdar15, SetFormat::Ppocr, SetFormat::Mmocr, SetFormat::Coco],
                 seed,
+                styles: Vec::new(),
+                mask: MaskMode::default(),
             };
             let share = &mut *self.share;
             let made =
@@ -213,24 +203,16 @@ impl Quickstart<'_> {
         Ok(first)
     }
 
-    /// Trains a detector and judges it; F by instance.
-    fn detector(&mut self, kind: Kind) -> Result<Option<f64>> {
+    /// Trains a detector and judges it.
+    fn detector(&mut self, kind: Kind) -> Result<Option<Failures>> {
         let run = self.out.join(kind.name());
-        let mut config = DetectorConfig::new(kind, Backbone::Tiny, self.out.join("dataset"));
-        config.batch.crop = CROP;
+        let mut config = stages::quick_detector(kind, self.out.join("dataset"), CROP);
         (config.run.steps, config.run.seconds) = (0, self.o.detector_seconds);
-        // In so few steps, Adam learns what the published rules have not begun to.
-        (config.optim.rule, config.optim.rate) = ("adam".into(), RATE);
-        config.decode.db.unclip = 0.0;
-        let resume = folder::checkpoints(&run).exists();
-        let mut run = if resume { RunFolder::open(&run)?.0 } else { RunFolder::create(&run, true)? };
-        let trained = detection::train(&config, &mut run, (resume, None), self.stop, self.events)?;
-        if trained.summary.interrupted {
-            return Ok(None);
-        }
-        let set = detection::labelled(&self.out.join("judged"))?;
-        let (share, n) = (&mut *self.share, set.len() as f64);
-        let judged = judge::judge(&trained.detector, &config, &set, self.stop, &mut |i| share(i as f64 / n))?;
-        Ok(judged.map(|j| j.evaluation.instance.f))
+        let Some(trained) = stages::detector(&run, &config, self.stop, self.events)? else { return Ok(None) };
+        let [dataset, judged] = ["dataset", "judged"].map(|name| self.out.join(name));
+        let seed = report::unused_seed(&[&dataset, &judged])?;
+        let detector = (&trained.detector, &config);
+        let judging = Judging { detector, name: &run.display().to_string(), set: &judged, runs: &[self.run()], seed };
+        judging.judge(self.stop, &mut *self.share)
     }
 }

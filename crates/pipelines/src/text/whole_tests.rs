@@ -6,15 +6,22 @@ use super::edit::{self, Change, Edit, EditOptions};
 use super::field::config::{Config, Preset};
 use super::field::{model::TextModel, recipe, scores};
 use super::label::fitting::FitOptions;
-use super::label::{self, Cameras, LabelOptions};
+use super::label::{self, Cameras, LabelOptions, Labeler};
 use super::make_scenes::{SceneOptions, generate};
 use super::placed;
-use super::synth::dataset::{self, JOURNAL, Synthesized};
+use super::styling::MaskMode;
+use super::synth::dataset::{self, Synthesized};
+use super::synth::journal::JOURNAL;
 use super::synth::merging;
 use super::synth::plan::{Scenes, Shard, SynthOptions};
 use super::synth::sampling::Sampling;
+use super::synth::{refusal_tests, styled_tests};
+use super::viewing;
 use crate::run::RunFolder;
+use crate::run::viewing::ViewedModel;
 use diorama_data::text_set::{self, SetFormat};
+use diorama_geom::view_controls::{ControlValue, ControlValues, check_lists};
+use diorama_geom::view_source::ViewRequest;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
@@ -57,6 +64,8 @@ fn options(sampling: Sampling) -> SynthOptions {
         prior: None,
         formats: vec![SetFormat::Icdar15, SetFormat::Mmocr],
         seed: 5,
+        styles: Vec::new(),
+        mask: MaskMode::default(),
     }
 }
 
@@ -78,7 +87,7 @@ fn a_scene_becomes_labels_edits_and_data_sets() {
     assert!(e.contains("regions.json: is missing; run `diorama text label"), "{e}");
     // Labels of all photographs.
     let labels = LabelOptions {
-        fit: FitOptions::default(),
+        labeler: Labeler::Surfaces(FitOptions::default()),
         cameras: Cameras::All,
         formats: vec![SetFormat::Icdar15],
         out: dir.path().join("labels"),
@@ -88,6 +97,12 @@ fn a_scene_becomes_labels_edits_and_data_sets() {
     assert!(done.images == 14 && done.regions == 2 && a.labelled > 10, "{done:?}");
     assert!(a.corner_error_px < 1.5 && a.pose_error_deg < 15.0 && a.center_error < 0.05 && a.visibility_error < 0.25, "{a:?}");
     assert_eq!(text_set::read(&labels.out).unwrap().len(), 14);
+    // The same from photograph to photograph, without regions in space.
+    let stereo = LabelOptions { labeler: Labeler::Stereo, out: dir.path().join("stereo"), ..labels.clone() };
+    let done = label::label(&run, None, &stereo, &ON, &mut |_, _| ()).unwrap();
+    let a = done.accuracy.clone().unwrap();
+    assert!(done.regions == 0 && a.labelled > 5 && a.corner_error_px < 2.0 && a.pose_error_deg.is_nan(), "{done:?}");
+    assert!(text_set::read(&stereo.out).unwrap().iter().flat_map(|i| &i.words).all(|w| w.pose.is_none()));
     // Edits: only what they cover changes.
     let made = edit::edit(&run, None, &edits(Change::Words(2)), &ON, &mut |_, _| ()).unwrap();
     assert!(made.edits.len() >= 2, "{made:?}");
@@ -95,22 +110,52 @@ fn a_scene_becomes_labels_edits_and_data_sets() {
     assert!(edit.words.len() == 1 && !edit.words[0].characters.is_empty() && edit.colors.len() == edit.directions.len());
     let share = |k: usize| edit.shares.data.chunks_exact(2).map(|s| s[k]).sum::<f32>() / (edit.shares.data.len() / 2) as f32;
     assert!(share(0) > share(1) && share(1) > 0.02 && share(0) < 0.9, "{} {}", share(0), share(1));
+    let texts = |text: &str| edit::edit(&run, None, &edits(Change::Text(text.into())), &ON, &mut |_, _| ()).unwrap().edits;
+    let (first, second) = (texts("Oslo"), texts("Rome"));
+    assert!(first != second && texts("Oslo") == first, "another text is another edit: {first:?} {second:?}");
+    first.iter().chain(&second).for_each(|name| std::fs::remove_dir_all(run.join(edit::EDITS).join(name)).unwrap());
     let mut wrong = edits(Change::Erase);
     wrong.regions = vec![7];
     let e = edit::edit(&run, None, &wrong, &ON, &mut |_, _| ()).unwrap_err().to_string();
     assert!(e.contains("--region 7: the run has 0 ("), "{e}");
+    in_the_viewer(&run);
     data_sets(dir.path(), &run);
+    refusal_tests::check(dir.path(), &run, &options(Sampling::Balanced));
+    styled_tests::check(dir.path(), &run, &options(Sampling::Balanced));
 }
 
 fn edits(change: Change) -> EditOptions {
     EditOptions { regions: Vec::new(), change, font: None, eraser: Eraser::PatchMatch, blend: Blend::Alpha, color: None, seed: 1 }
 }
 
+/// The viewer shows regions and other writing on them.
+fn in_the_viewer(run: &Path) {
+    let shown = viewing::open(run, recipe::load(run, None).unwrap().0).unwrap().model();
+    let controls = shown.controls();
+    check_lists(&shown.layers(), &controls).unwrap();
+    let frame = &shown.capture().frames[0];
+    let picture = |layer: &str, given: &[(&str, ControlValue)]| {
+        let given = given.iter().map(|(id, v)| (id.to_string(), v.clone()));
+        let values = ControlValues::checked(&controls, given).unwrap();
+        let (camera, world_from_camera) = (frame.camera, frame.world_from_camera);
+        shown.view(&ViewRequest { camera, world_from_camera, layer: layer.into(), values, clip: None }).unwrap().data
+    };
+    let off = ("outlines", ControlValue::Switch(false));
+    let without = std::slice::from_ref(&off);
+    let plain = picture("rgb", without);
+    assert!(picture("rgb", &[]) != plain && picture("classes", without) != plain && picture("depth", without) != plain);
+    let edits = Edit::names(run).unwrap();
+    let control = format!("writing_{}", Edit::head(run, &edits[0]).unwrap().region);
+    let edited = picture("rgb", &[off, (&control, ControlValue::Choice(edits[0].clone()))]);
+    let changed = edited.chunks_exact(3).zip(plain.chunks_exact(3)).filter(|(a, b)| a != b).count();
+    assert!(changed > 10 && changed < plain.len() / 6, "{changed}");
+}
+
 /// Data sets are the same in one piece, in shards, and after an interruption.
 fn data_sets(dir: &Path, run: &Path) {
     let o = options(Sampling::Balanced);
     let whole = set(&dir.join("whole"), run, &o, Shard::WHOLE);
-    assert!(whole.images == 6 && whole.misfits == 0 && whole.words >= 6, "{whole:?}");
+    assert!(whole.images == 6 && whole.misfits == 0 && whole.compared >= 6 && whole.words >= 6, "{whole:?}");
     let counts = whole.clusters.iter().filter(|n| **n > 0);
     assert!(counts.clone().max().unwrap() - counts.min().unwrap() <= 1, "{whole:?}");
     let shards: Vec<_> = (1..=3).map(|part| (dir.join(format!("shard-{part}")), Shard { part, of: 3 })).collect();

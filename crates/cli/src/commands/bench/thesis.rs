@@ -6,7 +6,7 @@ use crate::terminal::Progress;
 use clap::Args;
 use diorama_pipelines::Result;
 use diorama_pipelines::bench::thesis::{self, OurRow, ThesisObject, ThesisOptions, ThesisRow};
-use diorama_pipelines::object::evaluate;
+use diorama_pipelines::run::perceptual;
 use std::path::PathBuf;
 
 /// Make the objects of the thesis with its settings, and print our figures beside its own
@@ -52,7 +52,7 @@ impl Verb for Thesis {
             Ok((key.to_string(), PathBuf::from(folder)))
         };
         let data = self.data.iter().map(pair).collect::<Result<Vec<_>>>()?;
-        let lpips = if self.lpips.is_empty() { None } else { Some(evaluate::load_lpips(&self.lpips)?) };
+        let lpips = if self.lpips.is_empty() { None } else { Some(perceptual::load_lpips(&self.lpips)?) };
         let options = ThesisOptions { out: self.out.clone(), quick: self.quick, data, lpips };
         watch_interrupts();
         let (mut progress, mut current) = (Progress::new(), String::new());

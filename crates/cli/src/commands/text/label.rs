@@ -6,7 +6,7 @@ use crate::terminal::ShareShown;
 use clap::Args;
 use diorama_data::text_set::SetFormat;
 use diorama_pipelines::text::label::fitting::{Extent, FitOptions};
-use diorama_pipelines::text::label::{self, Cameras, LabelOptions};
+use diorama_pipelines::text::label::{self, Cameras, LabelOptions, Labeler};
 use diorama_pipelines::text::surface::Wanted;
 use diorama_pipelines::{PipelineError, Result};
 use std::path::PathBuf;
@@ -19,6 +19,9 @@ use std::path::PathBuf;
 pub struct Label {
     /// Folder of the run
     run: PathBuf,
+    /// What carries labels to views: field (regions in space), or stereo (a homography from a labelled photograph, without poses)
+    #[arg(long, default_value = "field")]
+    labeler: String,
     /// Surface of the regions: auto (a quadric where it fits much better than a plane), plane or quadric
     #[arg(long, default_value = "auto")]
     surface: String,
@@ -74,7 +77,12 @@ impl Label {
             file => Cameras::File(PathBuf::from(file)),
         };
         let out = self.out.clone().unwrap_or_else(|| self.run.join("labels"));
-        Ok(LabelOptions { fit: FitOptions { surface, extent }, cameras, formats: formats(&self.formats)?, out })
+        let labeler = match &self.labeler[..] {
+            "field" => Labeler::Surfaces(FitOptions { surface, extent }),
+            "stereo" => Labeler::Stereo,
+            other => return Err(usage(format!("labeler {other:?}: expected field or stereo"))),
+        };
+        Ok(LabelOptions { labeler, cameras, formats: formats(&self.formats)?, out })
     }
 }
 
@@ -98,7 +106,9 @@ impl Verb for Label {
         if self.json {
             println!("{}", serde_json::to_string(&done).expect("plain values"));
         } else if !done.interrupted {
-            println!("{} regions, {} without a surface", done.regions, done.without_surface);
+            if self.labeler == "field" {
+                println!("{} regions, {} without a surface", done.regions, done.without_surface);
+            }
             println!("{} images, {} words, {} not to be read", done.images, done.words, done.unreadable);
             if let Some(a) = &done.accuracy {
                 println!(

@@ -6,8 +6,11 @@ mod eval;
 mod eval_detector;
 mod label;
 mod make_scenes;
+mod prepare;
 mod prior;
 mod quickstart;
+mod report;
+mod study;
 mod synth;
 mod train;
 mod train_detector;
@@ -25,8 +28,11 @@ pub enum Text {
     EvalDetector(eval_detector::EvalDetector),
     MakeScenes(make_scenes::MakeScenes),
     Merge(synth::Merge),
+    Prepare(prepare::Prepare),
     Prior(prior::PriorCommand),
     Quickstart(quickstart::Quickstart),
+    Report(report::Report),
+    Study(study::Study),
     Synth(synth::Synth),
     Train(train::Train),
     TrainDetector(train_detector::TrainDetector),
@@ -43,8 +49,11 @@ impl Text {
             Text::EvalDetector(v) => v,
             Text::MakeScenes(v) => v,
             Text::Merge(v) => v,
+            Text::Prepare(v) => v,
             Text::Prior(v) => v,
             Text::Quickstart(v) => v,
+            Text::Report(v) => v,
+            Text::Study(v) => v,
             Text::Synth(v) => v,
             Text::Train(v) => v,
             Text::TrainDetector(v) => v,

@@ -8,7 +8,7 @@ use diorama_pipelines::run::{RunFolder, config};
 use diorama_pipelines::text::field::config::{Config, Preset};
 use diorama_pipelines::text::field::recipe;
 use diorama_pipelines::{PipelineError, Result};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Train the field of a scene with writing, then the classes of its text regions
 #[derive(Args, Clone, Debug)]
@@ -61,6 +61,21 @@ pub struct Train {
     json: bool,
 }
 
+/// Checks values that a resumed run keeps.
+///
+/// # Errors
+/// With the keys that differ.
+fn unchanged(run: &Path, before: &[(String, String)], now: &[(String, String)]) -> Result<()> {
+    let is_kept = |key: &str| key == "seed" || ["data.", "field.", "labels."].iter().any(|part| key.starts_with(part));
+    let differing: Vec<&str> = before.iter().zip(now).filter(|(a, b)| a != b && is_kept(&a.0)).map(|(a, _)| &a.0[..]).collect();
+    if differing.is_empty() {
+        return Ok(());
+    }
+    let (run, differing) = (run.display(), differing.join(", "));
+    let what = format!("--resume: {run} was begun with other {differing}; leave them out, or begin a new run with another --out");
+    Err(PipelineError::Usage(what))
+}
+
 impl Verb for Train {
     fn json(&self) -> bool {
         self.json
@@ -80,6 +95,7 @@ impl Verb for Train {
         if self.resume && (self.no_s3im || self.no_dist || self.no_pe) {
             return Err(PipelineError::Usage("--resume: the run knows its losses; leave out --no-s3im, --no-dist and --no-pe".into()));
         }
+        let before = config::values(&config);
         let off = [(self.no_s3im, "loss.s3im"), (self.no_dist, "loss.distortion"), (self.no_pe, "labels.waves")];
         off.into_iter().filter(|(off, _)| *off).try_for_each(|(_, key)| config.set(key, "0"))?;
         self.steps.iter().for_each(|s| config.run.steps = *s);
@@ -87,6 +103,9 @@ impl Verb for Train {
         self.seed.iter().for_each(|s| config.seed = *s);
         self.device.iter().for_each(|d| config.device.clone_from(d));
         config::set_all(&mut config, &self.set)?;
+        if self.resume {
+            unchanged(&self.out, &before, &config::values(&config))?;
+        }
         // Nothing is written before the request is known to be sound.
         if !self.resume {
             recipe::check(&config)?;

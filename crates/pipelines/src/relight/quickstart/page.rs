@@ -1,6 +1,7 @@
 //! The report page of a quickstart: one HTML file beside the files that it shows.
 
 use super::Made;
+use crate::run::html::escaped;
 use std::path::Path;
 
 const STYLE: &str = "body{font:16px sans-serif;max-width:60em;margin:2em auto;padding:0 1em}\
@@ -46,8 +47,4 @@ diorama relight object data/chair -o chair.glb\ndiorama relight compose scene.to
         scene = scene.concat(),
         object = object.concat(),
     )
-}
-
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;")
 }

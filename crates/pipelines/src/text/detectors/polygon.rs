@@ -141,7 +141,7 @@ fn upright(angle: f64) -> f64 {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(in crate::text) mod tests {
     use super::*;
     use proptest::prelude::*;
 

@@ -30,7 +30,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use unicode_script::{Script, UnicodeScript};
 
 /// Folder of a run's edits, and the file of one, which is written last.
-const EDITS: &str = "edits";
+pub(super) const EDITS: &str = "edits";
 const EDIT: &str = "edit.json";
 const LIMIT: u64 = 1 << 24;
 /// Stream of random numbers of words and fonts.
@@ -98,15 +98,24 @@ impl Edit {
         Ok(folder)
     }
 
+    /// Reads one of a run without its images.
+    ///
+    /// # Errors
+    /// When it is missing or damaged.
+    pub fn head(run: &Path, name: &str) -> Result<Edit> {
+        let file = run.join(EDITS).join(name).join(EDIT);
+        let bytes = error::read(&file, LIMIT)?;
+        Ok(serde_json::from_slice(&bytes).map_err(|e| DataError::input(&file, format!("{e}; make the edit again")))?)
+    }
+
     /// Reads one of a run.
     ///
     /// # Errors
     /// When it is missing or damaged.
     pub fn read(run: &Path, name: &str) -> Result<Edit> {
+        let mut edit = Edit::head(run, name)?;
         let folder = run.join(EDITS).join(name);
         let file = folder.join(EDIT);
-        let bytes = error::read(&file, LIMIT)?;
-        let mut edit: Edit = serde_json::from_slice(&bytes).map_err(|e| DataError::input(&file, format!("{e}; make the edit again")))?;
         let load = |name: String| -> Result<Image> {
             let image = photo::load(&folder.join(name))?;
             let data = image.data.chunks_exact(image.channels).flat_map(|p| [0, 1, 2].map(|k| p[k.min(p.len() - 1)] as f32 / 255.0));
@@ -218,7 +227,7 @@ pub fn edit(run: &Path, data: Option<&Path>, o: &EditOptions, stop: &AtomicBool,
         let ground = ground::erased(&model, rectangle, o.eraser, o.seed)
             .map_err(|e| PipelineError::Usage(format!("region {} ({:?}): {e}", region.id, region.transcription)))?;
         out.notes.extend(ground.notes.iter().map(|n| format!("region {} ({:?}): {n}", region.id, region.transcription)));
-        for (name, text, face) in texts(region, o, &faces) {
+        for (name, text, face) in texts(run, region, o, &faces)? {
             let writing = Writing { text: &text, face, blend: o.blend, color: o.color, seed: o.seed };
             let edit = drawing::written(region.id, &ground, rectangle, &mut fonts, &writing)?;
             let folder = edit.save(run, &name)?;
@@ -250,12 +259,12 @@ fn chosen(run: &Path, ids: &[u32]) -> Result<Vec<PlacedRegion>> {
 }
 
 /// Names, texts and faces of the edits of a region.
-fn texts<'a>(region: &PlacedRegion, o: &EditOptions, faces: &'a [Face]) -> Vec<(String, String, &'a Face)> {
+fn texts<'a>(run: &Path, region: &PlacedRegion, o: &EditOptions, faces: &'a [Face]) -> Result<Vec<(String, String, &'a Face)>> {
     let rng = Rng::new(o.seed.wrapping_mul(1009).wrapping_add(region.id as u64), WORDS_STREAM);
     let face = |k: u64| &faces[rng.below(4 * k + 1, faces.len() as u64) as usize];
-    match &o.change {
+    Ok(match &o.change {
         Change::Erase => vec![(format!("{}-erased", region.id), String::new(), face(0))],
-        Change::Text(text) => vec![(format!("{}-text", region.id), text.clone(), face(0))],
+        Change::Text(text) => vec![(named(run, region.id, text)?, text.clone(), face(0))],
         Change::Words(n) => {
             let word = |k: usize| {
                 let word = WORDS[rng.below(4 * k as u64, WORDS.len() as u64) as usize];
@@ -263,7 +272,18 @@ fn texts<'a>(region: &PlacedRegion, o: &EditOptions, faces: &'a [Face]) -> Vec<(
             };
             (0..*n).map(|k| (format!("{}-word-{k:03}", region.id), word(k), face(k as u64))).collect()
         }
+    })
+}
+
+/// Name of the edit of a text: that of the earlier one with it, else the first that is free.
+fn named(run: &Path, region: u32, text: &str) -> Result<String> {
+    let (names, name) = (Edit::names(run)?, |k: usize| format!("{region}-text-{k:03}"));
+    for k in 0.. {
+        if !names.contains(&name(k)) || Edit::head(run, &name(k))?.text == text {
+            return Ok(name(k));
+        }
     }
+    unreachable!("some number is free")
 }
 
 /// The training photograph's view that shows a region largest, before and after an edit, side by side.

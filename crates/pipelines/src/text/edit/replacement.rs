@@ -33,6 +33,13 @@ pub struct Overlay {
     shares: Texture,
 }
 
+/// Share of each pixel `[H, W, 1]` that is a glyph.
+pub struct Glyphs {
+    pub visible: Image,
+    /// Whatever stands before them.
+    pub whole: Image,
+}
+
 /// What a pixel takes from an edit.
 struct Replaced {
     pixel: usize,
@@ -115,9 +122,10 @@ impl Overlay {
         (out[0] < out[2] && out[1] < out[3]).then_some(out)
     }
 
-    /// Puts the edit into a view of a camera in the world; returns the share of each pixel that is a visible glyph.
-    pub fn put(&self, model: &TextModel, camera: &Camera, pose: &Pose, view: &mut View) -> Image {
-        let mut glyphs = Image::zeros(view.rgb.width, view.rgb.height, 1);
+    /// Puts the edit into a view of a camera in the world; returns its glyphs.
+    pub fn put(&self, model: &TextModel, camera: &Camera, pose: &Pose, view: &mut View) -> Glyphs {
+        let none = Image::zeros(view.rgb.width, view.rgb.height, 1);
+        let mut glyphs = Glyphs { visible: none.clone(), whole: none };
         let replaced = self.replaced(model, camera, pose);
         if replaced.is_empty() {
             return glyphs;
@@ -145,7 +153,8 @@ impl Overlay {
             }
             let o = &mut view.opacity.data[r.pixel];
             *o = o.max(front.opacity[i] + light * r.share);
-            glyphs.data[r.pixel] = light * r.glyph;
+            glyphs.visible.data[r.pixel] = light * r.glyph;
+            glyphs.whole.data[r.pixel] = r.glyph;
         }
         glyphs
     }

@@ -124,7 +124,7 @@ impl Labels {
 }
 
 /// Whether a polygon contains a point, by the number of sides to its right.
-fn contains(polygon: &[DVec2], p: DVec2) -> bool {
+pub fn contains(polygon: &[DVec2], p: DVec2) -> bool {
     let sides = (0..polygon.len()).map(|k| (polygon[k], polygon[(k + 1) % polygon.len()]));
     let crossed = sides.filter(|(a, b)| (a.y > p.y) != (b.y > p.y) && p.x < a.x + (p.y - a.y) / (b.y - a.y) * (b.x - a.x));
     crossed.count() % 2 == 1

@@ -8,6 +8,7 @@ use crate::run::photographs::StoredPhotographs;
 use crate::text::truth;
 use diorama_data::{DataError, import, photo};
 use diorama_engine::metrics;
+use diorama_engine::metrics::lpips::Lpips;
 use diorama_engine::renderers::view::View;
 use diorama_engine::renderers::volume::Quality;
 use diorama_engine::samplers::pixels::PixelSource;
@@ -27,6 +28,17 @@ pub struct Scores {
     pub miou: Option<f64>,
     /// Median over the pixels of all views of the error of depth over depth; none where it is not known.
     pub depth_error: Option<f64>,
+    pub per_view: Vec<ViewScore>,
+}
+
+/// Figures of a held-out view.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ViewScore {
+    pub name: String,
+    pub psnr: f64,
+    pub ssim: f64,
+    /// Perceptual distance, where weights for it were given.
+    pub lpips: Option<f64>,
 }
 
 /// Pixels of each class that are its own in both maps, and in either.
@@ -71,6 +83,14 @@ pub fn classes(shares: &[f32], count: usize) -> Vec<u8> {
 /// Colors of the classes in pictures.
 const PALETTE: [[u8; 3]; 7] = [[30, 30, 30], [230, 80, 70], [70, 150, 230], [90, 200, 90], [240, 190, 60], [170, 100, 220], [80, 210, 210]];
 
+/// Color of a class in pictures.
+pub fn class_color(class: u8) -> [u8; 3] {
+    match class {
+        0 => PALETTE[0],
+        c => PALETTE[1 + (c as usize - 1) % (PALETTE.len() - 1)],
+    }
+}
+
 /// Photograph, rendered view, classes and known classes side by side.
 fn sheet(photo: &Image, view: &Image, classes: [Option<&[u8]>; 2]) -> ImageU8 {
     let (w, h) = (photo.width, photo.height);
@@ -81,8 +101,7 @@ fn sheet(photo: &Image, view: &Image, classes: [Option<&[u8]>; 2]) -> ImageU8 {
             let color = |im: &Image| [0, 1, 2].map(|k| (im.data[3 * i + k].clamp(0.0, 1.0) * 255.0).round() as u8);
             let class = |map: Option<&[u8]>| match map.map(|m| m[i]) {
                 None | Some(UNKNOWN) => [128; 3],
-                Some(0) => PALETTE[0],
-                Some(c) => PALETTE[1 + (c as usize - 1) % (PALETTE.len() - 1)],
+                Some(c) => class_color(c),
             };
             let cells = [color(photo), color(view), class(classes[0]), class(classes[1])];
             for (k, cell) in cells.iter().enumerate() {
@@ -99,6 +118,14 @@ fn sheet(photo: &Image, view: &Image, classes: [Option<&[u8]>; 2]) -> ImageU8 {
 /// # Errors
 /// When none is held out, a photograph cannot be read, or `look` fails.
 pub fn evaluate(model: &TextModel, look: &mut dyn FnMut(&str, &ImageU8) -> Result<()>) -> Result<Scores> {
+    evaluate_with(model, None, look)
+}
+
+/// [`evaluate`], with the perceptual distance where `lpips` is given.
+///
+/// # Errors
+/// As [`evaluate`]; when a view is too small for the distance.
+pub fn evaluate_with(model: &TextModel, lpips: Option<&Lpips>, look: &mut dyn FnMut(&str, &ImageU8) -> Result<()>) -> Result<Scores> {
     let held_out = model.capture.indices(Split::Test);
     if held_out.is_empty() {
         let path = model.config.data.path.display();
@@ -115,7 +142,12 @@ pub fn evaluate(model: &TextModel, look: &mut dyn FnMut(&str, &ImageU8) -> Resul
             pixel.copy_from_slice(&photographs.rgba(k, i as u32 % w, i as u32 / w)[..3]);
         }
         let view = model.tracer(Quality::Full).view(&camera, &mut |_| ());
-        let compared = metrics::compare(&view.rgb, &photo, |x, y| photographs.counts(k, x as u32, y as u32));
+        let counts = |x: usize, y: usize| photographs.counts(k, x as u32, y as u32);
+        let compared = metrics::compare(&view.rgb, &photo, counts);
+        let name = &model.capture.frames[*frame].name;
+        let too_small = |e: String| PipelineError::Usage(format!("{name}: {e}"));
+        let distance = lpips.map(|l| l.distance(&where_it_counts(&view.rgb, &photo, counts), &photo)).transpose().map_err(too_small)?;
+        scores.per_view.push(ViewScore { name: name.clone(), psnr: compared.psnr, ssim: compared.ssim, lpips: distance });
         scores.psnr += compared.psnr / held_out.len() as f64;
         scores.ssim += compared.ssim / held_out.len() as f64;
         let got = model.shares(&camera, &mut |_| ()).map(|s| classes(&s, model.labels.count()));
@@ -124,12 +156,23 @@ pub fn evaluate(model: &TextModel, look: &mut dyn FnMut(&str, &ImageU8) -> Resul
             overlap.add(got, wanted);
         }
         depth_errors(model, *frame, &view, &mut off)?;
-        look(&model.capture.frames[*frame].name, &sheet(&photo, &view.rgb, [got.as_deref(), wanted.as_deref()]))?;
+        look(name, &sheet(&photo, &view.rgb, [got.as_deref(), wanted.as_deref()]))?;
     }
     scores.miou = overlap.mean();
     off.sort_by(f64::total_cmp);
     scores.depth_error = off.get(off.len() / 2).copied();
     Ok(scores)
+}
+
+/// A view whose pixels that do not count are those of the photograph.
+fn where_it_counts(view: &Image, photo: &Image, counts: impl Fn(usize, usize) -> bool) -> Image {
+    let (mut out, width) = (view.clone(), view.width);
+    for (i, (o, p)) in out.data.chunks_exact_mut(3).zip(photo.data.chunks_exact(3)).enumerate() {
+        if !counts(i % width, i / width) {
+            o.copy_from_slice(p);
+        }
+    }
+    out
 }
 
 /// Adds the errors of a view's depth over the exact depth of a generated scene, where it has surfaces.

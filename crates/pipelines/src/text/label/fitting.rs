@@ -153,3 +153,49 @@ fn carried(surface: &Surface, (frame, region): &Outline) -> Option<Vec<DVec2>> {
     };
     region.polygon.iter().map(at).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diorama_data::text_labels::Kind;
+    use diorama_geom::glam::DMat3;
+    use diorama_geom::rng::Rng;
+    use diorama_geom::{Camera, Pose};
+
+    /// A board of 0.8 × 0.2 that waves by `height`, and a photograph of it from 2 before it, with its outline.
+    fn board(height: f64) -> (Cloud, Frame, LabelledRegion) {
+        let rng = Rng::new(4, 0);
+        let u = |k: u64| rng.uniform(k) as f64 - 0.5;
+        let at = |k: u64| DVec3::new(0.8 * u(2 * k), 0.2 * u(2 * k + 1), 0.0);
+        let points = (0..3000).map(at).map(|p| p + DVec3::Z * height * (12.0 * p.x).sin()).collect();
+        let eye = DVec3::new(0.0, 0.0, 2.0);
+        let pose = Pose { rotation: DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)), translation: eye };
+        let camera = Camera::pinhole(640, 480, 0.8);
+        let corner = |[x, y]: [f64; 2]| camera.project(pose.inverse().point(DVec3::new(x, y, 0.0))).unwrap().to_array();
+        let region = LabelledRegion {
+            id: 3,
+            polygon: [[-0.4, 0.1], [0.4, 0.1], [0.4, -0.1], [-0.4, -0.1]].map(corner).to_vec(),
+            transcription: "CAFE".into(),
+            script: None,
+            kind: Kind::Text,
+            ignore: false,
+        };
+        (Cloud { points, views: 2, eye }, Frame::new("a", "a.png", camera, pose), region)
+    }
+
+    #[test]
+    fn points_that_are_on_no_surface_and_too_few_of_them_are_told() {
+        let (cloud, frame, region) = board(0.0);
+        let fitted = rectangle(&cloud, &[(&frame, &region)], FitOptions::default()).unwrap();
+        assert!((fitted.reading_size() - DVec2::new(0.8, 0.2)).length() < 0.01, "{:?}", fitted.reading_size());
+        let one_view = Cloud { views: 1, ..cloud };
+        let e = rectangle(&one_view, &[(&frame, &region)], FitOptions::default()).unwrap_err();
+        assert!(e.contains("3000 points in 1 views, of which 50 in 2 are needed; label a photograph"), "{e}");
+        let few = Cloud { points: one_view.points[..49].to_vec(), views: 2, eye: one_view.eye };
+        let e = rectangle(&few, &[(&frame, &region)], FitOptions::default()).unwrap_err();
+        assert!(e.contains("49 points in 2 views, of which 50 in 2"), "{e}");
+        let (waving, frame, region) = board(0.06);
+        let e = rectangle(&waving, &[(&frame, &region)], FitOptions::default()).unwrap_err();
+        assert!(e.contains("not a surface: its points deviate by ") && e.contains("its polygons are kept view by view"), "{e}");
+    }
+}

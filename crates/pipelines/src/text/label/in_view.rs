@@ -8,7 +8,8 @@ use super::super::surface::{Kind, Rectangle};
 use super::super::truth::rows;
 use diorama_data::text_labels::{self, UNREADABLE};
 use diorama_data::text_set::{SetCharacter, SetWord, WordPose};
-use diorama_engine::fields::FieldBuffers;
+use diorama_engine::fields::{FieldBuffers, Pruning};
+use diorama_engine::renderers::volume::Tracer;
 use diorama_engine::samplers::RayBatch;
 use diorama_geom::glam::{DVec2, DVec3, dvec2};
 use diorama_geom::{Camera, Pose};
@@ -23,6 +24,8 @@ pub const READABLE_PX: f64 = 8.0;
 const BENT_POINTS: usize = 10;
 /// Transmittance from which a point is seen.
 const SEEN: f32 = 0.5;
+/// Where less light is left than any check asks for, rays end.
+const DARK: Pruning = Pruning { stop: 0.1, min_alpha: 0.0, thin: f32::INFINITY, min_weight: 0.0 };
 /// Steps along the ray before a surface that are its own at least.
 const STEPS: f64 = 1.5;
 
@@ -157,8 +160,9 @@ pub fn transmittance(model: &TextModel, eye: DVec3, points: &[DVec3], front: f64
         batch.near_far[2 * i..2 * i + 2].copy_from_slice(&if far > near { [near, far] } else { [0.0; 2] });
         (batch.images[i], batch.jitter[i]) = (0, 0.5);
     }
-    let traced = model.tracer(super::QUALITY).trace(&mut batch, &mut buf);
-    traced.opacity.iter().map(|o| 1.0 - o).collect()
+    let tracer = model.tracer(super::QUALITY);
+    let tracer = Tracer { placement: tracer.placement.with_pruning(DARK), ..tracer };
+    tracer.trace(&mut batch, &mut buf).opacity.iter().map(|o| 1.0 - o).collect()
 }
 
 /// Where, in model space, what stands before a surface at a distance ends; `front` is in units of the capture.

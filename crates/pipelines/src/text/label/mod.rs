@@ -6,8 +6,10 @@
 pub mod accuracy;
 mod by_mask;
 pub mod fitting;
+pub mod homography;
 pub mod in_view;
 mod points;
+mod stereo;
 
 use super::field::model::TextModel;
 use super::field::recipe;
@@ -27,6 +29,7 @@ use points::ViewCache;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
+use stereo::Stereo;
 
 /// Quality of all views that geometry is read from.
 const QUALITY: Quality = Quality::Full;
@@ -42,10 +45,19 @@ pub enum Cameras {
     File(PathBuf),
 }
 
+/// How labels come to views.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Labeler {
+    /// By regions in space.
+    Surfaces(FitOptions),
+    /// From labelled photographs to each view, without regions in space.
+    Stereo,
+}
+
 /// What to label, and how.
 #[derive(Clone, Debug)]
 pub struct LabelOptions {
-    pub fit: FitOptions,
+    pub labeler: Labeler,
     pub cameras: Cameras,
     pub formats: Vec<SetFormat>,
     /// Folder of the data set.
@@ -73,11 +85,27 @@ struct LabelledView {
     name: String,
     camera: Camera,
     world_from_camera: Pose,
-    /// The photograph; none: it is rendered.
+    /// The capture's frame, and its photograph; none: it is rendered.
+    frame: Option<usize>,
     photograph: Option<PathBuf>,
 }
 
-/// Fits the regions of a run, writes them to its `regions.json`, and writes a labelled data set of the views.
+/// What labels views.
+enum Carrier<'a> {
+    Regions(&'a TextModel, Vec<PlacedRegion>),
+    Stereo(Stereo<'a>),
+}
+
+impl Carrier<'_> {
+    fn words(&self, view: &LabelledView) -> Vec<SetWord> {
+        match self {
+            Carrier::Regions(model, regions) => words(model, regions, view),
+            Carrier::Stereo(stereo) => stereo.words(view),
+        }
+    }
+}
+
+/// Fits the regions of a run and writes them to its `regions.json`, unless labels are carried by stereo, and writes a labelled data set of the views.
 ///
 /// # Errors
 /// When the run has no classes yet, no region has a surface or a class, the folder is not empty, or a file cannot be read or written.
@@ -89,21 +117,15 @@ pub fn label(
     progress: &mut dyn FnMut(f64, &str),
 ) -> Result<Labelled> {
     let (model, notes) = recipe::load(run, data)?;
-    if model.classes.is_none() {
-        let what = "has learned no classes yet; go on with `diorama text train --resume`";
-        return Err(PipelineError::Usage(format!("{}: {what}", run.display())));
-    }
     let views = views(&model, &options.cameras)?;
     let mut out = Labelled { notes, ..Labelled::default() };
-    let Some(regions) = regions(&model, options.fit, stop, &mut out.notes, progress) else {
+    let carrier = match options.labeler {
+        Labeler::Surfaces(fit) => place(&model, run, fit, &mut out, stop, progress)?.map(|regions| Carrier::Regions(&model, regions)),
+        Labeler::Stereo => Stereo::new(&model, stop, progress).map(Carrier::Stereo),
+    };
+    let Some(carrier) = carrier else {
         return Ok(Labelled { interrupted: true, ..out });
     };
-    if regions.iter().all(|r| r.rectangle.is_none()) {
-        let why = out.notes.last().cloned().unwrap_or_default();
-        return Err(PipelineError::Usage(format!("{}: no region has a surface; {why}", run.display())));
-    }
-    placed::save(run, &regions)?;
-    (out.regions, out.without_surface) = (regions.len(), regions.iter().filter(|r| r.rectangle.is_none()).count());
     let truth = truth(&model)?;
     let mut collected = Collected::default();
     let mut images = Vec::new();
@@ -116,7 +138,7 @@ pub fn label(
             return Ok(Labelled { interrupted: true, ..out });
         }
         progress(k as f64 / views.len() as f64, "labels");
-        let words = words(&model, &regions, view);
+        let words = carrier.words(view);
         if let Some(known) = truth.as_ref().and_then(|t| accuracy::view_of(t, &view.name)) {
             collected.add(known, &words);
         }
@@ -129,6 +151,29 @@ pub fn label(
     text_set::write(&options.out, &images, &options.formats)?;
     (out.images, out.accuracy) = (images.len(), collected.accuracy());
     Ok(out)
+}
+
+/// Fits the regions of a run and writes them to its `regions.json`; none after an interrupt.
+fn place(
+    model: &TextModel,
+    run: &Path,
+    fit: FitOptions,
+    out: &mut Labelled,
+    stop: &AtomicBool,
+    progress: &mut dyn FnMut(f64, &str),
+) -> Result<Option<Vec<PlacedRegion>>> {
+    if model.classes.is_none() {
+        let what = "has learned no classes yet; go on with `diorama text train --resume`";
+        return Err(PipelineError::Usage(format!("{}: {what}", run.display())));
+    }
+    let Some(regions) = regions(model, fit, stop, &mut out.notes, progress) else { return Ok(None) };
+    if regions.iter().all(|r| r.rectangle.is_none()) {
+        let why = out.notes.last().cloned().unwrap_or_default();
+        return Err(PipelineError::Usage(format!("{}: no region has a surface; {why}", run.display())));
+    }
+    placed::save(run, &regions)?;
+    (out.regions, out.without_surface) = (regions.len(), regions.iter().filter(|r| r.rectangle.is_none()).count());
+    Ok(Some(regions))
 }
 
 /// Fits all regions; none after an interrupt.
@@ -197,6 +242,7 @@ fn views(model: &TextModel, cameras: &Cameras) -> Result<Vec<LabelledView>> {
                 name: format!("{k:06}"),
                 camera: v.camera,
                 world_from_camera: v.world_from_camera,
+                frame: None,
                 photograph: None,
             };
             return Ok(path.views.iter().enumerate().map(view).collect());
@@ -209,7 +255,7 @@ fn views(model: &TextModel, cameras: &Cameras) -> Result<Vec<LabelledView>> {
     let view = |i: &usize| {
         let f = &model.capture.frames[*i];
         let name = Path::new(&f.name).file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        LabelledView { name, camera: f.camera, world_from_camera: f.world_from_camera, photograph: Some(f.image.clone()) }
+        LabelledView { name, camera: f.camera, world_from_camera: f.world_from_camera, frame: Some(*i), photograph: Some(f.image.clone()) }
     };
     Ok(frames.iter().map(view).collect())
 }

@@ -77,7 +77,9 @@ fn letters_that_share_a_glyph_are_one_piece_and_sizes_scale() {
 fn characters_without_a_font_are_named() {
     let mut fonts = Fonts::shipped();
     let face = face(&fonts, "Sora");
-    let error = fonts.set("Cafe \u{5e02}\u{0e01}", &face, 32.0).unwrap_err().to_string();
+    let lacking = fonts.set("Cafe \u{5e02}\u{0e01}", &face, 32.0).unwrap_err();
+    let error = lacking.to_string();
+    assert!(lacking.is_input());
     assert!(error.contains("U+0E01") && error.contains("(Thai)") && error.contains("U+5E02") && error.contains("(Han)"), "{error}");
     let error = fonts.set(" \n ", &face, 32.0).unwrap_err().to_string();
     assert!(error.contains("nothing of it has ink"), "{error}");

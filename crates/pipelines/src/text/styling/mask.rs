@@ -3,6 +3,7 @@
 use crate::text::retouch::blur;
 use diorama_geom::Image;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 /// Percentiles of importance that become 0 and 1.
 const PERCENTILES: [f64; 2] = [0.05, 0.95];
@@ -10,15 +11,23 @@ const PERCENTILES: [f64; 2] = [0.05, 0.95];
 const SMOOTHING: f32 = 1.0 / 160.0;
 
 /// Which places keep their detail.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum MaskMode {
     /// Rarely seen ones, and text.
     #[default]
-    Ours,
+    Text,
     /// Rarely seen ones, as published.
     Paper,
     /// None.
     Off,
+}
+
+impl MaskMode {
+    /// The mode of a name: text, paper or off.
+    pub fn named(name: &str) -> Option<MaskMode> {
+        [("text", MaskMode::Text), ("paper", MaskMode::Paper), ("off", MaskMode::Off)].into_iter().find(|m| m.0 == name).map(|m| m.1)
+    }
 }
 
 /// Importance of each pixel: 1/n, scaled by its 5th and 95th percentiles and smoothed; 0 where all counts are alike.
@@ -69,7 +78,7 @@ pub fn dilated(text: &Image, radius_px: usize) -> Image {
 pub fn protection(importance: &Image, text: &Image, radius_px: usize, mode: MaskMode) -> Image {
     assert_eq!(importance.data.len(), text.data.len(), "importance and text have different sizes");
     match mode {
-        MaskMode::Ours => {
+        MaskMode::Text => {
             let mut out = dilated(text, radius_px);
             out.data.iter_mut().zip(&importance.data).for_each(|(m, i)| *m = m.max(*i));
             out

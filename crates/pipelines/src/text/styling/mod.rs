@@ -7,10 +7,12 @@
 pub mod haar;
 pub mod mask;
 pub mod presets;
+pub mod style;
 pub mod transfer;
 
 pub use mask::{MaskMode, blend, importance, protection};
 pub use presets::Preset;
+pub use style::Style;
 pub use transfer::{Moments, Transfer};
 
 #[cfg(test)]

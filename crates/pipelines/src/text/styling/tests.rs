@@ -181,7 +181,7 @@ fn text_is_protected_with_a_margin() {
     assert!(wide.pixel(30, 23)[0] > 0.5 && wide.pixel(30, 32)[0] < 0.01);
     assert_eq!(dilated(&text, 0), text);
     let rare = Image { width, height, channels: 1, data: (0..width * height).map(|i| if i % width < 10 { 0.7 } else { 0.0 }).collect() };
-    let ours = protection(&rare, &text, 4, MaskMode::Ours);
+    let ours = protection(&rare, &text, 4, MaskMode::Text);
     assert_eq!([ours.pixel(3, 3)[0], ours.pixel(30, 20)[0]], [0.7, 0.9]);
     assert_eq!(protection(&rare, &text, 4, MaskMode::Paper), rare);
     assert!(protection(&rare, &text, 4, MaskMode::Off).data.iter().all(|m| *m == 0.0));

@@ -15,8 +15,8 @@ pub const DETAIL: usize = 3 * BANDS;
 const STRENGTH: f64 = 0.5;
 /// Least standard deviation along an axis, of colors from 0 to 1 and of details: what is flatter is noise.
 const FLAT: f64 = 2e-3;
-/// Largest and least factor along an axis.
-const GAINS: [f64; 2] = [0.2, 4.0];
+/// Least and largest factor along an axis: where a scene has little color of its own, larger ones make noise and edges garish.
+const GAINS: [f64; 2] = [0.2, 2.2];
 
 /// Second moments of an image's Haar bands, colors sRGB-encoded from 0 to 1.
 #[derive(Clone, Debug, PartialEq)]

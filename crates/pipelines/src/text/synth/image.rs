@@ -4,6 +4,7 @@ use super::super::edit::Edit;
 use super::super::edit::replacement::Overlay;
 use super::super::label::in_view::{self, OnSurface};
 use super::super::placed::from_rows;
+use super::appearance::Appearance;
 use super::sampling::{Clustering, Drawn};
 use super::scene::SynthScene;
 use super::verification;
@@ -11,6 +12,7 @@ use diorama_data::text_set::{SetImage, SetWord};
 use diorama_engine::renderers::volume::Quality;
 use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, Image, ImageU8};
+use std::time::{Duration, Instant};
 
 /// Stream of random numbers of edits.
 const EDITS: u64 = 83;
@@ -21,8 +23,12 @@ pub struct Drawing {
     /// Share of each pixel that is a visible glyph of an edit, one channel.
     pub glyphs: ImageU8,
     pub record: SetImage,
-    /// Largest distance in pixels between a label's corner and that of the glyphs' own pixels, over all edited words that are wholly visible.
-    pub misfit_px: Option<f64>,
+    /// Labels of edited words that were compared with their glyphs, and the largest distance in pixels between a label's corner and that of the
+    /// glyphs' own pixels.
+    pub compared: usize,
+    pub misfit_px: f64,
+    /// Time that the change of its look took.
+    pub styling: Duration,
 }
 
 /// Edits of a scene, ready to be seen, by region.
@@ -51,10 +57,10 @@ impl SceneEdits {
     }
 }
 
-/// Draws the image of a camera.
+/// Draws the image of a camera; its look changes nothing of its labels.
 pub fn draw(
     scene: &SynthScene,
-    edits: &SceneEdits,
+    (edits, appearance): (&SceneEdits, Option<&Appearance>),
     clustering: &Clustering,
     (camera, drawn): (&Camera, &Drawn),
     (name, seed): (&str, u64),
@@ -62,7 +68,7 @@ pub fn draw(
     let (model, pose) = (&scene.model, &drawn.pose);
     let mut view = model.tracer(Quality::Fast).view(&scene.posed(camera, pose), &mut |_| ());
     let mut glyphs = Image::zeros(camera.width as usize, camera.height as usize, 1);
-    let (mut words, mut misfit_px): (Vec<SetWord>, Option<f64>) = (Vec::new(), None);
+    let (mut words, mut compared, mut misfit_px): (Vec<SetWord>, usize, f64) = (Vec::new(), 0, 0.0);
     for (k, region) in scene.regions.iter().enumerate() {
         let Some(overlay) = edits.chosen(k, seed) else {
             words.extend(OnSurface::of(region).and_then(|w| in_view::labelled(model, &w, camera, pose)));
@@ -71,16 +77,20 @@ pub fn draw(
         let own = overlay.put(model, camera, pose, &mut view);
         for word in overlay.edit.words.iter().filter_map(|w| w.on(region)) {
             let Some(label) = in_view::labelled(model, &word, camera, pose) else { continue };
-            if let Some(off) = verification::misfit_px(&word, &label, &own, (camera, pose)) {
-                misfit_px = Some(misfit_px.map_or(off, |m| m.max(off)));
+            if let Some(off) = verification::misfit_px(&word, &label, &own.whole, (camera, pose)) {
+                (compared, misfit_px) = (compared + 1, misfit_px.max(off));
             }
             words.push(label);
         }
-        glyphs.data.iter_mut().zip(&own.data).for_each(|(g, v)| *g = g.max(*v));
+        glyphs.data.iter_mut().zip(&own.visible.data).for_each(|(g, v)| *g = g.max(*v));
     }
     for word in &mut words {
         word.cluster = word.pose.as_ref().map(|p| clustering.nearest(&from_rows(&p.text_pose).0));
     }
+    let began = Instant::now();
+    let changed = appearance.and_then(|a| a.changed(scene, (camera, pose), (&view, &glyphs), seed));
+    let styling = appearance.map(|_| began.elapsed()).unwrap_or_default();
+    let (style, picture) = changed.map_or((None, view.rgb), |(name, image)| (Some(name), image));
     let (r, t) = (&pose.rotation, pose.translation);
     let record = SetImage {
         image: format!("images/{name}.png"),
@@ -89,9 +99,9 @@ pub fn draw(
         intrinsic: [camera.fx, camera.fy, camera.cx, camera.cy],
         world_from_camera: std::array::from_fn(|k| [r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]]),
         scene: scene.name.clone(),
-        style: None,
+        style,
         seed: Some(seed),
         words,
     };
-    Drawing { picture: view.rgb.to_u8(), glyphs: glyphs.to_u8(), record, misfit_px }
+    Drawing { picture: picture.to_u8(), glyphs: glyphs.to_u8(), record, compared, misfit_px, styling }
 }

@@ -1,6 +1,7 @@
 //! Shards of one data set joined to the whole.
 
-use super::dataset::{self, Done, Synthesized};
+use super::dataset::{self, Synthesized};
+use super::journal::{self, Done};
 use super::plan::Shard;
 use crate::error::{PipelineError, Result};
 use diorama_data::{DataError, atomic};
@@ -25,7 +26,7 @@ pub fn merge(out: &Path, shards: &[PathBuf]) -> Result<Synthesized> {
             return usage(format!("{}: is of another data set than {}", folder.display(), shards[0].display()));
         }
         first = Some(whole);
-        let done = dataset::read_journal(folder)?;
+        let done = journal::read(folder)?;
         let wanted = manifest.shard.samples(manifest.options.count).len();
         if done.len() < wanted {
             let what = format!("has {} of its {wanted} images; finish it with `diorama text synth` first", done.len());
@@ -43,14 +44,14 @@ pub fn merge(out: &Path, shards: &[PathBuf]) -> Result<Synthesized> {
         std::fs::create_dir_all(&sub).map_err(DataError::io(&sub, "create"))?;
     }
     for (done, folder) in all.values() {
-        for file in [done.record.image.clone(), dataset::glyphs(&done.record.image)] {
+        for file in [done.record.image.clone(), journal::glyphs(&done.record.image)] {
             let (from, to) = (folder.join(&file), out.join(&file));
             std::fs::copy(&from, &to).map_err(DataError::io(&from, "copy"))?;
         }
     }
     let done: BTreeMap<usize, Done> = all.into_iter().map(|(k, (d, _))| (k, d)).collect();
-    let journal: String = done.values().map(|d| serde_json::to_string(d).expect("plain values") + "\n").collect();
-    atomic::write(&out.join(dataset::JOURNAL), journal.as_bytes())?;
+    let lines: String = done.values().map(|d| serde_json::to_string(d).expect("plain values") + "\n").collect();
+    atomic::write(&out.join(journal::JOURNAL), lines.as_bytes())?;
     dataset::finish(out, &manifest.options, &done)?;
     atomic::write(&out.join(dataset::MANIFEST), &serde_json::to_vec_pretty(&manifest).expect("plain values"))?;
     let mut result = Synthesized::default();

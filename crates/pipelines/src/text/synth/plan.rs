@@ -1,6 +1,7 @@
 //! What a data set is to hold: `scenes.toml`, options, and the samples of a shard.
 
 use super::super::fnv;
+use super::super::styling::MaskMode;
 use super::sampling::Sampling;
 use crate::error::{PipelineError, Result};
 use crate::run::folder;
@@ -81,6 +82,10 @@ pub struct SynthOptions {
     pub prior: Option<PathBuf>,
     pub formats: Vec<SetFormat>,
     pub seed: u64,
+    /// Looks of which each image takes one, as [`Style::read`](super::super::styling::Style::read) takes them; empty: as the scenes are.
+    pub styles: Vec<String>,
+    /// What keeps its detail under a style.
+    pub mask: MaskMode,
 }
 
 impl SynthOptions {

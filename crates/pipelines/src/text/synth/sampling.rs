@@ -20,6 +20,9 @@ const PERTURBED: f64 = 5.0;
 const SHARES: [f64; 4] = [1.0, 0.5, 0.25, 0.125];
 /// Deviation of the place, over the picture, and of the logarithm of the area, of a camera like a photograph.
 const JITTER: [f64; 2] = [0.05, 0.2];
+/// Area ratios among which possible ones are told, and their number.
+const AREAS: [f64; 2] = [1e-4, 1.0];
+const AREA_STEPS: usize = 65;
 /// Stream of random numbers of a sample, and those of the probes of a scene.
 const SAMPLE: u64 = 81;
 const PROBE: u64 = 82;
@@ -171,6 +174,36 @@ impl Draws<'_> {
         let placed: Placed = region.placed().ok_or(Fault::NoCamera)?;
         let pose = camera::solve(&self.camera, &placed, wanted).map_err(|_| Fault::NoCamera)?;
         self.scene.check(region, &self.camera, &pose).map(|()| pose)
+    }
+
+    /// The check that most attempts failed first; where size or distance is at fault, also the areas that can be, of a cluster or of any.
+    pub fn why(&self, cluster: Option<usize>, faults: &Faults) -> String {
+        let Some((fault, _)) = faults.iter().max_by_key(|(_, n)| **n) else { return String::new() };
+        if !matches!(fault, Fault::Small | Fault::Distance | Fault::Outside) {
+            return fault.to_string();
+        }
+        let clusters = cluster.map_or(0..self.clustering.centers.len(), |c| c..c + 1);
+        let areas: Vec<f64> = clusters.flat_map(|c| self.areas(c)).collect();
+        let (low, high) = areas.iter().fold((f64::INFINITY, 0.0f64), |(low, high), a| (low.min(*a), high.max(*a)));
+        match areas.is_empty() {
+            true => format!("{fault}; no share of the picture can be its area"),
+            false => format!("{fault}; {:.2} % to {:.2} % of the picture can be its area", 100.0 * low, 100.0 * high),
+        }
+    }
+
+    /// Those of [`AREAS`] at which size, place, angle and distance are valid for a member of a cluster, in the middle of the picture or where
+    /// the photograph shows it.
+    fn areas(&self, cluster: usize) -> Vec<f64> {
+        let [low, high] = AREAS.map(f64::ln);
+        let all = (0..AREA_STEPS).map(|k| (low + (high - low) * k as f64 / (AREA_STEPS - 1) as f64).exp());
+        let members = self.clustering.rotations(self.number, cluster);
+        let is_valid = |member: &Member, center: [f64; 2], area: f64| {
+            let wanted = self.wanted(DMat3::from_quat(member.camera_from_region), center, area);
+            let Some(region) = self.scene.regions.get(member.region) else { return false };
+            let pose = region.placed().and_then(|placed| camera::solve(&self.camera, &placed, &wanted).ok());
+            pose.is_some_and(|pose| self.scene.check_geometry(region, &self.camera, &pose).is_ok())
+        };
+        all.filter(|a| members.iter().any(|m| is_valid(m, [0.5; 2], *a) || is_valid(m, m.center, *a))).collect()
     }
 
     /// Clusters of which the scene has cameras, and why it has none of the others.

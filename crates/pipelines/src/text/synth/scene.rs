@@ -13,7 +13,13 @@ use diorama_kernels::ops::ray_generation::PosedCamera;
 use std::path::Path;
 
 /// Pixels along the longer side of the depth maps of the photographs.
-const COARSE: u32 = 64;
+pub(super) const COARSE: u32 = 64;
+
+/// Width and height of a picture that is reduced to `side` pixels along its longer side; smaller ones are enlarged to it.
+pub(super) fn coarse_size((width, height): (u32, u32), side: u32) -> [u32; 2] {
+    let longer = width.max(height) as f64;
+    [width, height].map(|v| ((v as f64 * side as f64 / longer) as u32).max(1))
+}
 
 /// A region as a photograph shows it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -87,8 +93,7 @@ impl SynthScene {
     pub fn look(&mut self) {
         let coarse = |frame: &usize| {
             let posed = self.model.posed(*frame);
-            let longer = posed.camera.width.max(posed.camera.height) as f64;
-            let size = [posed.camera.width, posed.camera.height].map(|v| ((v as f64 * COARSE as f64 / longer) as u32).max(1));
+            let size = coarse_size((posed.camera.width, posed.camera.height), COARSE);
             let coarse = PosedCamera { camera: posed.camera.resized(size[0], size[1]), ..posed };
             let view = self.model.tracer(Quality::Full).view(&coarse, &mut |_| ());
             (self.model.capture.frames[*frame].world_from_camera, coarse, view)

@@ -57,10 +57,7 @@ impl SynthScene {
     /// # Errors
     /// With the first check that fails, cheap ones first.
     pub fn check(&self, region: &PlacedRegion, camera: &Camera, pose: &Pose) -> Result<(), Fault> {
-        let rectangle = region.rectangle.as_ref().ok_or(Fault::NoCamera)?;
-        let middle = rectangle.reading_point(DVec2::ZERO);
-        self.check_picture(region, camera, pose)?;
-        self.check_photographs(middle, pose.translation)?;
+        let middle = self.check_geometry(region, camera, pose)?;
         let distance = middle.distance(pose.translation);
         if self.is_in_matter(pose.translation, FREE * distance) {
             return Err(Fault::InMatter);
@@ -71,6 +68,18 @@ impl SynthScene {
             return Err(Fault::Hidden);
         }
         self.check_view(camera, pose)
+    }
+
+    /// The checks that need no view: size, place, angle and distance; returns the region's middle.
+    ///
+    /// # Errors
+    /// With the first check that fails.
+    pub(super) fn check_geometry(&self, region: &PlacedRegion, camera: &Camera, pose: &Pose) -> Result<DVec3, Fault> {
+        let rectangle = region.rectangle.as_ref().ok_or(Fault::NoCamera)?;
+        let middle = rectangle.reading_point(DVec2::ZERO);
+        self.check_picture(region, camera, pose)?;
+        self.check_photographs(middle, pose.translation)?;
+        Ok(middle)
     }
 
     /// Whether enough of the region is in the picture.

@@ -1,31 +1,26 @@
 //! Labels against the glyphs' own pixels.
 
-use super::super::label::in_view::{self, OnSurface};
+use super::super::label::in_view::{self, InView, OnSurface};
 use diorama_data::text_set::SetWord;
 use diorama_geom::glam::{DVec2, dvec2};
 use diorama_geom::{Camera, Image, Pose};
 
-/// Visibility from which a word's glyphs are wholly seen.
-const WHOLE: f64 = 0.999;
-/// Pixels by which a corner of a label differs from that of the whole word where the border cuts it.
-const CUT_PX: f64 = 1e-6;
 /// Share of the strongest pixel from which a pixel is a glyph.
 const GLYPH: f32 = 0.35;
 /// Pixels around a word in which glyphs are its own.
 const AROUND_PX: f64 = 3.0;
 
-/// Whether a label ends at the border of the picture.
-fn touches_border(label: &SetWord, camera: &Camera) -> bool {
+/// Whether a word reaches beyond the picture.
+fn leaves_picture(whole: &InView, camera: &Camera) -> bool {
     let size = [camera.width as f64, camera.height as f64];
-    label.quad.iter().any(|p| (0..2).any(|k| p[k] <= 0.0 || p[k] >= size[k]))
+    whole.quad.iter().any(|p| (0..2).any(|k| p[k] < 0.0 || p[k] > size[k]))
 }
 
-/// Largest distance between the corners of a word's label and of the bounding quadrilateral, in the word's frame, of the glyphs that a view
-/// shows; none where the word is partly hidden or cut, or no glyph of it is seen.
+/// Largest distance between the corners of a word's label and of the bounding quadrilateral, in the word's frame, of the pixels of its
+/// `glyphs`, also where something stands before them; none where the border cuts the word, or no pixel is one of its glyphs.
 pub fn misfit_px(word: &OnSurface, label: &SetWord, glyphs: &Image, (camera, pose): (&Camera, &Pose)) -> Option<f64> {
     let whole = in_view::seen(word.rectangle, word.bounds, camera, pose)?;
-    let is_cut = (0..4).any(|k| DVec2::from(whole.quad[k]).distance(DVec2::from(label.quad[k])) > CUT_PX);
-    if label.visibility < WHOLE || (is_cut && touches_border(label, camera)) {
+    if leaves_picture(&whole, camera) {
         return None;
     }
     let [from, to] = [f64::min, f64::max].map(|f| [0, 1].map(|k| label.quad.iter().map(|p| p[k]).reduce(f).expect("four corners")));
@@ -110,8 +105,8 @@ mod tests {
         let off = |by: f64| misfit_px(&word, &label(by), &glyphs, (&camera, &pose)).unwrap();
         assert!(off(0.0) < 0.8, "{}", off(0.0));
         assert!((off(3.0) - 3.0).abs() < 0.9 && off(3.0) > 2.0, "{}", off(3.0));
-        let hidden = SetWord { visibility: 0.9, ..label(0.0) };
-        assert!(misfit_px(&word, &hidden, &glyphs, (&camera, &pose)).is_none());
+        let hidden = SetWord { visibility: 0.3, ..label(3.0) };
+        assert_eq!(misfit_px(&word, &hidden, &glyphs, (&camera, &pose)), Some(off(3.0)), "what stands before a word does not matter");
         assert!(misfit_px(&word, &label(0.0), &Image::zeros(160, 120, 1), (&camera, &pose)).is_none());
     }
 }
