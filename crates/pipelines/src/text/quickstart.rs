@@ -42,7 +42,7 @@ pub struct QuickstartOptions {
 impl Default for QuickstartOptions {
     /// Less than a quarter of an hour on two cores.
     fn default() -> Self {
-        QuickstartOptions { steps: None, words: 8, images: 500, detector_seconds: 100.0 }
+        QuickstartOptions { steps: None, words: 8, images: 500, detector_seconds: 180.0 }
     }
 }
 

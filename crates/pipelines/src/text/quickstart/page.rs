@@ -4,7 +4,7 @@ use super::Made;
 use crate::run::html::escaped;
 
 /// What follows all figures.
-pub const FOOT: &str = "<h2>Your own scene</h2>\n<pre>diorama prepare walk.mp4 -o data/shop\n\
+pub const FOOT: &str = "<h2>Your own scene</h2>\n<pre>diorama text prepare walk.mp4 -o data/shop\n\
 diorama text annotate data/shop labels/ --format labelme\ndiorama text train data/shop -o runs/shop\ndiorama text label runs/shop\n\
 diorama text edit runs/shop --words 8\ndiorama text synth runs/shop --count 1000 -o data/set\n\
 diorama text train-detector --data data/set -o runs/db</pre>\n";

@@ -7,7 +7,7 @@ use super::image::{self, Drawing, SceneEdits};
 use super::journal::{Done, glyphs, hash};
 use super::plan::{self, Scenes, SynthOptions};
 use super::prior::Prior;
-use super::sampling::{Clustering, Draws, Faults, Sampling, sample_seed};
+use super::sampling::{Clustering, Draws, Faults, OWN_ROUNDS, Sampling, sample_seed};
 use super::scene::SynthScene;
 use crate::error::{PipelineError, Result};
 use diorama_data::{atomic, photo, text_set};
@@ -15,9 +15,8 @@ use rayon::prelude::*;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Rounds of attempts in a sample's cluster, and all rounds, those in the next clusters, before it is given up.
-const OWN_ROUNDS: u64 = 8;
-const ROUNDS: u64 = 16;
+/// Rounds of attempts in a sample's cluster and the next ones before it is given up.
+const ROUNDS: u64 = 2 * OWN_ROUNDS;
 /// Seed of the clusters of text poses: data sets of the same scenes number the same clusters alike, whatever their own seed.
 const CLUSTERING: u64 = 0;
 /// Samples per thread that are drawn side by side.

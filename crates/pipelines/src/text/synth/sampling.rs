@@ -16,6 +16,8 @@ use std::collections::BTreeMap;
 const ATTEMPTS: u64 = 32;
 /// Largest angle by which a rotation differs from its member's, in degrees.
 const PERTURBED: f64 = 5.0;
+/// Rounds of attempts in a cluster before it is given up.
+pub(super) const OWN_ROUNDS: u64 = 8;
 /// Shares of it that are tried.
 const SHARES: [f64; 4] = [1.0, 0.5, 0.25, 0.125];
 /// Deviation of the place, over the picture, and of the logarithm of the area, of a camera like a photograph.
@@ -211,9 +213,17 @@ impl Draws<'_> {
         let (mut out, mut lacking) = (Vec::new(), Vec::new());
         for cluster in 0..self.clustering.centers.len() {
             let seed = sample_seed(self.seed ^ PROBE, &self.scene.name, cluster);
-            match self.balanced(cluster, seed) {
-                Ok(_) => out.push(cluster),
-                Err(faults) => lacking.push((cluster, faults)),
+            let mut faults = Faults::new();
+            let mut fails = |round: u64| {
+                let failed = self.balanced(cluster, seed.wrapping_add(round)).err();
+                let is_failed = failed.is_some();
+                failed.into_iter().flatten().for_each(|(fault, n)| *faults.entry(fault).or_default() += n);
+                is_failed
+            };
+            if (0..OWN_ROUNDS).all(&mut fails) {
+                lacking.push((cluster, faults));
+            } else {
+                out.push(cluster);
             }
         }
         (out, lacking)
