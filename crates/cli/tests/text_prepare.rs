@@ -75,7 +75,7 @@ fn sharp_photographs_get_poses_and_fewer_than_usual_are_told() {
     let (code, said, made) = shop.prepare(&["photos", "-o", "data"]);
     assert_eq!(code, Some(0), "{said}");
     assert!(
-        said.contains("24 of 26 photographs are sharp") && said.contains("only 24 sharp frames, 50 to 80 are usual; film longer"),
+        said.contains("24 of 26 photographs are taken") && said.contains("only 24 sharp frames, 50 to 80 are usual; film longer"),
         "{said}"
     );
     assert_eq!((&made["images"], &made["registered"]), (&24.into(), &24.into()));

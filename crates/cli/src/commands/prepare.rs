@@ -102,12 +102,12 @@ impl Verb for Prepare {
         self.check_numbers()?;
         let name = self.out.file_name().unwrap_or_default().to_string_lossy();
         let next = format!("diorama train {} -o runs/{name}", self.out.display());
-        carry_out(&self.options()?, "prepare", &next, self.json)
+        carry_out(&self.options()?, &next, self.json)
     }
 }
 
-/// Prepares a data set, prints progress and what was made; `command` is the one that goes on after an interrupt, `next` what to do then.
-pub fn carry_out(options: &PrepareOptions, command: &str, next: &str, json: bool) -> Result<Outcome> {
+/// Prepares a data set, prints progress and what was made, and `next`, what to do then.
+pub fn carry_out(options: &PrepareOptions, next: &str, json: bool) -> Result<Outcome> {
     watch_interrupts();
     let (mut last, mut stage) = (Instant::now(), String::new());
     let mut note = |text: &str| {
@@ -119,9 +119,7 @@ pub fn carry_out(options: &PrepareOptions, command: &str, next: &str, json: bool
         }
     };
     let Some(made) = prepare::prepare(options, &INTERRUPT, &mut note)? else {
-        let sfm = if options.sfm == Sfm::None { " --sfm none" } else { "" };
-        let (input, out) = (options.input.display(), options.out.display());
-        eprintln!("interrupted; continue with: diorama {command} {input} -o {out}{sfm} --resume");
+        eprintln!("interrupted: the same command goes on with --resume added");
         return Ok(Outcome::Interrupted);
     };
     if json {

@@ -52,11 +52,12 @@ pub struct Made {
     pub psnr: f64,
     pub ssim: f64,
     pub miou: Option<f64>,
-    pub corner_error_px: f64,
-    pub pose_error_deg: f64,
+    pub corner_error_px: Option<f64>,
+    pub pose_error_deg: Option<f64>,
     pub images: usize,
     pub images_per_s: f64,
-    /// Labels more than 2 pixels from their glyphs.
+    /// Labels of new words that were compared with their glyphs, and those more than 2 pixels off.
+    pub compared: usize,
     pub misfits: usize,
     /// F by instance on images of the same scene that no detector was trained on.
     pub f_db: f64,
@@ -102,6 +103,7 @@ pub fn quickstart(out: &Path, o: &QuickstartOptions, stop: &AtomicBool, listener
         pose_error_deg: accuracy.pose_error_deg,
         images: made.images,
         images_per_s: made.images_per_s,
+        compared: made.compared,
         misfits: made.misfits,
         f_db: f(&db),
         f_east: f(&east),

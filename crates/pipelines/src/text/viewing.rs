@@ -20,6 +20,7 @@ use diorama_kernels::ops::ray_generation::PosedCamera;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
+use std::time::SystemTime;
 
 /// A run in the viewer.
 pub type RunView = AnyRunView<ViewedText>;
@@ -43,8 +44,8 @@ pub struct ViewedText {
     run: PathBuf,
     /// None before `diorama text label`.
     regions: Vec<PlacedRegion>,
-    /// Edits that were shown, by name.
-    overlays: Mutex<BTreeMap<String, Arc<Overlay>>>,
+    /// Edits that were shown, by name, with the time of their files.
+    overlays: Mutex<BTreeMap<String, (SystemTime, Arc<Overlay>)>>,
 }
 
 /// Opens the view of a trained run.
@@ -61,23 +62,31 @@ impl ViewedText {
         PosedCamera { camera: r.camera, pose: self.model.model_from_world.pose(&r.world_from_camera) }
     }
 
-    /// Edits of a region, as options: their names and what they say.
+    /// Edits of a region, as options: their names and what they say; those that cannot be read say so, at every region.
     fn writing(&self, region: u32) -> Vec<(String, String)> {
-        let names = Edit::names(&self.run).unwrap_or_default();
-        let edits = names.into_iter().filter_map(|n| Edit::head(&self.run, &n).ok().map(|e| (n, e)));
-        let own = edits.filter(|(_, e)| e.region == region);
-        own.map(|(n, e)| (n, if e.text.is_empty() { "(erased)".to_string() } else { e.text })).collect()
+        let names = match Edit::names(&self.run) {
+            Ok(names) => names,
+            Err(e) => return vec![("unreadable".into(), e.to_string())],
+        };
+        let option = |name: String| match Edit::head(&self.run, &name) {
+            Ok(e) if e.region != region => None,
+            Ok(e) if e.text.is_empty() => Some((name, "(erased)".to_string())),
+            Ok(e) => Some((name, e.text)),
+            Err(e) => Some((name, e.to_string())),
+        };
+        names.into_iter().filter_map(option).collect()
     }
 
-    /// An edit, read when it is first shown.
+    /// An edit, read when it is first shown and when it was made anew.
     fn overlay(&self, name: &str, region: &PlacedRegion) -> Result<Option<Arc<Overlay>>> {
+        let time = Edit::time(&self.run, name)?;
         let mut known = self.overlays.lock().expect("no other thread fails with it");
-        if !known.contains_key(name)
+        if known.get(name).is_none_or(|k| k.0 != time)
             && let Some(overlay) = Overlay::new(Edit::read(&self.run, name)?, region)
         {
-            known.insert(name.to_string(), Arc::new(overlay));
+            known.insert(name.to_string(), (time, Arc::new(overlay)));
         }
-        Ok(known.get(name).cloned())
+        Ok(known.get(name).map(|k| k.1.clone()))
     }
 
     /// The view with the chosen writing.

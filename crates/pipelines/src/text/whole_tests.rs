@@ -95,13 +95,15 @@ fn a_scene_becomes_labels_edits_and_data_sets() {
     let done = label::label(&run, None, &labels, &ON, &mut |_, _| ()).unwrap();
     let a = done.accuracy.clone().unwrap();
     assert!(done.images == 14 && done.regions == 2 && a.labelled > 10, "{done:?}");
-    assert!(a.corner_error_px < 1.5 && a.pose_error_deg < 15.0 && a.center_error < 0.05 && a.visibility_error < 0.25, "{a:?}");
+    let within = |v: Option<f64>, most: f64| v.is_some_and(|v| v < most);
+    assert!(within(a.corner_error_px, 1.5) && within(a.pose_error_deg, 8.0) && within(a.center_error, 0.05), "{a:?}");
+    assert!(a.visibility_error < 0.25, "{a:?}");
     assert_eq!(text_set::read(&labels.out).unwrap().len(), 14);
     // The same from photograph to photograph, without regions in space.
     let stereo = LabelOptions { labeler: Labeler::Stereo, out: dir.path().join("stereo"), ..labels.clone() };
     let done = label::label(&run, None, &stereo, &ON, &mut |_, _| ()).unwrap();
     let a = done.accuracy.clone().unwrap();
-    assert!(done.regions == 0 && a.labelled > 5 && a.corner_error_px < 2.0 && a.pose_error_deg.is_nan(), "{done:?}");
+    assert!(done.regions == 0 && a.labelled > 5 && within(a.corner_error_px, 2.0) && a.pose_error_deg.is_none(), "{done:?}");
     assert!(text_set::read(&stereo.out).unwrap().iter().flat_map(|i| &i.words).all(|w| w.pose.is_none()));
     // Edits: only what they cover changes.
     let made = edit::edit(&run, None, &edits(Change::Words(2)), &ON, &mut |_, _| ()).unwrap();

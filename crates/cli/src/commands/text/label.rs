@@ -22,12 +22,12 @@ pub struct Label {
     /// What carries labels to views: field (regions in space), or stereo (a homography from a labelled photograph, without poses)
     #[arg(long, default_value = "field")]
     labeler: String,
-    /// Surface of the regions: auto (a quadric where it fits much better than a plane), plane or quadric
-    #[arg(long, default_value = "auto")]
-    surface: String,
-    /// What the sides of regions follow: labels (the outlines that were labelled), or points (of the learned class)
-    #[arg(long, default_value = "labels")]
-    extent: String,
+    /// Surface of the regions: auto (a quadric where it fits much better than a plane), plane or quadric [default: auto]
+    #[arg(long, value_name = "SURFACE")]
+    surface: Option<String>,
+    /// What the sides of regions follow: labels (the outlines that were labelled), or points (of the learned class) [default: labels]
+    #[arg(long, value_name = "EXTENT")]
+    extent: Option<String>,
     /// Views to be labelled: all, training or held-out photographs, or a camera_path.json, whose views are rendered
     #[arg(long, default_value = "all")]
     cameras: String,
@@ -59,13 +59,13 @@ pub fn formats(names: &[String]) -> Result<Vec<SetFormat>> {
 
 impl Label {
     fn options(&self) -> Result<LabelOptions> {
-        let surface = match &self.surface[..] {
+        let surface = match self.surface.as_deref().unwrap_or("auto") {
             "auto" => Wanted::Auto,
             "plane" => Wanted::Plane,
             "quadric" => Wanted::Quadric,
             other => return Err(usage(format!("surface {other:?}: expected auto, plane or quadric"))),
         };
-        let extent = match &self.extent[..] {
+        let extent = match self.extent.as_deref().unwrap_or("labels") {
             "labels" => Extent::Labels,
             "points" => Extent::Points,
             other => return Err(usage(format!("extent {other:?}: expected labels or points"))),
@@ -79,6 +79,9 @@ impl Label {
         let out = self.out.clone().unwrap_or_else(|| self.run.join("labels"));
         let labeler = match &self.labeler[..] {
             "field" => Labeler::Surfaces(FitOptions { surface, extent }),
+            "stereo" if self.surface.is_some() || self.extent.is_some() => {
+                return Err(usage("--labeler stereo has no surfaces; leave --surface and --extent out".into()));
+            }
             "stereo" => Labeler::Stereo,
             other => return Err(usage(format!("labeler {other:?}: expected field or stereo"))),
         };
@@ -111,10 +114,9 @@ impl Verb for Label {
             }
             println!("{} images, {} words, {} not to be read", done.images, done.words, done.unreadable);
             if let Some(a) = &done.accuracy {
-                println!(
-                    "against the truth: corners {:.2} px, pose {:.1}°, visibility {:.3}",
-                    a.corner_error_px, a.pose_error_deg, a.visibility_error
-                );
+                let corners = a.corner_error_px.map(|v| format!("corners {v:.2} px, ")).unwrap_or_default();
+                let poses = a.pose_error_deg.map(|v| format!("pose {v:.1}°, ")).unwrap_or_default();
+                println!("against the truth: {corners}{poses}visibility {:.3}", a.visibility_error);
             }
             println!("{}", options.out.display());
         }

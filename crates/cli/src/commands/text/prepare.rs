@@ -115,6 +115,6 @@ impl Verb for Prepare {
         use_threads(self.threads)?;
         let out = self.out.display();
         let next = format!("label one to three photographs of {out}/images, then diorama text annotate {out} LABELS --format labelme");
-        carry_out(&self.options()?, "text prepare", &next, self.json)
+        carry_out(&self.options()?, &next, self.json)
     }
 }

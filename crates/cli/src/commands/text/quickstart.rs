@@ -48,8 +48,10 @@ impl Verb for Quickstart {
             return Ok(Outcome::Done);
         }
         println!("field      {:.2} dB, SSIM {:.3}, mIoU {:.3}", made.psnr, made.ssim, made.miou.unwrap_or(f64::NAN));
-        println!("labels     corners {:.2} px, poses {:.1}° off", made.corner_error_px, made.pose_error_deg);
-        println!("images     {} at {:.1}/s, {} labels more than 2 px from their glyphs", made.images, made.images_per_s, made.misfits);
+        let [corners, poses] = [made.corner_error_px, made.pose_error_deg].map(|v| v.unwrap_or(f64::NAN));
+        println!("labels     corners {corners:.2} px, poses {poses:.1}° off");
+        println!("images     {} at {:.1}/s", made.images, made.images_per_s);
+        println!("           {} of {} labels of new words more than 2 px from their glyphs", made.misfits, made.compared);
         println!("detectors  F {:.1} (DB), {:.1} (EAST) on other images of the scene", 100.0 * made.f_db, 100.0 * made.f_east);
         println!("data set   {}", made.dataset.display());
         println!("report     {}", made.report.display());

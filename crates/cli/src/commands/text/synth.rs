@@ -133,9 +133,7 @@ fn print(made: &Synthesized, out: &Path, json: bool) {
         println!("{} images in a style, {:.0} % of the time", made.styled, 100.0 * made.styling_share);
     }
     let Synthesized { compared, misfits, largest_misfit_px: largest, .. } = made;
-    println!(
-        "{compared} labels of new words compared with their glyphs: {misfits} images with one more than 2 px off, the farthest {largest:.2} px"
-    );
+    println!("{misfits} of {compared} labels of new words more than 2 px from their glyphs, the farthest {largest:.2} px");
     println!("{}", out.display());
 }
 

@@ -83,7 +83,7 @@ pub fn of_folder(
         }
     }
     let sharp = sharpness::sharp(&values, windows);
-    note(&format!("{} of {} photographs are sharp; at most {windows} are taken", sharp.len(), all.len()));
+    note(&format!("{} of {} photographs are taken: the sharpest of each of {windows} parts, without blurred ones", sharp.len(), all.len()));
     sharp.into_iter().for_each(|k| is_taken[readable[k]] = true);
     Ok(Some(all.into_iter().zip(is_taken).filter(|(_, taken)| *taken).map(|(file, _)| file).collect()))
 }

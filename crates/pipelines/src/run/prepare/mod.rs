@@ -167,7 +167,6 @@ fn pose(program: &Path, o: &PrepareOptions, interrupt: &AtomicBool, note: &mut d
     }
     let broken = left_out(&work.join(BROKEN))?;
     let images = photo_import::list(&o.out.join(IMAGES))?;
-    o.wanted.check(&o.input, images.len(), note)?;
     let names: Vec<String> = images.iter().map(|p| p.file_name().unwrap_or_default().to_string_lossy().into_owned()).collect();
     let is_video = !o.input.is_dir();
     let one_size = one_size(&images)?;
@@ -344,6 +343,11 @@ fn left_out(file: &Path) -> Result<Vec<String>> {
 /// Fills the image folder; returns false when interrupted.
 fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &mut dyn FnMut(&str)) -> Result<bool> {
     let folder = o.out.join(IMAGES);
+    // What an interrupted or refused call has left may be another choice.
+    if folder.exists() {
+        std::fs::remove_dir_all(&folder).map_err(DataError::io(&folder, "remove"))?;
+    }
+    std::fs::create_dir_all(&folder).map_err(DataError::io(&folder, "create"))?;
     let mut focal_ratio = None;
     let mut broken = Vec::new();
     if o.input.is_dir() {
@@ -385,6 +389,7 @@ fn take_images(o: &PrepareOptions, work: &Path, interrupt: &AtomicBool, note: &m
             }
         }
     }
+    o.wanted.check(&o.input, photo_import::list(&folder)?.len(), note)?;
     atomic::write(&work.join(BROKEN), broken.join("\n").as_bytes())?;
     let kept = focal_ratio.map(|f| f.to_string()).unwrap_or_default();
     atomic::write(&work.join(IMAGES_DONE), kept.as_bytes())?;

@@ -27,6 +27,7 @@ use replacement::Overlay;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::SystemTime;
 use unicode_script::{Script, UnicodeScript};
 
 /// Folder of a run's edits, and the file of one, which is written last.
@@ -106,6 +107,15 @@ impl Edit {
         let file = run.join(EDITS).join(name).join(EDIT);
         let bytes = error::read(&file, LIMIT)?;
         Ok(serde_json::from_slice(&bytes).map_err(|e| DataError::input(&file, format!("{e}; make the edit again")))?)
+    }
+
+    /// When one of a run was made.
+    ///
+    /// # Errors
+    /// When it is missing.
+    pub fn time(run: &Path, name: &str) -> Result<SystemTime> {
+        let file = run.join(EDITS).join(name).join(EDIT);
+        Ok(file.metadata().and_then(|m| m.modified()).map_err(DataError::io(&file, "read"))?)
     }
 
     /// Reads one of a run.

@@ -13,11 +13,12 @@ pub struct Accuracy {
     /// Region views that the truth has, and that were labelled.
     pub regions: usize,
     pub labelled: usize,
-    /// Median over region views of the mean distance of the four corners in pixels.
-    pub corner_error_px: f64,
-    /// Medians of the angle between poses in degrees, and of the distance of centers over that from the camera.
-    pub pose_error_deg: f64,
-    pub center_error: f64,
+    /// Median over region views of the mean distance of the four corners in pixels; none where none was labelled.
+    pub corner_error_px: Option<f64>,
+    /// Medians of the angle between poses in degrees, and of the distance of centers over that from the camera; none where labels have no
+    /// poses.
+    pub pose_error_deg: Option<f64>,
+    pub center_error: Option<f64>,
     /// Mean absolute difference of visibilities, over all regions that either has.
     pub visibility_error: f64,
 }
@@ -72,10 +73,10 @@ fn corner_error(shown: &Shown, word: &SetWord) -> f64 {
     (0..4).map(|k| DVec2::from(shown.quad[k]).distance(DVec2::from(word.quad[k]))).sum::<f64>() / 4.0
 }
 
-/// 0 of nothing.
-fn median(values: &mut [f64]) -> f64 {
+/// None of nothing.
+fn median(values: &mut [f64]) -> Option<f64> {
     values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+    values.get(values.len() / 2).copied()
 }
 
 /// The view of the truth of a frame's name.

@@ -12,13 +12,15 @@ diorama text train-detector --data data/set -o runs/db</pre>\n";
 /// The title, and the figures of all steps.
 pub fn head(m: &Made) -> String {
     let row = |name: &str, value: String| format!("<tr><td>{name}</td><td>{value}</td></tr>\n");
+    // A call that goes on with a complete set draws nothing.
+    let rate = if m.images_per_s > 0.0 { format!(" at {:.1} per second", m.images_per_s) } else { String::new() };
     let table = [
         row("Held-out photographs", format!("{:.2} dB, SSIM {:.3}", m.psnr, m.ssim)),
         row("Classes of their pixels, mIoU", m.miou.map_or("unknown".into(), |v| format!("{v:.3}"))),
-        row("Corners of labels of all photographs, median error", format!("{:.2} px", m.corner_error_px)),
-        row("Text poses, median error", format!("{:.1}°", m.pose_error_deg)),
-        row("Images drawn", format!("{} at {:.1} per second", m.images, m.images_per_s)),
-        row("Labels more than 2 px from their glyphs", m.misfits.to_string()),
+        row("Corners of labels of all photographs, median error", m.corner_error_px.map_or("unknown".into(), |v| format!("{v:.2} px"))),
+        row("Text poses, median error", m.pose_error_deg.map_or("unknown".into(), |v| format!("{v:.1}°"))),
+        row("Images drawn", m.images.to_string() + &rate),
+        row("Labels of new words more than 2 px from their glyphs", format!("{} of {}", m.misfits, m.compared)),
         row("DB, F by instance on other images of the scene", format!("{:.1}", 100.0 * m.f_db)),
         row("EAST, the same", format!("{:.1}", 100.0 * m.f_east)),
     ];

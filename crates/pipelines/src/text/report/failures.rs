@@ -77,14 +77,24 @@ pub fn filling(set: &Path, clusters: &[usize], runs: &[PathBuf], seed: u64) -> R
         [(name, _)] => runs.iter().find(|r| r.file_name().is_some_and(|f| f.to_string_lossy() == *name)),
         _ => None,
     };
-    let scenes = run.map_or_else(|| "scenes.toml".into(), |r| r.display().to_string());
+    let scenes = run.map_or_else(|| "scenes.toml".into(), |r| quoted(r));
     let (o, numbers) = (&made.options, clusters.iter().map(usize::to_string).collect::<Vec<_>>().join(","));
-    let prior = o.prior.as_ref().map_or(String::new(), |p| format!(" --prior {}", p.display()));
+    let prior = o.prior.as_ref().map_or(String::new(), |p| format!(" --prior {}", quoted(p)));
     let (w, h) = o.size;
     Ok(Some(format!(
         "diorama text synth {scenes} --clusters {} --only {numbers} --size {w}x{h}{prior} --seed {seed} -o data/weak",
         o.clusters
     )))
+}
+
+/// A path as a shell takes it.
+fn quoted(path: &Path) -> String {
+    let text = path.display().to_string();
+    if text.contains(|c: char| c.is_whitespace() || "'\"$`\\&;()<>|*?".contains(c)) {
+        format!("'{}'", text.replace('\'', "'\\''"))
+    } else {
+        text
+    }
 }
 
 /// The seed after those of all data sets that `text synth` wrote.

@@ -47,7 +47,7 @@ pub struct Gathered {
     pub aspect: f64,
     /// Places and areas of the words that are to be read.
     pub prior: Prior,
-    /// Words by their visible share, in [`VISIBILITY`] bins from 0 to 1; none where it is not told.
+    /// Words by their visible share, in equal bins from 0 to 1; none where it is not told.
     pub visibility: Option<Vec<usize>>,
     /// Words by script, most first; those that are not to be read apart, last.
     pub scripts: Vec<(String, usize)>,

@@ -1,6 +1,6 @@
 //! A page about data sets of images with writing, what detectors miss in them, and how well fields draw views: one HTML file.
 //!
-//! [`gathered`] counts, [`failures`] judges detectors, [`charts`] draws, [`page`] puts all together.
+//! `gathered` counts, `failures` judges detectors, `charts` draws, `page` puts all together.
 
 mod charts;
 mod failures;
@@ -16,9 +16,9 @@ use super::field::recipe;
 use super::field::scores::{self, Scores};
 use crate::error::Result;
 use crate::run::perceptual;
-use diorama_data::atomic;
 use diorama_data::text_labels::LabelledImage;
 use diorama_data::text_set::{self, SetImage};
+use diorama_data::{DataError, atomic};
 use diorama_engine::metrics::lpips::Lpips;
 pub use failures::{Failures, Judging, unused_seed};
 pub use gathered::Gathered;
@@ -121,6 +121,9 @@ impl Contents {
 /// # Errors
 /// When a data set, a detector or a run cannot be read, or the page cannot be written.
 pub fn report(out: &Path, o: &ReportOptions, stop: &AtomicBool, progress: &mut dyn FnMut(f64, &str)) -> Result<Option<Contents>> {
+    if let Some(folder) = out.parent().filter(|p| !p.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).map_err(DataError::io(folder, "create"))?;
+    }
     let mut contents = Contents {
         sets: o.sets.iter().map(|s| LabelledSet::read(s)).collect::<Result<_>>()?,
         real: o.real.as_ref().map(|r| Gathered::of_labels(&r.name, &r.images, &r.sizes)),

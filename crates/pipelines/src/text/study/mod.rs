@@ -19,7 +19,7 @@ use serde_json::Value;
 use table::Trial;
 
 /// Keys of options that may change while a study goes on: stages of the others stay right.
-const FREE: [&str; 4] = ["device", "models", "seeds", "real"];
+const FREE: [&str; 3] = ["models", "seeds", "real"];
 
 /// When the training of a detector ends.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]

@@ -299,7 +299,7 @@ mod tests {
     #[test]
     fn the_table_has_both_sets_and_their_difference() {
         let trials = [(PASTED, 20.0), (OURS, 45.0)].map(|(set, f)| Trial { test: GENERATED, ..trial(Kind::East, set, 0, [f; 3]) });
-        let scene = SceneStage { scene: "room-000".into(), psnr: 25.0, miou: None, corner_error_px: 1.0, left_out: None };
+        let scene = SceneStage { scene: "room-000".into(), psnr: 25.0, miou: None, corner_error_px: Some(1.0), left_out: None };
         let tests = [Test { name: GENERATED, key: GENERATED.into(), images: Vec::new() }];
         let text = text(&options(), &[scene], &[], (&tests, &trials), &[]);
         for expected in [

@@ -10,6 +10,7 @@ use crate::text::detectors::config::Kind;
 use crate::text::detectors::{judge, recipe as detection};
 use crate::text::field::config::{Config, Preset};
 use crate::text::field::{recipe, scores};
+use crate::text::fnv;
 use crate::text::make_scenes::{self, SceneOptions};
 use crate::text::stages;
 use crate::text::styling::MaskMode;
@@ -18,6 +19,7 @@ use crate::text::synth::plan::{SceneEntry, Scenes, Shard, SynthOptions};
 use crate::text::synth::prior::Prior;
 use crate::text::synth::sampling::{Clustering, Draws, Sampling, sample_seed};
 use crate::text::synth::scene::SynthScene;
+use diorama_data::error;
 use diorama_data::text_set::SetFormat;
 use diorama_data::text_set::detector_set::DetectorImage;
 use serde::{Deserialize, Serialize};
@@ -36,7 +38,7 @@ pub struct SceneStage {
     pub psnr: f64,
     pub miou: Option<f64>,
     /// Median over labels of all photographs.
-    pub corner_error_px: f64,
+    pub corner_error_px: Option<f64>,
     /// Why no image can be drawn of it; none of the others.
     pub left_out: Option<String>,
 }
@@ -118,12 +120,7 @@ impl<'a, 'l> Work<'a, 'l> {
             (self.listeners.stage)(&format!("{scene}: field, regions and words ({} of {})", k + 1, scenes.len()));
             let (photographs, run) = (self.at(place).join(scene), self.at("runs").join(scene));
             let Work { folder, common, stop, listeners } = self;
-            let work = || match field(scene, (&photographs, &run), common, stop, listeners) {
-                Err(PipelineError::Usage(why)) => {
-                    Ok(Some(SceneStage { scene: scene.clone(), psnr: 0.0, miou: None, corner_error_px: 0.0, left_out: Some(why) }))
-                }
-                other => other,
-            };
+            let work = || field(scene, (&photographs, &run), common, stop, listeners);
             let Some(done) = folder.once(&format!("field-{scene}"), &run, work)? else { return Ok(None) };
             out.push(done);
         }
@@ -209,7 +206,8 @@ impl<'a, 'l> Work<'a, 'l> {
         (self.listeners.stage)(&format!("{detector}: judging on {} images ({})", test.images.len(), test.name));
         let run = self.at("detectors").join(detector);
         let Work { folder, stop, listeners, .. } = self;
-        folder.once(&format!("scores-{detector}-{}", test.key), &run, || {
+        let weights = error::read(&run.join(detection::WEIGHTS), u64::MAX)?;
+        folder.once(&format!("scores-{detector}-{:016x}-{}", fnv::hash(weights), test.key), &run, || {
             let (network, config) = detection::open(&run, None, None)?;
             let look = &mut |i: usize| (listeners.share)(i as f64 / test.images.len() as f64);
             Ok(judge::judge(&network, &config, &test.images, stop, look)?.map(|j| Judgement::of(&j)))
@@ -230,7 +228,10 @@ pub fn usable(stages: &[SceneStage]) -> Result<(Vec<SceneStage>, Vec<String>)> {
     let note = |s: &SceneStage| format!("{} is left out: {}", s.scene, s.left_out.as_deref().unwrap_or_default());
     let notes: Vec<String> = left_out.iter().map(note).collect();
     match usable.is_empty() {
-        true => Err(PipelineError::Usage(format!("images can be drawn of no scene; give more --field-steps: {}", notes.join("; ")))),
+        true => Err(PipelineError::Usage(format!(
+            "images can be drawn of no scene; begin anew with more --field-steps and another --out: {}",
+            notes.join("; ")
+        ))),
         false => Ok((usable, notes)),
     }
 }
@@ -251,18 +252,23 @@ fn field(
     }
     let (model, _) = recipe::load(run, None)?;
     let scores = scores::evaluate(&model, &mut |_, _| Ok(()))?;
-    let labelled = stages::labels(run, run.join("labels"), stop, share)?;
-    if labelled.interrupted || stages::words(run, (common.words, common.seed), stop, share)?.interrupted {
-        return Ok(None);
+    let mut stage = SceneStage { scene: scene.into(), psnr: scores.psnr, miou: scores.miou, corner_error_px: None, left_out: None };
+    let mut drawable = || -> Result<bool> {
+        let labelled = stages::labels(run, run.join("labels"), stop, share)?;
+        stage.corner_error_px = labelled.accuracy.and_then(|a| a.corner_error_px);
+        if labelled.interrupted || stages::words(run, (common.words, common.seed), stop, share)?.interrupted {
+            return Ok(false);
+        }
+        probe(scene, run, common).map(|()| true)
+    };
+    match drawable() {
+        Ok(false) => return Ok(None),
+        Ok(true) => {}
+        // The field is good enough to be scored, but not to be written on.
+        Err(PipelineError::Usage(why)) => stage.left_out = Some(why),
+        Err(e) => return Err(e),
     }
-    probe(scene, run, common)?;
-    Ok(Some(SceneStage {
-        scene: scene.into(),
-        psnr: scores.psnr,
-        miou: scores.miou,
-        corner_error_px: labelled.accuracy.unwrap_or_default().corner_error_px,
-        left_out: None,
-    }))
+    Ok(Some(stage))
 }
 
 /// Sees whether a scene has cameras for balanced and for random sets.

@@ -20,8 +20,6 @@ use std::time::Instant;
 /// What a folder's data set is made of.
 pub const MANIFEST: &str = "synth.json";
 const LIMIT: u64 = 1 << 26;
-/// Distance in pixels from which a label does not fit its glyphs.
-const MISFIT_PX: f64 = 2.0;
 
 /// What a data set, or a shard of one, was made of.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -40,7 +38,7 @@ pub struct Synthesized {
     pub images: usize,
     pub words: usize,
     pub unreadable: usize,
-    /// Labels of new words that were compared with their glyphs, images with one that is more than 2 pixels off, and the largest distance.
+    /// Labels of new words that were compared with their glyphs, those that are more than 2 pixels off, and the largest distance.
     pub compared: usize,
     pub misfits: usize,
     pub largest_misfit_px: f64,
@@ -134,7 +132,7 @@ pub fn count(result: &mut Synthesized, done: &BTreeMap<usize, Done>, clusters: u
             *c += 1;
         }
         result.compared += d.compared;
-        result.misfits += (d.misfit_px > MISFIT_PX) as usize;
+        result.misfits += d.misfits;
         result.largest_misfit_px = result.largest_misfit_px.max(d.misfit_px);
     }
     while result.clusters.last() == Some(&0) {

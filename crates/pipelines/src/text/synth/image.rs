@@ -14,6 +14,8 @@ use diorama_geom::rng::Rng;
 use diorama_geom::{Camera, Image, ImageU8};
 use std::time::{Duration, Instant};
 
+/// Distance in pixels from which a label does not fit its glyphs.
+pub const MISFIT_PX: f64 = 2.0;
 /// Stream of random numbers of edits.
 const EDITS: u64 = 83;
 
@@ -23,9 +25,10 @@ pub struct Drawing {
     /// Share of each pixel that is a visible glyph of an edit, one channel.
     pub glyphs: ImageU8,
     pub record: SetImage,
-    /// Labels of edited words that were compared with their glyphs, and the largest distance in pixels between a label's corner and that of the
-    /// glyphs' own pixels.
+    /// Labels of edited words that were compared with their glyphs, those more than [`MISFIT_PX`] off, and the largest distance in pixels
+    /// between a label's corner and that of the glyphs' own pixels.
     pub compared: usize,
+    pub misfits: usize,
     pub misfit_px: f64,
     /// Time that the change of its look took.
     pub styling: Duration,
@@ -68,7 +71,8 @@ pub fn draw(
     let (model, pose) = (&scene.model, &drawn.pose);
     let mut view = model.tracer(Quality::Fast).view(&scene.posed(camera, pose), &mut |_| ());
     let mut glyphs = Image::zeros(camera.width as usize, camera.height as usize, 1);
-    let (mut words, mut compared, mut misfit_px): (Vec<SetWord>, usize, f64) = (Vec::new(), 0, 0.0);
+    let mut words: Vec<SetWord> = Vec::new();
+    let (mut compared, mut misfits, mut misfit_px) = (0, 0, 0.0f64);
     for (k, region) in scene.regions.iter().enumerate() {
         let Some(overlay) = edits.chosen(k, seed) else {
             words.extend(OnSurface::of(region).and_then(|w| in_view::labelled(model, &w, camera, pose)));
@@ -78,7 +82,8 @@ pub fn draw(
         for word in overlay.edit.words.iter().filter_map(|w| w.on(region)) {
             let Some(label) = in_view::labelled(model, &word, camera, pose) else { continue };
             if let Some(off) = verification::misfit_px(&word, &label, &own.whole, (camera, pose)) {
-                (compared, misfit_px) = (compared + 1, misfit_px.max(off));
+                (compared, misfits) = (compared + 1, misfits + (off > MISFIT_PX) as usize);
+                misfit_px = misfit_px.max(off);
             }
             words.push(label);
         }
@@ -103,5 +108,5 @@ pub fn draw(
         seed: Some(seed),
         words,
     };
-    Drawing { picture: picture.to_u8(), glyphs: glyphs.to_u8(), record, compared, misfit_px, styling }
+    Drawing { picture: picture.to_u8(), glyphs: glyphs.to_u8(), record, compared, misfits, misfit_px, styling }
 }

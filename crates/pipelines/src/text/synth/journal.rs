@@ -21,8 +21,9 @@ pub struct Done {
     pub cluster: usize,
     /// Hash of the image's file.
     pub hash: String,
-    /// Labels of new words that were compared with their glyphs, and the largest distance between both.
+    /// Labels of new words that were compared with their glyphs, those that are more than 2 pixels off, and the largest distance between both.
     pub compared: usize,
+    pub misfits: usize,
     pub misfit_px: f64,
     pub record: SetImage,
 }

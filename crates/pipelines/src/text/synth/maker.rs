@@ -96,8 +96,9 @@ impl<'a> Maker<'a> {
                     .map(|(c, f)| format!("{}: cluster {c} has no valid camera: {}", scene.name, draws.why(Some(*c), f))),
             );
             if feasible.is_empty() {
-                let why = notes.last().cloned().unwrap_or_else(|| format!("{}: there is no such cluster", scene.name));
-                return Err(PipelineError::Usage(why));
+                let why = notes.last().cloned().unwrap_or_else(|| format!("{}: no cluster has a valid camera", scene.name));
+                let cure = if self.scenes.scenes.len() > 1 { "; leave this scene out of the list of scenes" } else { "" };
+                return Err(PipelineError::Usage(why + cure));
             }
         }
         let began = Instant::now();
@@ -183,8 +184,8 @@ impl<'a> Maker<'a> {
         let bytes = photo::encode_png(&made.picture);
         atomic::write(&out.join(&made.record.image), &bytes)?;
         photo::save_png(&out.join(glyphs(&made.record.image)), &made.glyphs)?;
-        let Drawing { compared, misfit_px, styling, record, .. } = made;
-        let done = Done { sample, cluster: drawn.cluster, hash: hash(&bytes), compared, misfit_px, record };
+        let Drawing { compared, misfits, misfit_px, styling, record, .. } = made;
+        let done = Done { sample, cluster: drawn.cluster, hash: hash(&bytes), compared, misfits, misfit_px, record };
         Ok((done, [styling, began.elapsed()]))
     }
 }

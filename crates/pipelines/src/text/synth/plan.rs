@@ -99,6 +99,12 @@ impl SynthOptions {
         if !(1..=256).contains(&self.clusters) {
             return fault("--clusters: expected a number from 1 to 256");
         }
+        if let Some(c) = self.only.iter().find(|c| **c >= self.clusters) {
+            return fault(&format!("--only {c}: there is no such cluster; they are 0 to {}", self.clusters - 1));
+        }
+        if self.sampling == Sampling::Random && !self.only.is_empty() {
+            return fault("--only, or a list of --clusters: goes with --sampling balanced alone");
+        }
         Ok(())
     }
 }
