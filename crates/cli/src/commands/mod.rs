@@ -22,6 +22,7 @@ mod stages;
 mod text;
 mod train;
 mod view;
+mod work_flags;
 
 use clap::{Parser, Subcommand};
 use diorama_pipelines::Result;

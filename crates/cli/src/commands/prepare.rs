@@ -2,6 +2,7 @@
 
 use super::mask_flags::MaskFlags;
 use super::process::{INTERRUPT, usage, use_threads, watch_interrupts};
+use super::work_flags::WorkFlags;
 use super::{Outcome, Verb};
 use clap::Args;
 use diorama_data::split::SplitRule;
@@ -78,31 +79,21 @@ pub struct Prepare {
     /// Fail if fewer than this percentage of the photographs find a pose
     #[arg(long, default_value_t = 80.0)]
     min_registered: f64,
-    /// Number of CPU threads [default: all]
-    #[arg(long)]
-    threads: Option<usize>,
-    /// Continue where an interrupted call stopped
-    #[arg(long)]
-    resume: bool,
-    /// Replace an earlier data set
-    #[arg(long, conflicts_with = "resume")]
-    force: bool,
-    /// Print one JSON object on stdout
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    work: WorkFlags,
 }
 
 impl Verb for Prepare {
     fn json(&self) -> bool {
-        self.json
+        self.work.json
     }
 
     fn run(&self) -> Result<Outcome> {
-        use_threads(self.threads)?;
+        use_threads(self.work.threads)?;
         self.check_numbers()?;
         let name = self.out.file_name().unwrap_or_default().to_string_lossy();
         let next = format!("diorama train {} -o runs/{name}", self.out.display());
-        carry_out(&self.options()?, &next, self.json)
+        carry_out(&self.options()?, &next, self.work.json)
     }
 }
 
@@ -182,9 +173,9 @@ impl Prepare {
             split: split.unwrap_or(SplitRule::File),
             seed: self.seed,
             min_registered: self.min_registered,
-            threads: self.threads,
-            resume: self.resume,
-            force: self.force,
+            threads: self.work.threads,
+            resume: self.work.resume,
+            force: self.work.force,
             skip_broken: self.skip_broken,
         })
     }

@@ -261,3 +261,18 @@ fn weights_that_are_frozen_beside_layers_that_are_not_are_refused() {
     let described = step(0, stratified(), photometric(ColorLoss::Mse));
     CpuTrainer::new(scene(), &of).step(&mut of, Some(&Photographs { pixels: &pixels, observations: &[] }), &described);
 }
+
+#[test]
+fn given_rays_end_where_they_are_told_to() {
+    let (origins, dirs) = ([-1.0, 0.5, 0.5].repeat(3), [1.0, 0.0, 0.0].repeat(3));
+    let of = |far: &[f32]| {
+        let mut near_far = vec![0.0; 6];
+        let (images, jitter) = (&[0; 3], &[0.5; 3]);
+        let given = GivenRays { images, origins: &origins, dirs: &dirs, far, jitter, target: &[], background: &[0.0; 9], codes: &[] };
+        given.extents((0.0, 1.0), 0.05, &mut near_far);
+        near_far
+    };
+    assert_eq!(of(&[]), [1.0, 2.0, 1.0, 2.0, 1.0, 2.0]);
+    // The last ends before the scene begins.
+    assert_eq!(of(&[f32::MAX, 1.25, 0.5]), [1.0, 2.0, 1.0, 1.25, 0.0, 0.0]);
+}

@@ -1,6 +1,7 @@
 //! `diorama relight prepare`
 
 use crate::commands::process::{INTERRUPT, note, usage, use_threads, watch_interrupts};
+use crate::commands::work_flags::WorkFlags;
 use crate::commands::{Outcome, Verb};
 use clap::Args;
 use diorama_geom::glam::DVec3;
@@ -63,27 +64,17 @@ pub struct Prepare {
     /// Leave out photographs that cannot be decoded
     #[arg(long)]
     skip_broken: bool,
-    /// Number of CPU threads [default: all]
-    #[arg(long)]
-    threads: Option<usize>,
-    /// Continue where an interrupted call stopped
-    #[arg(long)]
-    resume: bool,
-    /// Replace an earlier data set
-    #[arg(long, conflicts_with = "resume")]
-    force: bool,
-    /// Print one JSON object on stdout
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    work: WorkFlags,
 }
 
 impl Verb for Prepare {
     fn json(&self) -> bool {
-        self.json
+        self.work.json
     }
 
     fn run(&self) -> Result<Outcome> {
-        use_threads(self.threads)?;
+        use_threads(self.work.threads)?;
         let options = self.options()?;
         watch_interrupts();
         let (mut last, mut stage) = (Instant::now(), String::new());
@@ -100,7 +91,7 @@ impl Verb for Prepare {
             return Ok(Outcome::Interrupted);
         };
         made.notes.iter().for_each(|n| note(n));
-        if self.json {
+        if self.work.json {
             println!("{}", serde_json::to_string(&made).expect("plain values"));
         } else {
             print(&made);
@@ -136,10 +127,10 @@ impl Prepare {
             seed: self.seed,
             up: self.up.as_ref().map(vector).transpose()?,
             rescale: self.rescale,
-            threads: self.threads,
+            threads: self.work.threads,
             skip_broken: self.skip_broken,
-            resume: self.resume,
-            force: self.force,
+            resume: self.work.resume,
+            force: self.work.force,
         })
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::commands::prepare::carry_out;
 use crate::commands::process::{usage, use_threads};
+use crate::commands::work_flags::WorkFlags;
 use crate::commands::{Outcome, Verb};
 use clap::Args;
 use diorama_data::import;
@@ -49,18 +50,8 @@ pub struct Prepare {
     /// Leave out photographs that cannot be decoded, and list them
     #[arg(long)]
     skip_broken: bool,
-    /// Number of CPU threads [default: all]
-    #[arg(long)]
-    threads: Option<usize>,
-    /// Continue where an interrupted call stopped
-    #[arg(long)]
-    resume: bool,
-    /// Replace an earlier data set
-    #[arg(long, conflicts_with = "resume")]
-    force: bool,
-    /// Print one JSON object on stdout
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    work: WorkFlags,
 }
 
 impl Prepare {
@@ -98,9 +89,9 @@ impl Prepare {
             split: if sfm == Sfm::None { SplitRule::File } else { SplitRule::Every(HELD_OUT) },
             seed: 0,
             min_registered: self.min_registered,
-            threads: self.threads,
-            resume: self.resume,
-            force: self.force,
+            threads: self.work.threads,
+            resume: self.work.resume,
+            force: self.work.force,
             skip_broken: self.skip_broken,
         })
     }
@@ -108,13 +99,13 @@ impl Prepare {
 
 impl Verb for Prepare {
     fn json(&self) -> bool {
-        self.json
+        self.work.json
     }
 
     fn run(&self) -> Result<Outcome> {
-        use_threads(self.threads)?;
+        use_threads(self.work.threads)?;
         let out = self.out.display();
         let next = format!("label one to three photographs of {out}/images, then diorama text annotate {out} LABELS --format labelme");
-        carry_out(&self.options()?, &next, self.json)
+        carry_out(&self.options()?, &next, self.work.json)
     }
 }

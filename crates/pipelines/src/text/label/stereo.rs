@@ -50,7 +50,7 @@ impl<'a> Stereo<'a> {
 
     /// Labels of a view, whose capture's frame is given if it is a photograph: of each region from the labelled photograph with most matches.
     pub(super) fn words(&self, to: &LabelledView) -> Vec<SetWord> {
-        let camera = PosedCamera { camera: to.camera, ..super::posed(self.model, to) };
+        let camera = super::posed(self.model, to);
         let view = self.model.surface_view(&camera);
         let carried = |id: &u32| {
             let of = |s: &Source| self.carried(s, *id, to.frame, (&camera, &view)).map(|c| (c.inliers, c));

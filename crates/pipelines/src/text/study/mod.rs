@@ -77,6 +77,24 @@ impl Common {
         }
     }
 
+    /// The least of everything.
+    #[cfg(test)]
+    fn small(model: Kind, seeds: u64, limit: Limit) -> Common {
+        Common {
+            scenes: 2,
+            images: 3,
+            words: 2,
+            size: (96, 72),
+            clusters: 4,
+            field_steps: 10,
+            device: "cpu".into(),
+            models: vec![model],
+            seeds,
+            limit,
+            seed: 0,
+        }
+    }
+
     /// Photographs of scenes as `make-scenes --size ci` takes them, of other families and another number.
     fn photographs(&self, families: Vec<String>, scenes: usize) -> Result<SceneOptions> {
         Ok(SceneOptions { families, scenes, seed: self.seed, ..SceneOptions::named("ci")? })

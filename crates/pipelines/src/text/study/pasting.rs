@@ -280,19 +280,7 @@ mod tests {
     }
 
     fn options() -> PastingOptions {
-        let common = Common {
-            scenes: 2,
-            images: 3,
-            words: 2,
-            size: (96, 72),
-            clusters: 4,
-            field_steps: 10,
-            device: "cpu".into(),
-            models: vec![Kind::East],
-            seeds: 1,
-            limit: Limit { steps: 0, seconds: 2.5 },
-            seed: 0,
-        };
+        let common = Common::small(Kind::East, 1, Limit { steps: 0, seconds: 2.5 });
         PastingOptions { common, test_family: "street".into(), test_images: 4, real: None }
     }
 

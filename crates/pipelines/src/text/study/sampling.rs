@@ -139,19 +139,7 @@ mod tests {
     use std::cell::Cell;
 
     fn options() -> SamplingOptions {
-        let common = Common {
-            scenes: 2,
-            images: 3,
-            words: 2,
-            size: (96, 72),
-            clusters: 4,
-            field_steps: 10,
-            device: "cpu".into(),
-            models: vec![Kind::Db],
-            seeds: 2,
-            limit: Limit { steps: 4, seconds: 0.0 },
-            seed: 0,
-        };
+        let common = Common::small(Kind::Db, 2, Limit { steps: 4, seconds: 0.0 });
         SamplingOptions { common, test_scenes: 1, test_images: 4 }
     }
 

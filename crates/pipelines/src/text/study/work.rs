@@ -278,7 +278,7 @@ fn field(
 fn probe(name: &str, run: &Path, common: &Common) -> Result<()> {
     let mut scene = SynthScene::load(name.into(), run, &mut |_| ())?;
     scene.look();
-    let clustering = Clustering::new(&[scene.members.clone()], common.clusters, common.seed);
+    let clustering = Clustering::new(&[scene.members.clone()], common.clusters);
     let (prior, camera) = (Prior::default(), scene.camera(common.size));
     let draws = Draws { scene: &scene, number: 0, clustering: &clustering, prior: &prior, camera, seed: common.seed };
     let valid = (0..PROBES).filter(|k| draws.random(sample_seed(common.seed, name, *k)).is_ok()).count();

@@ -44,7 +44,7 @@ pub struct Synthesized {
     pub largest_misfit_px: f64,
     /// Images of each cluster of text poses.
     pub clusters: Vec<usize>,
-    /// Images whose look was changed, and the share of `seconds` that this took.
+    /// Images whose look was changed, and the share of the time of all images that this took.
     pub styled: usize,
     pub styling_share: f64,
     pub seconds: f64,

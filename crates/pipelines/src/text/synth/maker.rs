@@ -17,8 +17,6 @@ use std::time::{Duration, Instant};
 
 /// Rounds of attempts in a sample's cluster and the next ones before it is given up.
 const ROUNDS: u64 = 2 * OWN_ROUNDS;
-/// Seed of the clusters of text poses: data sets of the same scenes number the same clusters alike, whatever their own seed.
-const CLUSTERING: u64 = 0;
 /// Samples per thread that are drawn side by side.
 const SIDE_BY_SIDE: usize = 4;
 
@@ -69,7 +67,7 @@ impl<'a> Maker<'a> {
             members.push(scene.members.clone());
             loaded = Some((k, scene));
         }
-        let clustering = Clustering::new(&members, options.clusters, CLUSTERING);
+        let clustering = Clustering::new(&members, options.clusters);
         Ok(Maker { scenes, options, prior, clustering, styles, styling: Duration::ZERO, drawing: Duration::ZERO, loaded, present: None })
     }
 

@@ -28,6 +28,8 @@ const AREA_STEPS: usize = 65;
 /// Stream of random numbers of a sample, and those of the probes of a scene.
 const SAMPLE: u64 = 81;
 const PROBE: u64 = 82;
+/// Seed of the clusters.
+const CLUSTERING: u64 = 0;
 /// Random numbers of an attempt.
 const PER_ATTEMPT: u64 = 32;
 
@@ -60,10 +62,10 @@ pub struct Clustering {
 pub type Faults = BTreeMap<Fault, usize>;
 
 impl Clustering {
-    /// At most `k` clusters.
-    pub fn new(scenes: &[Vec<Member>], k: usize, seed: u64) -> Clustering {
+    /// At most `k` clusters, which data sets of the same scenes number alike.
+    pub fn new(scenes: &[Vec<Member>], k: usize) -> Clustering {
         let all: Vec<DQuat> = scenes.iter().flatten().map(|m| m.camera_from_region).collect();
-        let found = clusters(&all, k, seed);
+        let found = clusters(&all, k, CLUSTERING);
         let mut of = found.of.iter();
         let sorted = |members: &Vec<Member>| {
             let mut out = vec![Vec::new(); found.centers.len()];
@@ -252,7 +254,7 @@ mod tests {
         let member =
             |angle: f64| Member { region: 0, camera_from_region: DQuat::from_rotation_y(angle), center: [0.5; 2], area_ratio: 0.1 };
         let scenes = [vec![member(0.0), member(0.02)], vec![member(0.01), member(1.0), member(1.02)]];
-        let c = Clustering::new(&scenes, 2, 3);
+        let c = Clustering::new(&scenes, 2);
         assert_eq!(c.centers.len(), 2);
         let [front, side] = [0.0, 1.0].map(|a| c.nearest(&DMat3::from_rotation_y(a)));
         assert_ne!(front, side);
